@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -61,6 +61,9 @@ rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decis
 
 rig-families: setup  ## insertions on 100 random rigs, emulated and in simulated time (hours)
 	$(BIN)/python studies/rig_families.py --out $(or $(DIR),runs/rig-families)
+
+rig-ros: setup  ## what ROS subscribers cost an insertion on an emulated rig, and stops over ROS (an hour)
+	$(BIN)/python studies/rig_ros.py --pairs 5 --out $(or $(DIR),runs/rig-ros)
 
 fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
 	$(BIN)/python studies/fuzz_galil.py

@@ -7,7 +7,7 @@ from math import degrees, inf
 from typing import Any
 
 import numpy as np
-from fault_list import ENDED_HELD, RESTED, Fault
+from fault_list import RESTED, Fault
 from rig_trials import moved_between, rests
 
 from flexneedle.rig.emulator.coupled.truth import Truth
@@ -17,6 +17,8 @@ MOTION_MM = 0.5
 END = "end"
 """The state of a rig whose controller has stopped it, at the end of an insertion."""
 _BY_CONTROLLER = "the controller"  # who stops the motors then
+_RECORDED = ("holding", "stopped", "fault")  # states with a reason of their own
+_AT_REST = 1e-3  # from where an axis is at the end (mm, rad)
 _PAUSE_S = 0.02  # of an axis between two motions; within one it is somewhere else after 4 ms
 
 
@@ -59,6 +61,7 @@ class Evidence:
             "why": detection.why if detection else "",
             "detection_s": max(0.0, detection.time - self.injected) if detection else None,
             "from_motion_s": self._from_motion(detection.time) if detection else None,
+            "rest_s": self._rest(*span) if span and span[0] == self.injected else None,
             "motion_mm": None if span is None else self._moved("insertion", *span),
             "rolled_deg": None if span is None else degrees(self._moved("rotation", *span)),
             "during": self._during(),
@@ -76,6 +79,15 @@ class Evidence:
         if detection is not None:
             return detection.time, resumed
         return (self.injected, inf) if "" in self.fault.reaction.outcomes else None
+
+    def _rest(self, since: float, until: float) -> float:
+        """Time from the fault until all axes are where they are at the end of a span."""
+        at = (self.truth.time >= since) & (self.truth.time <= until)
+        moving = [
+            self.truth.time[at][np.abs(place[at] - place[at][-1]) > _AT_REST]
+            for place in self.truth.positions.values()
+        ]
+        return max((float(times[-1]) - since for times in moving if len(times)), default=0.0)
 
     def _moved(self, axis: str, since: float, until: float) -> float:
         return moved_between(self.truth, since, until, axis)
@@ -124,8 +136,10 @@ def problems(fault: Fault, row: Mapping[str, Any]) -> list[str]:
     checks = {
         f"states: {row['states'] or 'none'}": required,
         f"outcome: {row['outcome']}": not required or row["outcome"] in required,
-        f"reason: {row['why']}": row["detection_s"] is None or _is_because(fault, row),
-        f"detection: {detection_s(fault, row)}": _is_timely(fault, row),
+        f"reason: {_reason(fault, row)}": _is_because(fault, row),
+        f"{'rest' if fault.timed == 'rest_s' else 'detection'}: {seconds_of(fault, row)}": _is_timely(
+            fault, row
+        ),
         f"motion: {row['motion_mm']} mm": row["motion_mm"] is None or row["motion_mm"] <= MOTION_MM,
         "no rest": row["rests"],
         f"processes left: {row['left']}": row["left"] == 0,
@@ -133,19 +147,29 @@ def problems(fault: Fault, row: Mapping[str, Any]) -> list[str]:
     return [problem for problem, fine in checks.items() if not fine]
 
 
-def detection_s(fault: Fault, row: Mapping[str, Any]) -> float | None:
-    """Time to detection in a trial; None without one."""
-    found: float | None = row["from_motion_s" if fault.from_motion else "detection_s"]
+def seconds_of(fault: Fault, row: Mapping[str, Any]) -> float | None:
+    """The time that counts in a trial: to detection or to rest; None without one."""
+    found: float | None = row[fault.timed]
     return found
 
 
+def _reason(fault: Fault, row: Mapping[str, Any]) -> str:
+    """The reason of the detection: that of the state, and where that has none that of the outcome."""
+    return str(row["why" if set(fault.reaction.detected) & set(_RECORDED) else "reason"])
+
+
 def _is_because(fault: Fault, row: Mapping[str, Any]) -> bool:
-    return fault.reaction is ENDED_HELD or bool(re.search(fault.because.format(axis=row["axis"]), row["why"]))
+    """Whether the reason is that of the fault; without a detection by the supervisor there is none to compare."""
+    if row["detection_s"] is None and set(fault.reaction.detected) & set(_RECORDED):
+        return True
+    return re.search(fault.because.format(axis=row["axis"]), _reason(fault, row)) is not None
 
 
 def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Whether it was detected in time. What shows only in a motion need not be, if there is none before the end."""
-    seconds = detection_s(fault, row)
+    """Whether it was in time. What shows only in a motion need not be detected, if there is none before the end."""
+    seconds = seconds_of(fault, row)
+    if fault.within is None:
+        return True
     if seconds is None:
-        return fault.within is None or (fault.from_motion and row["detection_s"] is None)
-    return fault.within is None or seconds <= fault.within
+        return fault.timed == "from_motion_s" and row["detection_s"] is None
+    return seconds <= fault.within

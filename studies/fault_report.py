@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_judging import MOTION_MM, detection_s, good
+from fault_judging import MOTION_MM, good, seconds_of
 from fault_list import Fault
 
 Row = Mapping[str, Any]
@@ -39,7 +39,9 @@ def rows_of(fault: Fault, rows: Sequence[Row]) -> list[Row]:
 
 def _line(fault: Fault, rows: Sequence[Row]) -> str:
     outcomes = sorted({"no record" if row["outcome"] == "running" else row["outcome"] for row in rows})
-    longest = _longest([detection_s(fault, row) for row in rows])
+    longest = _longest([seconds_of(fault, row) for row in rows])
+    if fault.timed == "rest_s":
+        longest = f"at rest: {longest}"
     cells = [
         *(fault.group, fault.name, fault.reaction.text, ", ".join(outcomes)),
         "–" if fault.within is None else f"{longest} ({fault.within:g})",
@@ -69,7 +71,7 @@ def draw(faults: Sequence[Fault], rows: Sequence[Row], path: Path) -> None:
         width_ratios=[3, 3, 2],
     )
     for at, (fault, mine) in enumerate(shown):
-        seconds = [detection_s(fault, row) for row in mine]
+        seconds = [seconds_of(fault, row) for row in mine]
         columns = (seconds, *([row[key] for row in mine] for key in ("motion_mm", "rolled_deg")))
         for axis, found in zip(axes, columns, strict=True):
             values = [value for value in found if value is not None]
@@ -78,7 +80,7 @@ def draw(faults: Sequence[Fault], rows: Sequence[Row], path: Path) -> None:
         if fault.within is not None:
             axes[0].plot([fault.within], [at], "|", color=_RED, markersize=11, markeredgewidth=2)
     axes[1].axvline(MOTION_MM, color=_RED, linewidth=2)
-    axes[0].set(xscale="log", xlim=(8e-4, 4.0), xlabel="time to detection (s); its limit")
+    axes[0].set(xscale="log", xlim=(8e-4, 4.0), xlabel="time to detection, or to rest (s); its limit")
     axes[0].set_yticks(range(len(shown)), [f"{fault.group}: {fault.name}" for fault, _ in shown])
     axes[1].set(xlabel=f"motion of the base after detection (mm); limit {MOTION_MM:g}", xlim=(-0.02, 0.6))
     axes[2].set(xlabel="roll after detection (°)", xlim=(-5.0, 185.0))

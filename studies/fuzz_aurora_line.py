@@ -312,7 +312,7 @@ def _refused(line: Line, tally: Tally, random: Random) -> None:
     line.damage, begun = _damage(random)[1], monotonic()
     try:
         Aurora(str(line.serial.link), ZeroClock()).close()
-    except RunError as error:
+    except (InputError, RunError) as error:  # InputError: the port does not exist, since the cable is pulled
         tally.refused += 1
         if "\n" in str(error):
             raise Failure(f"message {str(error)!r}") from error

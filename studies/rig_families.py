@@ -10,7 +10,7 @@ emulated rig (controller, tracker and phantom in three processes, in real time),
 
 Insertions mostly wait, so that several run at once. Rows are appended to OUT/rows.jsonl as they end, and not repeated:
 the study can be interrupted. Records are kept of insertions that are not done. Exit status 1 if an insertion failed or
-was refused, or was held where the simulated one is done.
+was refused, was held where the simulated one is done, or has no row.
 """
 
 import argparse
@@ -350,7 +350,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the rigs that are missing, and print the summary."""
+    """Run the rigs that are missing, and print the summary; exit status 1 if one is bad, or has no row."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -365,9 +365,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows.append(row)
             if new:
                 print(f"{len(rows)} of {len(numbers)}: {shown(row)}", file=sys.stderr, flush=True)
+    if not rows:
+        return 1
     print(summary(rows))
     draw(rows, args.out / "families.png")
-    return int(any(map(is_bad, rows)))
+    if len(rows) < len(numbers):
+        print(f"{len(numbers) - len(rows)} of {len(numbers)} rigs have no row", file=sys.stderr)
+    return int(len(rows) < len(numbers) or any(map(is_bad, rows)))
 
 
 def _rows(numbers: range, out: Path, seen: Witness, workers: int) -> Iterator[tuple[dict[str, Any], bool]]:

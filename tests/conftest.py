@@ -32,6 +32,11 @@ engaged_width_mm = 5.0
 """
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than cores: many tests wait for processes that they have started."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interrupts():
     """Ctrl-C means what it means in a terminal, also where the tests were started in the background."""

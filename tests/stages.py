@@ -345,6 +345,20 @@ class Noting(Stage):
         super()._called(*call)
 
 
+class Printing(Stage):
+    """Motors in memory, of somebody who prints."""
+
+    def read(self):
+        print("position of the stage:")
+        return super().read()
+
+
+def printing_motors(_settings, channels):
+    """A driver of a rig file, `stages:printing_motors`."""
+    print("opens the stage")
+    return Printing(WallClock(), channels)
+
+
 def noting_motors(settings, channels):
     """A driver of a rig file, `stages:noting_motors`; file: path of its notes; address: of its motors."""
     made = Noting(settings["file"], channels)

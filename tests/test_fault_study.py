@@ -32,16 +32,23 @@ from rig_trials import Lines
 BY_NAME = {fault.name: fault for fault in FAULTS}
 INJECTED = 10.0
 END = (20.0, "stopped", "the controller")
-MISSING = "missing: no reading for 0.2 s"
+MISSING = "missing: tip not measured (missing)"
 
 
-def evidence(name, *states, outcome="done", moves=(), left=0, axis="insertion"):
+REASONS = {
+    "disk full": "trace.mcap cannot be written: No space left on device",
+    "supervisor killed": "the supervisor has ended: it was killed",
+}
+
+
+def evidence(name, *states, outcome="done", reason=None, moves=(), left=0, axis="insertion"):
     """Of a fault at 10 s: states that the supervisor has entered, motions of the base (begin and end in s, mm)."""
     time = np.arange(8.0, 23.0, 0.004)
     base = sum((np.clip((time - a) / (b - a), 0.0, 1.0) * mm for a, b, mm in moves), np.zeros(len(time)))
     positions = {"insertion": base, "rotation": np.zeros(len(time))}
     recorded = [{"time_s": at, "state": state, "why": why} for at, state, why in states]
-    run = {"status": outcome, "timing": {"ticks": {"states": recorded}}}
+    reason = REASONS.get(name, "") if reason is None else reason
+    run = {"status": outcome, "reason": reason, "timing": {"ticks": {"states": recorded}}}
     truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
     return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left)
 
@@ -78,6 +85,19 @@ INTERRUPT = (10.02, "stopped", "signal SIGINT")
         ("Ctrl-C", [INTERRUPT], "interrupted"),
         ("disk full", [(10.4, "stopped", "the controller")], "held"),
         ("guide stalls", [END], "done"),
+        ("frozen: values repeat", [(10.4, "holding", "frozen: 9 identical readings"), END], "held"),
+        ("frozen: values repeat", [(10.4, "holding", "innovation: 1 mm, limit 1 mm"), END], "held"),
+        ("jump of 5 mm", [(10.1, "holding", "out of plane: 2 mm, limit 1 mm"), END], "held"),
+        ("garbled", [(10.4, "holding", "missing: no reading for 0.2 s (no reply)"), END], "held"),
+        ("indicator high", [(10.6, "holding", "field distorted: ref2 0.2, limit 0.1"), END], "held"),
+        ("? in reply", [(10.02, "fault", "TPABCD refused: 7 Command not valid while running")], "failed"),
+        ("no replies", [(10.1, "fault", "no reply in time (to TPABCD)")], "failed"),
+        ("garbled replies", [(10.1, "fault", "not a reply: ' 1\\xee' (to TPABCD)")], "failed"),
+        (
+            "connection lost",
+            [(10.05, "fault", "TPABCD not sent: the controller closed the connection")],
+            "failed",
+        ),
         ("controller killed", [], "running"),
         ("supervisor killed", [], "failed"),
     ],
@@ -108,11 +128,42 @@ def test_the_required_reaction_is_good(name, states, outcome):
         ("guide stalls", [(11.0, "fault", "guide_y: stalls")], "done", "outcome: done"),
         ("supervisor killed", [OFF], "failed", "states: fault"),
         ("motor off", [(10.25, *OFF[1:])], "failed", "detection: 0.25"),
+        ("frozen: values repeat", [HOLD, END], "held", "reason: missing"),
+        ("not a number", [(10.1, "holding", "jump: 5 mm, limit 1 mm"), END], "held", "reason: jump"),
+        ("jump of 5 mm", [HOLD, END], "held", "reason: missing"),
+        ("garbled", [(10.2, "holding", "frozen: 9 identical readings"), END], "held", "reason: frozen"),
+        ("indicator high", [HOLD, END], "held", "reason: missing"),
+        ("? in reply", [OFF], "failed", "reason: insertion"),
+        ("no replies", [OFF], "failed", "reason: insertion"),
+        ("connection lost", [OFF], "failed", "reason: insertion"),
     ],
 )
 def test_another_state_reason_or_outcome_is_not(name, states, outcome, problem):
     found = wrong(name, *states, outcome=outcome)
     assert any(one.startswith(problem) for one in found), found
+
+
+def test_every_fault_that_is_detected_has_its_reason():
+    recorded = {"controller killed", "both killed"}  # by nobody
+    for fault in FAULTS:
+        quiet = fault.within is None or fault.name in recorded or fault.decision_s == 0.5
+        assert quiet or fault.because, fault.name
+
+
+def test_what_ended_the_insertion_is_the_reason_where_the_supervisor_has_none():
+    full = (10.4, "stopped", "the controller")
+    held = "held for 1.1 s (limit 1 s): missing"
+    assert wrong("disk full", full, outcome="held", reason=held) == [f"reason: {held}"]
+    assert wrong("supervisor killed", outcome="failed", reason="late") == ["reason: late"]
+
+
+def test_a_killed_process_is_timed_until_all_axes_rest():
+    found = row("both killed", outcome="running", moves=[(9.9, 10.1, 0.5)])
+    assert found["rest_s"] == pytest.approx(0.1, abs=0.005)
+    assert good(BY_NAME["both killed"], found)
+    late = wrong("both killed", outcome="running", moves=[(9.9, 10.5, 0.4)])
+    assert [one[:8] for one in late] == ["rest: 0."]
+    assert row("motor off", OFF)["rest_s"] is None
 
 
 def test_a_state_before_the_fault_is_no_reaction():
@@ -224,7 +275,10 @@ def test_table_and_picture(tmp_path):
     rows = [row("motor off", OFF, outcome="failed"), bad, row("controller killed", outcome="running")]
     lines = table(FAULTS, rows).splitlines()
     assert lines[2] == "| motors | motor off | fault | failed | 0.020 (0.1) | 0.000 | 0.0 | 1 of 2 |"
-    assert lines[3] == "| computer | controller killed | stop | no record | – | 0.000 | 0.0 | 1 of 1 |"
+    assert (
+        lines[3]
+        == "| computer | controller killed | stop | no record | at rest: 0.000 (0.225) | 0.000 | 0.0 | 1 of 1 |"
+    )
     assert lines[-1] == "3 faults, during: 0 an advance, 0 a roll, 3 a rest between two steps."
     draw(FAULTS, rows, tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000

@@ -21,7 +21,7 @@ def row(pair, ms, error=0.03, innovation=0.001, outcome="done"):
     return found | {
         "true_error_mm": error,
         "axial_innovation_mm": innovation,
-        "late": 1,
+        "late": 0,
         "periods": 70,
         "ticks": 900,
     }
@@ -52,7 +52,7 @@ def test_every_second_pair_is_a_world_that_fits_the_rig():
 def test_both_bounds_are_those_of_the_means(growth, innovation, within):
     zero, fifty, _ = study.lines(rows(growth, innovation))
     assert fifty.growth == pytest.approx((growth, growth, growth))
-    assert fifty.within is within
+    assert (fifty.problems == []) is within
     assert zero.growth[0] == 0.0
 
 
@@ -62,8 +62,41 @@ def test_a_pair_counts_once_it_is_done_with_every_time():
     lines = list(study.lines(found))
     assert [line.pairs for line in lines] == [19, 19, 19]
     assert lines[1].growth[0] == pytest.approx(0.01)
-    assert all(line.within for line in lines)
-    assert not next(study.lines([*found, row(100, 0, outcome="failed")])).within
+    assert study.problems(lines, 0) == []
+    assert study.problems(list(study.lines([*found, row(100, 0, outcome="failed")])), 0) == [
+        "0 ms: 1 neither done nor held"
+    ]
+
+
+def test_insertions_without_a_row_are_not_as_required():
+    assert study.problems(list(study.lines(rows(0.01))), 3) == ["3 insertions have no row"]
+    assert study.problems([], 9) == ["9 insertions have no row", "no pair is complete"]
+
+
+@pytest.mark.parametrize(
+    ("only_with", "only_without", "fine"),
+    [(5, 0, True), (6, 0, False), (8, 3, True), (10, 2, False), (0, 9, True)],
+)
+def test_pairs_that_are_held_only_with_a_delay_are_no_more_than_chance_explains(
+    only_with, only_without, fine
+):
+    found = rows(0.01)
+    for at in range(only_with):
+        found += [row(100 + at, 0), row(100 + at, 50, outcome="held"), row(100 + at, 150)]
+    for at in range(only_without):
+        found += [row(200 + at, 0, outcome="held"), row(200 + at, 50), row(200 + at, 150, outcome="held")]
+    _, fifty, _ = study.lines(found)
+    assert fifty.held == (only_with, only_without)
+    assert (fifty.problems == []) is fine, fifty.problems
+
+
+def test_ticks_that_no_stall_explains_and_late_decisions_are_not_as_required():
+    found = rows(0.01)
+    found[0] |= {"unexplained": 1}
+    zero, fifty, most = study.lines([one | {"late": int(one["pair"] < 15)} for one in found])
+    assert [one[:8] for one in zero.problems] == ["0 ms: 1 ", "0 ms: 15"]
+    assert fifty.problems == ["50 ms: 15 of 1400 decisions late, limit 1%"]
+    assert most.problems == []  # it leaves 50 ms, which a busy machine needs
 
 
 def test_the_interval_is_that_of_the_mean():

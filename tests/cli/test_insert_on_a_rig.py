@@ -1,6 +1,7 @@
 """`flexneedle insert --rig`: it plans, opens the rig, shows where the axes are, and asks before anything moves."""
 
 import json
+import signal
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ import tomli_w
 import fake_engine
 from bench_rig import values
 from commands import run
+from flexneedle.cli.insert import _Signals
 from flexneedle.errors import RunError
 from flexneedle.rig import insert as insertion
 
@@ -28,12 +30,27 @@ def events(monkeypatch, in_tmp, engine, ends):
 
     def inserted(*given, watchers, **options):
         found.append("opened")
-        watchers.opened(SimpleNamespace(positions=POSITIONS))
+        watchers.opened(SimpleNamespace(positions=POSITIONS, rig=options["rig"]))
         found.append("inserted")
         return fake_engine.insert(*given, **(options | ends))
 
     monkeypatch.setattr(insertion, "insert", inserted)
     return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_the_command_alone_reaches_the_supervisor_before_anything_else(number):
+    found, before = [], {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signals = _Signals()
+    signals.supervisor = SimpleNamespace(signal=found.append)
+    try:
+        signals.handle()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+    assert found == [number]
 
 
 @pytest.fixture

@@ -8,11 +8,14 @@ from http.client import HTTPConnection
 
 import pytest
 
+import flexneedle
+from commands import run
 from flexneedle.page.server import app
 from flexneedle.page.server.folder import RunsFolder, zipped
 from flexneedle.page.server.refusal import Refusal
 from page_clients import Client, get, port_of
 from page_worker import ROWS
+from replays import insertion
 
 RUN = {
     "kind": "insertion",
@@ -170,10 +173,20 @@ def test_a_file_that_is_none_of_the_four_is_refused(server):
     assert get(server, "/runs/older/run.json")[:2] == (404, choices)
 
 
+@pytest.mark.usefixtures("empty_figures")
+def test_a_replay_is_what_the_command_writes(runs, server, capsys):
+    flexneedle.save(insertion(), runs / "mine")
+    status, text, headers = get(server, "/runs/mine/replay.html")
+    assert (status, headers["content-disposition"]) == (200, 'attachment; filename="mine-replay.html"')
+    assert headers["content-type"].startswith("text/html")
+    assert run(capsys, "view", str(runs / "mine"), "--html", "-") == (0, text, "")
+
+
 @pytest.mark.usefixtures("runs")
-def test_what_a_command_refuses_is_the_reason(server):
-    """The run here has no trace: `flexneedle export` says so."""
-    status, text, _headers = get(server, "/runs/older/trace.csv")
+@pytest.mark.parametrize("file", ["trace.csv", "replay.html"])
+def test_what_a_command_refuses_is_the_reason(server, file):
+    """The run here has no plan and no trace: the commands refuse it."""
+    status, text, _headers = get(server, f"/runs/older/{file}")
     assert status == 404
     assert "older" in text
     assert "Traceback" not in text

@@ -53,8 +53,8 @@ class Axes:
     def __init__(self, *more):
         self.more, self.steps = list(more), []
 
-    def step(self, roll, travel, duration, expected):
-        self.steps.append((roll, dict(travel), duration, expected))
+    def step(self, roll, travel, duration, expected, roll_duration):
+        self.steps.append((roll, dict(travel), duration, expected, roll_duration))
         turned = roll + travel.get("rotation", 0.0) + (self.more.pop(0) if self.more else 0.0)
         return Done(len(self.steps), {**travel, "rotation": turned}, 1.0, 1.4, State.INSERTING, "", None)
 
@@ -145,8 +145,8 @@ class Resting:
     def arm(self, deepest):
         self.calls.append(("armed", round(deepest, 6)))
 
-    def move_to(self, axis, _position):
-        self.calls.append(axis)
+    def move_to(self, axis, _position, speed):
+        self.calls.append(axis if speed == math.radians(360.0) else (axis, speed))
 
     def wait(self, _seconds):
         pass
@@ -159,11 +159,11 @@ class Resting:
 def opened(monkeypatch):
     """Return a function that opens a rig at rest for a plan 40 mm deep; return what was done, asked included."""
 
-    def open_rig(rest, dry=False):
+    def open_rig(rest, dry=False, scenario=PHANTOM):
         monkeypatch.setattr("flexneedle.rig.supervised.Supervisor", rest)
-        watchers = Watchers(confirm=lambda _positions: rest.calls.append("asked"))
+        watchers = Watchers(confirm=lambda _supervisor: rest.calls.append("asked"))
         plan = make_plan("manipulation", (40.0, 5.0, 0.0), 0)
-        with supervised(rest.rig, PHANTOM, plan, watchers, dry=dry):
+        with supervised(rest.rig, scenario, plan, watchers, dry=dry):
             pass
         return rest.calls
 
@@ -183,6 +183,15 @@ def test_the_loop_asks_its_watchers_for_holds(monkeypatch):
 def test_the_tip_is_measured_anew_after_the_confirmation(opened):
     rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
     assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]
+
+
+def test_the_needle_rolls_at_the_scenarios_speed(opened):
+    slow = PHANTOM.with_values({"setup.rotation_speed_deg_s": 90.0})
+    assert ("rotation", math.radians(90.0)) in opened(Resting(), scenario=slow)
+    axes = Axes()
+    driver = SupervisedDriver(axes, slow, 0.0)
+    driver.apply(Control(db_x=0.5, flip=True), 0.2)
+    assert axes.steps[0][4] == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize(
@@ -263,8 +272,11 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
         done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry)
-        assert rig.ask("TPA") == (" 0\r\n:" if dry else rig.ask("TPA"))
+        counts = float(rig.ask("TPA").strip(" \r\n:"))
     found = read_truth(truth)
+    advanced = sum(period.applied.db_x for period in done.periods)
+    scale = load_rig(path).axes.insertion.scale
+    assert counts == pytest.approx(0.0 if dry else scale * advanced, abs=0.02 * scale)
     assert found.tips[0, 0] < PHANTOM.setup.start_tip_x - PHANTOM.guard.past_target_mm
     assert done.outcome == "done"
     assert done.reached

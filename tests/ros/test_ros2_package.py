@@ -196,6 +196,26 @@ def test_a_stop_is_repeated_until_the_rig_reports_it(running):
     assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
 
 
+def test_an_idle_rig_is_asked_until_it_reports_the_stop(running):
+    """What it last reported may be older than the stop, and an arm may be on its way."""
+    report = running.state[1]
+    report(SimpleNamespace(data="idle"))
+    answers = []
+    caller = Thread(target=lambda: answers.append(running.call("~/stop")))
+    caller.start()
+    until(lambda: len(running.sent) >= 3)
+    report(SimpleNamespace(data="idle"))  # once a second
+    report(SimpleNamespace(data="stopped"))
+    caller.join()
+    assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
+
+
+def test_a_stop_that_an_idle_rig_does_not_report_fails(running):
+    running.state[1](SimpleNamespace(data="idle"))
+    answered = running.call("~/stop")
+    assert (answered.success, answered.message) == (False, "not done within 1 s: the rig reports 'idle'")
+
+
 def test_an_arm_is_asked_for_once_and_may_fail(running):
     running.state[1](SimpleNamespace(data="idle"))
     answered = running.call("~/arm")

@@ -163,6 +163,11 @@ def test_a_broken_rule_of_an_axis_is_reported_in_one_line(file, key, value, rule
     ("key", "value", "rule"),
     [
         ("loop.queue_ms", 0, "must be above 0"),
+        (
+            "loop.queue_mm",
+            0.03,
+            "must be at least 0.04, twice tolerance_mm of axes.insertion: a motor may rest within one",
+        ),
         ("loop.queue_ms", 101, "must be at most 100"),
         ("loop.queue_ms", 24, "must be at least 25, the time of a tick at rate_hz (40): motors would stop"),
         ("loop.rate_hz", 1001, "must be at most 1000"),

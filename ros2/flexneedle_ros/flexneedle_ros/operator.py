@@ -8,7 +8,8 @@ import sys
 import threading
 import time
 
-STOPPED = ("stopped", "fault", "idle")
+STOPPED = ("stopped", "fault")
+"""Not idle: that may have been reported before the stop, which an idle rig confirms by "stopped"."""
 ARMED = ("armed",)
 REPEAT_S = 0.05
 

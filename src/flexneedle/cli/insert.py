@@ -31,7 +31,10 @@ from flexneedle.console.values import seed
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from flexneedle.console.progress import Progress
+    from flexneedle.rig.supervisor.client import Supervisor
     from flexneedle.ros.bridge import Bridge
     from flexneedle.runs.recording import Choices
     from flexneedle.scenario.model import Scenario
@@ -125,10 +128,10 @@ def _insert(args: argparse.Namespace) -> int:
 
     if args.list:
         return _list()
-    if args.rig is not None:  # so that the record is completed as after Ctrl-C
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
     choices = _choices(args)
+    signals = _Signals()
+    if choices.rig is not None:
+        signals.handle()
     with ExitStack() as stack:
         with _refusal_printed(args, choices):
             scenario = _scenario(args, choices)
@@ -143,7 +146,7 @@ def _insert(args: argparse.Namespace) -> int:
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
-                insertion = _execute(args, folder, scenario, choices, bridge)
+                insertion = _execute(args, folder, scenario, choices, bridge, signals)
             status = report(scenario, insertion, args.json, folder.path)
             if choices.moves and insertion.periods and insertion.outcome is not Outcome.DONE:
                 print_still_in(args.rig)
@@ -182,7 +185,12 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
 
 
 def _execute(
-    args: argparse.Namespace, folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None
+    args: argparse.Namespace,
+    folder: Folder,
+    scenario: Scenario,
+    choices: Choices,
+    bridge: Bridge | None,
+    signals: _Signals,
 ) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.rig.supervised import Watchers
@@ -193,10 +201,13 @@ def _execute(
         show = _InsertProgress(progress, scenario)
         if bridge is not None:
             bridge.show = progress.print_line
-        confirm = None
-        if choices.rig is not None and choices.moves:
-            question = "Insert?" if _asks(args, choices) else ""
-            confirm = partial(_confirm, progress, scenario, choices.rig, question)
+        question = "Insert?" if _asks(args, choices) else ""
+
+        def confirm(supervisor: Supervisor) -> None:
+            signals.supervisor = supervisor
+            if choices.moves:
+                _confirm(progress, scenario, supervisor, question)
+
         insertion = record_insertion(
             folder,
             scenario,
@@ -279,17 +290,33 @@ def _asks(args: argparse.Namespace, choices: Choices) -> bool:
     return choices.moves and not (args.yes or (ros is not None and ros.arm))
 
 
-def _confirm(
-    progress: Progress, scenario: Scenario, rig: RigFile, question: str, positions: Mapping[str, float]
-) -> None:
-    """Print where the axes are (mm or rad), and ask before motors move; "": do not ask.
+class _Signals:
+    """Signals that end an insertion on a rig, SIGINT, SIGTERM and SIGHUP: its supervisor gets them, too, since it stops
+    the motors whatever this process does; here the record is completed."""
+
+    def __init__(self) -> None:
+        self.supervisor: Supervisor | None = None
+
+    def handle(self) -> None:
+        """Take the signals of this process from now on."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._received)
+
+    def _received(self, number: int, frame: FrameType | None) -> None:
+        if self.supervisor is not None:
+            self.supervisor.signal(number)
+        signal.default_int_handler(number, frame)
+
+
+def _confirm(progress: Progress, scenario: Scenario, supervisor: Supervisor, question: str) -> None:
+    """Print where the axes are, and ask before motors move; "": do not ask.
 
     Raises RunError for any answer but yes.
     """
     from flexneedle.rig.start import announced
 
     with progress.paused():
-        confirm_motions([*announced(rig, scenario, positions), ARMS], question)
+        confirm_motions([*announced(supervisor.rig, scenario, supervisor.positions), ARMS], question)
 
 
 def _list() -> int:

@@ -78,9 +78,7 @@ def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
     if not insertion.ticks:
         return []
     found = insertion.ticks
-    times = (
-        f"{found['late_p99_ms'] + found['work_p99_ms']:.2f} ms (99 %), longest {found['work_max_ms']:.2f} ms"
-    )
+    times = f"{found['ended_p99_ms']:.2f} ms (99 %), longest {found['ended_max_ms']:.2f} ms"
     return [("ticks", f"{found['count']:.0f}, {times}, {found['missed']:.0f} missed")]
 
 

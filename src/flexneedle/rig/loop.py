@@ -16,7 +16,7 @@ from flexneedle.control.forecast import missed, warning
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, at_depth
 from flexneedle.control.methods import DEFAULT, used
-from flexneedle.errors import DriverError, RefusedError, RunError, StoppedError, one_line
+from flexneedle.errors import CommandError, DriverError, RefusedError, RunError, StoppedError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.planning.origin import check_origin, placed
@@ -214,7 +214,10 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
         return Motion(command, begun, rig.clock.now())
     reading = scenario.tracker.period
     readings = math.ceil(travel_time(scenario.setup, command) / reading - 1e-6)
-    motion = rig.driver.apply(command, max(1, readings) * reading)
+    try:
+        motion = rig.driver.apply(command, max(1, readings) * reading)
+    except CommandError as error:  # of a controller: refused, with a record of all before
+        raise RefusedError(one_line(error)) from error
     return instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
 
 

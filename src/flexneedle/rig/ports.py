@@ -145,7 +145,11 @@ class Motors(Protocol):
         ...
 
     def reconnect(self) -> None:
-        """Drop the connection and open a new one. It moves nothing, and changes nothing in the device."""
+        """Drop the connection and open a new one. It moves nothing, and changes nothing in the device.
+
+        One that takes longer than the reply timeout is opened in a thread: this call raises DriverError until it is
+        open, and is repeated.
+        """
         ...
 
     def close(self) -> None:

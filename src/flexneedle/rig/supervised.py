@@ -13,6 +13,7 @@ import numpy as np
 from flexneedle.errors import DriverError, RigError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.rig.fit import fit_problems, start_problems
+from flexneedle.rig.pace import roll_time
 from flexneedle.rig.start import checked_start, deepest, needed
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
@@ -79,7 +80,8 @@ class Columns:
 @dataclass
 class Ticks:
     """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
-    those before which others were left out; changes of the rig's state. Times are on the monotonic clock.
+    those before which others were left out; changes of the rig's state, at the end of the tick that found them. Times
+    are on the monotonic clock.
 
     queued: the largest motion in the queue of each axis (mm or rad).
     """
@@ -103,14 +105,15 @@ class Ticks:
         for name, axis in report.axes.items():
             self.queued[name] = max(self.queued.get(name, 0.0), axis.queued)
         if not self.states or self.states[-1][1:] != (report.state, report.why):
-            self.states.append((time, report.state, report.why))
+            self.states.append((time + report.work, report.state, report.why))
 
     def summary(self) -> dict[str, Any]:
-        """Number of ticks, ticks left out, late and work in ms: median, 99 % and largest; stalls and states; largest
-        motion in the queue by axis, in mm or degrees.
+        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and
+        states; largest motion in the queue by axis, in mm or degrees.
         """
         found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
-        for name, values in (("late", self.late), ("work", self.work)):
+        ended = [late + work for late, work in zip(self.late, self.work, strict=True)]
+        for name, values in (("late", self.late), ("work", self.work), ("ended", ended)):
             for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
                 found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
         found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
@@ -140,13 +143,13 @@ class Follower(Protocol):
 class Watchers:
     """What is given each tick of a rig: the record of ticks, and what follows the insertion.
 
-    confirm: called with the positions of the axes (mm or rad) before the rig is armed; what it raises ends the
-    insertion before anything has moved. hold: as for `Rig`.
+    confirm: called with the supervisor before the rig is armed; what it raises ends the insertion before anything has
+    moved. hold: as for `Rig`.
     """
 
     ticks: Ticks = field(default_factory=Ticks)
     followers: tuple[Follower, ...] = ()
-    confirm: Callable[[Mapping[str, float]], None] | None = None
+    confirm: Callable[[Supervisor], None] | None = None
     hold: Callable[[], str] = never
 
     def opened(self, supervisor: Supervisor) -> None:
@@ -154,7 +157,7 @@ class Watchers:
         for follower in self.followers:
             follower.opened(supervisor)
         if self.confirm is not None:
-            self.confirm(supervisor.positions)
+            self.confirm(supervisor)
 
     def report(self, report: Report) -> None:
         """Hand out what a tick found."""
@@ -183,14 +186,15 @@ class SupervisedDriver:
         self._expected = Expectation(begin, (x, y, z), limit)
 
     def apply(self, command: Control, duration: float) -> Motion:
-        """Roll, confirm that by its position, then travel within `duration` s.
+        """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.
 
         A motion that the monitor ended is returned as far as it went. Raises CommandError if the command breaks a limit
         of the scenario, RefusedError if it breaks one of the rig, DriverError after a fault, StoppedError after a stop.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
-        done = self._supervisor.step(roll, self._columns.travel(command), duration, self._expected)
+        travel, roll_duration = self._columns.travel(command), roll_time(self._scenario.setup, roll)
+        done = self._supervisor.step(roll, travel, duration, self._expected, roll_duration)
         row = self._columns.control(done.travelled, *self._rotation(done, command, roll))
         self._moved += np.array(row[:MOVES])
         self._rolled += row.roll + row.spin
@@ -271,7 +275,8 @@ def supervised(
         watchers.opened(supervisor)
         supervisor.arm(start_advance(supervisor, scenario, plan, dry=dry))
         if rig.axes.rotation is not None:
-            supervisor.move_to("rotation", plan.roll)
+            speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
+            supervisor.move_to("rotation", plan.roll, speed)
         if scenario.monitor.enabled and scenario.monitor.references:
             supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
         driver = SupervisedDriver(supervisor, scenario, plan.roll)

@@ -21,7 +21,7 @@ from flexneedle.scenario.rig import RosSettings
 from flexneedle.types import Period, Plan, Point
 
 POLL_S = 0.01
-"""Longest time between two looks for a stop."""
+"""Longest time between two checks for a stop."""
 _STATE_S = 1.0  # the state is published at least this often
 _CHECK_S = 0.05  # while an arm or a target is awaited
 _MOST_EVENTS = 1000  # in the record

@@ -7,20 +7,20 @@ the stream does. Acceleration is left to the controller of the joints.
 import os
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import partial
 from math import copysign, isfinite
 from typing import Any, Self
 
-from flexneedle.errors import DriverError
+from flexneedle.errors import DriverError, FlexneedleError, one_line
 from flexneedle.rig.ports import MotorState
-from flexneedle.ros.client import NodeClient
+from flexneedle.ros.joints import JointLink, abandon, opening
 from flexneedle.ros.profile import Profile
-from flexneedle.ros.records import JointReading, JointTargets, Lost, Refused
+from flexneedle.ros.records import JointReading
 from flexneedle.ros.settings import DriverSettings, checked, profile_with
-from flexneedle.scenario.problems import printable
 
-_CONNECT_S = 5.0
-_LONGEST = 200  # characters of a list of joints
+_CONNECTING = "the ROS node is connecting"
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,13 @@ class RosMotors:
     """The port `Motors` of joints on topics; channels are the names of joints."""
 
     def __init__(self, profile: Profile, channels: Sequence[str], stale_s: float) -> None:
-        self._profile, self._channels, self._stale = profile, tuple(channels), stale_s
+        self._profile, self._channels = profile, tuple(channels)
         self._speeds: dict[str, float] = {}
         self._offsets = dict.fromkeys(channels, 0.0)
-        self._connect()
+        self._points: dict[str, SetPoint] = {}
+        self._connect = partial(JointLink, profile, self._channels, stale_s)
+        self._link: JointLink | None = self._connect()
+        self._opening: Future[JointLink] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -68,7 +71,7 @@ class RosMotors:
 
     def read(self) -> Mapping[str, MotorState]:
         """State of every channel; it also sends the set points of a motion that is under way."""
-        reading = self._fresh()
+        reading = self._connected.fresh()
         if any(point.moving for point in self._points.values()):
             self._advance()
         return {channel: self._state(channel, reading) for channel in self._channels}
@@ -85,32 +88,29 @@ class RosMotors:
     def follow(self, positions: Mapping[str, float]) -> None:
         """Move channels to absolute positions; each call replaces the one before."""
         self._check(positions)
-        reading, now = self._fresh(), time.monotonic()
+        reading, now = self._connected.fresh(), time.monotonic()
         for channel, position in positions.items():
             if channel not in self._speeds:
                 raise DriverError(f"joint {channel}: set its speed first")
             goal = position - self._offsets[channel]
             point = self._points.get(channel) or SetPoint(reading.positions[channel], goal, 0.0, now)
             self._points[channel] = replace(point.at(now), goal=goal, speed=self._speeds[channel])
-        self._stopped = False
         self._send()
 
     def stop(self) -> None:
-        """Hold all channels where they were measured last, at once, or at their set points if that is too old."""
-        self._poll()
-        if not self._stopped:
-            now = time.monotonic()
-            held = self._measured_lately(now)
-            for channel, point in self._points.items():
-                place = held.get(channel, point.at(now).position)
-                self._points[channel] = SetPoint(place, place, point.speed, now)
-            self._stopped = True
+        """Hold all channels at their present set points, at once.
+
+        Not where they were measured, which was earlier: a set point there would be a jump back, at no limited speed.
+        """
+        self._connected.poll()
+        for channel, point in self._points.items():
+            self._points[channel] = replace(point, goal=point.position)
         self._send()
 
     def define(self, channel: str, position: float) -> None:
         """Call the present position of a channel at rest `position`."""
         self._check({channel: position})
-        reading = self._fresh()
+        reading = self._connected.fresh()
         if channel in self._points and self._points[channel].moving:
             raise DriverError(f"joint {channel}: moves: its position can be defined at rest only")
         self._offsets[channel] = position - reading.positions[channel]
@@ -122,63 +122,39 @@ class RosMotors:
             raise DriverError(f"joint {channel}: joints of topics cannot be switched off here")
 
     def reconnect(self) -> None:
-        """Start a new node. Motions that were under way are not taken up."""
-        self._node.close()
-        self._connect()
+        """Start a new node, in a thread; motions that were under way are not taken up.
+
+        Raises DriverError until the node is connected: call it again. Also with the reason, if it does not connect;
+        the next call starts another one.
+        """
+        if self._opening is None:
+            old, self._link, self._points = self._link, None, {}
+            self._opening = opening(partial(self._reopened, old))
+        if not self._opening.done():
+            raise DriverError(_CONNECTING)
+        found, self._opening = self._opening, None
+        try:
+            self._link = found.result()
+        except FlexneedleError as error:
+            raise DriverError(one_line(error)) from error
 
     def close(self) -> None:
         """End the node."""
-        self._node.close()
+        if self._link is not None:
+            self._link.close()
+        if self._opening is not None:
+            abandon(self._opening)
 
-    def _connect(self) -> None:
-        self._node = NodeClient(self._profile, epoch=time.time() - time.monotonic())
-        self._reading: JointReading | None = None
-        self._refused = ""
-        self._points: dict[str, SetPoint] = {}
-        self._stopped = True
-        try:
-            self._await_states(time.monotonic() + _CONNECT_S)
-            self._fresh()
-        except BaseException:  # also on Ctrl-C: the process must end
-            self._node.close()
-            raise
+    @property
+    def _connected(self) -> JointLink:
+        if self._link is None:
+            raise DriverError("the ROS node is not connected")
+        return self._link
 
-    def _await_states(self, deadline: float) -> None:
-        while time.monotonic() < deadline:
-            self._poll()
-            if self._reading is not None:
-                return
-            time.sleep(0.01)
-
-    def _poll(self) -> None:
-        for request in self._node.poll():
-            if isinstance(request, JointReading):
-                self._reading, self._refused = request, ""
-            elif isinstance(request, Refused):
-                self._refused = f": {request.reason}"
-            elif isinstance(request, Lost):
-                raise DriverError(request.reason)
-
-    def _fresh(self) -> JointReading:
-        """The newest joint states. Raises DriverError if they are missing, too old or without a channel."""
-        self._poll()
-        topic, reading = self._profile.subscribe.joint_states, self._reading
-        name = topic.topic if topic else ""
-        if reading is None:
-            raise DriverError(f"{name}: no joint states{self._refused}")
-        age = time.monotonic() - reading.time
-        if age > self._stale:
-            raise DriverError(f"{name}: the last joint states are {age:.2f} s old{self._refused}")
-        missing = [channel for channel in self._channels if channel not in reading.positions]
-        if missing:
-            found = printable(", ".join(reading.positions))[:_LONGEST]
-            raise DriverError(f"{name}: no joint {', '.join(missing)}; joints: {found}")
-        return reading
-
-    def _measured_lately(self, now: float) -> Mapping[str, float]:
-        """Measured positions, none if they are too old."""
-        reading = self._reading
-        return reading.positions if reading is not None and now - reading.time <= self._stale else {}
+    def _reopened(self, old: JointLink | None) -> JointLink:
+        if old is not None:
+            old.close()
+        return self._connect()
 
     def _state(self, channel: str, reading: JointReading) -> MotorState:
         measured, offset = reading.positions[channel], self._offsets[channel]
@@ -201,7 +177,7 @@ class RosMotors:
     def _send(self) -> None:
         if self._points:
             positions = {channel: point.position for channel, point in self._points.items()}
-            self._node.publish(JointTargets(time.monotonic(), positions))
+            self._connected.send(positions)
 
 
 def make_motors(settings: Mapping[str, Any], channels: Sequence[str]) -> RosMotors:

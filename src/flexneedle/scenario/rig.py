@@ -25,6 +25,7 @@ Settings = TypeVar("Settings", bound=Section)
 _FASTEST_HZ = 1000.0
 _QUEUE_MS, _QUEUE_TICKS, _LONGEST_QUEUE_MS = 75.0, 3.0, 100.0
 _LEAST_QUEUE = 2.0  # tolerances
+_ROUNDING = 1e-9
 
 
 class Part(Section):
@@ -50,7 +51,8 @@ class LoopSettings(Section):
     """Time of the motion that is queued in the motors: what they still do after the computer has stopped. Not set:
     three ticks, at least 75 and at most 100."""
     queue_mm: Positive = 0.5
-    """Largest distance of that motion, for axes with a length. A faster axis is slowed down."""
+    """Largest distance of that motion, for axes with a length. A faster axis is slowed down. At least twice the
+    tolerance of each axis."""
     decision_ms: Positive = 200.0
     """Time for a decision. While it takes longer the needle rests, and the period counts as late."""
     decision_limit_s: Positive = 2.0
@@ -112,6 +114,21 @@ class RigFile(Section):
     loop: LoopSettings = LoopSettings()
     ros: RosSettings | None = None
     """Connection to ROS 2. Not set: none."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(_short_queue(self))
+        return self
+
+
+def _short_queue(rig: RigFile) -> Iterator[Problem]:
+    """A queue from which a motor may not move on."""
+    linear = [(name, axis) for name, axis in rig.axes.items() if axis.unit == "mm"]
+    name, axis = max(linear, key=lambda one: one[1].tolerance)
+    least = _LEAST_QUEUE * axis.tolerance
+    if rig.loop.queue_mm < least * (1.0 - _ROUNDING):
+        rule = f"must be at least {axis.shown(least)}, twice tolerance_mm of axes.{name}: a motor may rest within one"
+        yield Problem("loop.queue_mm", rig.loop.queue_mm, rule)
 
 
 def settings_of(model: type[Settings], settings: Mapping[str, Any]) -> Settings:

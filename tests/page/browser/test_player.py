@@ -41,7 +41,7 @@ def test_scrubbing_shows_a_period(player):
     until(page, f"{PERIOD} === 0")
     page.keyboard.press("ArrowRight")
     until(page, f"{PERIOD} === 1")
-    assert "period 2 of 50" in page.get_attribute(SCRUB, "aria-valuetext")
+    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 2 of 50']")
     for key, period in ((".", 2), (",", 1), ("End", 49)):
         page.keyboard.press(key)
         until(page, f"{PERIOD} === {period}")

@@ -1,5 +1,6 @@
 """What a driver or tracker of a user returns that is not of its type is one line: class, method, what is wanted."""
 
+import math
 import sys
 
 import numpy as np
@@ -121,6 +122,14 @@ def test_what_a_driver_has_besides_is_of_its_type(monkeypatch, part, value, line
         (frame(position=(1.0, 2.0)), "Frame: sensor tip: position must be 3 numbers or None"),
         (frame(position="123"), "Frame: sensor tip: position must be 3 numbers or None"),
         (frame(orientation=(1.0, 0.0)), "Frame: sensor tip: orientation must be 4 numbers or None"),
+        (
+            frame(orientation=(0.0, 1.02, 0.0, 0.0)),
+            "Frame: sensor tip: orientation must be a unit quaternion w, x, y, z, not one of length 1.02",
+        ),
+        (
+            frame(orientation=(0.0, 0.0, 0.0, 0.0)),
+            "Frame: sensor tip: orientation must be a unit quaternion w, x, y, z, not one of length 0",
+        ),
         (frame(indicator="0"), "Frame: sensor tip: indicator must be a number or None, not a str"),
         (frame(status=None), "Frame: sensor tip: status must be text, not None"),
     ],
@@ -130,6 +139,13 @@ def test_frames_are_of_their_type(monkeypatch, answer, line):
     with pytest.raises(DriverError) as caught:
         open_tracker(rig(**FOUND), Clock()).read()
     assert str(caught.value) == f"tracker parts:open_camera: Camera.read(): {line}"
+
+
+def test_a_rounded_orientation_is_one_and_that_of_no_number_is_left_to_the_monitor(monkeypatch):
+    for orientation in ((0.992, 0.0, 0.0, 0.0), (0.0, 0.71, 0.0, 0.71), (math.nan, 0.0, 0.0, 1.0)):
+        frames = frame(orientation=orientation)
+        monkeypatch.setattr(Camera, "answer", frames)
+        assert open_tracker(rig(**FOUND), Clock()).read() is frames
 
 
 def test_a_status_that_is_a_method_is_none(monkeypatch):

@@ -16,7 +16,7 @@ from flexneedle.rig.devices.galil.replies import (
     parse,
     text,
 )
-from flexneedle.rig.emulator.galil.controller import Device, reply
+from flexneedle.rig.emulator.galil.controller import Device, advanced, reply
 
 TRANSCRIPTS = {
     path.stem: tomllib.loads(path.read_text())
@@ -45,7 +45,7 @@ def test_the_emulated_controller_answers_like_the_makers_examples(name):
     """But for spaces, which the documents print in several ways."""
     device = Device()
     for exchange in TRANSCRIPTS[name]["exchange"]:
-        device, answer = reply(device, exchange["command"])
+        device, answer = reply(advanced(device, exchange.get("after_ms", 0)), exchange["command"])
         if exchange.get("emulated", True):
             assert "".join(answer.split()) == "".join(exchange["reply"].split()), exchange["command"]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.errors import DriverError, RefusedError, RunError
+from flexneedle.errors import CommandError, DriverError, RefusedError, RunError
 from flexneedle.types import Outcome
 from insertions import Tank, facts, first_periods, run
 
@@ -46,6 +46,14 @@ def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, par
     assert [facts(period) for period in done.periods] == [facts(period) for period in expected]
     assert done.summary == f"failed after {kept} periods: {LOST}"
     assert not done.reached
+
+
+def test_a_command_beyond_a_limit_of_the_scenario_ends_the_insertion_as_held(plan):
+    beyond = CommandError("db_x", 1.1, 1.0, "must be at most 1 mm")
+    rig = Failing(plan.roll, apply=beyond)
+    done = run(plan, rig.rig())
+    assert (done.outcome, done.reason, len(done.periods)) == (Outcome.HELD, str(beyond), LAST)
+    assert rig.stops == 1
 
 
 def test_a_command_that_the_rig_refuses_ends_the_insertion_as_held(plan):

@@ -240,14 +240,16 @@ def test_times_of_readings_are_those_of_the_motors_and_not_of_a_slow_tracker():
         return read()
 
     slow.camera.read = slowly
-    spans = []
+    times = []
     for one in (slow, fast):
+        asked = one.clock.time
         one.core.request(step())
         done = one.until(1)
-        spans.append(done.ended - done.begun)
-        begun = done.begun - (one.stage.calls and 0.0)
-    assert spans[0] == pytest.approx(spans[1], abs=0.012)
-    assert begun > 0.0
+        times.append((done.begun - asked, done.ended - done.begun))
+    (begun, lasted), (of_fast, duration) = times
+    assert begun == pytest.approx(of_fast, abs=0.012)
+    assert 0.0 <= of_fast < 2 * TICK_S
+    assert lasted == pytest.approx(duration, abs=0.012)
 
 
 # Motions of the operator
@@ -257,6 +259,16 @@ def test_a_jog_is_no_faster_than_asked(bench):
     bench.core.request(say.Go(1, "guide_y", 1.0, 2.0))
     speeds = [call[2] for call in bench.stage.calls if call[0] == "set_speed"]
     assert speeds == pytest.approx([2.0 * 500.0])
+
+
+def test_a_speed_that_is_refused_has_the_unit_of_the_file(bench):
+    for axis, speed in (("rotation", 4.0 * math.pi), ("guide_y", 12.5)):
+        bench.core.request(say.Go(1, axis, 1.0, speed))
+        expected = {
+            "rotation": "speed of rotation = 720 deg/s: must be above 0, at most 360 deg/s",
+            "guide_y": "speed of guide_y = 12.5 mm/s: must be above 0, at most 10 mm/s",
+        }
+        assert bench.sent[-1].why == expected[axis]
 
 
 @pytest.mark.parametrize("tracked", [True, False])

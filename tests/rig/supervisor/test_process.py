@@ -87,8 +87,8 @@ def test_operators_move_axes(supervisor):
 def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     shown = []
 
-    def refuse(positions):
-        shown.append(positions)
+    def refuse(asked):
+        shown.append(asked.positions)
         raise RunError("not confirmed")
 
     with pytest.raises(RunError, match="not confirmed"):
@@ -97,7 +97,7 @@ def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     assert supervisor.report.state is State.IDLE
     supervisor.stop("the test")
     with pytest.raises(StoppedError, match="stopped: the test"):
-        Watchers(confirm=shown.append).opened(supervisor)
+        Watchers(confirm=refuse).opened(supervisor)
     assert len(shown) == 1
 
 
@@ -188,6 +188,15 @@ def test_a_device_that_does_not_open_is_the_reason():
         Supervisor(task(position="nowhere"))
 
 
+def test_what_a_driver_prints_is_kept_from_standard_output(capfd):
+    """There `insert --json` prints its result."""
+    with Supervisor(task(driver="stages:printing_motors")):
+        pass
+    found = capfd.readouterr()
+    assert found.out == ""
+    assert "opens the stage\nposition of the stage:\n" in found.err
+
+
 def test_a_supervisor_that_hangs_is_an_error(supervisor):
     supervisor.arm()
     os.kill(supervisor.pid, signal.SIGSTOP)
@@ -256,30 +265,6 @@ if {how!r} == "close":
 else:
     made.move_to("insertion", 100.0, 1.0)
 """
-
-CLIENT = """
-import sys
-sys.path.insert(0, {tests!r})
-from rig.supervisor.test_process import task
-from flexneedle.rig.supervisor.client import Supervisor
-
-with Supervisor(task()) as made:
-    made.arm()
-    print(made.pid, flush=True)
-    made.move_to("insertion", 100.0, 1.0)
-"""
-
-
-def test_without_its_client_the_supervisor_stops_and_ends(tmp_path):
-    script = tmp_path / "client.py"
-    script.write_text(textwrap.dedent(CLIENT.format(tests=str(TESTS))))
-    client = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
-    pid = int(client.stdout.readline())
-    client.kill()
-    client.wait()
-    client.stdout.close()
-    until(lambda: ended(pid))
-    assert client.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(

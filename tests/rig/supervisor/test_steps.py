@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexneedle.rig.ports import MotorPaces
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
 from stages import TICK_S, Bench, Moves, Stage, rig_file
@@ -86,22 +87,44 @@ def test_slow_motors_arrive_later_and_no_target_is_further_from_one_than_the_que
     bench.core.request(
         step(1, roll=math.pi if roll else 0.0, duration=1.0 / speed, insertion=1.0, guide_y=-0.2)
     )
+    means = {"insertion": speed, "guide_y": 0.2 * speed, "rotation": rig.axes.rotation.speed}
     done, limits = bench.until(1), rig.loop.model_copy(update={"queue_ms": queue_ms})
     assert done.why == ""
     assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
     for report in bench.reports:
         for name, axis in rig.axes.items():
-            most = limits.queue_of(axis, axis.speed)
+            most = limits.queue_of(axis, min(axis.speed, 2.0 * means[name]))  # a trapezoid's largest speed
             assert report.axes[name].queued <= most * 1.02
             assert most <= (0.5 if axis.unit == "mm" else axis.speed * 0.1)
 
 
-def test_motors_of_few_counts_are_not_slower_than_controllers_can_be(bench):
-    bench = Bench(rig_file(guide_y={"counts_per_mm": 100.0, "speed_mm_s": 1.0})).armed()
+class Coarse(Stage):
+    """Motors of a controller that takes speeds in steps of 2 counts/s."""
+
+    paces = MotorPaces((2.0, 1e9), (1.0, 1e9))
+
+
+def test_motors_of_few_counts_are_not_slower_than_their_controller_can_be():
+    bench = Bench(rig_file(guide_y={"counts_per_mm": 100.0, "speed_mm_s": 1.0}), motors=Coarse).armed()
     bench.core.request(step(guide_y=0.0001))
     bench.until(1)
     speeds = {call[1]: call[2] for call in bench.stage.calls if call[0] == "set_speed"}
     assert speeds["C"] == 10.0
+
+
+def test_counts_of_a_metre_have_the_speed_of_the_step_too():
+    bench = Bench(rig_file(insertion={"counts_per_mm": 1e-3})).armed()
+    bench.core.request(step(insertion=1.0))
+    bench.until(1)
+    speeds = {call[1]: call[2] for call in bench.stage.calls if call[0] == "set_speed"}
+    assert speeds["A"] == pytest.approx(1e-3 * 1.0 / 0.17, rel=0.05)
+
+
+def test_a_roll_takes_its_own_time_before_the_travel(bench):
+    bench.core.request(say.Step(1, math.pi, {"insertion": 1.0}, 0.2, None, 2.0))
+    done = bench.until(1)
+    assert done.turned == pytest.approx(2.0, abs=0.1)
+    assert done.ended == pytest.approx(2.2, abs=0.15)
 
 
 def test_without_ticks_motors_stop_within_the_queue(bench):

@@ -10,7 +10,6 @@ import zipfile
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from flexneedle.page.server.refusal import Refusal
@@ -120,10 +119,7 @@ async def trace_csv(folder: Path) -> bytes:
 
 async def replay_html(folder: Path) -> bytes:
     """The run as one file that replays it, as `flexneedle view --html` writes it. Raises Refusal."""
-    with TemporaryDirectory() as temporary:
-        path = Path(temporary) / "replay.html"
-        await _command(("view", str(folder), "--html", str(path)))
-        return await asyncio.to_thread(path.read_bytes)
+    return await _command(("view", str(folder), "--html", "-"))
 
 
 async def _command(arguments: Sequence[str]) -> bytes:

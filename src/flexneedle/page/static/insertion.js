@@ -1,16 +1,14 @@
 // Run an insertion: start, stop, pause, single periods, pace; arm a connected rig; disturb; decisions in words.
 
-import { button, make, shown } from "./dom.js";
+import { button, make } from "./dom.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
 import { rigForm } from "./insertion/rig.js";
+import { inWords } from "./insertion/words.js";
 import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const STATES = {
-  waiting: "Waiting for the computation", planning: "Planning", ready: "Ready", running: "Running", paused: "Paused",
-  holding: "Holding", done: "Ended", held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
-};
+const NONE = "No insertion yet: the plan is made first, if there is none.";
 
 export function mount(element, store, link) {
   const state = make("p", { role: "status" });
@@ -35,7 +33,7 @@ export function mount(element, store, link) {
     const live = store.get("insertion live");
     const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
-    state.textContent = inWords(live);
+    state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;
     for (const each of [pause, step, pace]) each.hidden = !runs || real;
@@ -47,16 +45,6 @@ export function mount(element, store, link) {
     disturb.hidden = !runs || real;
     disturb.disabled = !steers;
   });
-}
-
-function inWords(live) {
-  if (!live) return "No insertion yet: the plan is made first, if there is none.";
-  const where = live.rig ? ` on ${live.rig}` : "";
-  const parts = [`${STATES[live.state] ?? live.state}${where}: ${live.controller}, seed ${live.seed}, ${live.periods} periods.`];
-  if (live.summary) parts.push(live.summary);
-  else if ((live.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(live.error_mm, 3)} mm from the target.`);
-  if (live.folder && !isRunning(live)) parts.push(`Recorded as ${live.folder}.`);
-  return parts.join(" ");
 }
 
 const nearest = (pace) => PACES.reduce((best, each) => (Math.abs(each - pace) < Math.abs(best - pace) ? each : best));

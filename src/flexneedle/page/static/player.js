@@ -20,7 +20,8 @@ export function mount(element, store) {
   const scrub = make("input", { type: "range", min: "0", step: "1", "aria-label": "Period", input: () => player.show(Number(scrub.value)) });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, slower, speed, faster, newest, place);
   const nothing = make("p.quiet", {}, "No insertion and no recorded run yet.");
-  element.append(make("div.tools", { role: "group", "aria-label": "What is shown" }, ...choices), scrub, tools, nothing);
+  const group = make("div.tools", { role: "group", "aria-label": "What is shown" }, ...choices);
+  element.append(group, scrub, tools, nothing);
   element.addEventListener("keydown", (event) => player.key(event));
 
   store.subscribe([...SHOWN, "view playing", "view speed"], () => {
@@ -31,6 +32,7 @@ export function mount(element, store) {
       each.setAttribute("aria-pressed", String(each.dataset.of === of));
       each.hidden = each.dataset.of !== "scene" && !store.get(`insertion ${each.dataset.of}`);
     }
+    group.hidden = !store.get("scene"); // as in a replay, which has only its run
     const some = period !== null;
     scrub.hidden = tools.hidden = !some;
     nothing.hidden = some || Boolean(store.get("insertion live") ?? store.get("insertion first"));

@@ -3,11 +3,12 @@
 const CHOICE = "flexneedle theme";
 const colors = new Map(); // by name, in the present theme
 const system = matchMedia("(prefers-color-scheme: dark)");
+let choice = remembered();
 
 // Keep store key "view theme" ("light", "dark") and the attribute data-theme of the document; `button` switches.
 export function followTheme(store, button) {
   const apply = () => {
-    const theme = localStorage.getItem(CHOICE) ?? (system.matches ? "dark" : "light");
+    const theme = choice ?? (system.matches ? "dark" : "light");
     document.documentElement.dataset.theme = theme;
     colors.clear();
     button.textContent = theme === "dark" ? "Light" : "Dark";
@@ -15,7 +16,8 @@ export function followTheme(store, button) {
     store.set("view theme", theme);
   };
   button.addEventListener("click", () => {
-    localStorage.setItem(CHOICE, store.get("view theme") === "dark" ? "light" : "dark");
+    choice = store.get("view theme") === "dark" ? "light" : "dark";
+    remember();
     apply();
   });
   system.addEventListener("change", apply);
@@ -27,6 +29,23 @@ export function followTheme(store, button) {
 export function color(name) {
   if (!colors.has(name)) colors.set(name, computed(name));
   return colors.get(name);
+}
+
+// A browser may refuse to keep anything, above all for a page from a file: the choice is then that of this visit.
+function remembered() {
+  try {
+    return localStorage.getItem(CHOICE);
+  } catch {
+    return null;
+  }
+}
+
+function remember() {
+  try {
+    localStorage.setItem(CHOICE, choice);
+  } catch {
+    // as above
+  }
 }
 
 function computed(name) {

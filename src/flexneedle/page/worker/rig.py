@@ -1,7 +1,6 @@
 """The connected rig: its check, and insertions on it, which are those of `flexneedle insert --rig`."""
 
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
@@ -112,11 +111,11 @@ class Follower:
         if self._signals.stopped:
             raise StoppedError(f"stopped: {self._signals.stopped}")
 
-    def confirm(self, positions: Mapping[str, float]) -> None:
+    def confirm(self, supervisor: Supervisor) -> None:
         """Report what will move, and wait until it may. Raises StoppedError after a stop, DriverError after a fault."""
-        live, supervisor = self._live, self._opened
+        live = self._live
         live.planned(self._folder.plans[live.task.work.strategy])
-        self._wait([*announced(supervisor.rig, self._scenario, positions), SWITCHED_ON])
+        self._wait([*announced(supervisor.rig, self._scenario, supervisor.positions), SWITCHED_ON])
         live.announce("ready")
         while self._signals.held:
             supervisor.wait(_LOOK_S)

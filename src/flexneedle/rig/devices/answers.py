@@ -5,6 +5,7 @@ A user's own may return anything, and what is not of its type would fail far fro
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import hypot
 from numbers import Real
 from typing import Any
 
@@ -17,6 +18,7 @@ from flexneedle.types import Frame, SensorReading
 Rule = Callable[[Any], str]
 """Returns what is wrong with a value, or ""."""
 
+_UNIT = 0.01  # tolerance of the length of a quaternion; one with NaN is left to the monitor
 _VECTORS = {"position": 3, "orientation": 4}
 
 
@@ -95,6 +97,8 @@ def _reading(reading: SensorReading) -> str:
     for name, count in _VECTORS.items():
         if not _is_vector(getattr(reading, name), count):
             return f"{name} must be {count} numbers or None"
+    if reading.orientation is not None and abs((size := hypot(*reading.orientation)) - 1.0) > _UNIT:
+        return f"orientation must be a unit quaternion w, x, y, z, not one of length {size:g}"
     if reading.indicator is not None and not _is_number(reading.indicator):
         return f"indicator must be a number or None, not {_kind(reading.indicator)}"
     return _texts(reading, "status")

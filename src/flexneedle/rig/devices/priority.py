@@ -1,14 +1,27 @@
-"""Real-time priority of a process."""
+"""Real-time priority of a process, and of its threads."""
 
 import os
 from contextlib import suppress
+from pathlib import Path
+
+_THREADS = Path("/proc/self/task")
 
 
 def set_realtime_priority() -> None:
-    """Give this process real-time priority where the system permits it (Linux, as root or with an rtprio limit).
+    """Give all threads of this process real-time priority where the system permits it (Linux, as root or with an rtprio
+    limit). Threads that they start later have it, too.
 
-    Only for a process that mostly waits: it runs ahead of all others and could block the machine.
+    All, since one that is preempted while it holds Python's lock delays the others. Only for a process that mostly
+    waits: it runs ahead of all others and could block the machine.
     """
+    if not hasattr(os, "sched_setscheduler"):
+        return
+    for thread in _THREADS.iterdir():
+        with suppress(PermissionError, ProcessLookupError):
+            os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
+
+
+def set_normal_priority() -> None:
+    """Give this thread, and the processes that it starts, no more than the normal priority."""
     if hasattr(os, "sched_setscheduler"):
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

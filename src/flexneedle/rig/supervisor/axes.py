@@ -5,14 +5,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from flexneedle.errors import DriverError
-from flexneedle.rig.ports import Clock, Motors, MotorState
+from flexneedle.rig.ports import Clock, MotorPaces, Motors, MotorState
 from flexneedle.rig.supervisor.checks import at_home, misplaced, rests
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import AxisState
 from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
 from flexneedle.scenario.rig import RigFile
 
-_SLOWEST_SHARE, _SLOWEST = 0.01, 10.0  # of the largest speed, and counts/s
+_SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller takes
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class RigAxes:
         self.drives = {name: Drive(name, axis) for name, axis in rig.axes.items()}
         self._motors, self._clock = motors, clock
         self._loop = rig.loop
+        paces: MotorPaces | None = getattr(motors, "paces", None)
+        self._finest = 0.0 if paces is None else paces.speeds[0]
         self.lost = False
         self.newest = self.before = self._read()
         self.take_positions()
@@ -178,7 +180,7 @@ class RigAxes:
             axis = leg.drives[channel].axis
             fastest = axis.speed * abs(axis.scale)
             # Controllers round small speeds, to 0 as well; a motor that is faster waits for its next target.
-            slowest = min(fastest, max(_SLOWEST_SHARE * fastest, _SLOWEST))
+            slowest = min(fastest, max(_SLOWEST_SHARE * fastest, _FINE * self._finest))
             self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
         self.follow(leg, now)
 

@@ -31,6 +31,7 @@ _PATIENCE_S = 0.3  # for reports that have not been taken, after a time without 
 _OPEN_S = 60.0  # to find a tracker
 _END_S = 5.0
 _MOST_KEPT = 4000  # measurements: 100 s without a reader
+_STDERR = 2  # its descriptor: sys.stderr may be another object, without one
 _ENOUGH = 9  # measurements for a median
 
 
@@ -55,7 +56,10 @@ class Supervisor:
         self._sent = -1  # requests; the task, which is sent first, is none
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", f"{__package__}.process", str(theirs.fileno())]
-        self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+        # What a user's own device prints must not get into what a command prints, such as JSON.
+        self._process = subprocess.Popen(
+            command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=_STDERR
+        )
         theirs.close()
         self._connection = Connection(ours.detach())
         self._thread = Thread(target=self._receive, name="supervisor", daemon=True)
@@ -135,7 +139,7 @@ class Supervisor:
             found[:] = filter(None, map(_position, self._measurements))
             return len(found) >= _ENOUGH or monotonic() >= until
 
-        self._wait(enough, within + 1.0, "the clock stands still")
+        self._wait(enough, within + 1.0, "the clock does not advance")
         if not found:
             return None
         x, y, z = (median(values) for values in zip(*found, strict=True))
@@ -190,15 +194,26 @@ class Supervisor:
         """
         self._send(say.Stop(who), lost=True)
 
+    def signal(self, number: int) -> None:
+        """Send the supervisor's process a signal; it stops the motors at SIGINT, SIGTERM and SIGHUP.
+
+        It may be called in a handler of signals.
+        """
+        self._process.send_signal(number)
+
     def step(
         self,
         roll: float,
         travel: Mapping[str, float],
         duration: float,
         expected: say.Expectation | None = None,
+        roll_duration: float = 0.0,
     ) -> say.Done:
-        """Carry out a step of an insertion: roll (rad), then travel (mm or rad by axis) within `duration` s."""
-        return self._carry_out(lambda number: say.Step(number, roll, travel, duration, expected))
+        """Carry out a step of an insertion: roll (rad) in `roll_duration` s, then travel (mm or rad by axis) in
+        `duration` s, or as soon after that as the axes can."""
+        return self._carry_out(
+            lambda number: say.Step(number, roll, travel, duration, expected, roll_duration)
+        )
 
     def move_to(self, axis: str, position: float, speed: float | None = None) -> say.Done:
         """Move one axis alone to a position (mm or rad), at its largest speed or slower (mm/s or rad/s)."""
@@ -220,7 +235,7 @@ class Supervisor:
     def wait(self, seconds: float) -> None:
         """Wait while nothing moves."""
         until = monotonic() + seconds
-        self._wait(lambda: monotonic() >= until, seconds + 1.0, "the clock stands still", every=seconds)
+        self._wait(lambda: monotonic() >= until, seconds + 1.0, "the clock does not advance", every=seconds)
 
     def _go(self, axis: str, position: float, speed: float | None, *, retract: bool) -> say.Done:
         fastest = self._known(axis).speed if speed is None else speed

@@ -1,7 +1,8 @@
 """The supervisor without its process: requests, ticks, and what they make of motors and tracker.
 
 Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Motors get targets at most
-the queue of `loop` ahead, so that they stop by themselves where ticks end. Nothing here waits.
+the queue of `loop` ahead, so that they stop by themselves where ticks end. Nothing here waits but for replies of the
+devices, each at most its reply timeout.
 """
 
 from collections.abc import Callable

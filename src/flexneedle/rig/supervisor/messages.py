@@ -64,13 +64,15 @@ class Arm:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of an insertion: the roll (rad), confirmed by its position; then `travel` by axis within `duration` s."""
+    """A step of an insertion: the roll (rad) in `roll_duration` s, confirmed by its position; then `travel` by axis in
+    `duration` s. An axis that cannot do that takes longer."""
 
     number: int
     roll: float
     travel: Mapping[str, float]
     duration: float
     expected: Expectation | None = None
+    roll_duration: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ def stepping(step: Step) -> Motion:
     """A step of an insertion: its roll, then its travel."""
     legs = [(step.travel, step.duration)]
     if step.roll:
-        legs.insert(0, ({"rotation": step.roll}, 0.0))
+        legs.insert(0, ({"rotation": step.roll}, step.roll_duration))
     return Motion(step.number, legs, step.expected, roll=bool(step.roll))
 
 

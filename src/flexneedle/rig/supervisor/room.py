@@ -35,7 +35,10 @@ class Room:
         if go.retract and not (go.axis == "insertion" and go.position <= now):
             return f"retract to {drive.shown(go.position)}: must withdraw the base, which is at {drive.shown(now)}"
         if not 0.0 < go.speed <= drive.axis.speed * (1.0 + _ROUNDING):
-            return f"speed of {go.axis} = {go.speed:g}/s: must be above 0, at most {drive.axis.speed:g}/s"
+            speed, fastest = (
+                f"{drive.axis.shown(one)} {drive.axis.unit}/s" for one in (go.speed, drive.axis.speed)
+            )
+            return f"speed of {go.axis} = {speed}: must be above 0, at most {fastest}"
         return ""
 
     def home_problem(self, home: Home) -> str:

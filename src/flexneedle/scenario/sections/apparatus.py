@@ -55,7 +55,8 @@ class Setup(Section):
     max_base_turn_step_mrad: Positive = 5.0
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
-    """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms."""
+    """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms. This and the other speeds are means of a step: the motors
+    of a rig accelerate and slow down in it, and are faster in between."""
     guide_speed_mm_s: Positive | None = None
     """Lateral speed of the guide on an axis. Not set: its largest step takes as long as the largest advance."""
     base_speed_mm_s: Positive | None = None

@@ -1,0 +1,51 @@
+// A recorded run by itself (page/replay): the panels of the page that need no server, and what a worker reports of the
+// run, which is an element of the document.
+
+import { mount as mountAxial } from "./axial.js";
+import { make } from "./dom.js";
+import { unpacked } from "./frames.js";
+import { followDecisions } from "./insertion/decisions.js";
+import { inWords } from "./insertion/words.js";
+import { mount as mountPlayer } from "./player.js";
+import { mount as mountPlots } from "./plots.js";
+import { mount as mountSection } from "./section.js";
+import { mount as mountSpace } from "./space.js";
+import { Store } from "./store.js";
+import { followTheme } from "./theme.js";
+
+// In the order of main.js. Without a server nobody steers, so none of them asks for anything: they get no link.
+const PANELS = { insertion: mountWords, player: mountPlayer, section: mountSection, axial: mountAxial, plots: mountPlots, space: mountSpace };
+const RUNS = { first: "", second: "Compared with " };
+
+const store = new Store();
+window.flexneedle = { store }; // for the console, and for tests
+followTheme(store, document.getElementById("theme"));
+for (const each of JSON.parse(document.getElementById("run").textContent)) {
+  if (typeof each === "string") store.receiveFrame(unpacked(bytesOf(each)));
+  else store.receive(each);
+}
+for (const [name, mount] of Object.entries(PANELS)) load(mount, document.querySelector(`[data-panel="${name}"]`));
+
+// The ArrayBuffer of a text in base64.
+function bytesOf(text) {
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
+}
+
+async function load(mount, element) {
+  try {
+    await mount(element, store, null);
+  } catch (error) {
+    element.textContent = `This part of the replay could not be shown: ${error.message}`;
+    throw error;
+  }
+}
+
+function mountWords(element) {
+  for (const [of, what] of Object.entries(RUNS)) {
+    const run = store.get(`insertion ${of}`);
+    if (run) element.append(make("p", {}, make("strong", {}, `${what}${run.name}.`), ` ${inWords(run)}`));
+  }
+  const decisions = make("div.decisions");
+  element.append(decisions);
+  followDecisions(decisions, store);
+}
