@@ -22,7 +22,7 @@ from flexneedle.scenario.files import load_scenario
 STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))
 PATIENCE_S = 20.0
 """Time after which a test gives up; what it waits for takes milliseconds."""
-QUICK = Limits(rest_s=60.0, alone_s=0.1, lost_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
+QUICK = Limits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
 """Waits that tests can wait for; a changed scenario is not planned by itself."""
 
 

@@ -1,6 +1,8 @@
 """A worker of the page without physics: it answers every order at once with made-up news, and reports every signal.
 
 Seeds of a plan choose what goes wrong: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled.
+An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a fault then, 17 does
+not stop, 18 takes some beats of the server for its record.
 """
 
 import json
@@ -12,7 +14,7 @@ from queue import SimpleQueue
 
 from flexneedle.page.channel import packed, read
 
-CRASHES, HANGS, WORKS_ON = 13, 14, 15
+CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
 ROWS = 600
 FRAME = struct.pack("<BBBBIII", 1, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
 """A needle of the live insertion, 24 kB."""
@@ -36,7 +38,7 @@ def job(order, state, text=""):
     say("job", job=order["job"], kind=order["kind"], state=state, text=text)
 
 
-def insertion(order, of, state, summary="", pace=0.0):
+def insertion(order, of, state, summary="", pace=0.0, periods=0):
     say(
         "insertion",
         of=of,
@@ -46,9 +48,10 @@ def insertion(order, of, state, summary="", pace=0.0):
         controller=order.get("controller", ""),
         seed=order.get("seed", 0),
         target=[40.0, 0.0, 0.0],
-        periods=0,
+        periods=periods,
         pace=pace,
         rig=order.get("rig", ""),
+        folder="recorded" if order.get("rig") else "",
     )
 
 
@@ -82,6 +85,8 @@ def plan(order, signals):
 
 def insert(order, signals):
     """Rows and frames at once where it is not paused, then one for each advance, until it is stopped."""
+    if order.get("rig"):
+        return insert_on_rig(order, signals)
     count = 0
     insertion(order, "live", "paused" if order.get("paused") else "running", json.dumps(order), pace=1.0)
     if not order.get("paused"):
@@ -98,6 +103,42 @@ def insert(order, signals):
         insertion(order, "live", "interrupted" if ends else "running", json.dumps(signal))
         if ends:
             return "done" if signal.get("stop") else "cancelled"
+
+
+def rig_is(state, why="", waits=0):
+    say("rig_report", state=state, why=why, waits=waits, moves=[f"wait {waits}"] if waits else [])
+
+
+def insert_on_rig(order, signals):
+    """It waits, goes, holds and stops as it is signalled; its number of periods is that of the server's beats."""
+    beats, waits = 0, 1
+    insertion(order, "live", "ready", text := json.dumps(order))
+    rig_is("idle", waits=waits)
+    while True:
+        signal = signals.get()
+        beats += "alive" in signal
+        if "alive" in signal:
+            insertion(order, "live", "running" if waits == 0 else "ready", text, periods=beats)
+        elif signal.get("go") and order["seed"] == FAULTY:
+            rig_is("fault", "insertion: the motor is off")
+            insertion(order, "live", "failed", "the motor is off")
+            return "done"
+        elif signal.get("go"):
+            waits = 0
+            rig_is("armed")
+            rig_is("inserting")
+            insertion(order, "live", "running", json.dumps(signal))
+        elif "hold" in signal:
+            waits = 2
+            rig_is("holding", signal["hold"], waits)
+            insertion(order, "live", "holding", json.dumps(signal))
+        elif "stop" in signal and order["seed"] != UNSTOPPABLE:
+            rig_is("stopped", signal["stop"])
+            for _ in range(3 if order["seed"] == RECORDS else 0):
+                while "alive" not in signals.get():
+                    pass
+            insertion(order, "live", "interrupted", json.dumps(signal))
+            return "done"
 
 
 def do(order, signals):
@@ -117,6 +158,9 @@ def do(order, signals):
             insertion(order, of, "done", order["folder"])
             rows(of, 0, ROWS)
             write(frame(0, source=3 if of == "second" else 2))
+        case "check":
+            findings = [{"part": "driver", "item": "connection", "found": order["rig"], "problem": ""}]
+            say("check", revision=order["revision"], findings=findings)
         case "save":
             Path(order["folder"]).mkdir()
             (Path(order["folder"]) / "run.json").write_text("{}")

@@ -52,22 +52,22 @@ def replace_file(path: Path, data: bytes) -> None:
             raise RecordError.of(path, error) from error
 
 
-def new_folder(*parts: str, now: datetime | None = None) -> Path:
-    """Create and return a folder `runs/<date>-<part>-<part>`; further ones in the same second get a number.
+def new_folder(*parts: str, now: datetime | None = None, root: Path = RUNS) -> Path:
+    """Create and return a folder `<root>/<date>-<part>-<part>`; further ones in the same second get a number.
 
     now: time in the name (default: the present). Raises InputError if it cannot be created.
     """
     plain = (re.sub(r"[^\w.-]+", "-", part).strip("-.")[:_LONGEST_NAME] or "unnamed" for part in parts)
     opening = "-".join((f"{now or datetime.now(UTC):%Y%m%dT%H%M%SZ}", *plain))
     for number in count(1):
-        path = RUNS / (opening if number == 1 else f"{opening}-{number}")
+        path = root / (opening if number == 1 else f"{opening}-{number}")
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            if not RUNS.is_dir():
-                raise InputError(f"{RUNS}: is not a folder: choose another folder") from None
+            if not root.is_dir():
+                raise InputError(f"{root}: is not a folder: choose another folder") from None
             continue
         except OSError as error:
             raise InputError(f"{path}: cannot be created: {error.strerror}") from None
         return path
-    raise InputError(f"{RUNS / opening}: no unused name")
+    raise InputError(f"{root / opening}: no unused name")

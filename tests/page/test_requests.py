@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.page import messages as m
-from flexneedle.page.server.insertion import ConnectedRig
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from page_clients import QUICK, Client, get, served
 from page_worker import ROWS, WORKS_ON
@@ -78,7 +77,10 @@ STEERED = {
     "start": {"work": "plan"},
     "cancel": {"job": 1},
     "insert": {},
-    "arm": {"armed": True},
+    "check": {},
+    "prepare": {},
+    "arm": {"armed": True, "job": 1},
+    "go": {},
     "pace": {"pace": 1.0},
     "advance": {},
     "disturb": {"what": "drop", "size": 1.0},
@@ -246,124 +248,7 @@ def test_rows_are_filled_up_on_request(client):
     assert [row["index"] for row in client.rows["live"]] == list(range(ROWS))
 
 
-def test_without_a_rig_none_is_armed(client):
+def test_without_a_rig_nothing_is_done_to_it(client):
     reason = "no rig is connected: start flexneedle serve with --rig FILE"
-    assert client.refused("arm", armed=True) == reason
-    assert client.refused("insert", rig=True) == reason
-
-
-RIG = ConnectedRig("Bench", "bench.toml")
-
-
-@pytest.fixture
-def rig_server(tmp_path):
-    with served(tmp_path, rig=RIG) as server:
-        yield server
-
-
-@pytest.fixture
-def rig_client(rig_server):
-    with Client(rig_server) as client:
-        yield client.steer()
-
-
-def rig_is(client, state, why=None):
-    client.wait(lambda: client.newest["rig"]["state"] == state)
-    assert why is None or client.newest["rig"]["why"] == why
-    return True
-
-
-def test_a_rig_is_armed_for_one_insertion(rig_client):
-    client = rig_client
-    assert client.newest["welcome"]["rig"] == "Bench"
-    assert client.refused("insert", rig=True) == "Bench is not armed: arm it first"
-    client.do("arm", armed=True)
-    client.wait(lambda: client.newest["rig"]["armed"])
-    running(client, rig=True)
-    assert summary(client)["rig"] == "bench.toml"
-    assert not client.newest["rig"]["armed"]
-    assert rig_is(client, "inserting")
-    assert client.refused("insert", rig=True) == "an insertion runs on the rig: stop it first"
-    assert client.refused("insert") == "an insertion runs on the rig: stop it first"
-    assert client.refused("arm", armed=True).startswith("an insertion runs on the rig")
-    client.do("stop")
-    assert rig_is(client, "idle")
-    assert client.refused("insert", rig=True) == "Bench is not armed: arm it first"
-
-
-def test_an_armed_rig_is_still_not_used_for_a_virtual_insertion(rig_client):
-    rig_client.do("arm", armed=True)
-    running(rig_client)
-    assert "rig" not in summary(rig_client)
-    assert not rig_client.newest["rig"]["armed"]
-
-
-@pytest.mark.parametrize(
-    ("request_", "values", "why"),
-    [
-        ("edit", {"values": {"target.depth_mm": 35.0}}, "the scenario or an option was changed"),
-        ("options", {"seed": 3}, "the scenario or an option was changed"),
-        ("steer", {"take": False}, "the steering was released"),
-        ("arm", {"armed": False}, ""),
-    ],
-)
-def test_a_rig_is_disarmed(rig_client, request_, values, why):
-    rig_client.do("arm", armed=True)
-    rig_client.wait(lambda: rig_client.newest["rig"]["armed"])
-    rig_client.do(request_, **values)
-    rig_client.wait(lambda: not rig_client.newest["rig"]["armed"])
-    assert rig_client.newest["rig"]["why"] == why
-
-
-def test_a_rig_is_held_and_goes_on_but_has_no_other_pace(rig_client):
-    rig_client.do("arm", armed=True)
-    running(rig_client, rig=True)
-    assert rig_client.refused("pace", pace=2.0) == "pace = 2: must be 0 (hold) or 1 on a rig"
-    rig_client.do("pace", pace=0.0)
-    assert rig_is(rig_client, "held")
-    rig_client.wait(lambda: summary(rig_client).get("pace") == 0.0)
-    rig_client.do("pace", pace=1.0)
-    assert rig_is(rig_client, "inserting")
-
-
-def test_a_rig_is_not_disturbed(rig_client):
-    rig_client.do("arm", armed=True)
-    running(rig_client, rig=True)
-    reason = "an insertion runs on the rig: disturbances are for virtual insertions"
-    assert rig_client.refused("disturb", what="push", size=1.0) == reason
-    job = rig_client.newest["job insertion"]["job"]
-    assert rig_client.refused("cancel", job=job) == "an insertion runs on the rig: stop it instead"
-    assert rig_client.refused("advance").startswith("an insertion runs on the rig")
-
-
-def test_a_rig_is_held_when_the_steering_client_is_lost(rig_server):
-    with Client(rig_server) as watcher:
-        with Client(rig_server) as client:
-            client.steer().do("arm", armed=True)
-            running(client, rig=True)
-        assert rig_is(watcher, "held", why="nobody steers")
-        watcher.wait(lambda: summary(watcher).get("pace") == 0.0)
-        watcher.wait(lambda: watcher.newest["people"]["steering"] is None)
-        watcher.steer().do("pace", pace=1.0)
-        assert rig_is(watcher, "inserting")
-        watcher.do("steer", take=False)
-        assert rig_is(watcher, "held")
-
-
-def test_a_rig_is_not_held_when_the_steering_is_taken_again(tmp_path):
-    with served(tmp_path, rig=RIG, limits=replace(QUICK, lost_s=60.0)) as server, Client(server) as client:
-        client.steer().do("arm", armed=True)
-        running(client, rig=True)
-        client.do("steer", take=False)
-        assert "lost" in server.desk._timers
-        client.steer()
-        assert "lost" not in server.desk._timers
-        assert rig_is(client, "inserting")
-
-
-def test_a_rig_is_disarmed_when_the_steering_client_is_lost(rig_server):
-    with Client(rig_server) as watcher:
-        with Client(rig_server) as client:
-            client.steer().do("arm", armed=True)
-        watcher.wait(lambda: watcher.newest["rig"]["why"] == "the client that steered is gone")
-        assert not watcher.newest["rig"]["armed"]
+    for request, values in {"check": {}, "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}}.items():
+        assert client.refused(request, **values) == reason

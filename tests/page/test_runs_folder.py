@@ -145,7 +145,7 @@ def test_what_is_no_run_is_not_opened(client, name):
 def test_the_last_insertion_is_saved(runs, client):
     client.do("insert")
     client.wait(lambda: "insertion live" in client.newest)
-    assert client.refused("save", name="mine") == "the insertion runs: it can be saved when it has ended"
+    assert client.refused("save", name="mine") == "an insertion runs: it can be saved when it has ended"
     client.do("stop")
     client.job("insertion", "done")
     client.do("save", name="mine")

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ import pytest
 from flexneedle.cli import serve
 from flexneedle.cli.main import main
 from flexneedle.page.server.catalog import CONTROLLERS, SCHEMA
+from flexneedle.page.server.limits import Limits
+from flexneedle.page.server.rig import ConnectedRig
 from page_clients import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -110,15 +113,42 @@ def test_without_its_packages_it_names_them(capsys, monkeypatch):
     )
 
 
-def test_a_world_is_shown_without_a_rig(monkeypatch):
-    setups = []
+@pytest.fixture
+def setups(monkeypatch):
+    """What servers were started with."""
+    found = []
     monkeypatch.setattr(
-        "flexneedle.page.server.serve.PageServer", lambda setup, *_where: setups.append(setup) or Ended()
+        "flexneedle.page.server.serve.PageServer", lambda setup, *_where: found.append(setup) or Ended()
     )
+    return found
+
+
+def test_a_world_is_shown_without_a_rig(setups):
     assert main(["serve", "world:7", "--no-open"]) == 0
     (setup,) = setups
     assert setup.rig is None
     assert setup.session.name == "world:7"
+    assert setup.limits == Limits()
+
+
+def test_a_rig_is_named_by_its_file_and_clients_are_lost_sooner(setups):
+    assert main(["serve", "phantom", "--rig", "emulated", "--no-open"]) == 0
+    (setup,) = setups
+    assert setup.rig == ConnectedRig("Emulated rig", "emulated")
+    assert setup.limits.ping_s + setup.limits.pong_s <= 2.0 < Limits().pong_s
+
+
+def test_a_rig_that_cannot_be_used_is_refused_in_one_line(capsys, tmp_path):
+    assert failed(capsys, "--rig", "nonsense").startswith(
+        "flexneedle: nonsense: no such file, and no such rig"
+    )
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text() + "[ros]\narm = true\n"
+    )
+    message = failed(capsys, "--rig", str(path))
+    rule = "must be false for the page, which arms the rig and has the target: use flexneedle insert"
+    assert message == f"flexneedle: ros.arm = true: {rule}\n"
 
 
 class Ended:

@@ -98,11 +98,11 @@ def stopping(at, **signal):
 
 
 def test_a_stop_ends_it_as_interrupted():
-    one = stopping(4, stop=True)
+    one = stopping(4, stop="person 2")
     Insertions().insert(one)
     last = one.outbox.of("insertion")[-1]
     assert (last.state, last.periods) == ("interrupted", 5)
-    assert "stopped on the page" in last.summary
+    assert last.summary.endswith("stopped: person 2")
 
 
 def test_a_cancelled_one_has_no_result():

@@ -128,11 +128,11 @@ def orders(*messages):
 
 def test_signals_find_their_job_before_it_has_begun():
     work = [Work(job=number, do="plan", kind="plan") for number in (1, 2)]
-    inbox = orders(*work, Signal(job=9, stop=True), Signal(job=2, pace=3.0), Signal(job=1, stop=True))
+    inbox = orders(*work, Signal(job=9, stop="x"), Signal(job=2, pace=3.0), Signal(job=1, stop="y"))
     (first, one), (second, other) = inbox.next(), inbox.next()
     assert inbox.next() is None
     assert (first.job, second.job) == (1, 2)
-    assert (one.stopped, other.stopped, other.pace) == (True, False, 3.0)
+    assert (one.stopped, other.stopped, other.pace) == ("y", "the server of the page has ended", 3.0)
 
 
 def test_the_end_of_the_pipe_cancels_what_runs():
@@ -146,11 +146,24 @@ def test_the_end_of_the_pipe_cancels_what_runs():
 
 def test_a_stop_is_passed_on_at_once():
     signals, stops = Signals(), []
-    signals.on_stop = lambda: stops.append(1)
+    signals.on_stop = stops.append
     signals.take(Signal(job=1, pace=0.0))
     assert not stops
-    signals.take(Signal(job=1, stop=True))
-    assert stops == [1]
+    signals.take(Signal(job=1, stop="person 2"))
+    assert stops == ["person 2"]
+
+
+def test_a_rig_is_held_until_it_may_go_and_again_when_it_is_asked():
+    inbox = orders(Work(job=1, do="insert", kind="insertion", rig="rig.toml"))
+    _, signals = inbox.next()
+    assert signals.held == "not armed"
+    signals.take(Signal(job=1, alive=True))
+    assert signals.held == "not armed"
+    signals.take(Signal(job=1, go=True))
+    assert signals.held == ""
+    signals.take(Signal(job=1, hold="nobody steers"))
+    signals.take(Signal(job=1, alive=True))
+    assert signals.held == "nobody steers"
 
 
 class Clock:
@@ -212,9 +225,11 @@ def test_paused_it_waits_for_an_advance_or_a_pace():
     assert states == [False, True, False]
 
 
-@pytest.mark.parametrize(("signal", "error"), [("stop", StoppedError), ("cancel", Cancelled)])
+@pytest.mark.parametrize(
+    ("signal", "error"), [({"stop": "person 2"}, StoppedError), ({"cancel": True}, Cancelled)]
+)
 def test_a_stop_ends_a_pause(signal, error):
-    pacer, clock, _ = paced(1.0, {1: {"pace": 0.0}, 2: {signal: True}})
+    pacer, clock, _ = paced(1.0, {1: {"pace": 0.0}, 2: signal})
     with pytest.raises(error):
         pacer.after(0.4)
     assert len(clock.waits) == 2

@@ -170,6 +170,16 @@ def opened(monkeypatch):
     return open_rig
 
 
+def test_the_loop_asks_its_watchers_for_holds(monkeypatch):
+    rest = Resting()
+    monkeypatch.setattr("flexneedle.rig.supervised.Supervisor", rest)
+    plan, watchers = make_plan("manipulation", (40.0, 5.0, 0.0), 0), Watchers(hold=lambda: "nobody steers")
+    with supervised(rest.rig, PHANTOM, plan, watchers) as ports:
+        assert ports.hold() == "nobody steers"
+    with supervised(rest.rig, PHANTOM, plan, Watchers()) as ports:
+        assert ports.hold() == ""
+
+
 def test_the_tip_is_measured_anew_after_the_confirmation(opened):
     rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
     assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]

@@ -193,6 +193,7 @@ def _execute(
     signals: _Signals,
 ) -> Insertion:
     from flexneedle.console.progress import Progress
+    from flexneedle.rig.supervised import Watchers
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
 
@@ -214,7 +215,7 @@ def _execute(
             on_iteration=show.iteration,
             on_period=show.period,
             bridge=bridge,
-            confirm=confirm,
+            watchers=Watchers(confirm=confirm),
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
@@ -312,14 +313,10 @@ def _confirm(progress: Progress, scenario: Scenario, supervisor: Supervisor, que
 
     Raises RunError for any answer but yes.
     """
-    from flexneedle.rig.moves import resting
+    from flexneedle.rig.start import announced
 
-    depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
-    to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
-    rig = supervisor.rig
-    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
     with progress.paused():
-        confirm_motions([first, *resting(rig, supervisor.positions), ARMS], question)
+        confirm_motions([*announced(supervisor.rig, scenario, supervisor.positions), ARMS], question)
 
 
 def _list() -> int:

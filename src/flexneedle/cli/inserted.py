@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import entry_rows, print_json, print_table, target_row
+from flexneedle.console.common import STILL_IN, entry_rows, print_json, print_table, target_row
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def print_still_in(rig: str) -> None:
     """Print how a needle that was left in is withdrawn. rig: as the user gave it."""
-    print(f"flexneedle: the needle is still in: withdraw it by flexneedle rig retract {rig}", file=sys.stderr)
+    print(f"flexneedle: {STILL_IN.format(rig=rig)}", file=sys.stderr)
 
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:

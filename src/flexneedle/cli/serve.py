@@ -16,6 +16,7 @@ from flexneedle.files import RUNS
 
 if TYPE_CHECKING:
     from flexneedle.page.server.desk import Setup
+    from flexneedle.page.server.rig import ConnectedRig
 
 _HOST, _PORT, _LAST_PORT = "127.0.0.1", 8472, 65535
 _WORKER = (sys.executable, "-m", "flexneedle.page.worker")
@@ -30,6 +31,7 @@ def add_parser(commands: Commands) -> None:
         _serve,
         "flexneedle serve",
         "flexneedle serve mine.toml --port 0 --no-open",
+        "flexneedle serve mine.toml --rig rig.toml",
         about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
         "access. Prints its address; Ctrl-C ends it. One page steers at a time; any may watch, and stop.",
     )
@@ -39,6 +41,12 @@ def add_parser(commands: Commands) -> None:
         nargs="?",
         default="phantom",
         help="preset name, world:NUMBER or path of the scenario to begin with (default: phantom)",
+    )
+    parser.add_argument(
+        "--rig",
+        metavar="FILE",
+        help="rig file (its path, or emulated for the one of the package), on which the page can insert once it is "
+        "prepared and armed there; nothing moves before (default: virtual rigs alone)",
     )
     parser.add_argument(
         "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
@@ -91,13 +99,22 @@ def _serve(args: argparse.Namespace) -> int:
 def _setup(args: argparse.Namespace) -> Setup:
     from flexneedle.page.server.catalog import CONTROLLERS
     from flexneedle.page.server.desk import Setup
-    from flexneedle.page.server.limits import Limits
+    from flexneedle.page.server.limits import RIG, Limits
     from flexneedle.page.server.session import Session
     from flexneedle.scenario.files import load_scenario
 
     session = Session.of(args.scenario, load_scenario(args.scenario), CONTROLLERS[0]["name"])
-    # None: no rig. Insertions on a rig from the page have not been tried, so the command does not offer them.
-    return Setup(session, args.runs, Limits(), ((*_WORKER, "plans"), (*_WORKER, "insertion")), None)
+    workers = (*_WORKER, "plans"), (*_WORKER, "insertion")
+    rig = None if args.rig is None else _connected(args.rig)
+    return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)
+
+
+def _connected(source: str) -> ConnectedRig:
+    """The rig of a file. Raises RigError for one that the page cannot insert on. No device is opened."""
+    from flexneedle.page.rigs import usable_rig
+    from flexneedle.page.server.rig import ConnectedRig
+
+    return ConnectedRig(usable_rig(source).name, source)
 
 
 def _announce(address: str, opens: bool) -> None:

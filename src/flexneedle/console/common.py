@@ -18,11 +18,15 @@ if TYPE_CHECKING:
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
-ARMS = (
+SWITCHED_ON = (
     "The motors of all axes are switched on first. One that rests away from its commanded position is switched off "
-    "and on again, and held where it is: support a vertical axis. Ctrl-C stops."
+    "and on again, and held where it is: support a vertical axis."
 )
+"""What precedes any motion of a rig."""
+ARMS = f"{SWITCHED_ON} Ctrl-C stops."
 """Printed before any motion of a rig."""
+STILL_IN = "the needle is still in: withdraw it by flexneedle rig retract {rig}"
+"""How a needle that was left in is withdrawn; rig: as the user gave it."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""
 

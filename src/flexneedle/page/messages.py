@@ -88,29 +88,50 @@ class Cancel(Request):
 
 
 class Insert(Request):
-    """Start an insertion with the present plan, which is made first if there is none. rig: the connected one, armed."""
+    """Start a virtual insertion with the present scenario; it makes its own plan. paused: before its first period."""
 
     type: Literal["insert"]
-    rig: bool = False
     paused: bool = False
 
 
+class Check(Request):
+    """Compare the connected rig with its file and the present scenario, as `flexneedle rig check`. Nothing moves."""
+
+    type: Literal["check"]
+
+
+class Prepare(Request):
+    """Plan an insertion on the connected rig, open the rig, and measure the tip. Nothing moves; it then waits."""
+
+    type: Literal["prepare"]
+
+
 class Arm(Request):
-    """Arm the connected rig for one insertion, or disarm it. Its user has confirmed that the way is free."""
+    """Arm the rig whose insertion waits, or disarm it. Its user has confirmed what will move.
+
+    job: of the insertion whose `moves` were confirmed.
+    """
 
     type: Literal["arm"]
     armed: bool
+    job: Annotated[int, Field(ge=0)]
+
+
+class Go(Request):
+    """Begin the insertion on the armed rig, or go on with it after a hold. It is then no longer armed."""
+
+    type: Literal["go"]
 
 
 class Pace(Request):
-    """Pace of a virtual insertion: 1 is real time, 0 paused."""
+    """Pace of a virtual insertion: 1 is real time, 0 paused. A rig has none."""
 
     type: Literal["pace"]
     pace: Annotated[float, Field(ge=0.0, le=50.0)]
 
 
 class Advance(Request):
-    """Carry out one control period of a paused insertion."""
+    """Carry out one control period of a paused virtual insertion."""
 
     type: Literal["advance"]
 
@@ -171,7 +192,10 @@ AnyRequest = Annotated[
     | Start
     | Cancel
     | Insert
+    | Check
+    | Prepare
     | Arm
+    | Go
     | Pace
     | Advance
     | Stop
@@ -264,7 +288,7 @@ class Job(News):
 
     type: Literal["job"] = "job"
     job: int
-    kind: Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "recording", "save"]
+    kind: Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "check", "recording", "save"]
     state: Literal["waiting", "running", "done", "failed", "cancelled"]
     share: float | None = None
     text: str = ""
@@ -396,7 +420,8 @@ class Rows(News):
 class Insertion(News):
     """State of an insertion, or how it has ended. of: as for `Rows`; source: scenario and seed of a recording.
 
-    state: waiting, planning, running, paused, done, held, failed, interrupted, refused; unmeasured: on a real rig.
+    state: waiting, planning, running, paused, done, held, failed, interrupted, refused; on a rig also ready, before it
+    begins, and holding. rig: its name, "" of a virtual one; folder: name of the run that records it, "" without one.
     A new insertion or recording is announced before its rows and frames: the browser then forgets those of the last.
     """
 
@@ -412,6 +437,7 @@ class Insertion(News):
     pace: float
     error_mm: float | None = None
     rig: str = ""
+    folder: str = ""
     scene: Scene | None = None
 
     @property
@@ -440,13 +466,31 @@ class Disturbances(News):
 
 
 class RigState(News):
-    """State of the connected rig."""
+    """State of the connected rig.
+
+    state: idle (no program of this page has it), preparing, ready, armed, starting, inserting, holding, stopped, fault,
+    ended (its record is being written); stopped and fault stay until something else is done. why: of the state.
+    job: of its insertion, None without one; begun: whether that has begun; moves: what will move once it may go.
+    """
 
     type: Literal["rig"] = "rig"
     name: str
-    armed: bool
     state: str
-    why: str
+    why: str = ""
+    job: int | None = None
+    begun: bool = False
+    moves: list[str] = []
+
+
+class RigCheck(News):
+    """What the last check of the rig has found, for the scenario of a revision.
+
+    findings: part and item of the rig, what was found, and the problem, "" if there is none.
+    """
+
+    type: Literal["check"] = "check"
+    revision: int
+    findings: list[dict[str, str]]
 
 
 class Runs(News):

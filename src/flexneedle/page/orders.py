@@ -9,10 +9,16 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from flexneedle.page.messages import Disturb, Message, Strategy
+from flexneedle.page.messages import Disturb, Message, News, Strategy
 
-Do = Literal["scene", "estimate", "plan", "reach", "insert", "read", "save"]
-Kind = Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "recording", "save"]
+Do = Literal["scene", "estimate", "plan", "reach", "insert", "check", "read", "save"]
+Kind = Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "check", "recording", "save"]
+
+
+BEAT_S = 0.25
+"""Time between two signals of the server to a worker whose job moves a rig."""
+SILENT_S = 1.5
+"""Time without a signal after which the worker stops the rig: nobody could stop it any more."""
 
 
 class Ready(Message):
@@ -26,7 +32,8 @@ class Work(Message):
 
     scenario: nested tables of the scenario called `name`, with the revision that the results repeat. An insertion makes
     its own plan, with this seed. rig: rig file, "" for a virtual one; paused: whether the insertion waits for its pace.
-    folder: of the run to read as the first or second recording, or to save the last insertion in.
+    folder: of the run to read as the first or second recording, or to save the last insertion in; that in which an
+    insertion on a rig makes one for its record.
     """
 
     job: int
@@ -47,13 +54,30 @@ class Work(Message):
 class Signal(Message):
     """A change of the job at work; one of the others is set.
 
-    pace: as in `messages.Pace`; a rig has 0, which holds it, and 1. cancel: end without a result; stop: end the
-    insertion as interrupted.
+    cancel: end without a result; stop: why the insertion is to end as interrupted. Of a virtual insertion: advance,
+    pace, disturb. Of one on a rig: go: it may begin, or go on; hold: why it is to be held; alive: the server is there.
     """
 
     job: int
     cancel: bool = False
-    stop: bool = False
+    stop: str = ""
     advance: bool = False
     pace: float | None = None
     disturb: Disturb | None = None
+    go: bool = False
+    hold: str = ""
+    alive: bool = False
+
+
+class RigReport(News):
+    """State of the rig of an insertion, for the server alone.
+
+    state, why: of the supervisor; holding also where the page has it held, and ended once its motors are stopped at the
+    end. waits: while it rests until it may go the number of that wait, else 0; moves: what will move then, a line each.
+    """
+
+    type: Literal["rig_report"] = "rig_report"
+    state: str
+    why: str = ""
+    waits: int = 0
+    moves: list[str] = Field(default_factory=list)

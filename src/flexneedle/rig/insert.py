@@ -94,7 +94,7 @@ def insert(
 
 def _checked(watchers: Watchers, rig: RigFile) -> Watchers:
     """The watchers of a rig. Raises RigError if none of them follows the stop of its section `ros`."""
-    if rig.ros is not None and watchers.follower is None:
-        rule = "give watchers=Watchers(follower=Bridge(rig.ros)), see flexneedle.ros.bridge"
+    if rig.ros is not None and not watchers.followers:
+        rule = "give watchers=Watchers(followers=(Bridge(rig.ros),)), see flexneedle.ros.bridge"
         raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
     return watchers

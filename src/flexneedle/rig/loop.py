@@ -247,7 +247,7 @@ def _held_too_long(scenario: Scenario, progress: Progress) -> _Ending | None:
     limit, total = observation.hold_limit(scenario), scenario.control.hold_total_s
     if held is not None and held > limit - 1e-9:
         return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
-    if progress.held_in_all > total - 1e-9 and (held is not None or refused.reason):
-        why = refused.reason if held is None else observation.verdict
+    if progress.held_in_all > total - 1e-9 and (held is not None or progress.asked or refused.reason):
+        why = progress.asked or refused.reason if held is None else observation.verdict
         return Outcome.HELD, f"held for {progress.held_in_all:.2f} s in all (limit {total:g} s): {why}"
     return refused.ending(scenario.control.hold_limit_s)

@@ -99,7 +99,7 @@ class Progress:
 
     arrived_at: time (s) at which the needle arrived at its depth; moves: number of moves; in_a_row: number of
     consecutive decisions with a likely miss; predicted: the last predicted shape; late: a decision of the last period
-    that came late; held_in_all: time (s) of all holds.
+    that came late; held_in_all: time (s) of all holds; asked: why somebody has it held, "" if nobody has.
     """
 
     observation: Observation
@@ -112,6 +112,7 @@ class Progress:
     predicted: Shape | None = None
     late: Late | None = None
     held_in_all: float = 0.0
+    asked: str = ""
 
     def withheld(self, reason: str, before: "Progress") -> "Progress":
         """With a decision, on the progress before, that the rig has not carried out to its end."""
@@ -120,7 +121,7 @@ class Progress:
     @property
     def decides(self) -> bool:
         """Whether the controller decides on the next step."""
-        return self.hold is None and self.arrived_at is None
+        return self.hold is None and self.arrived_at is None and not self.asked
 
     @property
     def held(self) -> float | None:

@@ -1,12 +1,23 @@
-"""The start of an insertion on a rig: where the tip is before anything moves, and how far the base may go."""
+"""The start of an insertion on a rig: what will move, where the tip is before, and how far the base may go."""
 
 import math
+from collections.abc import Mapping
 
 from flexneedle.errors import RigError
+from flexneedle.rig.moves import resting
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.rig import RigFile
 from flexneedle.types import Point
 
 _SDS = 3.0  # standard deviations of the start that a tip may be off
+
+
+def announced(rig: RigFile, scenario: Scenario, positions: Mapping[str, float]) -> list[str]:
+    """What an insertion will move, a line for the needle and for each axis: where it is (mm or rad), and its speed."""
+    depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
+    to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
+    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
+    return [first, *resting(rig, positions)]
 
 
 def checked_start(scenario: Scenario, tip: Point | None) -> Point:

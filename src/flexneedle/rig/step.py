@@ -62,7 +62,14 @@ class Steering:
             delay = begun - progress.observation.measurement.time
             waiting = Decision(STILL, "waiting for the last reading", predicted=progress.predicted)
             return Step(Action.REST, waiting, max(reading, delay)), progress
-        return self._decided(progress, rig, begun)
+        asked = rig.hold()
+        if not asked:
+            step, decided = self._decided(replace(progress, asked=""), rig, begun)
+            asked = rig.hold()  # which may have come up while the controller decided
+            if not asked:
+                return step, decided
+        held = Decision(STILL, f"held: {asked}", predicted=progress.predicted)
+        return Step(Action.HOLD, held, reading), replace(progress, late=None, asked=asked)
 
     def _decided(self, progress: Progress, rig: Rig, begun: float) -> tuple[Step, Progress]:
         """The step of a decision: of the one that came late in the period before, if it still holds, or of a new one.

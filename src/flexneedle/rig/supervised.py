@@ -17,7 +17,7 @@ from flexneedle.rig.pace import roll_time
 from flexneedle.rig.start import checked_start, deepest, needed
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
-from flexneedle.rig.virtual import Rig, to_stage
+from flexneedle.rig.virtual import Rig, never, to_stage
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
 from flexneedle.simulator.control import MOVES, Limits, half_turned
@@ -141,28 +141,29 @@ class Follower(Protocol):
 
 @dataclass(frozen=True)
 class Watchers:
-    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing.
+    """What is given each tick of a rig: the record of ticks, and what follows the insertion.
 
     confirm: called with the supervisor before the rig is armed; what it raises ends the insertion before anything has
-    moved.
+    moved. hold: as for `Rig`.
     """
 
     ticks: Ticks = field(default_factory=Ticks)
-    follower: Follower | None = None
+    followers: tuple[Follower, ...] = ()
     confirm: Callable[[Supervisor], None] | None = None
+    hold: Callable[[], str] = never
 
     def opened(self, supervisor: Supervisor) -> None:
         """Hand out the supervisor before the rig is armed, and have the motions confirmed."""
-        if self.follower is not None:
-            self.follower.opened(supervisor)
+        for follower in self.followers:
+            follower.opened(supervisor)
         if self.confirm is not None:
             self.confirm(supervisor)
 
     def report(self, report: Report) -> None:
         """Hand out what a tick found."""
         self.ticks.add(report)
-        if self.follower is not None:
-            self.follower.report(report)
+        for follower in self.followers:
+            follower.report(report)
 
 
 class SupervisedDriver:
@@ -280,4 +281,4 @@ def supervised(
             supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
         driver = SupervisedDriver(supervisor, scenario, plan.roll)
         deadline = 1e-3 * rig.loop.decision_ms
-        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
+        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline, hold=watchers.hold)

@@ -29,13 +29,19 @@ from flexneedle.types import Control, Lateral, Point
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
 
+def never() -> str:
+    """No reason to hold the needle: ""."""
+    return ""
+
+
 @dataclass(frozen=True)
 class Rig:
     """Ports of the closed loop; `truth` is only recorded, None on hardware.
 
     expect: called with the estimate and the command before each motion, so that readings during it can be checked; None
     where they are not. deadline: time (s) of a decision after which it counts as late; the tracker is then read again
-    before it is used. None: no decision is late.
+    before it is used. None: no decision is late. hold: asked before each decision and each move why the needle is to be
+    held, "" if it is not.
 
     Raises InputError if one has not the functions of its port, and for a deadline that is not above 0.
     """
@@ -46,6 +52,7 @@ class Rig:
     truth: Callable[[], Condition] | None = None
     expect: Callable[[Estimate, Control], None] | None = None
     deadline: float | None = None
+    hold: Callable[[], str] = never
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,8 @@ from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_li
 from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
+from flexneedle.rig.step import OnDecision
 from flexneedle.rig.supervised import Watchers, check_fit
-from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.runs.saving import (
     PARTS,
     finish,
@@ -101,13 +101,13 @@ def record_insertion(
     *,
     on_iteration: OnIteration,
     on_period: OnPeriod,
+    on_decision: OnDecision | None = None,
     bridge: "Bridge | None" = None,
-    confirm: Callable[[Supervisor], None] | None = None,
+    watchers: Watchers | None = None,
 ) -> Insertion:
     """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    bridge: an open connection to ROS, which publishes all and may stop it. confirm: called with the supervisor of a rig
-    after planning, before anything moves; what it raises ends the insertion.
+    on_decision, watchers: as for `insert`. bridge: an open connection to ROS, which publishes all and may stop it.
 
     An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
@@ -126,9 +126,10 @@ def record_insertion(
         folder.values["scenario"] = scenario.values()
         if bridge is not None:
             bridge.publish(plan)
-        insertion = _insert(
-            folder, scenario, plan, choices, on_period, Watchers(follower=bridge, confirm=confirm)
-        )
+        given = watchers or Watchers()
+        followers = given.followers if bridge is None else (bridge, *given.followers)
+        followed = replace(given, followers=followers)
+        insertion = _insert(folder, scenario, plan, choices, on_period, on_decision, followed)
         finish_insertion(folder, insertion)
     return insertion
 
@@ -164,6 +165,7 @@ def _insert(
     plan: Plan,
     choices: Choices,
     on_period: OnPeriod,
+    on_decision: OnDecision | None,
     watchers: Watchers,
 ) -> Insertion:
     from flexneedle.rig.insert import insert
@@ -187,6 +189,7 @@ def _insert(
             "phantom": choices.phantom,
             "tracker": choices.tracker,
             "force": choices.force,
+            "on_decision": on_decision,
         }
         if choices.rig is not None:
             options |= {"rig": choices.rig, "dry_run": choices.dry_run, "watchers": watchers}

@@ -3,7 +3,7 @@
 import pytest
 
 from fake_page import until
-from flexneedle.page.messages import Disturbances, RigState
+from flexneedle.page.messages import Disturbances, Job, RigCheck, RigState
 from recorded_page import WELCOME, inserting, insertion, opening, people, row, rows
 
 pytestmark = pytest.mark.page
@@ -75,30 +75,122 @@ def test_disturbances_are_sent_and_listed(panel, server):
     page.wait_for_selector("text=Active: 0.25 N on the tip")
 
 
-def test_a_rig_is_armed_after_a_check_and_not_disturbed(panel, server):
-    welcome = WELCOME.model_copy(update={"rig": "emulated"})
-    page = panel(
-        [welcome, people(), *opening()[2:], RigState(name="emulated", armed=False, state="idle", why="")]
-    )
-    arm = page.locator(f"{PANEL} .rig button", has_text="Arm")
-    assert arm.is_disabled()
-    assert page.locator(".rig button", has_text="Insert on the rig").is_disabled()
-    page.check("#rig-free")
-    arm.click()
+MOVES = [
+    "Bench: the needle will be inserted from where it is, to a target 40 mm deep.",
+    "insertion: at 30 mm",
+]
+
+
+def rig(state, *moves, **more):
+    return RigState(name="Bench", state=state, moves=list(moves), **more)
+
+
+@pytest.fixture
+def rig_panel(panel):
+    """Open a page with a connected rig."""
+
+    def opened(*news, **how):
+        welcome = WELCOME.model_copy(update={"rig": "Bench"})
+        return panel([welcome, people(), *opening()[2:], rig("idle"), *news], **how)
+
+    return opened
+
+
+def shown_buttons(page):
+    """Names of the rig's buttons that can be seen, and whether they can be pressed."""
+    buttons = page.locator(f"{PANEL} .rig button:visible").all()
+    return {each.inner_text(): each.is_enabled() for each in buttons}
+
+
+def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
+    page = rig_panel()
+    assert shown_buttons(page) == {"Check": True, "Prepare": True}
+    click(page, "Prepare")
     page.wait_for_selector("text=you steer")
-    server.send(RigState(name="emulated", armed=True, state="armed", why=""))
-    page.click("text=Insert on the rig")
-    page.wait_for_timeout(100)
-    assert server.asked("arm") == [{"type": "arm", "armed": True}]
-    assert server.asked("insert") == [{"type": "insert", "rig": True}]
+    server.send(insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7))
+    page.wait_for_selector("text=is ready; nothing moves before it is armed and started")
+    assert page.locator(".rig .moves li").all_inner_texts() == MOVES
+    assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
+    assert page.locator(PANEL).get_by_role("button", name="Stop", exact=True).is_visible()
+    page.check("#rig-free")
+    assert shown_buttons(page) == {"Arm": True, "Insert on the rig": False}
+    click(page, "Arm")
+    server.send(rig("armed", *MOVES, job=7))
+    until(page, f"!document.querySelector('{PANEL} .rig button.danger').disabled")
+    assert shown_buttons(page) == {"Disarm": True, "Insert on the rig": True}
+    click(page, "Insert on the rig")
+    server.send(rig("inserting", job=7, begun=True), insertion("running", rig="Bench"))
+    page.wait_for_selector("text=It inserts.")
+    assert [each["type"] for each in server.requests[-4:]] == ["steer", "prepare", "arm", "go"]
+    assert server.asked("arm") == [{"type": "arm", "armed": True, "job": 7}]
+    assert shown_buttons(page) == {}
+    for what in (".disturb", "[aria-label=Pace]", "text=Pause", "text=One period"):
+        assert not page.locator(PANEL).locator(what).is_visible()
+    click(page, "Stop")
     server.send(
-        insertion("running", rig="emulated"),
-        RigState(name="emulated", armed=False, state="inserting", why=""),
+        insertion("interrupted", rig="Bench", summary="stopped: person 1", folder="2026-rig"),
+        rig("stopped", why="person 1 on the page"),
     )
-    page.wait_for_selector(f"{PANEL} button:visible >> text=Hold")
-    assert not page.is_visible(".disturb")
-    assert not page.is_visible("[aria-label=Pace]")
+    page.wait_for_selector("text=It was stopped: person 1 on the page.")
+    page.wait_for_selector("text=Recorded as 2026-rig.")
+    assert len(server.asked("stop")) == 1
+    assert shown_buttons(page) == {"Check": True, "Prepare": True}
+
+
+def test_a_rig_that_is_held_has_to_be_confirmed_again(rig_panel, server):
+    page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7))
+    page.check("#rig-free")
+    server.send(rig("holding", "Bench: further", job=7, begun=True, why="nobody steers"))
+    page.wait_for_selector("text=It holds: the needle rests where it is: nobody steers.")
     assert not page.is_checked("#rig-free")
+    assert shown_buttons(page) == {"Arm": False, "Go on": False}
+    page.check("#rig-free")
+    server.send(rig("armed", "Bench: further", job=7, begun=True))
+    page.wait_for_selector("text=It is armed for one start.")
+    assert page.is_checked("#rig-free")
+    server.send(
+        rig("holding", "Bench: further", job=7, begun=True, why="not started within 60 s: arm it again")
+    )
+    page.wait_for_selector("text=not started within 60 s")
+    assert not page.is_checked("#rig-free")
+
+
+def test_who_does_not_steer_can_only_stop_a_rig(rig_panel, server):
+    page = rig_panel(people(2, steering=2), insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7))
+    page.check("#rig-free")
+    assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
+    click(page, "Stop")
+    page.wait_for_timeout(100)
+    assert server.asked("stop") == [{"type": "stop"}]
+    assert server.asked("arm") == []
+
+
+def test_a_check_lists_its_problems(rig_panel, server):
+    page = rig_panel()
+    click(page, "Check")
+    page.wait_for_selector("text=you steer")
+    server.send(Job(job=9, kind="check", state="running", text="each device is read, nothing moves"))
+    page.wait_for_selector("text=Checking: each device is read, nothing moves …")
+    findings = [
+        {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
+        {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},
+    ]
+    server.send(RigCheck(revision=1, findings=findings), Job(job=9, kind="check", state="done"))
+    page.wait_for_selector("text=The check has found 1 problem.")
+    assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
+    assert page.locator(".findings details li").count() == 2
+    server.send(*opening(revision=2)[2:3])
+    page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_a_rig_fits_its_width(rig_panel, pictures, size, scheme):
+    waits = rig("ready", *MOVES, "The motors of all axes are switched on first." * 3, job=7)
+    page = rig_panel(insertion("ready", rig="Bench"), waits, width=size[0], height=size[1], scheme=scheme)
+    page.locator(f"{PANEL} .rig").scroll_into_view_if_needed()
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    pictures(page, f"rig-{size[0]}-{scheme}")
 
 
 def test_decisions_are_listed_where_they_change_and_show_their_period(panel, server):

@@ -15,11 +15,12 @@ from flexneedle.page.orders import Do, Kind, Work
 from flexneedle.page.server.catalog import CONTROLLERS, STRATEGIES
 from flexneedle.page.server.folder import RunsFolder
 from flexneedle.page.server.hub import Hub, Outbox
-from flexneedle.page.server.insertion import ConnectedRig, Live
+from flexneedle.page.server.insertion import Live
 from flexneedle.page.server.jobs import Jobs
 from flexneedle.page.server.limits import Limits
 from flexneedle.page.server.people import People
 from flexneedle.page.server.refusal import Refusal
+from flexneedle.page.server.rig import ConnectedRig, Rig
 from flexneedle.page.server.session import Session
 from flexneedle.scenario.preset import PRESETS
 
@@ -50,12 +51,13 @@ class Desk:
     def __init__(self, setup: Setup) -> None:
         self.limits, self.hub, self.people = setup.limits, Hub(), People()
         self.session, self.runs = setup.session, RunsFolder(setup.runs)
-        self._rig = setup.rig
         numbers, of_plans, of_insertions = count(1), *setup.workers
         self._plans = Jobs(
             "plans", of_plans, self.hub, setup.limits, numbers, self._job_ended, lambda _values: None
         )
-        self.live = Live(self.hub, lambda: self._insertions, setup.limits, setup.rig)
+        self.rig = Rig(self.hub, lambda: self._insertions, setup.limits, setup.rig)
+        self.live = Live(self.hub, lambda: self._insertions, setup.limits, self.rig)
+        self._rig_name = None if setup.rig is None else setup.rig.name
         self._insertions = Jobs(
             "insertions", of_insertions, self.hub, setup.limits, numbers, self._job_ended, self.live.note
         )
@@ -78,7 +80,7 @@ class Desk:
     def halt(self) -> None:
         """Stop the insertion, if one runs."""
         with suppress(Refusal):
-            self.live.stop()
+            self.live.stop("the server of the page ends")
 
     async def end(self) -> None:
         """End the workers."""
@@ -86,7 +88,9 @@ class Desk:
             timer.cancel()
         if self._watching is not None:
             self._watching.cancel()
-        await asyncio.gather(self._plans.worker.end(), self._insertions.worker.end())
+        insertions = self._insertions.worker
+        recorded = insertions.end(self.limits.record_s) if self.rig.active else insertions.end()
+        await asyncio.gather(self._plans.worker.end(), recorded)
 
     # Clients
 
@@ -112,7 +116,7 @@ class Desk:
             presets=PRESETS.names(),
             controllers=CONTROLLERS,
             strategies=STRATEGIES,
-            rig=None if self._rig is None else self._rig.name,
+            rig=self._rig_name,
         )
 
     def leave(self, client: int, outbox: Outbox) -> None:
@@ -122,7 +126,7 @@ class Desk:
         self.people.leave(client)
         self.hub.publish(self.people.news())
         if steered:
-            self._nobody_steers("the client that steered is gone")
+            self.rig.lost("nobody steers: who steered is gone")
         if not self.people.clients:
             self._start_timer("alone", self.limits.alone_s, self._alone)
 
@@ -153,23 +157,42 @@ class Desk:
                 self._open(request)
             case m.Save():
                 self._save(request.name)
+            case m.Stop():
+                self.live.stop(f"person {client} on the page")
+            case m.Check() | m.Prepare() | m.Arm() | m.Go():
+                self._steer_rig(request)
             case _:
                 self._steer_insertion(request)
 
-    def _steer_insertion(self, request: m.Insert | m.Arm | m.Pace | m.Advance | m.Stop | m.Disturb) -> None:
+    def _steer_insertion(self, request: m.Insert | m.Pace | m.Advance | m.Disturb) -> None:
         match request:
             case m.Insert():
-                self._insert(request)
-            case m.Arm():
-                self.live.arm(request.armed)
+                work = self._work("insert", "insertion").model_copy(update={"paused": request.paused})
+                self.live.start(work)
             case m.Pace():
                 self.live.set_pace(request.pace)
             case m.Advance():
                 self.live.advance()
-            case m.Stop():
-                self.live.stop()
             case m.Disturb():
                 self.live.disturb(request)
+            case _:
+                assert_never(request)
+
+    def _steer_rig(self, request: m.Check | m.Prepare | m.Arm | m.Go) -> None:
+        match request:
+            case m.Check():
+                source = self.rig.connected.source
+                self.live.require_none("it uses the devices: stop it first")
+                self._insertions.add(self._work("check", "check").model_copy(update={"rig": source}))
+            case m.Prepare():
+                work = self._work("insert", "insertion").model_copy(update={"folder": str(self.runs.path)})
+                self.live.prepare(work)
+            case m.Arm() if request.armed:
+                self.rig.arm(request.job)
+            case m.Arm():
+                self.rig.disarm("")
+            case m.Go():
+                self.rig.go()
             case _:
                 assert_never(request)
 
@@ -177,10 +200,8 @@ class Desk:
         before = self.people.steering
         self.people.steer(client, take)
         self.hub.publish(self.people.news())
-        if take:
-            self._stop_timer("lost")
-        elif before == client:
-            self._nobody_steers("the steering was released")
+        if before == client and not take:
+            self.rig.lost("nobody steers: the steering was released")
 
     def _begin(self, session: Session) -> None:
         """Go on with a changed session: what is computed for the old one is cancelled.
@@ -193,7 +214,7 @@ class Desk:
             self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
         self.session = session
         self.hub.publish(session.news())
-        self.live.disarm("the scenario or an option was changed")
+        self.rig.changed("the scenario or an option was changed")
         self._plans.cancel(*_SEARCHES)
         self._order("scene", "scene")
         self._order("estimate", "estimate")
@@ -227,15 +248,11 @@ class Desk:
     def _cancel(self, number: int) -> None:
         for jobs in (self._plans, self._insertions):
             if number in jobs.numbers:
-                if jobs is self._insertions and self.live.moves_rig:
-                    raise Refusal("an insertion runs on the rig: stop it instead")
+                if number == self.rig.job:
+                    raise Refusal("it is an insertion on the rig: stop it instead")
                 jobs.cancel_job(number)
                 return
         raise Refusal(f"job = {number}: does not run or wait")
-
-    def _insert(self, request: m.Insert) -> None:
-        work = self._work("insert", "insertion").model_copy(update={"paused": request.paused})
-        self.live.start(work, on_rig=request.rig)
 
     def _open(self, request: m.Open) -> None:
         of, source = _RECORDINGS[request.second]
@@ -257,18 +274,14 @@ class Desk:
     # What happens by itself
 
     def _at_rest(self) -> None:
-        if not self.live.moves_rig:  # whose loop would share the processor
+        if not self.rig.active:  # whose loop would share the processor
             self._order("plan", "plan")
 
     def _job_ended(self, work: Work, state: str, text: str) -> None:
         if work.kind == "insertion":
-            self.live.ended(state, text)
+            self.live.ended(work, state, text)
         if work.kind == "save":
             self._look.set()
-
-    def _nobody_steers(self, why: str) -> None:
-        self.live.disarm(why)
-        self._start_timer("lost", self.limits.lost_s, self.live.lost)
 
     def _alone(self) -> None:
         self._idle = True

@@ -27,7 +27,7 @@ class RunsFolder:
     """The runs in a folder, which need not exist yet."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path.resolve()
+        self.path = path.resolve()
         self._read = dict[str, tuple[tuple[int, int], dict[str, Any]]]()
 
     def listed(self) -> list[dict[str, Any]]:
@@ -44,13 +44,13 @@ class RunsFolder:
         """The folder of a run. Raises Refusal for a name that is not one of this folder."""
         if name not in self._names() or self._stat(name) is None:
             raise Refusal(f"{name!r}: no run of this name in the folder of runs")
-        return self._path / name
+        return self.path / name
 
     def new(self, name: str) -> Path:
         """The folder of a run that is to be saved. Raises Refusal if there is something of this name."""
         if not _NAME.fullmatch(name):
             raise Refusal(f"{name!r}: must be letters, digits, spaces and any of . _ + -")
-        folder = self._path / name
+        folder = self.path / name
         if folder.exists() or folder.is_symlink():
             raise Refusal(f"{name}: there is already something of this name: choose another")
         return folder
@@ -58,7 +58,7 @@ class RunsFolder:
     def _names(self) -> list[str]:
         """Names of the folders here; links, which may lead elsewhere, are none."""
         try:
-            with os.scandir(self._path) as entries:
+            with os.scandir(self.path) as entries:
                 names = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
         except OSError:
             return []
@@ -66,7 +66,7 @@ class RunsFolder:
 
     def _stat(self, name: str) -> os.stat_result | None:
         try:
-            return (self._path / name / RUN_FILE).stat()
+            return (self.path / name / RUN_FILE).stat()
         except OSError:
             return None
 
@@ -74,7 +74,7 @@ class RunsFolder:
         version = (stat.st_mtime_ns, stat.st_size)
         known = self._read.get(name)
         if known is None or known[0] != version:
-            known = (version, _entry_of(self._path / name / RUN_FILE, name, stat.st_mtime))
+            known = (version, _entry_of(self.path / name / RUN_FILE, name, stat.st_mtime))
             self._read[name] = known
         return known[1]
 

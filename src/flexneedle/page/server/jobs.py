@@ -18,6 +18,8 @@ _FINISHED: frozenset[Kind] = frozenset(("scene", "estimate"))
 """Short ones, which are not cancelled by a newer one: so a target that is dragged has estimates all along."""
 _BACKGROUND: frozenset[Kind] = frozenset(("reach",))
 """Those that are set back for any other."""
+_FOR_THE_SERVER = ("rig_report",)
+"""Types of a worker's messages that no client gets."""
 _ENDS = ("done", "failed", "cancelled")
 
 
@@ -70,10 +72,6 @@ class Jobs:
         """Numbers of the jobs that run or wait."""
         return [job.work.job for job in self._all()]
 
-    def runs(self, kind: Kind) -> bool:
-        """Whether a job of a kind runs or waits."""
-        return any(job.work.kind == kind for job in self._all())
-
     def add(self, work: Work) -> int:
         """Add a job, with a number that it gets here, and return that. It replaces an older one of its kind."""
         job = Job(work.model_copy(update={"job": next(self._numbers)}))
@@ -105,17 +103,20 @@ class Jobs:
             self._running.again = False
             self._cancel_running()
 
-    def signal(self, kind: Kind, **change: Any) -> bool:
-        """Change the job of a kind, as a `Signal`, if it runs; returns whether it does."""
+    def signal(self, number: int, **change: Any) -> bool:
+        """Change a job by number, as a `Signal`, if it runs; returns whether it does."""
         running = self._running
-        if running is None or running.work.kind != kind:
+        if running is None or running.work.job != number:
             return False
-        self.worker.send(Signal(job=running.work.job, **change))
+        self.worker.send(Signal(job=number, **change))
         return True
 
-    def expect_end(self, seconds: float) -> None:
-        """End the worker if the job that runs has not ended after a time."""
-        if self._deadline is None:
+    def expect_end(self, seconds: float | None) -> None:
+        """End the worker if the job that runs has not ended after a time; None: it may take any time."""
+        if seconds is None and self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+        elif seconds is not None and self._deadline is None:
             self._deadline = asyncio.get_running_loop().call_later(seconds, self.worker.kill)
 
     def _all(self) -> list[Job]:
@@ -124,7 +125,7 @@ class Jobs:
     def _cancel_running(self) -> None:
         if self._running is not None and not self._running.cancelled:
             self._running.cancelled = True
-            self.signal(self._running.work.kind, cancel=True)
+            self.signal(self._running.work.job, cancel=True)
             self.expect_end(self._limits.cancel_s)
 
     def _next(self) -> None:
@@ -136,7 +137,8 @@ class Jobs:
 
     def _message(self, message: Message, values: dict[str, Any] | None) -> None:
         if values is None or values["type"] != "job":
-            self._hub.hand_on(message, values)
+            if values is None or values["type"] not in _FOR_THE_SERVER:
+                self._hub.hand_on(message, values)
             if values is not None:
                 self._on_news(values)
             return
@@ -162,9 +164,7 @@ class Jobs:
 
     def _over(self, job: Job, state: str, text: str) -> None:
         self._running = None
-        if self._deadline is not None:
-            self._deadline.cancel()
-            self._deadline = None
+        self.expect_end(None)
         if job.again and state == "cancelled":
             again = Job(job.work)
             self._waiting.append(again)

@@ -28,18 +28,20 @@ class Limits:
     """The scenario is planned when it has not changed for this time."""
     alone_s: float = 5.0
     """Without clients for this time, work is cancelled."""
-    lost_s: float = 2.0
-    """Without a steering client for this time, a rig is held."""
+    armed_s: float = 60.0
+    """A rig that was armed and not started for this time is disarmed."""
     cancel_s: float = 1.0
     """A worker that has not cancelled by then is ended."""
     stop_s: float = 5.0
     """A worker that has not stopped an insertion by then is ended; the supervisor has stopped its rig before."""
+    record_s: float = 30.0
+    """At the end of the server, a worker that has not completed the record of an insertion by then is ended."""
     runs_s: float = 5.0
     """Time between two looks at the folder of runs."""
 
 
-RIG = Limits(pong_s=2.0, send_s=2.0)
-"""With a connected rig: a lost client is noticed sooner."""
+RIG = Limits(ping_s=0.5, pong_s=1.5, send_s=1.5)
+"""With a connected rig: a client that is silent is lost after 2 s at most, the sum of the first two."""
 
 
 class Rate:

@@ -53,8 +53,8 @@ class Worker:
         if self._process is not None:
             kill_process(self._process)
 
-    async def end(self) -> None:
-        """End the process for good: its stdin ends, on which it stops what it does; after 3 s it is killed."""
+    async def end(self, seconds: float = _END_S) -> None:
+        """End the process for good: its stdin ends, on which it stops what it does; after a time it is killed."""
         if self._keeping is not None:
             self._keeping.cancel()
             await asyncio.gather(self._keeping, return_exceptions=True)
@@ -64,7 +64,7 @@ class Worker:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            async with asyncio.timeout(_END_S):
+            async with asyncio.timeout(seconds):
                 await _drained(process)
         except TimeoutError:
             kill_process(process)

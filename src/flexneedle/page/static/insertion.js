@@ -5,10 +5,9 @@ import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
 import { rigForm } from "./insertion/rig.js";
 import { inWords } from "./insertion/words.js";
-import { maySteer } from "./shown.js";
+import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const RUNS = ["waiting", "planning", "running", "paused"];
 const NONE = "No insertion yet: the plan is made first, if there is none.";
 
 export function mount(element, store, link) {
@@ -32,18 +31,17 @@ export function mount(element, store, link) {
 
   store.subscribe(["insertion live", "people", "welcome"], () => {
     const live = store.get("insertion live");
-    const runs = RUNS.includes(live?.state);
+    const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
     state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
-    for (const each of [stop, pause]) each.hidden = !runs;
-    step.hidden = pace.hidden = !runs || real;
+    stop.hidden = !runs;
+    for (const each of [pause, step, pace]) each.hidden = !runs || real;
     pause.disabled = pace.disabled = !steers;
     step.disabled = !steers || !paused;
     pause.dataset.next = paused ? "go" : "pause";
-    pause.textContent = paused ? "Continue" : real ? "Hold" : "Pause";
-    if (real) pace.value = "1";
-    else if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
+    pause.textContent = paused ? "Continue" : "Pause";
+    if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
     disturb.disabled = !steers;
   });

@@ -2,8 +2,11 @@
 //   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
 //   "view period": the period that is shown; undefined: the newest
 
-const ACTIVE = ["planning", "running", "paused"];
+const ACTIVE = ["planning", "ready", "running", "paused", "holding"];
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
+
+// Whether an insertion (news "insertion", or none) runs or waits.
+export const runs = (live) => live?.state === "waiting" || ACTIVE.includes(live?.state);
 
 // Keys to subscribe to for all that this module gives.
 export const SHOWN = [

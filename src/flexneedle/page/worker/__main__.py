@@ -17,6 +17,7 @@ from flexneedle.page.worker.outbox import Outbox
 from flexneedle.page.worker.plans import estimate, plan
 from flexneedle.page.worker.reach import reach
 from flexneedle.page.worker.recording import read
+from flexneedle.page.worker.rig import check
 from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.page.worker.task import Task
@@ -42,6 +43,7 @@ def main() -> int:
         "reach": reach,
         "read": read,
         "insert": insertions.insert,
+        "check": check,
         "save": insertions.save,
     }
     while (order := inbox.next()) is not None:

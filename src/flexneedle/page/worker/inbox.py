@@ -35,13 +35,15 @@ class Inbox:
                 self._take(json.loads(message))
         finally:
             for job, signals in list(self._open.items()):
-                signals.take(Signal(job=job, cancel=True))
+                signals.take(Signal(job=job, cancel=True, stop="the server of the page has ended"))
             self._orders.put(None)
 
     def _take(self, values: dict[str, object]) -> None:
         if "do" in values:
             work = Work.model_validate(values)
-            signals = self._open[work.job] = Signals(0.0 if work.paused else 1.0)
+            signals = self._open[work.job] = Signals(
+                pace=0.0 if work.paused else 1.0, held="not armed" if work.rig else ""
+            )
             self._orders.put((work, signals))
             return
         signal = Signal.model_validate(values)

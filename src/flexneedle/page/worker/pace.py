@@ -6,7 +6,6 @@ from time import monotonic
 from flexneedle.errors import StoppedError
 from flexneedle.page.worker.signals import Signals
 
-_BY = "stopped on the page"
 _AT_ONCE_S = 1e-6
 
 
@@ -69,7 +68,7 @@ class Pacer:
     def _check(self) -> None:
         self._signals.check()
         if self._signals.stopped:
-            raise StoppedError(_BY)
+            raise StoppedError(f"stopped: {self._signals.stopped}")
 
     def _note(self, *, paused: bool) -> None:
         if paused != self._paused:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from threading import Condition
+from time import monotonic
 
 from flexneedle.page.messages import Disturb
 from flexneedle.page.orders import Signal
@@ -12,15 +13,17 @@ class Cancelled(Exception):
 
 
 class Signals:
-    """Signals of one job. pace: as in `orders.Signal`; stopped: whether the insertion is to end as interrupted.
+    """Signals of one job. pace: as in `orders.Signal`; stopped: why the insertion is to end as interrupted, or "".
 
-    on_stop: called at once, in the thread that reads orders, when the job is stopped or cancelled.
+    held: why the needle of a rig is to rest, "" if it may go. heard: when the last signal came (monotonic, s).
+    on_stop: called at once, in the thread that reads orders, with the reason when the job is stopped or cancelled.
     """
 
-    def __init__(self, pace: float = 1.0) -> None:
-        self.pace = pace
-        self.stopped = False
-        self.on_stop: Callable[[], None] = lambda: None
+    def __init__(self, pace: float = 1.0, held: str = "") -> None:
+        self.pace, self.held = pace, held
+        self.stopped = ""
+        self.heard = monotonic()
+        self.on_stop: Callable[[str], None] = lambda _why: None
         self._cancelled = False
         self._advances = 0
         self._disturbs: list[Disturb] = []
@@ -29,8 +32,10 @@ class Signals:
     def take(self, signal: Signal) -> None:
         """Take a signal of the server."""
         with self._changed:
+            self.heard = monotonic()
             self._cancelled |= signal.cancel
-            self.stopped |= signal.stop
+            self.stopped = self.stopped or signal.stop
+            self.held = signal.hold or ("" if signal.go else self.held)
             self._advances += signal.advance
             if signal.pace is not None:
                 self.pace = signal.pace
@@ -39,7 +44,7 @@ class Signals:
                 self._disturbs.append(signal.disturb)
             self._changed.notify_all()
         if signal.cancel or signal.stop:
-            self.on_stop()
+            self.on_stop(signal.stop or "cancelled")
 
     def check(self) -> None:
         """Raise Cancelled if the job is cancelled."""

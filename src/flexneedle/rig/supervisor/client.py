@@ -23,6 +23,8 @@ from flexneedle.scenario.sections.axes import Axis
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Measurement, Point
 
+CONTROLLER = "the controller"
+"""Who stops the motors at the end of an insertion."""
 _HEARTBEAT_S = 0.1
 _SILENT_S = 1.0  # without a report: the supervisor hangs
 _PATIENCE_S = 0.3  # for reports that have not been taken, after a time without Python's lock
@@ -171,7 +173,7 @@ class Supervisor:
         """Leave the states stopped and fault. It is refused while motors move: `stop` returns when they rest."""
         self._ask(say.Reset())
 
-    def stop(self, who: str = "the controller") -> None:
+    def stop(self, who: str = CONTROLLER) -> None:
         """Stop all motors, and return when they rest, so that a reset is accepted."""
         if self._ended is not None:
             return
