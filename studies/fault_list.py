@@ -113,7 +113,7 @@ FAULTS: Sequence[Fault] = (
     # It shows in motions faster than max_error / lag = 1.3 mm/s: at worst after a rest and a slow step.
     _motors("lag of 0.15 s", Device("galil:lag={channel}"), FAULT, 1.0, "{axis}", _SOME),
     _motors("overshoot by a fifth", Device("galil:overshoot={channel}"), FAULT, 1.2, "{axis}", _SOME),
-    _motors("limit switch", Device("galil:limit={channel}"), FAULT, 0.4, "({axis}|Limit Switch)", _SOME),
+    _motors("limit switch", Device("galil:limit={channel}"), FAULT, 0.4, "({axis}|[Ll]imit)", _SOME),
     _motors("? in reply", Device("galil:refuse"), FAULT, 0.1, "refused", _SOME),
     _motors("connection lost", Device("galil:unplug"), FAULT, 0.1, f"{_NOT_CONNECTED}|no reply", _SOME),
     _motors(

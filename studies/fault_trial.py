@@ -128,7 +128,7 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
         effective = fault.injection.inject(Running(rig, folder, trial.axis, controller, others))
         injected = due if fault.decision_s else effective
         _await_end(fault, process, injected, setting.record / "run.json")
-        _, printed, errors = ended(process, _END_S)
+        status, printed, errors = ended(process, _END_S)
         sleep(_REST_S)
         if keep is not None and setting.record.exists():
             name = f"{fault.group}-{fault.name}-{case.number}".replace(" ", "-")
@@ -137,7 +137,7 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
         times, left = (ordered, injected), _ended_by_force(others)
         evidence = Evidence(fault, trial.axis, *times, rig.read_truth(), run, errors, left)
         row = trial.key | {"roll_deg": round(degrees(roll), 1)} | evidence.row()
-    return row | {"seconds": monotonic() - begun}
+    return row | {"exit_status": status, "seconds": monotonic() - begun}
 
 
 def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generator) -> tuple[str, ...]:

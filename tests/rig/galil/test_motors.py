@@ -402,6 +402,18 @@ def test_after_a_limit_the_axis_moves_only_when_told_again():
     assert (state.position, state.stopped, state.forward_limit) == (-50, "", False)
 
 
+def test_a_target_for_an_axis_that_slows_down_at_its_limit_is_refused_with_that_reason():
+    with driven() as (motors, device):
+        axis = replace(device.device.axes[0], switches=(-1e9, 100.0))
+        device.device = replace(device.device, axes=(axis, *device.device.axes[1:]))
+        motors.set_speed("A", 20_000, 102_400)
+        motors.follow({"A": 5000.0})
+        until(lambda: device.answer("MG _SCA").startswith(b" 2.0000"))
+        with pytest.raises(DriverError, match=r"refused: 7 .*; A: at the forward limit: its switch, or FL$"):
+            motors.follow({"A": 5100.0})
+        assert not settled(motors)["A"].moving
+
+
 def test_the_setup_has_limits_errors_and_disabled_switches_of_the_controller():
     with driven(channels=("A", "B")) as (motors, device):
         device.device, _ = reply(device.device, "FLB=1000;OEB=1;ERB=200;LDB=1")

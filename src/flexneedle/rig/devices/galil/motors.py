@@ -156,7 +156,18 @@ class GalilMotors:
         targets = {letter: self._target(letter, position) for letter, position in positions.items()}
         if targets:
             self._stopping = None
-            (self._track if self._tracks else self._move)(targets, self._deadline())
+            deadline = self._deadline()
+            try:
+                (self._track if self._tracks else self._move)(targets, deadline)
+            except DriverError as error:
+                if not self._link.is_open or not (stops := self._stops(deadline)):
+                    raise
+                raise DriverError(f"{error}; {stops}") from None
+
+    def _stops(self, deadline: float) -> str:
+        """Which channels the controller itself has stopped and why, or "": it refuses their targets until they rest."""
+        found = ((letter, state.stopped) for letter, state in self._reports(deadline).items())
+        return "; ".join(f"{letter}: {why}" for letter, why in found if why)
 
     def _target(self, letter: str, position: float) -> int:
         self._known(letter)
