@@ -16,12 +16,15 @@ from flexneedle.mechanics.needle import (
     Cut,
     Laterals,
     Needle,
+    Plain,
     Pose,
     Solution,
     Work,
+    from_plain,
     solve,
     spring_energy,
     spring_rest,
+    to_plain,
 )
 from flexneedle.mechanics.shape import put, sample
 
@@ -99,9 +102,13 @@ def settled(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, 
 
 
 @kernel
+def _settle(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
+    return to_plain(settled(model, needle, rest, u, w, held))
+
+
 def settle(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Needle:
     """`settled`, for callers outside of kernels."""
-    return settled(model, needle, rest, u, w, held)
+    return from_plain(_settle(model, needle, rest, u, w, held))
 
 
 @inner
@@ -210,6 +217,42 @@ def _shape(
 
 
 @kernel
+def _rollout(
+    model: Model,
+    start: Needle,
+    rest0: Laterals,
+    u0: Laterals,
+    rest: Laterals,
+    u: Laterals,
+    w: Work,
+    commands: Floats,
+    axes: Laterals,
+    first: int,
+    last: int,
+    out: Outputs,
+) -> Plain:
+    needle = start
+    x, y, slope = (
+        np.empty(rest0.size + 2),
+        np.empty(rest0.size + 2, rest0.dtype),
+        np.empty(rest0.size + 2, rest0.dtype),
+    )
+    for j in range(first, last):
+        needle = start
+        rest[:], u[:] = rest0, u0
+        for k in range(commands.shape[1]):
+            needle = _advanced(model, needle, rest, u, w, commands[j, k])
+            tip = needle.solution.tip
+            put(out.tips[j, k], tip.x, tip.y, tip.slope)
+            out.energy[j, k] = _strain_energy(model, needle, u)
+            out.converged[j, k] = needle.solution.converged
+            if out.deflection.size > 0:
+                out.deflection[j, k] = _mean_square_deflection(model, needle, w, axes[j])
+            if out.shapes.size > 0:
+                _shape(model, needle, w, x, y, slope, out.shapes[j, k])
+    return to_plain(needle)
+
+
 def rollout(
     model: Model,
     start: Needle,
@@ -230,23 +273,4 @@ def rollout(
     Fills `out`. Returns the needle after the last sample, of which `rest`, `u` and `w` are left, arrays as in
     `needle.solve`.
     """
-    needle = start
-    x, y, slope = (
-        np.empty(rest0.size + 2),
-        np.empty(rest0.size + 2, rest0.dtype),
-        np.empty(rest0.size + 2, rest0.dtype),
-    )
-    for j in range(first, last):
-        needle = start
-        rest[:], u[:] = rest0, u0
-        for k in range(commands.shape[1]):
-            needle = _advanced(model, needle, rest, u, w, commands[j, k])
-            tip = needle.solution.tip
-            put(out.tips[j, k], tip.x, tip.y, tip.slope)
-            out.energy[j, k] = _strain_energy(model, needle, u)
-            out.converged[j, k] = needle.solution.converged
-            if out.deflection.size > 0:
-                out.deflection[j, k] = _mean_square_deflection(model, needle, w, axes[j])
-            if out.shapes.size > 0:
-                _shape(model, needle, w, x, y, slope, out.shapes[j, k])
-    return needle
+    return from_plain(_rollout(model, start, rest0, u0, rest, u, w, commands, axes, first, last, out))

@@ -41,6 +41,8 @@ from flexneedle.mechanics.model import CONTACT, GUIDE, Model
 Laterals = NDArray[Any]
 Work = NDArray[Any]
 
+Plain = tuple[Any, ...]
+
 COUPLED_ITERATIONS = 15
 BEARING_LOOKS = 15  # at the needle in its guide, in an iteration without coupling
 MAX_ITERATIONS = 100
@@ -132,6 +134,42 @@ class Needle(NamedTuple):
     cut: Cut
     channel: Channel
     solution: Solution
+
+
+@inner
+def to_plain(needle: Needle) -> Plain:
+    """A needle as tuples without names; `from_plain` makes it again.
+
+    Kernels return these. Compiled code that makes a named tuple for Python calls Python: if a signal's handler raises
+    there, as Ctrl-C does, the process crashes.
+    """
+    boundary, cut, solution = needle.boundary, needle.cut, needle.solution
+    base, begun, tip, last, loads = boundary.base, cut.tip, solution.tip, solution.last, solution.loads
+    guide, channel = last.guide, needle.channel
+    return (
+        (base.x, base.y, base.slope),
+        (boundary.guide, boundary.bevel, boundary.load),
+        (begun.x, begun.y, begun.slope),
+        (cut.channel.front, cut.channel.rest, cut.spin),
+        (channel.front, channel.rest),
+        (tip.x, tip.y, tip.slope),
+        (last.spring, last.shortening, last.behind),
+        (guide.wall, guide.give, guide.y, guide.force),
+        (loads.tip, loads.reaction, loads.shear, loads.moment),
+        (solution.iterations, solution.residual, solution.converged),
+    )
+
+
+def from_plain(plain: Plain) -> Needle:
+    """The needle of `to_plain`."""
+    base, imposed, begun, cut, channel, tip, last, guide, loads, found = plain
+    (front, rest, spin), (spring, shortening, behind) = cut, last
+    return Needle(
+        Boundary(Pose(*base), *imposed),
+        Cut(Pose(*begun), Channel(front, rest), spin),
+        Channel(*channel),
+        Solution(Pose(*tip), Iterate(spring, shortening, Bearing(*guide), behind), Loads(*loads), *found),
+    )
 
 
 def start(base: Pose, tip: Pose, bevel: Lateral, guide: Lateral) -> Needle:
