@@ -28,6 +28,7 @@ from flexneedle.errors import DriverError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.ros.client import NodeClient
 from flexneedle.ros.frames import FARTHEST_MM
+from flexneedle.ros.joints import JointLink
 from flexneedle.ros.motors import RosMotors
 from flexneedle.ros.parsing import Subscription
 from flexneedle.ros.profile import SUBSCRIBED, load_profile
@@ -192,10 +193,13 @@ class Consumers:
     def __init__(self) -> None:
         self.nodes = SilentNode(), SilentNode()
         self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
-        self.motors = RosMotors.__new__(RosMotors)
+        link, self.motors = JointLink.__new__(JointLink), RosMotors.__new__(RosMotors)
+        vars(link).update(
+            _channels=("a", "b"), _stale=1e9, _topic="joints", _reading=None, _refused="", _node=self.nodes[1]
+        )
         vars(self.motors).update(
-            _profile=load_profile("neutral"), _channels=("a", "b"), _stale=1e9, _speeds={"a": 1.0, "b": 1.0},
-            _offsets={"a": 0.0, "b": 0.0}, _node=self.nodes[1], _reading=None, _refused="", _points={}, _stopped=True,
+            _profile=load_profile("neutral"), _channels=("a", "b"), _speeds={"a": 1.0, "b": 1.0},
+            _offsets={"a": 0.0, "b": 0.0}, _points={}, _link=link, _opening=None,
         )  # fmt: skip
 
     def take(self, record: Request) -> str:

@@ -17,13 +17,15 @@ from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.kernels import all_compiled, compile_kernels
 
 def signatures():
-    found = {name: value for part in (insertion, shape, equilibrium) for name, value in vars(part).items()}
+    parts = {"insertion": insertion, "shape": shape, "equilibrium": equilibrium}
+    found = {f"{part}.{name}": value for part, module in parts.items() for name, value in vars(module).items()}
     return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
 
 compile_kernels()
 before = signatures()
 assert all_compiled()
-assert all(before[name] == 1 for name in ("_settle", "_rollout", "energies", "equal_arc_nodes", "step")), before
+entries = "insertion._settle", "insertion._rollout", "insertion.energies", "shape.equal_arc_nodes", "equilibrium.step"
+assert all(before[name] == 1 for name in entries), before
 quick = {"samples": 16, "iterations": 2}
 scenario = flexneedle.load_scenario("phantom").with_values({
     **{f"plan.{key}": value for key, value in quick.items()},

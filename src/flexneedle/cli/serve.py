@@ -30,7 +30,6 @@ def add_parser(commands: Commands) -> None:
         "open a page in the browser to plan, insert and replay",
         _serve,
         "flexneedle serve",
-        "flexneedle serve mine.toml --port 0 --no-open",
         "flexneedle serve mine.toml --rig rig.toml",
         about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
         "access. Prints its address; Ctrl-C ends it. One page steers at a time; any may watch, and stop.",

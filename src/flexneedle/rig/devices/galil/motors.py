@@ -160,14 +160,18 @@ class GalilMotors:
             try:
                 (self._track if self._tracks else self._move)(targets, deadline)
             except DriverError as error:
-                if not self._link.is_open or not (stops := self._stops(deadline)):
-                    raise
-                raise DriverError(f"{error}; {stops}") from None
+                raise DriverError("; ".join((str(error), *self._stops(deadline)))) from None
 
-    def _stops(self, deadline: float) -> str:
-        """Which channels the controller itself has stopped and why, or "": it refuses their targets until they rest."""
-        found = ((letter, state.stopped) for letter, state in self._reports(deadline).items())
-        return "; ".join(f"{letter}: {why}" for letter, why in found if why)
+    def _stops(self, deadline: float) -> list[str]:
+        """Which channels the controller itself has stopped, and why, if it says so: it refuses their targets until they
+        rest."""
+        if not self._link.is_open:
+            return []
+        try:
+            found = self._reports(deadline)
+        except DriverError:  # the refusal counts
+            return []
+        return [f"{letter}: {state.stopped}" for letter, state in found.items() if state.stopped]
 
     def _target(self, letter: str, position: float) -> int:
         self._known(letter)
