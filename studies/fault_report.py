@@ -80,9 +80,9 @@ def draw(faults: Sequence[Fault], rows: Sequence[Row], path: Path) -> None:
         if fault.within is not None:
             axes[0].plot([fault.within], [at], "|", color=_RED, markersize=11, markeredgewidth=2)
     axes[1].axvline(MOTION_MM, color=_RED, linewidth=2)
-    axes[0].set(xscale="log", xlim=(8e-4, 4.0), xlabel="time to detection, or to rest (s); its limit")
+    axes[0].set(xscale="log", xlim=(8e-4, 4.0), xlabel="time to detection, or to rest (s);\nred: its limit")
     axes[0].set_yticks(range(len(shown)), [f"{fault.group}: {fault.name}" for fault, _ in shown])
-    axes[1].set(xlabel=f"motion of the base after detection (mm); limit {MOTION_MM:g}", xlim=(-0.02, 0.6))
+    axes[1].set(xlabel="motion of the base after detection (mm);\nred: its limit", xlim=(-0.02, 0.6))
     axes[2].set(xlabel="roll after detection (°)", xlim=(-5.0, 185.0))
     for axis in axes:
         axis.grid(axis="both", color="0.9")
