@@ -11,6 +11,7 @@ from time import monotonic
 
 from websockets.sync.client import connect
 
+from flexneedle.page.frames import unpacked
 from flexneedle.page.server.catalog import CONTROLLERS
 from flexneedle.page.server.desk import Setup
 from flexneedle.page.server.hub import frame_key, key_of
@@ -111,7 +112,7 @@ class Client:
         """Read one message."""
         message = self.socket.recv(timeout=timeout)
         if isinstance(message, bytes):
-            self.newest[frame_key(message)] = message
+            self.newest[frame_key(unpacked(message))] = message
             return
         values = json.loads(message)
         self.newest[key_of(values)] = values

@@ -16,8 +16,8 @@ from flexneedle.page.channel import packed, read
 
 CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
 ROWS = 600
-FRAME = struct.pack("<BBBBIII", 1, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
-"""A needle of the live insertion, 24 kB."""
+FRAME = struct.pack("<BBBBIII", 4, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
+"""A sampled path of the live insertion, 24 kB."""
 
 
 def say(type_, **values):

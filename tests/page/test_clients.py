@@ -36,7 +36,7 @@ def test_the_steering_of_a_lost_client_ends(server):
 
 
 def recovered(client):
-    kinds = ("session", "scene", "estimate", "plan manipulation", "insertion live", "frame 1 1")
+    kinds = ("session", "scene", "estimate", "plan manipulation", "insertion live", "frame 1 4")
     client.wait(
         lambda: all(kind in client.newest for kind in kinds) and len(client.rows.get("live", ())) == ROWS
     )
@@ -49,7 +49,7 @@ def test_a_page_that_is_loaded_again_has_the_same_state(server):
         client.do("start", work="plan")
         client.job("plan", "done")
         client.do("insert")
-        client.wait(lambda: client.newest.get("frame 1 1") == frame(ROWS - 1))
+        client.wait(lambda: client.newest.get("frame 1 4") == frame(ROWS - 1))
         before = recovered(client)
     with Client(server) as client:
         assert recovered(client) == before
@@ -69,11 +69,11 @@ def test_a_slow_client_gets_the_newest_frame_and_all_rows(server):
     """While it reads nothing, 600 frames are made; of these it gets only what was on its way, and the last."""
     with Client(server) as client, SlowClient(server) as slow:
         client.steer().do("insert")
-        client.wait(lambda: client.newest.get("frame 1 1") == frame(ROWS - 1))
+        client.wait(lambda: client.newest.get("frame 1 4") == frame(ROWS - 1))
         frames = []
-        while slow.newest.get("frame 1 1") != frame(ROWS - 1) or len(slow.rows.get("live", ())) < ROWS:
+        while slow.newest.get("frame 1 4") != frame(ROWS - 1) or len(slow.rows.get("live", ())) < ROWS:
             slow.read()
-            frames.append(slow.newest.get("frame 1 1"))
+            frames.append(slow.newest.get("frame 1 4"))
         assert len(set(frames)) < 60
         assert [row["index"] for row in slow.rows["live"]] == list(range(ROWS))
         assert len(frame(0)) == len(FRAME)
@@ -91,7 +91,7 @@ def test_a_client_that_reads_nothing_is_disconnected_and_the_others_are_served(
         client.wait(lambda: client.newest["people"]["clients"] == 2)
         client.steer().do("insert")
         client.wait(lambda: client.newest["people"]["clients"] == 1)
-        client.wait(lambda: client.newest.get("frame 1 1") == frame(ROWS - 1))
+        client.wait(lambda: client.newest.get("frame 1 4") == frame(ROWS - 1))
         stuck.socket.socket.close()
 
 

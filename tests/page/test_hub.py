@@ -2,15 +2,15 @@
 
 import asyncio
 import json
-import struct
+import math
 
 import pytest
 
 from flexneedle.errors import RunError
 from flexneedle.page import messages
-from flexneedle.page.frames import Kind, Source, frame_of, packed
+from flexneedle.page.frames import Kind, Source, frame_of, packed, unpacked
 from flexneedle.page.messages import Job, People, Refused
-from flexneedle.page.server.hub import Hub, frame_key, key_of
+from flexneedle.page.server.hub import Hub, key_of
 
 
 def joined(hub):
@@ -72,15 +72,91 @@ def test_frames_are_kept_by_source_and_kind():
     frames = [
         packed(frame_of(kind, source, number, [[1.0, 2.0, 3.0]]))
         for number in range(3)
-        for kind in (Kind.NEEDLE, Kind.TRUE)
+        for kind in (Kind.SAMPLES, Kind.CHANNEL)
         for source in (Source.LIVE, Source.FIRST)
     ]
     for frame in frames:
         hub.hand_on(frame, None)
     assert drained(outbox) == frames[-4:]
-    assert frame_key(frames[0]) == "frame 1 1"
     hub.forget_frames(Source.LIVE)
     assert drained(joined(hub)) == [frames[-3], frames[-1]]
+
+
+def needle(hub, first, count, points=1, source=Source.LIVE):
+    """A worker shows needles of periods, at whose points x is the period."""
+    paths = [[[number, 0.0, 0.0]] * points for number in range(first, first + count)]
+    hub.hand_on(packed(frame_of(Kind.NEEDLE, source, first, *paths)), None)
+
+
+def periods(found):
+    """x of the paths of frames, by the number of their period."""
+    return {
+        frame.number + at: float(path[0, 0])
+        for frame in map(unpacked, found)
+        for at, path in enumerate(frame.values)
+    }
+
+
+def test_shapes_of_periods_are_sent_once_and_none_is_lost():
+    hub = Hub()
+    outbox = joined(hub)
+    for number in range(3):
+        needle(hub, number, 1)
+    assert periods(drained(outbox)) == {0: 0.0, 1: 1.0, 2: 2.0}
+    needle(hub, 3, 1)
+    needle(hub, 4, 2)
+    (message,) = drained(outbox)
+    assert periods([message]) == {3: 3.0, 4: 4.0, 5: 5.0}
+    assert drained(outbox) == []
+    assert [*periods(drained(joined(hub)))] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_period_without_a_shape_is_not_a_number():
+    hub = Hub()
+    needle(hub, 1, 1)
+    needle(hub, 4, 1)
+    found = periods(drained(joined(hub)))
+    assert (found[1], found[4]) == (1.0, 4.0)
+    assert math.isnan(found[2])
+    assert math.isnan(found[3])
+
+
+@pytest.mark.parametrize(("first", "points"), [(0, 1), (5, 1), (6, 2)])
+def test_shapes_of_a_new_insertion_replace_those_of_the_last(first, points):
+    hub = Hub()
+    outbox = joined(hub)
+    needle(hub, 0, 6)
+    drained(outbox)
+    needle(hub, first, 1, points)
+    for each in (outbox, joined(hub)):
+        assert periods(drained(each)) == {first: float(first)}
+
+
+def test_shapes_that_are_forgotten_are_not_sent():
+    hub = Hub()
+    outbox = joined(hub)
+    needle(hub, 0, 3)
+    needle(hub, 0, 2, source=Source.FIRST)
+    drained(outbox)
+    hub.forget_frames(Source.LIVE)
+    assert [*periods(drained(joined(hub)))] == [0, 1]
+    needle(hub, 3, 1)
+    for each in (outbox, joined(hub)):
+        assert 3 in periods(drained(each))
+    assert [frame.number for frame in hub.shapes["frame 1 1"].frames] == [3]
+
+
+def test_many_shapes_are_sent_in_parts():
+    hub = Hub()
+    for first in (0, 2, 5, 9):
+        needle(hub, first, 2, points=70_000)
+    parts = drained(joined(hub))
+    assert [(unpacked(part).number, unpacked(part).end) for part in parts] == [(0, 4), (5, 7), (9, 11)]
+
+
+def test_bytes_that_are_no_frame_are_an_error_of_the_worker():
+    with pytest.raises(RunError, match="a frame of 3 bytes"):
+        Hub().hand_on(b"abc", None)
 
 
 def test_rows_are_sent_once_and_in_order():
@@ -205,9 +281,3 @@ def test_the_keys_of_workers_messages_are_those_of_the_classes(news):
     message = example_of(news)
     values = {"type": message.type, "of": "first", "kind": "plan", "strategy": "steering"}
     assert key_of(values) == message.key
-
-
-def test_the_key_of_a_frame_is_read_where_frames_have_it():
-    data = packed(frame_of(Kind.SWEEP, Source.STEERING, 7, [[1.0, 2.0, 3.0]]))
-    assert frame_key(data) == f"frame {Source.STEERING:d} {Kind.SWEEP:d}"
-    assert struct.unpack_from("<I", data, 4) == (7,)

@@ -5,6 +5,7 @@ import json
 import math
 from threading import Event
 
+import numpy as np
 import pytest
 
 from flexneedle.errors import StoppedError
@@ -85,9 +86,18 @@ def sent(outbox, pipe):
 def test_the_newest_of_each_key_is_sent(outbox, pipe):
     for count in range(1000):
         outbox.put(People(clients=count, steering=None))
-        outbox.show(frame_of(Kind.NEEDLE, Source.LIVE, count, [[0.0, 0.0, 0.0]]))
+        outbox.show(frame_of(Kind.SAMPLES, Source.LIVE, count, [[0.0, 0.0, 0.0]]))
     people, frame = sent(outbox, pipe)
     assert people["clients"] == frame.number == 999
+
+
+def test_no_shape_of_a_period_is_lost(outbox, pipe):
+    for number in (0, 1, 3):
+        outbox.show(frame_of(Kind.NEEDLE, Source.LIVE, number, [[number, 0.0, 0.0]]))
+        outbox.show(frame_of(Kind.NEEDLE, Source.SCENE, number, [[number, 0.0, 0.0]]))
+    live, scene = sent(outbox, pipe)
+    np.testing.assert_array_equal(live.values[:, 0, 0], [0.0, 1.0, np.nan, 3.0])
+    assert (live.number, scene.number, len(scene.values)) == (0, 3, 1)
 
 
 def test_no_row_is_lost_and_a_new_insertion_begins_again(outbox, pipe):

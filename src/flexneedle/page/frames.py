@@ -2,11 +2,12 @@
 
 A header of 16 bytes, little-endian: kind (u8), columns (u8), source (u8), 0 (u8), number (u32) of the first period or
 of the iteration, paths (u32), points (u32) of each path; then paths × points × columns values, float32, point by point.
-Where a frame has several paths of an insertion, each is one period.
+Where a frame has several paths of an insertion, each is one period; one of a period without a path is not a number.
 """
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -49,6 +50,10 @@ class Source(IntEnum):
     STEERING = 5
 
 
+_OF_PERIODS = {Kind.NEEDLE, Kind.TRUE, Kind.PREDICTED}
+_INSERTIONS = {Source.LIVE, Source.FIRST, Source.SECOND}
+
+
 @dataclass(frozen=True, eq=False)
 class ShapeFrame:
     """A frame: kind, source, number of the first period or of the iteration, values (paths, points, columns)."""
@@ -57,6 +62,34 @@ class ShapeFrame:
     source: Source
     number: int
     values: NDArray[np.float32]
+
+    @property
+    def of_periods(self) -> bool:
+        """Whether its paths are those of successive periods of an insertion, which are all to be kept."""
+        return self.kind in _OF_PERIODS and self.source in _INSERTIONS
+
+    @property
+    def end(self) -> int:
+        """Number of the period after its last."""
+        return self.number + len(self.values)
+
+    def since(self, number: int) -> "ShapeFrame":
+        """Its periods from a number on."""
+        first = max(number, self.number)
+        return replace(self, number=first, values=self.values[first - self.number :])
+
+    def follows(self, before: "ShapeFrame") -> bool:
+        """Whether its periods are later ones of the same insertion."""
+        return self.number >= before.end and self.values.shape[1:] == before.values.shape[1:]
+
+
+def joined(frames: Sequence[ShapeFrame]) -> ShapeFrame:
+    """One frame of the periods of frames, each of which follows the one before."""
+    parts, end = list[NDArray[np.float32]](), frames[0].number
+    for frame in frames:
+        parts += [np.full((frame.number - end, *frame.values.shape[1:]), np.nan, np.float32), frame.values]
+        end = frame.end
+    return replace(frames[0], values=np.concatenate(parts))
 
 
 def packed(frame: ShapeFrame) -> bytes:

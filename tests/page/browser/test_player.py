@@ -1,9 +1,10 @@
 """The player: which period all views show; plots follow it, and choose it."""
 
+import numpy as np
 import pytest
 
 from fake_page import until
-from flexneedle.page.frames import Source
+from flexneedle.page.frames import Kind, Source, frame_of, packed
 from recorded_page import inserting, insertion, opening, period_frames, row, rows
 
 pytestmark = pytest.mark.page
@@ -96,14 +97,18 @@ def test_plots_follow_the_player(player):
     assert plotted(page, "Error") == f"Error (mm) at 4.0 s: error {expected}"
 
 
-def test_a_click_on_a_plot_shows_its_period(player):
-    page = player()
-    see_plots(page)
+def click_in_the_middle(page):
     plot = page.locator(f"{PLOTS} .u-over").first
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2 - 3, box["y"] + 20)
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
+
+
+def test_a_click_on_a_plot_shows_its_period(player):
+    page = player()
+    see_plots(page)
+    click_in_the_middle(page)
     until(page, f"Math.abs({PERIOD} - 25) <= 2")
 
 
@@ -117,6 +122,26 @@ def test_two_runs_are_plotted_beside_each_other(player, server, pictures):
     )
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     pictures(page, "plots-compared")
+
+
+def test_a_second_run_begins_where_the_first_does(player, server):
+    page = player()
+    later = [row(k).model_copy(update={"time": 0.2 * k + 60.0}) for k in range(50)]
+    server.send(
+        insertion("done", of="second", periods=50), rows(0, 1, "second").model_copy(update={"rows": later})
+    )
+    see_plots(page)
+    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
+    click_in_the_middle(page)
+    until(page, f"Math.abs({PERIOD} - 25) <= 2")
+
+
+def test_a_period_without_a_shape_shows_none(player):
+    path = np.zeros((1, 3), np.float32)
+    shapes = frame_of(Kind.PREDICTED, Source.FIRST, 2, path + 2, path + np.nan, path + 4)
+    page = player([*opening(), *recorded()[:2], packed(shapes)])
+    read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
+    assert page.evaluate(read) == [2, None, 4, None]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

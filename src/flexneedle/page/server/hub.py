@@ -1,22 +1,24 @@
 """The newest news of each key, and what each client has not got of them yet.
 
 A client has a set of keys, not a queue: what it gets of a key is what is newest when it is ready for it. Rows of an
-insertion are a list; each client gets those after the last that it has.
+insertion and the shapes of its periods are lists; each client gets those after the last that it has.
 """
 
 import asyncio
 import json
+from bisect import bisect_right
 from collections.abc import Iterable
 from typing import Any
 
 from flexneedle.errors import RunError
 from flexneedle.page.channel import Message
+from flexneedle.page.frames import ShapeFrame, joined, packed, unpacked
 from flexneedle.page.messages import News
 
 _PART = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}
 """Type of a message and the part of it that its key has, as `News.key`."""
 _ROWS, _JOB, _FIRST = "rows", "job", "first"
-_ROWS_AT_ONCE = 250
+_ROWS_AT_ONCE, _VALUES_AT_ONCE = 250, 1_000_000
 
 
 class Rows:
@@ -32,6 +34,34 @@ class Rows:
         if first == 0:
             self.edition += 1
         self.texts[first:] = [json.dumps(row, separators=(",", ":")) for row in rows]
+
+
+class Shapes:
+    """The shapes of an insertion's periods, of one kind. `edition` counts the insertions."""
+
+    def __init__(self) -> None:
+        self.edition, self.frames = 0, list[ShapeFrame]()
+
+    def put(self, frame: ShapeFrame) -> None:
+        """Add the shapes of later periods; with those of an earlier one a new insertion begins."""
+        if self.frames and not frame.follows(self.frames[-1]):
+            self.frames = []
+        if not self.frames:
+            self.edition += 1
+        self.frames.append(frame)
+
+    def since(self, number: int) -> ShapeFrame | None:
+        """Those of periods from a number on, as many as one message has; None if there are none."""
+        first = bisect_right(self.frames, number, key=lambda frame: frame.end)
+        if first == len(self.frames):
+            return None
+        some = [self.frames[first].since(number)]
+        size = max(some[0].values[0].size, 1)
+        for frame in self.frames[first + 1 :]:
+            if (frame.end - some[0].number) * size > _VALUES_AT_ONCE:
+                break
+            some.append(frame)
+        return joined(some)
 
 
 class Outbox:
@@ -102,7 +132,10 @@ class Outbox:
     def _message(self, key: str) -> Message | None:
         if key in self._own:
             return self._own.pop(key)
-        return self._missing(key) if key.startswith(_ROWS) else self._hub.newest(key)
+        if key.startswith(_ROWS):
+            return self._missing(key)
+        shapes = self._hub.shapes.get(key)
+        return self._hub.newest(key) if shapes is None else self._missing_of(key, shapes)
 
     def _missing(self, key: str) -> str | None:
         """Rows after those that this client has, some at once, so that other news get their turn."""
@@ -116,11 +149,23 @@ class Outbox:
         of = json.dumps(key.removeprefix(_ROWS).strip())
         return f'{{"type":"rows","of":{of},"first":{first},"rows":[{",".join(some)}]}}' if some else None
 
+    def _missing_of(self, key: str, shapes: Shapes) -> bytes | None:
+        """Shapes of the periods after those that this client has, some at once."""
+        edition, end = self._has.get(key, (0, 0))
+        some = shapes.since(end if edition == shapes.edition else 0)
+        if some is None:
+            return None
+        self._has[key] = (shapes.edition, some.end)
+        if some.end < shapes.frames[-1].end:
+            self._keys[key] = None
+        return packed(some)
+
 
 class Hub:
-    """The newest news, and the outboxes of all clients."""
+    """The newest news, and the outboxes of all clients. shapes: those of periods, by key."""
 
     def __init__(self) -> None:
+        self.shapes = dict[str, Shapes]()
         self._newest = dict[str, Message]()
         self._rows = dict[str, Rows]()
         self._outboxes = set[Outbox]()
@@ -128,7 +173,7 @@ class Hub:
     @property
     def keys(self) -> list[str]:
         """All keys that have news."""
-        return [*self._newest, *self._rows]
+        return [*self._newest, *self.shapes, *self._rows]
 
     def newest(self, key: str) -> Message | None:
         """The newest message of a key, None if there is none."""
@@ -153,9 +198,12 @@ class Hub:
         self._put(news.key, news.model_dump_json())
 
     def hand_on(self, message: Message, values: dict[str, Any] | None) -> None:
-        """Send a worker's message to all clients as it is; values: of a text. Raises RunError if rows are missing."""
+        """Send a worker's message to all clients as it is; values: of a text.
+
+        Raises RunError if rows are missing, and for bytes that are no frame.
+        """
         if isinstance(message, bytes):
-            self._put(frame_key(message), message)
+            self._put_frame(message)
         elif values is None:
             raise RunError("a text without values")
         elif values["type"] == _ROWS:
@@ -169,6 +217,8 @@ class Hub:
         """Forget the news of keys: clients that have not got them do not get them."""
         for key in keys:
             self._newest.pop(key, None)
+            if key in self.shapes:
+                self.shapes[key].frames = []
             if key in self._rows:
                 self._rows[key].put(0, ())
             for outbox in self._outboxes:
@@ -181,7 +231,19 @@ class Hub:
     def forget_frames(self, *sources: int) -> None:
         """Forget the frames of sources."""
         openings = tuple(map(_frames_of, sources))
-        self.forget([key for key in self._newest if key.startswith(openings)])
+        self.forget([key for key in (*self._newest, *self.shapes) if key.startswith(openings)])
+
+    def _put_frame(self, message: bytes) -> None:
+        try:
+            frame = unpacked(message)
+        except ValueError as error:
+            raise RunError(str(error)) from None
+        key = frame_key(frame)
+        if not frame.of_periods:
+            self._put(key, message)
+            return
+        self.shapes.setdefault(key, Shapes()).put(frame)
+        self._touch(key)
 
     def _put(self, key: str, message: Message) -> None:
         self._newest[key] = message
@@ -202,10 +264,10 @@ def key_of(values: dict[str, Any]) -> str:
     return f"{kind} {values[_PART[kind]]}" if kind in _PART else str(kind)
 
 
-def frame_key(frame: bytes) -> str:
-    """The key of a frame: its source and kind, whose places are those of `page/frames.py`."""
-    return f"{_frames_of(frame[2])}{frame[0]}"
+def frame_key(frame: ShapeFrame) -> str:
+    """The key of a frame: its source and kind."""
+    return f"{_frames_of(frame.source)}{frame.kind:d}"
 
 
 def _frames_of(source: int) -> str:
-    return f"frame {source} "
+    return f"frame {source:d} "

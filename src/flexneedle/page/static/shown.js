@@ -39,9 +39,9 @@ export function shownRow(store, of = shownOf(store)) {
 
 // Shape (paths, points, columns, values) of a kind, such as "needle", of what is shown; or null.
 export function shownShape(store, kind, of = shownOf(store)) {
-  if (of === "scene") return store.get(`shape ${kind} scene`) ?? null;
-  const start = kind === "needle" ? store.get("shape needle scene") ?? null : null;
-  return store.track(kind, of, shownPeriod(store, of) ?? Infinity) ?? start;
+  const period = of === "scene" ? null : shownPeriod(store, of);
+  const before = of === "scene" || (kind === "needle" && period === null); // of the insertion's first period
+  return before ? store.get(`shape ${kind} scene`) ?? null : store.track(kind, of, period ?? Infinity);
 }
 
 // The second recorded run, {row, shape(kind)}, at the period that is shown, or null.

@@ -12,6 +12,7 @@ const KINDS = Object.keys(Kind).map((name) => name.toLowerCase());
 const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
 const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of" };
 const BEFORE_ROWS = ["waiting", "planning"];
+const STAY = ["samples", "channel"];
 const INSERTIONS = ["live", "first", "second"];
 const OWN = /^(view |connection|refusals$|draft$)/;
 const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (path|samples|reach|sweep) scene)$/;
@@ -88,12 +89,13 @@ export class Store {
     this.set(`shape ${kind} ${source}`, frame);
   }
 
-  // The shape of an insertion at a period, or the newest before it: {period, paths, points, columns, values} or null.
+  // The shape of an insertion at a period: {period, paths, points, columns, values}, or null if it has none. Samples and
+  // the cut channel, which are not of every period: the newest until then.
   track(kind, source, period = Infinity) {
-    const track = this.#tracks.get(`${kind} ${source}`);
-    if (!track) return null;
-    for (let at = Math.min(period, track.length - 1); at >= 0; at--) if (track[at]) return track[at];
-    return null;
+    const track = this.#tracks.get(`${kind} ${source}`) ?? [];
+    let at = Math.min(period, track.length - 1);
+    while (STAY.includes(kind) && at >= 0 && !track[at]) at--;
+    return track[at] ?? null;
   }
 
   #keep(kind, source, frame) {
@@ -106,7 +108,8 @@ export class Store {
       return;
     }
     for (let at = 0; at < frame.paths; at++) {
-      track[number + at] = { period: number + at, paths: 1, points, columns, values: pathOf(frame, at) };
+      const values = pathOf(frame, at);
+      if (!Number.isNaN(values[0])) track[number + at] = { period: number + at, paths: 1, points, columns, values };
     }
   }
 

@@ -4,19 +4,20 @@ from collections.abc import Callable
 from contextlib import suppress
 from threading import Condition, Thread
 
-from flexneedle.page import channel, frames
+from flexneedle.page import channel
+from flexneedle.page.frames import ShapeFrame, joined, packed
 from flexneedle.page.messages import Job, News, Rows
 
 Write = Callable[[bytes], object]
 
 
 class Outbox:
-    """One place for each key: what has not been written by then is replaced. Rows are a list, none is lost."""
+    """One place for each key: what has not been written by then is replaced, but for rows and the shapes of periods."""
 
     def __init__(self, write: Write) -> None:
         """write: called in a thread with the bytes of a message of `page/channel.py`; may wait."""
         self._write = write
-        self._places: dict[str, News | frames.ShapeFrame] = {}
+        self._places: dict[str, News | ShapeFrame] = {}
         self._changed = Condition()
         self._writing = self._broken = False
         Thread(target=self._run, name="outbox", daemon=True).start()
@@ -32,10 +33,14 @@ class Outbox:
             self._places[news.key] = news
             self._changed.notify_all()
 
-    def show(self, frame: frames.ShapeFrame) -> None:
-        """Report a frame."""
+    def show(self, frame: ShapeFrame) -> None:
+        """Report a frame. The shapes of periods continue those that were reported before."""
+        key = f"frame {frame.source} {frame.kind}"
         with self._changed:
-            self._places[f"frame {frame.source} {frame.kind}"] = frame
+            before = self._places.get(key)
+            if isinstance(before, ShapeFrame) and frame.of_periods and frame.follows(before):
+                frame = joined([before, frame])
+            self._places[key] = frame
             self._changed.notify_all()
 
     def flush(self) -> None:
@@ -61,6 +66,4 @@ class Outbox:
                 key = next(iter(self._places))
                 one = self._places.pop(key)
                 self._writing = True
-            self._write(
-                channel.packed(one.model_dump_json() if isinstance(one, News) else frames.packed(one))
-            )
+            self._write(channel.packed(one.model_dump_json() if isinstance(one, News) else packed(one)))

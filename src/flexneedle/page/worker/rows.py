@@ -69,16 +69,13 @@ def frames_of(periods: Sequence[Period], source: Source) -> list[ShapeFrame]:
     }
     found = []
     for kind, paths in shapes.items():
-        for begin, end in _runs(paths):
-            found.append(frame_of(kind, source, first + begin, *paths[begin:end]))
+        known = [path for path in paths if path is not None]
+        if known:
+            without = np.full_like(known[0], np.nan, dtype=np.float32)
+            found.append(
+                frame_of(kind, source, first, *(without if path is None else path for path in paths))
+            )
     return found
-
-
-def _runs(paths: Sequence[Any]) -> list[tuple[int, int]]:
-    """Longest ranges of paths that are known."""
-    known = [False, *(path is not None for path in paths), False]
-    edges = [k for k in range(len(paths) + 1) if known[k] != known[k + 1]]
-    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _with_sd(shape: Shape) -> Floats:

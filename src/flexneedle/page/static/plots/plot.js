@@ -53,7 +53,8 @@ export class PlotView {
     const { lines } = this.#spec;
     const one = [rows.map(({ time }) => time), ...lines.map(({ of }) => rows.map(of))];
     if (!second?.length) return one;
-    const two = [second.map(({ time }) => time), ...lines.map(({ of }) => second.map(of))];
+    const later = (rows[0]?.time ?? 0) - second[0].time; // a rig's clock begins before its first period
+    const two = [second.map(({ time }) => time + later), ...lines.map(({ of }) => second.map(of))];
     return uPlot.join([one, two]);
   }
 
