@@ -9,7 +9,7 @@ const CONNECTIONS = {
 };
 const JOBS = {
   scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
-  insertion: "Insertion", recording: "Recorded run", save: "Saving",
+  insertion: "Insertion", recording: "Recorded run", study: "Study", row: "Computing again", save: "Saving",
 };
 const STEPS_IN = ["waiting", "planning", "running", "paused"];
 const SHOWN_FOR = 12_000; // ms
