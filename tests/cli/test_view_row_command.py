@@ -1,6 +1,7 @@
 """`flexneedle view --row`: a row of a study as a run, its figures and its replay."""
 
 import json
+import math
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -42,8 +43,9 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def study(made, in_tmp, drawing):  # noqa: ARG001
-    """A study of two rows in the folder `mine`."""
+def study(made, in_tmp, drawing, monkeypatch):  # noqa: ARG001
+    """A study of two rows in the folder `mine`; no row takes so long that its progress is shown."""
+    monkeypatch.setattr(view, "_SHORT_S", math.inf)
     return shutil.copytree(made, in_tmp / "mine")
 
 

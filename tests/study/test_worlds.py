@@ -170,7 +170,7 @@ def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkey
         raise ZeroDivisionError("nowhere")
 
     monkeypatch.setattr(rows, "reach", reach)
-    monkeypatch.setattr(rows, "_insertion", lambda *_args: done)
+    monkeypatch.setattr(rows, "insertion_at", lambda *_args, **_options: done)
     monkeypatch.setattr(rows, "_times", lambda _insertion: {})
     (row,) = run_job(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
     assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
