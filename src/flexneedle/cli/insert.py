@@ -142,7 +142,7 @@ def _insert(args: argparse.Namespace) -> int:
                 scenario = with_target(scenario, bridge.await_target())
             if _asks(args, choices):
                 require_terminal()  # before the time of planning is spent
-            compile_first()
+            compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
