@@ -116,6 +116,21 @@ def test_an_archive_has_the_files_of_the_run_alone(runs):
 # Over sockets: tmp_path / "runs" is the server's folder
 
 
+@pytest.mark.parametrize(
+    "path", ["older/figure.png", "older/run.zip", "older/trace.csv", "older/replay.html"]
+)
+def test_a_link_within_a_run_is_not_followed(runs, server, path):
+    (runs.parent / "secret" / "insertion.png").write_text("secret")
+    (runs / "older" / "insertion.png").symlink_to(runs.parent / "secret" / "insertion.png")
+    reason = "older: insertion.png is a link, which may lead elsewhere\n"
+    assert get(server, f"/runs/{path}")[:2] == (404, reason)
+
+
+def test_a_run_with_a_link_is_not_opened(runs, client):
+    (runs / "older" / "trace.mcap").symlink_to(runs.parent / "secret" / "run.json")
+    assert client.refused("open", name="older") == "older: trace.mcap is a link, which may lead elsewhere"
+
+
 def test_clients_get_the_runs_and_new_ones(runs, client):
     client.wait(lambda: [run["name"] for run in client.newest["runs"]["runs"]] == ["newer", "older"])
     write_run(runs / "newest", "2026-01-03T12:00:00Z")
