@@ -9,7 +9,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Literal, assert_never
 
-from flexneedle import __version__
 from flexneedle.page import messages as m
 from flexneedle.page.frames import Source
 from flexneedle.page.orders import Do, Kind, Work
@@ -114,7 +113,6 @@ class Desk:
     def _welcome(self, client: int) -> m.Welcome:
         return m.Welcome(
             client=client,
-            version=__version__,
             presets=PRESETS.names(),
             controllers=CONTROLLERS,
             strategies=STRATEGIES,
