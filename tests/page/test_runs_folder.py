@@ -139,15 +139,15 @@ def test_clients_get_the_runs_and_new_ones(runs, client):
 
 def test_a_run_is_opened_and_closed(runs, server, client):
     client.do("open", name="older")
-    client.wait(lambda: len(client.rows.get("first", ())) == ROWS and "frame 2 1" in client.newest)
+    client.wait(lambda: len(client.rows.get("first", ())) == ROWS and "frame 2 4" in client.newest)
     assert client.newest["insertion first"]["summary"] == str(runs / "older")
     client.do("open", name="newer", second=True)
-    client.wait(lambda: len(client.rows.get("second", ())) == ROWS and "frame 3 1" in client.newest)
+    client.wait(lambda: len(client.rows.get("second", ())) == ROWS and "frame 3 4" in client.newest)
     client.do("open", name=None)
     assert client.wait(lambda: client.newest.get("closed")) == {"type": "closed", "of": "first"}
     with Client(server) as other:
         other.wait(lambda: "insertion second" in other.newest and len(other.rows.get("second", ())) == ROWS)
-        assert "frame 2 1" not in other.newest
+        assert "frame 2 4" not in other.newest
         assert "first" not in other.rows
 
 
