@@ -70,6 +70,11 @@ def test_strategies_are_side_by_side_with_their_terms(plans):
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
     page.wait_for_timeout(200)
     assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    captions = page.locator(f"{PLANS} .sweeps figcaption").all_inner_texts()
+    assert [caption.partition(" ×")[0] for caption in captions] == [
+        "manipulation, lateral",
+        "steering, lateral",
+    ]
     for canvas in page.locator(f"{PLANS} .sweeps canvas").all():
         assert canvas.evaluate(INKED) > 30
 
@@ -77,7 +82,9 @@ def test_strategies_are_side_by_side_with_their_terms(plans):
 def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
     page = plans([*opening(), plan(), *plan_frames()])
     page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
-    server.send(session(2), Estimate(revision=2, error_mm=0.31, reached=False, tip=TARGET, seconds=0.1))
+    server.send(
+        session(2), Estimate(revision=2, error_mm=0.31, reached=False, tip=TARGET, roll_deg=0.0, seconds=0.1)
+    )
     page.wait_for_selector(f"{PLANS} >> text=First estimate: ends 0.31 mm off, out of reach.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")

@@ -86,6 +86,14 @@ def plotted(page, title):
     return page.get_attribute(f"{PLOTS} [aria-label^='{title}']", "aria-label")
 
 
+def test_a_colour_of_the_plots_has_one_meaning(player):
+    """The guide's is that of the guide in the views, not those of the strategies."""
+    page = player()
+    see_plots(page)
+    guide = page.locator(f"{PLOTS} figure", has_text="Guide").locator(".swatch")
+    assert [each.get_attribute("style") for each in guide.all()] == ["color: var(--guide);"] * 2
+
+
 def test_plots_follow_the_player(player):
     page = player()
     see_plots(page)

@@ -41,9 +41,12 @@ class RunsFolder:
         )
 
     def run(self, name: str) -> Path:
-        """The folder of a run. Raises Refusal for a name that is not one of this folder."""
+        """The folder of a run. Raises Refusal for a name that is not one of this folder, and for one with links."""
         if name not in self._names() or self._stat(name) is None:
             raise Refusal(f"{name!r}: no run of this name in the folder of runs")
+        for path in (self.path / name).iterdir():
+            if path.is_symlink():
+                raise Refusal(f"{name}: {path.name} is a link, which may lead elsewhere")
         return self.path / name
 
     def new(self, name: str) -> Path:
@@ -103,7 +106,7 @@ def _summary(values: dict[str, Any]) -> str:
 
 
 def zipped(folder: Path) -> bytes:
-    """The files of a run as a ZIP archive, in a folder of its name."""
+    """The files of a run as a ZIP archive, in a folder of its name; links are none."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.iterdir()):

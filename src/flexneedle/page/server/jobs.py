@@ -89,9 +89,9 @@ class Jobs:
         self._next()
         return job.work.job
 
-    def cancel(self, *kinds: Kind) -> None:
-        """Cancel the jobs of kinds."""
-        for job in [job for job in self._all() if job.work.kind in kinds]:
+    def cancel(self, *kinds: Kind, of: str | None = None) -> None:
+        """Cancel the jobs of kinds. of: the recordings that are this one of the two alone."""
+        for job in [job for job in self._all() if job.work.kind in kinds and of in (None, job.work.of)]:
             self.cancel_job(job.work.job)
 
     def cancel_job(self, number: int) -> None:
@@ -136,19 +136,20 @@ class Jobs:
             self.worker.send(self._running.work)
 
     def _message(self, message: Message, values: dict[str, Any] | None) -> None:
-        if values is None or values["type"] != "job":
-            if values is None or values["type"] not in _FOR_THE_SERVER:
+        """A message of the worker. What comes of a job after it was cancelled may be of what was forgotten."""
+        running, news = self._running, values or {}
+        if news.get("type") in _FOR_THE_SERVER:
+            self._on_news(news)
+        elif news.get("type") != "job":
+            if running is None or not running.cancelled:
                 self._hub.hand_on(message, values)
-            if values is not None:
-                self._on_news(values)
-            return
-        running = self._running
-        if running is None or values["job"] != running.work.job:
-            return
-        if values["state"] not in _ENDS:
-            self._hub.hand_on(message, values)
-            return
-        self._over(running, values["state"], values.get("text", ""))
+                if news:
+                    self._on_news(news)
+        elif running is not None and news["job"] == running.work.job:
+            if news["state"] in _ENDS:
+                self._over(running, news["state"], news.get("text", ""))
+            elif not running.cancelled:
+                self._hub.hand_on(message, values)
 
     def _ended(self, status: int) -> None:
         """The process has ended: so has its job, or all if it was never ready."""
@@ -163,6 +164,8 @@ class Jobs:
             self._over(self._running, "failed", text)
 
     def _over(self, job: Job, state: str, text: str) -> None:
+        if job.cancelled and job.work.kind != "save":  # which has no results that were not handed on
+            state, text = "cancelled", ""
         self._running = None
         self.expect_end(None)
         if job.again and state == "cancelled":

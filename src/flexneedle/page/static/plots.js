@@ -17,8 +17,8 @@ const PLOTS = [
     { name: "− 2 sd", tone: "--predicted", of: lower, thin: true },
   ] },
   { title: "Guide (mm)", lines: [
-    { name: "y", tone: "--manipulation", of: (row) => row.guide[0] },
-    { name: "z", tone: "--steering", of: (row) => row.guide[1], dash: true },
+    { name: "y", tone: "--guide", of: (row) => row.guide[0] },
+    { name: "z", tone: "--guide", of: (row) => row.guide[1], dash: true },
   ] },
   { title: "Roll (°)", lines: [{ name: "roll", tone: "--needle", of: (row) => row.roll_deg }] },
   { title: "Tissue energy (mJ)", lines: [
