@@ -124,7 +124,7 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     assert [each["type"] for each in server.requests[-4:]] == ["steer", "prepare", "arm", "go"]
     assert server.asked("arm") == [{"type": "arm", "armed": True, "job": 7}]
     assert shown_buttons(page) == {}
-    for what in (".disturb", "[aria-label=Pace]", "text=Pause", "text=One period"):
+    for what in (".disturb", "[aria-label=Pace]", "button[data-next]", "text=One period"):
         assert not page.locator(PANEL).locator(what).is_visible()
     click(page, "Stop")
     server.send(
