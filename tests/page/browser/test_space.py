@@ -304,4 +304,4 @@ def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):
     page = visit(before=NO_WEBGL, ready=f"{SPACE} [role=note]")
     assert "no WebGL" in page.inner_text(f"{SPACE} [role=note]")
     assert not page.locator(CANVAS).count()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
