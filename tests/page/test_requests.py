@@ -89,6 +89,7 @@ STEERED = {
     "advance": {},
     "disturb": {"what": "drop", "size": 1.0},
     "open": {"name": None},
+    "study": {"name": "mine"},
     "save": {"name": "mine"},
 }
 

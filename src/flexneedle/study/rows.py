@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -15,7 +16,7 @@ from flexneedle.study.reach import reach
 from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import plain, plan_values
 from flexneedle.trace.results import RESULT_COLUMNS, insertion_row, plan_row
-from flexneedle.types import Insertion, Plan
+from flexneedle.types import Insertion, Period, Plan
 
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""
@@ -76,7 +77,7 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
     if job.plan is not None:
         results |= plan_row(job.plan)
         try:
-            insertion = _insertion(job, job.plan, seed)
+            insertion = insertion_at(job.point, job.plan, seed, threads=1)
         except RunError as error:
             results |= {"outcome": "refused", "reason": str(error)}
         except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
@@ -100,8 +101,15 @@ def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
         return None, f"no reach: {_error_text(error)}"
 
 
-def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
-    point = job.point
+def insertion_at(
+    point: GridPoint,
+    made: Plan,
+    seed: int,
+    *,
+    threads: int | None = None,
+    on_period: Callable[[Period], None] | None = None,
+) -> Insertion:
+    """Return an insertion of a point, as `flexneedle.insert` does; threads and on_period are as there."""
     with warnings.catch_warnings():
         # The study has checked all tables; a table of another of its controllers is not unused.
         warnings.simplefilter("ignore", ScenarioWarning)
@@ -112,7 +120,8 @@ def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
             controller=point.controller,
             phantom=point.plant,
             tracker=point.tracker,
-            threads=1,
+            threads=threads,
+            on_period=on_period,
         )
 
 

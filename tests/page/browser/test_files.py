@@ -1,10 +1,11 @@
-"""Presets, scenario files, links, recorded runs."""
+"""Presets, scenario files, links, recorded runs, rows of studies."""
 
 import numpy as np
 import pytest
 
 from fake_page import until
 from flexneedle.page.frames import Source
+from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
 from recorded_page import insertion, period_frames, rows
 
 pytestmark = pytest.mark.page
@@ -120,6 +121,82 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
         {"type": "open", "name": "first", "second": True},
         {"type": "open", "name": None, "second": False},
     ]
+
+
+MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
+
+
+def study_row(index, **changes):
+    given = {
+        "settings": "base", "controller": "adaptive-mpc", "target": (40.0, 5.0, 0.0), "error_mm": 0.2214,
+        "outcome": "done", "reason": "", "opens": True, **changes,
+    }  # fmt: skip
+    return StudyRow(index=index, **given)
+
+
+REFUSED = study_row(
+    9, target=(40.0, 5.0, 3.0), error_mm=None, outcome="refused", reason="plan misses", opens=False
+)
+
+
+def listing(request):
+    """What the server sends of the rows of a study."""
+    index = request.get("index")
+    found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
+    about = {"title": "Many targets", "insertions": 150, "finished": 149}
+    return [StudyRows(name=request["name"], index=index, rows=found, **about)]
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width):
+    server.news[-1] = Runs(runs=[MANY])
+    server.answers["study"] = listing
+    page = files(width=width)
+    assert not page.is_visible("text=Worst first")
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=many: Many targets, 149 of 150 rows")
+    entries = page.locator("[aria-label='Rows of the study'] li").all_inner_texts()
+    assert entries[0].split("\n")[:2] == ["Row 17", "done, 0.221 mm off: base, adaptive-mpc, target 40, 5 mm"]
+    refused = ["Row 9", "refused: base, adaptive-mpc, target 40, 5, 3 mm", "plan misses"]
+    assert entries[2].split("\n") == refused
+    assert entries[3] == "3 of 149 finished rows: choose the first row for others"
+    assert page.locator("[aria-label='Open row 9']").count() == 0
+    pictures(page.locator(FILES), f"study-{width}")
+    page.click("[aria-label='Open row 17']")
+    page.click("[aria-label='Compare with row 3']")
+    page.fill("[aria-label='First row']", "120")
+    page.click("text=From this row")
+    page.wait_for_selector("text=Row 120")
+    page.click("text=Worst first")
+    page.wait_for_selector("text=Row 17")
+    assert server.asked("open") == [
+        {"type": "open", "name": "many", "row": 17, "second": False},
+        {"type": "open", "name": "many", "row": 3, "second": True},
+    ]
+    assert server.asked("study") == [
+        {"type": "study", "name": "many"},
+        {"type": "study", "name": "many", "index": 120},
+        {"type": "study", "name": "many", "index": None},
+    ]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_a_study_without_finished_rows_is_named_so(files, server):
+    server.news[-1] = Runs(runs=[MANY])
+    about = {"title": "Many", "insertions": 150, "finished": 0}
+    server.answers["study"] = lambda _: [StudyRows(name="many", index=None, rows=[], **about)]
+    page = files()
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=No row is finished yet")
+
+
+def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
+    page = files()
+    server.send(Job(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
+    page.wait_for_selector("text=Computing again: many, row 17")
+    page.click("[aria-label='Cancel: Computing again']")
+    page.wait_for_timeout(100)
+    assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
 
 def test_an_insertion_that_has_ended_is_saved(files, server):

@@ -10,7 +10,8 @@ const CONNECTIONS = {
 };
 const JOBS = {
   scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
-  insertion: "Insertion", check: "Check of the rig", recording: "Recorded run", save: "Saving",
+  insertion: "Insertion", check: "Check of the rig", recording: "Recorded run", study: "Study", row: "Computing again",
+  save: "Saving",
 };
 const CONTROL = {
   take: "To change the scenario, plan and insert. Anyone can stop an insertion.",
