@@ -190,7 +190,7 @@ class Desk:
             case m.Prepare():
                 work = self._work("insert", "insertion").model_copy(update={"folder": str(self.runs.path)})
                 self.live.prepare(work)
-                self._plans.cancel(*_SEARCHES)
+                self._plans.cancel(*_SEARCHES, "row")
             case m.Arm() if request.armed:
                 self.rig.arm(request.job)
             case m.Arm():
@@ -231,10 +231,10 @@ class Desk:
         return self.session.with_options(options)
 
     def _require_processor(self) -> None:
-        """Raise Refusal while an insertion is on the rig, whose loop a search would take time from."""
+        """Raise Refusal while an insertion is on the rig, whose loop a long computation would take time from."""
         if self.rig.active:
             raise Refusal(
-                "an insertion is on the rig, and a search would take processor time from it: search when it has ended"
+                "an insertion is on the rig, and this would take processor time from it: wait for its end"
             )
 
     def _order(self, do: Do, kind: Kind) -> None:
@@ -269,15 +269,15 @@ class Desk:
         of, source = _RECORDINGS[request.second]
         work = Work(job=0, do="read", kind="recording", name=request.name or "", of=of)
         if request.name is not None and request.row is not None:
+            self._require_processor()
             folder = str(self.runs.study(request.name))
             work = work.model_copy(update={"do": "row", "kind": "row", "row": request.row, "folder": folder})
         elif request.name is not None:
             work = work.model_copy(update={"folder": str(self.runs.run(request.name))})
-        self._plans.cancel("recording", of=of)
+        self._plans.cancel_slot("recording", of)
         self.hub.forget((f"rows {of}", f"insertion {of}"))
         self.hub.forget_frames(source)
         if request.name is None:
-            self._plans.cancel_slot("recording", of)
             self.hub.publish(m.Closed(of=of))
         else:
             self._plans.add(work)

@@ -103,9 +103,9 @@ class Jobs:
         self._next()
         return job.work.job
 
-    def cancel(self, *kinds: Kind, of: str | None = None) -> None:
-        """Cancel the jobs of kinds. of: the recordings that are this one of the two alone."""
-        for job in [job for job in self._all() if job.work.kind in kinds and of in (None, job.work.of)]:
+    def cancel(self, *kinds: Kind) -> None:
+        """Cancel the jobs of kinds."""
+        for job in [job for job in self._all() if job.work.kind in kinds]:
             self.cancel_job(job.work.job)
 
     def cancel_slot(self, kind: Kind, of: str) -> None:
