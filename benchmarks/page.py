@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -24,7 +23,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from page_drive import Pointer, inserted, loaded, new_page, until, until_ended
-from page_figures import Figure, clicked, estimate_delays, plan_delay, rate, spread, table
+from page_figures import Figure, clicked, estimate_delays, growth, plan_delay, rate, spread, table
 
 from chromium import ARGUMENTS, CHROMIUM
 
@@ -32,8 +31,6 @@ PRESETS = ("phantom", "phantom3d")
 FIRST_WORLD, WORLDS_END = 100_000, 200_000  # numbers for reports (flexneedle/scenario/worlds.py)
 WARM_S = 60.0
 """Time after which memory is compared with that at the end."""
-GROWTH_MB = {"server": 5.0, "browser": 1.0}
-"""Growth that counts as none: ten minutes have forty insertions, whose rows have 0.1 MB each."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +211,7 @@ def grown(
     for page in pages:
         page.context.close()
     yield spread(f"server, {viewers} pages watch", "% of a core", shares, 15.0)
-    yield from growth(np.array(memory), warm, viewers)
+    yield from growth(memory, warm, viewers)
 
 
 def heaps(pages: Sequence[Page]) -> tuple[float, float]:
@@ -229,17 +226,6 @@ def heaps(pages: Sequence[Page]) -> tuple[float, float]:
         session.detach()
     objects, arrays = np.max(found, axis=0).tolist()
     return objects, arrays
-
-
-def growth(memory: Any, warm: int, viewers: int) -> Iterator[Figure]:
-    """Growth from the first insertions after `warm` to the last, for rows of memory (MB)."""
-    few = max(1, min(3, (len(memory) - warm) // 2))
-    first, last = (np.median(part, axis=0) for part in (memory[warm : warm + few], memory[-few:]))
-    bars = (GROWTH_MB["server"], None, GROWTH_MB["browser"], None)
-    names = ("server", "its workers", "objects of a page", "arrays of a page")
-    for name, then, now, bar in zip(names, first, last, bars, strict=True):
-        detail = f"{then:.1f} to {now:.1f} MB, {viewers} pages, {len(memory)} insertions"
-        yield Figure(f"growth of memory: {name}", "MB", float(now - then), bar, detail)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 
 Log = Mapping[str, Any]
+GROWTH_MB = {"server": 5.0, "its workers": 20.0, "objects of a page": 1.0, "arrays of a page": 5.0}
+"""Growth that counts as none. Ten minutes have forty insertions; to keep one takes a server or a page 0.1 MB for its
+rows, a page 4 MB for its shapes, and a worker 1 MB, whose size varies by some MB."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,22 @@ def rate(frames: Sequence[Sequence[float]], bar: float) -> Figure:
         f"least of {len(rates)} insertions; median {np.median(rates):.1f}, longest pause {longest:.0f} ms"
     )
     return Figure("animation frames", "1/s", min(rates), bar, detail, least=True)
+
+
+def growth(memory: Sequence[Sequence[float]], warm: int, viewers: int) -> list[Figure]:
+    """Growth from the first insertions after `warm` to the last, of what `GROWTH_MB` names, in MB after each."""
+    few = max(1, min(3, (len(memory) - warm) // 2))
+    first, last = (np.median(part, axis=0) for part in (memory[warm : warm + few], memory[-few:]))
+    return [
+        Figure(
+            f"growth of memory: {name}",
+            "MB",
+            float(now - then),
+            bar,
+            f"{then:.1f} to {now:.1f} MB, {viewers} pages, {len(memory)} insertions",
+        )
+        for (name, bar), then, now in zip(GROWTH_MB.items(), first, last, strict=True)
+    ]
 
 
 def estimate_delays(log: Log) -> list[float]:

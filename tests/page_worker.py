@@ -1,8 +1,10 @@
 """A worker of the page without physics: it answers every order at once with made-up news, and reports every signal.
 
 Seeds of a plan choose what goes wrong: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled.
-Row 15 of a study does that, too. An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a
-fault then, 17 does not stop, 18 takes some beats of the server for its record.
+Row 15 of a study does that, too.
+An insertion that is cancelled still sends a row, and a run called SLOW is read only when it is cancelled.
+An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a fault then, 17 does
+not stop, 18 takes some beats of the server for its record.
 """
 
 import json
@@ -15,7 +17,7 @@ from queue import SimpleQueue
 from flexneedle.page.channel import packed, read
 
 CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
-ROWS = 600
+ROWS, SLOW = 600, "slow"
 FRAME = struct.pack("<BBBBIII", 4, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
 """A sampled path of the live insertion, 24 kB."""
 
@@ -100,6 +102,9 @@ def insert(order, signals):
             rows("live", count, 1)
             count += 1
         ends = signal.get("stop") or signal.get("cancel")
+        if signal.get("cancel"):
+            rows("live", count, 1)
+            write(frame(count))
         insertion(order, "live", "interrupted" if ends else "running", json.dumps(signal))
         if ends:
             return "done" if signal.get("stop") else "cancelled"
@@ -155,6 +160,8 @@ def do(order, signals):
             return insert(order, signals)
         case "read":
             of = order.get("of", "first")
+            if Path(order["folder"]).name == SLOW:
+                signals.get()
             insertion(order, of, "done", order["folder"])
             rows(of, 0, ROWS)
             write(frame(0, source=3 if of == "second" else 2))

@@ -8,6 +8,7 @@ import numpy as np
 from flexneedle.page.frames import Kind, Source, frame_of, packed
 from flexneedle.page.messages import (
     Disturbances,
+    Estimate,
     Insertion,
     Iteration,
     Job,
@@ -28,7 +29,6 @@ START, LENGTH, NODES = -28.5, 90.0, 46
 
 WELCOME = Welcome(
     client=1,
-    version="1.0.0",
     presets=["phantom", "phantom3d"],
     controllers=[
         {"name": "adaptive-mpc", "summary": "Estimates stiffness and bevel, and searches."},
@@ -78,8 +78,6 @@ def scene(revision=1, target=TARGET, axes=2):
         needle_radius_mm=0.41,
         axis={"point": (0.0, 0.0), "slope": (0.0, 0.0)},
         target=target,
-        bevel={"angle_deg": 90.0, "offset_mm": 0.1},
-        travel={"lateral_mm": 20.0, "depth_mm": 60.0},
     )
 
 
@@ -155,11 +153,18 @@ def reach_frame():
 def plan(strategy="manipulation", **changes):
     given = {
         "revision": 1, "seed": 0, "reached": True, "summary": "ends 0.001 mm off", "limit": "", "error_mm": 0.001,
-        "energy_mj": 0.0021, "flips": 0, "cost": 0.19, "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
+        "energy_mj": 0.0021, "flips": 0, "roll_deg": 0.0, "cost": 0.19,
+        "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
         "history": [2.0 / (1 + k) ** 2 for k in range(ITERATIONS)], "tip": TARGET,
         "guide": [(0.02 * k, 0.01 * k) for k in range(PERIODS)], "seconds": 0.3, **changes,
     }  # fmt: skip
     return Plan(strategy=strategy, **given)
+
+
+def estimate(revision=1, roll_deg=0.0):
+    return Estimate(
+        revision=revision, error_mm=0.31, reached=True, tip=TARGET, roll_deg=roll_deg, seconds=0.1
+    )
 
 
 def row(index):

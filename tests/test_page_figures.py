@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from page_figures import Figure, estimate_delays, plan_delay, rate, spread, table
+from page_figures import Figure, estimate_delays, growth, plan_delay, rate, spread, table
 
 LOG = {
     "moves": [0.0, 40.0, 60.0, 300.0],
@@ -48,6 +48,24 @@ def test_a_rate_is_the_least_of_all():
     assert figure.value == pytest.approx(50.0)
     assert not figure.kept
     assert figure.detail.endswith("longest pause 30 ms")
+
+
+@pytest.mark.parametrize("leaking", range(4))
+def test_memory_that_grows_with_each_insertion_exceeds_its_bar(leaking):
+    """Forty insertions, each of which leaves its rows, its periods, its objects, or its shapes."""
+    left = (0.2, 1.0, 0.1, 4.0)[leaking]
+    memory = [[50.0, 400.0, 9.0, 12.0] for _ in range(40)]
+    assert all(figure.kept for figure in growth(memory, 4, 10))
+    for count, row in enumerate(memory):
+        row[leaking] += left * count
+    figures = growth(memory, 4, 10)
+    assert [figure.kept for figure in figures] == [at != leaking for at in range(4)]
+    assert figures[leaking].value == pytest.approx(33.0 * left)
+
+
+def test_what_is_used_at_first_is_no_growth():
+    memory = [[50.0 * min(count, 4)] * 4 for count in range(40)]
+    assert [figure.value for figure in growth(memory, 4, 10)] == [0.0] * 4
 
 
 def test_the_table_has_bar_figure_and_verdict():

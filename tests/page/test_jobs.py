@@ -2,11 +2,13 @@
 
 import sys
 from dataclasses import replace
+from threading import Event
+from time import monotonic
 
 import pytest
 
-from page_clients import QUICK, STUB, Client, served
-from page_worker import CRASHES, HANGS, WORKS_ON
+from page_clients import PATIENCE_S, QUICK, STUB, Client, served
+from page_worker import CRASHES, HANGS, SLOW, WORKS_ON
 
 
 @pytest.fixture
@@ -130,12 +132,42 @@ def test_work_is_cancelled_when_nobody_is_connected_and_done_again(server):
         client.job("scene", "done")
 
 
+def test_a_plan_that_is_missing_is_made_when_somebody_comes_again(server):
+    with Client(server) as client:
+        client.job("plan", "done")
+        first = client.newest["job plan"]["job"]
+    wait_until_idle(server)
+    with Client(server) as client:
+        client.job("estimate", "done")
+        assert client.newest["job plan"]["job"] == first
+        client.steer().do("edit", values={"target.depth_mm": 35.0})
+    wait_until_idle(server)
+    with Client(server) as client:
+        client.wait(lambda: client.newest.get("plan manipulation", {}).get("revision") == 2)
+
+
+def wait_until_idle(server):
+    end = monotonic() + PATIENCE_S
+    while not server.desk._idle and monotonic() < end:
+        Event().wait(0.01)
+
+
+def test_a_run_that_is_closed_before_it_is_read_is_not_shown(server, client, tmp_path):
+    (tmp_path / "runs" / SLOW).mkdir(parents=True)
+    (tmp_path / "runs" / SLOW / "run.json").write_text("{}")
+    client.do("open", name=SLOW, second=True)
+    client.job("recording", "running")
+    client.do("open", name=None)  # the other one
+    client.do("open", name=None, second=True)
+    client.job("recording", "cancelled")
+    with Client(server) as other:
+        other.do("rows_from", index=0)
+        assert not {"insertion second", "frame 3 4"} & set(other.newest)
+
+
 def wait_until_alone(server):
     """Wait for the timer that cancels; the server's thread has no other event to wait for."""
-    from threading import Event
-    from time import monotonic
-
-    end = monotonic() + 10.0
+    end = monotonic() + PATIENCE_S
     while (server.desk._plans.numbers or server.desk._insertions.numbers) and monotonic() < end:
         Event().wait(0.01)
 

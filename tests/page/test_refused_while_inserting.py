@@ -1,6 +1,10 @@
 """A virtual insertion in real time while its server is attacked over real sockets, as `flexneedle serve` runs it.
 
-Everything is refused with a reason, and the insertion has the same rows at the same times as without the attack.
+Everything is refused with a reason, and the insertion is not disturbed: it has the same rows as without the attack, and
+misses no control period. A period is missed if its decision takes longer than it lasts, or if it ends half of it too
+late, by which all later rows are then late. A row that is late alone was kept by the attacked server on its way to the
+page, for which the insertion does not wait. Whatever else runs on the computer may make it miss a period as well, so
+an insertion that misses one is attacked again: an attack that disturbs does so each time.
 """
 
 import json
@@ -33,6 +37,8 @@ TIMED = {"decide_ms"}
 """Parts of a row that the wall clock decides."""
 PERIOD_S = 0.2
 """A control period of the preset `phantom`, at 5 mm/s."""
+ATTEMPTS = 3
+"""Of an attack in which no period is missed, while other tests may run."""
 SECRET = "nobody may read this"
 SERVER = {"python", "flexneedle", "root:", "def ", SECRET}
 """Of which there is something in files that are not the page's."""
@@ -101,15 +107,17 @@ class Watched:
         return [{key: value for key, value in row.items() if key not in TIMED} for row in self.rows]
 
     @property
-    def missed(self) -> int:
-        """Number of decisions that took longer than a control period."""
-        return sum(row["decide_ms"] > 1e3 * PERIOD_S for row in self.rows)
-
-    @property
-    def delayed(self) -> int:
-        """Number of rows that came later after the row before than their period lasts, by half of it or more."""
-        planned = np.diff([row["time"] for row in self.rows])
-        return int((np.diff(self.times) - planned > 0.5 * PERIOD_S).sum())
+    def missed(self) -> list[int]:
+        """Indices of the periods that were missed."""
+        late = np.subtract(
+            self.times, [row["time"] for row in self.rows]
+        )  # and a constant between two clocks
+        with_all_later = np.minimum.accumulate(late[::-1])[::-1]
+        return [
+            row["index"]
+            for row, more in zip(self.rows, np.diff(with_all_later, prepend=with_all_later[0]), strict=True)
+            if row["decide_ms"] > 1e3 * PERIOD_S or more > 0.5 * PERIOD_S
+        ]
 
 
 def inserted(client: Member, name: str) -> Watched:
@@ -129,6 +137,19 @@ def rows_in(folder: Path) -> list:
     return [row_of(period, insertion.plan).model_dump(exclude=TIMED) for period in insertion.periods]
 
 
+def watched(times, decide_ms=12.0):
+    rows = [{"index": k, "time": PERIOD_S * (k + 1), "decide_ms": decide_ms} for k in range(len(times))]
+    return Watched(rows, times, {})
+
+
+def test_a_period_that_is_missed_is_found():
+    in_time = (100.0 + PERIOD_S * np.arange(20)).tolist()
+    assert watched(in_time).missed == []
+    assert watched([*in_time[:12], *(time + 0.11 for time in in_time[12:])]).missed == [12]
+    assert watched([*in_time[:12], in_time[12] + 0.15, *in_time[13:]]).missed == []
+    assert watched(in_time[:3], decide_ms=210.0).missed == [0, 1, 2]
+
+
 def test_all_is_refused_and_the_insertion_is_not_disturbed(server, tmp_path, monkeypatch):
     monkeypatch.setattr(
         page_clients, "PATIENCE_S", 200.0
@@ -140,27 +161,32 @@ def test_all_is_refused_and_the_insertion_is_not_disturbed(server, tmp_path, mon
         revision = client.newest["session"]["revision"]
         client.wait(lambda: client.newest.get("plan manipulation", {}).get("revision") == revision)
         alone = inserted(client, "alone")
-        watching = pool.submit(inserted, client, "attacked")
-        rounds = 0
-        while not watching.done() or rounds == 0:
-            for attack in ATTACKS:
-                attack(server)
-            rounds += 1
-        attacked = watching.result()
+        for attempt in range(ATTEMPTS):
+            attacked = attacked_by_all(server, client, pool, name := f"attacked {attempt}")
+            assert client.most == 32
+            assert attacked.plain == alone.plain
+            if not attacked.missed:
+                break
 
-    assert client.most == 32
+    assert not attacked.missed
     assert attacked.end["state"] == "done"
     assert len(attacked.times) == attacked.end["periods"] == alone.end["periods"] > 50
-    assert not any(row["late"] for row in attacked.rows)
-    assert attacked.plain == alone.plain
-    assert attacked.missed <= alone.missed + 1
-    assert attacked.delayed <= 2 * alone.delayed + 2  # other tests may run meanwhile
     target = ("--target", str(DEPTH_MM), str(LATERAL_MM), "--seed", str(SEED))
     command = [*FLEXNEEDLE, "insert", "phantom", *target, "--out", str(tmp_path / "command")]
     subprocess.run(command, check=True, capture_output=True)
     by_command = rows_in(tmp_path / "command")
-    np.testing.assert_equal(rows_in(server.runs / "attacked"), by_command)  # NaN equals NaN
+    np.testing.assert_equal(rows_in(server.runs / name), by_command)  # NaN equals NaN
     assert len(by_command) == len(attacked.rows)
+
+
+def attacked_by_all(server, client, pool, name) -> Watched:
+    """An insertion during which everything is tried, once at least."""
+    watching, rounds = pool.submit(inserted, client, name), 0
+    while not watching.done() or rounds == 0:
+        for attack in ATTACKS:
+            attack(server)
+        rounds += 1
+    return watching.result()
 
 
 # Sockets

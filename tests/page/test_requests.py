@@ -57,7 +57,11 @@ def test_a_plan_that_was_asked_for_is_not_replaced_by_that_at_rest(tmp_path):
         for name in ("one", "two"):  # each is listed after 0.05 s
             (tmp_path / "runs" / name).mkdir(parents=True)
             (tmp_path / "runs" / name / "run.json").write_text("{}")
-            client.wait(lambda name=name: name in {run["name"] for run in client.newest["runs"]["runs"]})
+            client.wait(
+                lambda name=name: (
+                    name in {run["name"] for run in client.newest.get("runs", {"runs": []})["runs"]}
+                )
+            )
         assert client.newest["job compare"]["state"] == "running"
 
 
@@ -238,6 +242,41 @@ def test_a_newer_virtual_insertion_replaces_the_older(client):
     client.do("insert", paused=True)
     client.wait(lambda: client.newest["job insertion"]["job"] > first)
     client.job("insertion", "running")
+
+
+def test_what_comes_late_of_an_insertion_that_was_replaced_is_not_handed_on(server, client):
+    """The worker sends a row of it after it was cancelled, when its rows are forgotten already."""
+    running(client)
+    client.wait(lambda: len(client.rows.get("live", ())) == ROWS)
+    worker = server.desk._insertions.worker._process.pid
+    client.do("insert", paused=True)
+    client.wait(lambda: client.newest["insertion live"]["state"] == "paused")
+    client.do("advance")
+    client.wait(lambda: len(client.rows["live"]) == 1)
+    assert "frame 1 4" not in joined(server).newest
+    assert server.desk._insertions.worker._process.pid == worker
+
+
+def joined(server):
+    """A page that has come now, with the state of all keys."""
+    with Client(server) as other:
+        other.do("rows_from", index=0)
+        return other
+
+
+def test_an_insertion_that_is_cancelled_has_the_rows_that_were_shown(client):
+    running(client)
+    client.wait(lambda: len(client.rows.get("live", ())) == ROWS)
+    client.do("cancel", job=client.newest["job insertion"]["job"])
+    client.wait(lambda: client.newest["insertion live"]["state"] == "interrupted")
+    assert client.newest["insertion live"]["periods"] == len(client.rows["live"]) == ROWS
+
+
+def test_a_virtual_layer_is_not_without_stiffness(client):
+    running(client, paused=True)
+    reason = "size = 0: must be above 0 for a layer, the factor on its stiffness"
+    assert client.refused("disturb", what="stiffen", size=0.0) == reason
+    client.do("disturb", what="push", size=0.0)
 
 
 def test_rows_are_filled_up_on_request(client):

@@ -9,7 +9,7 @@ import pytest
 
 from flexneedle.page.server.rig import ConnectedRig
 from page_clients import QUICK, Client, served
-from page_worker import FAULTY, RECORDS, UNSTOPPABLE
+from page_worker import FAULTY, RECORDS, UNSTOPPABLE, WORKS_ON
 
 RIG = ConnectedRig("Bench", "bench.toml")
 WITHOUT_ANYBODY = "nobody steers: who steered is gone"
@@ -155,6 +155,56 @@ def test_pauses_periods_paces_and_disturbances_are_refused(client):
     assert client.refused("check") == "an insertion runs: it uses the devices: stop it first"
     assert client.refused("save", name="mine") == "an insertion runs: it can be saved when it has ended"
     assert rig_is(client, "inserting")
+
+
+@pytest.mark.parametrize("so_far", [prepared, inserting])
+@pytest.mark.parametrize("work", ["plan", "compare", "reach"])
+def test_nothing_is_searched_beside_an_insertion(client, so_far, work):
+    so_far(client)
+    why = "an insertion is on the rig, and this would take processor time from it: wait for its end"
+    assert client.refused("start", work=work) == why
+    assert client.refused("open", name="study", row=1, second=False) == why
+    client.do("stop")
+    client.wait(lambda: client.newest["rig"]["job"] is None)
+    client.do("start", work=work)
+
+
+def test_a_search_ends_when_an_insertion_is_prepared(client):
+    client.do("options", seed=WORKS_ON)
+    for work in ("compare", "reach"):
+        client.do("start", work=work)
+    client.job("compare", "running")
+    prepared(client)
+    client.job("compare", "cancelled")
+    client.job("reach", "cancelled")
+
+
+def test_a_scenario_that_was_changed_beside_an_insertion_is_planned_when_that_has_ended(tmp_path):
+    with served(tmp_path, rig=RIG, limits=replace(QUICK, rest_s=0.01)) as server, Client(server) as client:
+        client.steer().job("plan", "done")
+        inserting(client)
+        job = client.newest["job plan"]["job"]
+        client.do("edit", values={"target.depth_mm": 35.0})
+        client.wait(lambda: client.newest["estimate"]["revision"] == 2)
+        beats = client.newest["insertion live"]["periods"]
+        client.wait(
+            lambda: client.newest["insertion live"]["periods"] > beats
+        )  # 0.25 s, so that it has rested
+        assert client.newest["job plan"]["job"] == job
+        client.do("stop")
+        client.wait(lambda: client.newest["plan manipulation"]["revision"] == 2)
+        assert client.newest["job plan"]["job"] > job
+
+
+def test_a_scenario_that_is_planned_is_not_planned_again_after_an_insertion(client):
+    client.job("plan", "done")
+    job = client.newest["job plan"]["job"]
+    inserting(client)
+    client.do("stop")
+    client.wait(lambda: client.newest["rig"]["job"] is None)
+    client.do("edit", values={"target.depth_mm": 35.0})
+    client.wait(lambda: client.newest["estimate"]["revision"] == 2)
+    assert client.newest["job plan"]["job"] == job
 
 
 def test_it_is_recorded_already(client):

@@ -116,6 +116,40 @@ def test_nobody_steers_after_it_has_begun(on_loop, state, signals):
     on_loop(test)
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_nobody_steers_before_the_insertion_has_gone_on(on_loop, times):
+    """Its loop has not looked since it may go, so that it still rests, and reports no new wait."""
+
+    def test(bench):
+        bench.starts()
+        bench.reports("holding", why="nobody steers", waits=2)
+        bench.arm(JOB)
+        bench.go()
+        assert bench.shown == "holding"
+        for _ in range(times):
+            bench.lost("person 2 is gone")
+        bench.reports("holding", why="person 2 is gone", waits=2)
+        bench.arm(JOB)
+        assert bench.shown == "armed"
+        bench.go()
+        assert bench.jobs.signals[-1] == {"go": True}
+
+    on_loop(test)
+
+
+def test_nobody_steers_just_after_the_insertion_has_gone_on(on_loop):
+    def test(bench):
+        bench.starts()
+        bench.reports("inserting")
+        bench.lost("nobody steers")
+        with pytest.raises(Refusal, match="not ready"):
+            bench.arm(JOB)
+        bench.reports("holding", waits=2)
+        bench.arm(JOB)
+
+    on_loop(test)
+
+
 def test_a_rig_that_has_a_fault_is_not_armed_any_more(on_loop):
     def test(bench):
         bench.reports("idle", waits=1)

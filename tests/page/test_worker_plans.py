@@ -10,7 +10,7 @@ from flexneedle.page.frames import Kind, Source, packed, unpacked
 from flexneedle.page.orders import Signal
 from flexneedle.page.worker.__main__ import carry_out
 from flexneedle.page.worker.plans import estimate, plan, samples_of
-from flexneedle.page.worker.reach import reach
+from flexneedle.page.worker.reach import _DEEPEST, reach
 from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.planning.horizon import Samples
@@ -54,6 +54,7 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy):
     made = flexneedle.plan(short(), strategy=strategy, seed=2)
     (news,) = reported.of("plan")
     assert (news.tip, news.cost, news.terms, news.seed) == (made.tip_mm, made.cost, made.terms, 2)
+    assert news.roll_deg == math.degrees(made.roll)
     assert news.history == [entry["best"] for entry in made.history]
     iterations = reported.of("iteration")
     assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
@@ -65,6 +66,17 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy):
         assert (np.diff(costs) >= 0.0).all()
         assert costs[0] == pytest.approx(one.quantiles[0], rel=1e-5)
     assert reported.shapes(Kind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
+
+
+@pytest.mark.parametrize(("action", "kind"), [(plan, "plan"), (estimate, "estimate")])
+def test_the_roll_with_which_a_plan_begins_is_reported(action, kind):
+    """The bevel begins with the side to which the needle has to bend: the one away from +y."""
+    rolls = []
+    for lateral in (0.5, -0.5):
+        scenario = short(**{"target.lateral_mm": lateral})
+        (news,) = done(action, task(kind, scenario=scenario, strategy="steering")).of(kind)
+        rolls.append(abs(news.roll_deg))
+    assert sorted(rolls) == pytest.approx([0.0, 180.0])
 
 
 def test_a_comparison_plans_both():
@@ -113,18 +125,30 @@ def test_the_reach_grows_with_the_depth_and_is_within_the_travel():
     scenario = short(**{"setup.stroke_mm": 40.0})
     reported, last = reached(scenario)
     first = reported.of("reach")[0]
-    assert len(first.depths) < len(last.depths)
-    assert set(first.depths) <= set(last.depths)
-    assert max(last.depths) < scenario.setup.max_depth
-    assert last.high[0] < last.high[-1] <= scenario.setup.max_lateral + 0.1
-    assert all(low < -0.5 * high for low, high in zip(last.low, last.high, strict=True))
-    deepest = dict(zip(first.depths, first.high, strict=True))
-    assert all(high >= deepest.get(depth, high) for depth, high in zip(last.depths, last.high, strict=True))
+    assert len(first.high) < len(last.high)
+    (depths, high), (_, low) = zip(*last.high, strict=True), zip(*last.low, strict=True)
+    assert all(np.diff(depths) > 0.0)
+    assert depths[-1] < scenario.setup.max_depth
+    assert high[0] < high[-1] <= scenario.setup.max_lateral + 0.1
+    assert all(least < -0.5 * greatest for least, greatest in zip(low, high, strict=True))
+    assert high[-1] >= first.high[-1][1]
+
+
+def test_the_reach_ends_where_the_needle_does():
+    """The stroke ends before a needle that bends much is as deep as a straight one would be."""
+    scenario = short(**{"setup.stroke_mm": 12.0, "setup.max_guide_step_mm": 2.0})
+    reported, last = reached(scenario)
+    sought = scenario.setup.max_depth * _DEEPEST
+    assert max(depth for depth, _ in (*last.low, *last.high)) < sought - 0.2
+    edges = np.array([last.high, last.low]).swapaxes(0, 1)
+    assert (np.diff(edges[:, :, 0], axis=0) >= 0.0).all()
+    outlines = reported.shapes(Kind.REACH, Source.SCENE)[-1].values
+    np.testing.assert_allclose(outlines[:, :2, :2], edges, atol=1e-4)
 
 
 def test_the_bevel_alone_reaches_less():
     scenario = short(**{"setup.stroke_mm": 40.0})
-    assert reached(scenario, strategy="steering")[1].high[-1] < reached(scenario)[1].high[-1]
+    assert reached(scenario, strategy="steering")[1].high[-1][1] < reached(scenario)[1].high[-1][1]
 
 
 def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
@@ -132,9 +156,12 @@ def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
     reported, last = reached(short("phantom3d", **values))
     assert last.angle_deg == pytest.approx(45.0)
     outlines = reported.shapes(Kind.REACH, Source.SCENE)[-1].values
-    assert pytest.approx(np.tile(last.depths, (9, 1))) == outlines[:, :, 0].T
+    assert outlines.shape == (2, 9, 3)
     assert (outlines[:, 0] == outlines[:, -1]).all()
-    assert outlines[:, 0, 1:].sum(axis=1) / math.sqrt(2.0) == pytest.approx(last.high, abs=1e-4)
+    assert outlines[:, 0, 0] == pytest.approx([depth for depth, _ in last.high])
+    assert outlines[:, 0, 1:].sum(axis=1) / math.sqrt(2.0) == pytest.approx(
+        [off for _, off in last.high], abs=1e-4
+    )
 
 
 def test_a_reach_is_cancelled():

@@ -1,6 +1,7 @@
 """The page's worker as a process, and behind the server over a web socket."""
 
 import json
+import os
 import subprocess
 import sys
 from time import monotonic
@@ -39,12 +40,14 @@ def send(process, order):
 def test_it_cancels_within_a_plan_and_ends_with_its_stdin():
     with subprocess.Popen((*COMMAND, "plans"), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         until(process, lambda news: news["type"] == "ready")
+        niceness = os.getpriority(os.PRIO_PROCESS, process.pid)
+        assert niceness == min(os.nice(0) + 10, 19)  # so that it disturbs no insertion
         send(process, Work(job=1, do="plan", kind="plan", scenario=short(**_LONG).values()))
         until(process, lambda news: news["type"] == "iteration")
         begun = monotonic()
         send(process, Signal(job=1, cancel=True))
         until(process, lambda news: news["type"] == "job" and news["state"] == "cancelled")
-        assert monotonic() - begun < 5.0  # 0.1 s on a machine that is free
+        assert monotonic() - begun < 30.0  # 0.1 s on a machine that is free, where the plan takes a minute
         send(process, Work(job=2, do="plan", kind="plan", scenario=short(**_LONG).values()))
         until(process, lambda news: news["type"] == "iteration")
         process.stdin.close()

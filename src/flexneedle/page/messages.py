@@ -254,7 +254,6 @@ class Welcome(News):
 
     type: Literal["welcome"] = "welcome"
     client: int
-    version: str
     presets: list[str]
     controllers: list[dict[str, str]]
     strategies: list[str]
@@ -292,8 +291,7 @@ class Scene(News):
     """Where everything is before the insertion. The needle at the start is the frame NEEDLE number 0.
 
     layers: name, top_mm and bottom_mm (None: no end), shear_modulus_kpa; guide: x, y, z, None without one; base: x, y,
-    z; axis: point (y, z at x = 0) and slope (y, z) of the needle's axis; bevel: angle_deg about x from y to z, and
-    offset_mm; travel: lateral_mm of guide and base, depth_mm, both the largest.
+    z; axis: point (y, z at x = 0) and slope (y, z) of the needle's axis.
     """
 
     type: Literal["scene"] = "scene"
@@ -306,8 +304,6 @@ class Scene(News):
     needle_radius_mm: float
     axis: dict[str, tuple[float, float]]
     target: Vector
-    bevel: dict[str, float]
-    travel: dict[str, float | None]
 
 
 class Job(News):
@@ -327,13 +323,14 @@ class Job(News):
 
 
 class Estimate(News):
-    """First estimate of a plan, a few iterations of a small search: where it ends, error (mm)."""
+    """First estimate of a plan, a few iterations of a small search: where it ends, error (mm), roll at the start."""
 
     type: Literal["estimate"] = "estimate"
     revision: int
     error_mm: float
     reached: bool
     tip: Vector
+    roll_deg: float
     seconds: float
 
 
@@ -360,6 +357,7 @@ class Iteration(News):
 class Plan(News):
     """A plan that is found. history: best cost of each iteration; terms: weighted terms of the cost by name.
 
+    roll_deg: at the start, of the bevel's direction about x from y to z.
     Its needles are a frame SWEEP, the tip's path a frame PATH.
     """
 
@@ -373,6 +371,7 @@ class Plan(News):
     error_mm: float
     energy_mj: float
     flips: int
+    roll_deg: float
     cost: float
     terms: dict[str, float]
     history: list[float]
@@ -387,13 +386,16 @@ class Plan(News):
 
 
 class Reach(News):
-    """Targets that can be hit, in the plane of y or, in space, of the target: outlines are the frame REACH."""
+    """Targets that can be hit, in the plane of y or, in space, of the target: outlines are the frame REACH.
+
+    low, high: depth and lateral offset of points on its edges, at angle_deg. They are where needles have ended: those
+    that bend much less deep than was sought, where the stroke ends.
+    """
 
     type: Literal["reach"] = "reach"
     revision: int
-    depths: list[float]
-    low: list[float]
-    high: list[float]
+    low: list[tuple[float, float]]
+    high: list[tuple[float, float]]
     angle_deg: float
 
 

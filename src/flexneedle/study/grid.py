@@ -128,6 +128,11 @@ class Study:
         """Title of tables and reports."""
         return str(self.definition["title"])
 
+    @property
+    def axes(self) -> list[int]:
+        """Values of `setup.axes` in the study."""
+        return sorted({point.scenario.setup.axes for point in self.points})
+
     def __len__(self) -> int:
         return len(self.grid) * self.repeats
 

@@ -1,14 +1,10 @@
 """Jobs of a worker: plan, or run insertions and return a row for each. A failure is a row, too."""
 
-import fcntl
-import os
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import RunError, ScenarioWarning
@@ -59,7 +55,7 @@ class JobResult:
 
 def make_plan(point: GridPoint) -> PlanResult:
     """Plan for a point, on one thread."""
-    _compile_once()
+    _compile_once(point.scenario.setup.axes)
     try:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
     except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
@@ -69,7 +65,7 @@ def make_plan(point: GridPoint) -> PlanResult:
 
 def run_job(job: Job) -> JobResult:
     """Run the insertions of a job, on one thread."""
-    _compile_once()
+    _compile_once(job.point.scenario.setup.axes)
     return JobResult([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
 
 
@@ -142,9 +138,7 @@ def _error_text(error: Exception) -> str:
 
 
 @cache
-def _compile_once() -> None:
-    """Compile the kernels once per process; locked, since parallel compilation could corrupt the cache."""
+def _compile_once(axes: int) -> None:
+    """Compile the kernels once per process."""
     versions()  # digest of the source, read now while the files are still those that were imported
-    with (Path(tempfile.gettempdir()) / f"flexneedle-{os.getuid()}.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        compile_kernels()
+    compile_kernels(axes)

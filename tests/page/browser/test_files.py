@@ -20,7 +20,7 @@ def files(visit, server):
 
     def opened(**how):
         page = visit(ready=f"{FILES} li", **how)
-        page.wait_for_selector("text=nobody steers")
+        page.wait_for_selector("text=nobody is in control")
         return page
 
     return opened
@@ -40,7 +40,7 @@ def test_a_file_is_loaded(files, server):
     page = files()
     payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
     page.set_input_files(f"{FILES} input[type=file]", payload)
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     page.wait_for_timeout(100)
     assert server.asked("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
 
@@ -53,20 +53,50 @@ def test_a_file_that_is_too_large_is_not_sent(files, server):
     assert not server.asked("load")
 
 
+CLIPBOARD = """
+  const writeText = async (text) => { window.copied = text; };
+  Object.defineProperty(navigator, "clipboard", { value: { writeText } });
+"""
+NO_CLIPBOARD = "Object.defineProperty(navigator, 'clipboard', { value: undefined });"
+
+
 def test_a_link_reproduces_scenario_and_options(files, server):
-    page = files()
+    page = files(before=CLIPBOARD)
     page.click("text=Copy a link")
-    until(page, "location.hash.startsWith('#state=')")
-    address = page.url
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    address = page.evaluate("window.copied")
+    assert address.startswith(f"{server.url}#state=")
     page.goto("about:blank")
     page.goto(address)
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     until(page, "!location.hash")
     page.wait_for_timeout(200)
     assert server.asked("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
     assert server.asked("options") == [
         {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
     ]
+
+
+def test_copying_a_link_leaves_the_address_so_a_reload_keeps_later_changes(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    assert page.url == server.url
+    page.reload()
+    page.wait_for_selector("text=nobody is in control")
+    page.wait_for_timeout(200)
+    assert not server.asked("load")
+
+
+def test_without_a_clipboard_the_link_is_shown_to_be_copied(files, server):
+    page = files(before=NO_CLIPBOARD)
+    assert not page.is_visible("[aria-label='Link to copy']")
+    page.click("text=Copy a link")
+    page.wait_for_selector("text=The clipboard is not available")
+    assert page.input_value("[aria-label='Link to copy']").startswith(f"{server.url}#state=")
+    selected = "(({ value, selectionStart, selectionEnd }) => value.slice(selectionStart, selectionEnd))"
+    assert page.evaluate(f"{selected}(document.activeElement)").startswith(f"{server.url}#state=")
+    assert page.url == server.url
 
 
 def test_a_damaged_link_is_reported(files, server):

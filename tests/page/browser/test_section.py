@@ -4,13 +4,26 @@ import numpy as np
 import pytest
 
 from fake_page import until
+from flexneedle.page.frames import Source
 from flexneedle.page.messages import Reach
-from recorded_page import TARGET, inserting, insertion, opening, people, planned, scene
+from recorded_page import (
+    TARGET,
+    estimate,
+    inserting,
+    insertion,
+    opening,
+    people,
+    plan,
+    plan_frames,
+    planned,
+    scene,
+    session,
+)
 
 pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
-REACH = Reach(revision=1, depths=[5.0, 45.0], low=[-1.0, -12.0], high=[1.0, 12.0], angle_deg=31.0)
+REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 COLORS = """canvas => {
   const pen = canvas.getContext("2d");
   return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
@@ -54,6 +67,58 @@ def test_the_legend_names_what_is_drawn(views):
         "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
         "needle", "target, 1 mm",
     }  # fmt: skip
+
+
+def legends(page):
+    """Names in the legends of section, view along the axis, and view in space."""
+    panels = (SECTION, AXIAL, "[data-panel=space]")
+    return [set(page.locator(f"{panel} .legend li").all_inner_texts()) for panel in panels]
+
+
+def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
+    """Also where there is one of an earlier state of the scenario."""
+    page = views(
+        [*opening(), plan(), *plan_frames(), session(2), scene(2), *plan_frames(Source.SCENE), estimate(2)]
+    )
+    until(page, "document.querySelector('[data-panel=space] .legend li')")
+    wanted = {"first estimate", "needle at the target, first estimate", "needle", "target, 1 mm"}
+    assert legends(page) == [wanted] * 3
+    server.send(*plan_frames(), plan(revision=2))
+    until(page, "document.querySelector('[data-panel=axial] .legend').textContent.includes('planned path')")
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('planned path')")
+    wanted = {"planned path", "needle at the target, planned", "needle", "target, 1 mm"}
+    assert legends(page) == [wanted] * 3
+
+
+def test_a_plan_of_an_earlier_state_stays_where_there_is_no_estimate(views):
+    page = views([*opening(), plan(), *plan_frames(), session(2), scene(2)])
+    until(page, "document.querySelector('[data-panel=space] .legend li')")
+    assert legends(page) == [{"planned path", "needle", "target, 1 mm"}] * 3
+
+
+DRAWN = """async (stretch) => {
+  const { drawScene } = await import("/static/flat/section.js");
+  const { mappingOf, planeOf } = await import("/static/flat/plane.js");
+  const [scene, calls] = [flexneedle.store.get("scene"), []];
+  const pen = new Proxy({}, { get: (_, name) => (...values) => calls.push([name, ...values]), set: () => true });
+  const map = mappingOf({ left: -50, right: 50, half: 10 }, 400, 300, stretch);
+  const plane = planeOf("target", scene, scene.target);
+  drawScene(pen, { width: 400, height: 300, map, plane, name: "target", scene });
+  const target = calls.find(([name]) => name === "ellipse");
+  const texts = calls.filter(([name]) => name === "fillText").map(([, text]) => text);
+  return { scales: [map.sx, map.sy], radii: target.slice(3, 5), texts };
+}"""
+
+
+@pytest.mark.parametrize(
+    ("stretch", "times", "label"),
+    [(1, 1.0, ""), (3, 3.0, ", lateral ×3"), (5, 3.81, ", lateral ×3.8")],  # as much as there is room for
+)
+def test_a_stretched_axis_is_named_and_the_target_is_1_mm_in_it(views, stretch, times, label):
+    drawn = views().evaluate(DRAWN, stretch)
+    assert drawn["radii"] == drawn["scales"]
+    assert drawn["scales"][1] / drawn["scales"][0] == pytest.approx(times, rel=0.01)
+    assert f"from the axis (mm){label}" in drawn["texts"]
 
 
 def test_arrow_keys_move_the_target_in_its_plane(views, server):

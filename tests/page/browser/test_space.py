@@ -11,6 +11,7 @@ from flexneedle.page.messages import Reach
 from recorded_page import (
     PERIODS,
     TARGET,
+    estimate,
     inserting,
     insertion,
     iteration,
@@ -18,10 +19,12 @@ from recorded_page import (
     opening,
     people,
     period_frames,
+    plan,
     planned,
     rows,
     samples,
     scene,
+    session,
 )
 
 pytestmark = pytest.mark.page
@@ -29,7 +32,7 @@ pytestmark = pytest.mark.page
 SPACE = "[data-panel=space]"
 CANVAS = f"{SPACE} canvas"
 SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
-REACH = Reach(revision=1, depths=[5.0, 45.0], low=[-1.0, -12.0], high=[1.0, 12.0], angle_deg=31.0)
+REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 STATES = {"opening": opening, "planned": lambda: [*planned(), REACH], "inserting": inserting}
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
 
@@ -135,6 +138,28 @@ def test_scrubbing_shows_the_shapes_of_a_period(space):
     settled(page)
     tip = on_view(page, "return view.shapes.bevel.position.toArray()")
     np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
+
+
+BEVEL = """
+const [, head] = view.shapes.bevel.children;
+return head.position.clone().applyQuaternion(view.shapes.bevel.quaternion).normalize().toArray();
+"""
+
+
+@pytest.mark.parametrize(
+    ("news", "direction"),
+    [
+        ([], (0.0, 1.0, 0.0)),
+        ([plan(roll_deg=90.0)], (0.0, 0.0, 1.0)),
+        ([plan(roll_deg=90.0), session(2)], (0.0, 1.0, 0.0)),
+        ([estimate(roll_deg=180.0)], (0.0, -1.0, 0.0)),
+        ([plan(roll_deg=90.0), *inserting(20)], (0.0, np.cos(np.radians(60.0)), np.sin(np.radians(60.0)))),
+    ],
+)
+def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, news, direction):
+    page = space([*opening(), *news])
+    settled(page)
+    np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
 
 
 def test_sampled_paths_narrow_with_each_iteration(space, server):
@@ -279,4 +304,4 @@ def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):
     page = visit(before=NO_WEBGL, ready=f"{SPACE} [role=note]")
     assert "no WebGL" in page.inner_text(f"{SPACE} [role=note]")
     assert not page.locator(CANVAS).count()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")

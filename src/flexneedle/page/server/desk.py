@@ -1,6 +1,7 @@
 """What becomes of each request, and of clients that come and go."""
 
 import asyncio
+import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -8,7 +9,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Literal, assert_never
 
-from flexneedle import __version__
 from flexneedle.page import messages as m
 from flexneedle.page.frames import Source
 from flexneedle.page.orders import Do, Kind, Work
@@ -102,17 +102,17 @@ class Desk:
         outbox = self.hub.join(self._welcome(client))
         self._stop_timer("alone")
         self._look.set()
-        if self._idle:  # what was cancelled is done again
+        if self._idle:  # what every page shows is done again; what somebody has asked for is not
             self._idle = False
             self._order("scene", "scene")
             self._order("estimate", "estimate")
+            self._plan_if_missing()
         self.hub.publish(self.people.news())
         return client, outbox
 
     def _welcome(self, client: int) -> m.Welcome:
         return m.Welcome(
             client=client,
-            version=__version__,
             presets=PRESETS.names(),
             controllers=CONTROLLERS,
             strategies=STRATEGIES,
@@ -148,6 +148,7 @@ class Desk:
             case m.Options():
                 self._begin(self._with_options(request))
             case m.Start():
+                self._require_processor()
                 self._order("reach" if request.work == "reach" else "plan", request.work)
             case m.Cancel():
                 self._cancel(request.job)
@@ -189,6 +190,7 @@ class Desk:
             case m.Prepare():
                 work = self._work("insert", "insertion").model_copy(update={"folder": str(self.runs.path)})
                 self.live.prepare(work)
+                self._plans.cancel(*_SEARCHES, "row")
             case m.Arm() if request.armed:
                 self.rig.arm(request.job)
             case m.Arm():
@@ -228,6 +230,13 @@ class Desk:
             raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
         return self.session.with_options(options)
 
+    def _require_processor(self) -> None:
+        """Raise Refusal while an insertion is on the rig, whose loop a long computation would take time from."""
+        if self.rig.active:
+            raise Refusal(
+                "an insertion is on the rig, and this would take processor time from it: wait for its end"
+            )
+
     def _order(self, do: Do, kind: Kind) -> None:
         if do == "plan":
             self._stop_timer("plan")
@@ -260,14 +269,15 @@ class Desk:
         of, source = _RECORDINGS[request.second]
         work = Work(job=0, do="read", kind="recording", name=request.name or "", of=of)
         if request.name is not None and request.row is not None:
+            self._require_processor()
             folder = str(self.runs.study(request.name))
             work = work.model_copy(update={"do": "row", "kind": "row", "row": request.row, "folder": folder})
         elif request.name is not None:
             work = work.model_copy(update={"folder": str(self.runs.run(request.name))})
+        self._plans.cancel_slot("recording", of)
         self.hub.forget((f"rows {of}", f"insertion {of}"))
         self.hub.forget_frames(source)
         if request.name is None:
-            self._plans.cancel_slot("recording", of)
             self.hub.publish(m.Closed(of=of))
         else:
             self._plans.add(work)
@@ -285,12 +295,19 @@ class Desk:
     # What happens by itself
 
     def _at_rest(self) -> None:
-        if not self.rig.active:  # whose loop would share the processor
+        if not self.rig.active:  # else when its insertion has ended
             self._order("plan", "plan")
+
+    def _plan_if_missing(self) -> None:
+        newest = self.hub.newest(f"plan {self.session.strategy}")
+        if newest is None or json.loads(newest)["revision"] != self.session.revision:
+            self._at_rest()
 
     def _job_ended(self, work: Work, state: str, text: str) -> None:
         if work.kind == "insertion":
             self.live.ended(work, state, text)
+            if work.rig and not self._idle:
+                self._plan_if_missing()
         if work.kind == "save":
             self._look.set()
 

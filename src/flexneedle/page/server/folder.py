@@ -44,11 +44,11 @@ class RunsFolder:
         )
 
     def run(self, name: str) -> Path:
-        """The folder of a run. Raises Refusal for a name that is not one of this folder."""
+        """The folder of a run. Raises Refusal for a name that is not one of this folder, and for one with links."""
         return self._folder(name, RUN_FILE, "run")
 
     def study(self, name: str) -> Path:
-        """The folder of a study. Raises Refusal for a name that is not one of this folder."""
+        """The folder of a study. Raises Refusal for a name that is not one of this folder, and for one with links."""
         return self._folder(name, STUDY_FILE, "study")
 
     def new(self, name: str) -> Path:
@@ -64,6 +64,9 @@ class RunsFolder:
         held = self._held(name) if name in self._names() else None
         if held is None or held[0] != file:
             raise Refusal(f"{name!r}: no {what} of this name in the folder of runs")
+        for path in (self.path / name).iterdir():
+            if path.is_symlink():
+                raise Refusal(f"{name}: {path.name} is a link, which may lead elsewhere")
         return self.path / name
 
     def _names(self) -> list[str]:
@@ -121,7 +124,7 @@ def _summary(values: dict[str, Any]) -> str:
 
 
 def zipped(folder: Path) -> bytes:
-    """The files of a run as a ZIP archive, in a folder of its name."""
+    """The files of a run as a ZIP archive, in a folder of its name; links are none."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.iterdir()):

@@ -68,8 +68,13 @@ class Live:
         self._signal("a single period", advance=True)
 
     def disturb(self, disturb: Disturb) -> None:
-        """Disturb the insertion. Raises Refusal unless it is virtual, and for a layer or a field that it has not."""
+        """Disturb the insertion. Raises Refusal unless it is virtual, and for a layer or a field that it has not.
+
+        A layer without stiffness is refused, too: nothing holds the needle in it.
+        """
         self._require_virtual("a disturbance")
+        if disturb.what == "stiffen" and disturb.size == 0.0:
+            raise Refusal("size = 0: must be above 0 for a layer, the factor on its stiffness")
         if disturb.what == "stiffen" and disturb.layer >= self._layers:
             raise Refusal(f"layer = {disturb.layer}: must be below {self._layers}, the number of layers")
         if disturb.what == "plate" and not self._in_a_field:
@@ -97,11 +102,15 @@ class Live:
         elif work.job != self._job:  # it was replaced
             return
         self._job = None
-        if state == "failed" and work.rig and self._news is not None and self._news["periods"]:
+        if self._news is None:
+            return
+        rows = len(self._hub.rows(_ROWS).texts)
+        periods = max(rows, self._news["periods"])  # which may be older than the newest row
+        if state == "failed" and work.rig and periods:
             text = "; ".join((text, STILL_IN.format(rig=work.rig)))
-        if state != "done" and self._news is not None and self._news["state"] in _RUNS:
+        if state != "done" and self._news["state"] in _RUNS:
             outcome = "failed" if state == "failed" else "interrupted"
-            over = {"state": outcome, "summary": text or outcome, "pace": 0.0}
+            over = {"state": outcome, "summary": text or outcome, "pace": 0.0, "periods": periods}
             self._hub.publish(Insertion.model_validate(self._news | over))
 
     def require_none(self, why: str) -> None:

@@ -155,19 +155,20 @@ class Jobs:
             self.worker.send(self._running.work)
 
     def _message(self, message: Message, values: dict[str, Any] | None) -> None:
-        if values is None or values["type"] != "job":
-            if values is None or values["type"] not in _FOR_THE_SERVER:
+        """A message of the worker. What comes of a job after it was cancelled may be of what was forgotten."""
+        running, news = self._running, values or {}
+        if news.get("type") in _FOR_THE_SERVER:
+            self._on_news(news)
+        elif news.get("type") != "job":
+            if running is None or not running.cancelled:
                 self._hub.hand_on(message, values)
-            if values is not None:
-                self._on_news(values)
-            return
-        running = self._running
-        if running is None or values["job"] != running.work.job:
-            return
-        if values["state"] not in _ENDS:
-            self._hub.hand_on(message, values)
-            return
-        self._over(running, values["state"], values.get("text", ""))
+                if news:
+                    self._on_news(news)
+        elif running is not None and news["job"] == running.work.job:
+            if news["state"] in _ENDS:
+                self._over(running, news["state"], news.get("text", ""))
+            elif not running.cancelled:
+                self._hub.hand_on(message, values)
 
     def _ended(self, status: int) -> None:
         """The process has ended: so has its job, or all if it was never ready."""
@@ -182,6 +183,8 @@ class Jobs:
             self._over(self._running, "failed", text)
 
     def _over(self, job: Job, state: str, text: str) -> None:
+        if job.cancelled and job.work.kind != "save":  # which has no results that were not handed on
+            state, text = "cancelled", ""
         self._running = None
         self.expect_end(None)
         if job.again and state == "cancelled":

@@ -22,6 +22,8 @@ class Limits:
     answers: int = 500
     ping_s: float = 1.0
     pong_s: float = 10.0
+    silent_s: int = 10
+    """A connection that is no web socket is closed when it has asked for nothing for this time, or up to twice it."""
     send_s: float = 10.0
     """A client that does not take a message for this time is disconnected."""
     rest_s: float = 0.1

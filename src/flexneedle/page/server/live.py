@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from flexneedle.page.messages import REQUESTS, AnyRequest, Done, Load, Refused
+from flexneedle.page.messages import REQUESTS, AnyRequest, Done, Load, Refused, Stop
 from flexneedle.page.server.desk import Desk
 from flexneedle.page.server.hub import Outbox
 from flexneedle.page.server.limits import Limits, Rate
@@ -19,7 +19,7 @@ from flexneedle.scenario.problems import printable
 
 _TRY_LATER, _AGAINST_RULES = 1013, 1008
 _LONGEST_REASON = 120  # bytes of the reason of a close frame, of which 123 are allowed
-_STOP = '"stop"'
+_LONGEST_STOP = 100
 
 
 class _Gone(Exception):
@@ -75,8 +75,7 @@ async def _read(socket: WebSocket, desk: Desk, client: int, outbox: Outbox) -> N
         received = await _received(socket)
         text = received.get("text")
         size = len(text or received.get("bytes") or "")
-        # Anybody may stop at any time, also a page that has sent too much.
-        if not rate.allows(size, clock()) and not (text and size <= 100 and _STOP in text):
+        if not rate.allows(size, clock()) and not _is_stop(text):
             if rate.exhausted:
                 raise _Closing(_AGAINST_RULES, "too many messages")
             outbox.notice(Refused(what="message", reason="too many messages: wait a moment"))
@@ -84,6 +83,14 @@ async def _read(socket: WebSocket, desk: Desk, client: int, outbox: Outbox) -> N
         if outbox.waiting > desk.limits.answers:
             raise _Closing(_AGAINST_RULES, "too many requests whose answers were not read")
         _answer(desk, client, outbox, text)
+
+
+def _is_stop(text: str | None) -> bool:
+    """Whether a message stops the insertion, which anybody may at any time, also a page that has sent too much."""
+    try:
+        return isinstance(_parsed(text, _LONGEST_STOP), Stop)
+    except Refusal:
+        return False
 
 
 def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:

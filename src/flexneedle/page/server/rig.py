@@ -119,6 +119,8 @@ class Rig:
         """Nobody steers: an insertion rests, or ends if it has not begun."""
         if self.active and self._state in _MOVING:
             self._set_armed(None)
+            if self._report is not None and self._report.waits == self._gone:
+                self._gone -= 1  # it may not have gone yet: then it still waits, and reports no new wait
             self._signal(hold=why)
             self._refresh(why)
         else:

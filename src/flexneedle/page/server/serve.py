@@ -10,6 +10,7 @@ import uvicorn
 
 from flexneedle.errors import InputError
 from flexneedle.page.server.app import STATIC, application
+from flexneedle.page.server.connections import Connection
 from flexneedle.page.server.desk import Desk, Setup
 from flexneedle.page.server.guard import Gate, is_loopback
 from flexneedle.page.server.limits import Limits
@@ -92,7 +93,7 @@ def _config(application: Any, limits: Limits) -> uvicorn.Config:
     return uvicorn.Config(
         application,
         loop="asyncio",
-        http="h11",
+        http=Connection,
         ws="websockets-sansio",
         ws_max_size=_LONGEST_MESSAGE,
         ws_ping_interval=limits.ping_s,
@@ -104,5 +105,6 @@ def _config(application: Any, limits: Limits) -> uvicorn.Config:
         access_log=False,
         proxy_headers=False,
         server_header=False,
+        timeout_keep_alive=limits.silent_s,
         timeout_graceful_shutdown=2,
     )

@@ -26,10 +26,14 @@ from flexneedle.page.worker.warm import warm_up
 from flexneedle.scenario.problems import unexpected
 
 Actions = Mapping[Do, Callable[[Task], None]]
+_NICE = 10
+"""Niceness of plans, so that an insertion beside them, above all on a rig, has the processor first."""
 
 
 def main() -> int:
     """Do the orders on stdin until it ends; report on stdout."""
+    if "plans" in sys.argv[1:]:
+        os.nice(_NICE)
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what anything prints is no message
     warnings.simplefilter("ignore", ScenarioWarning)  # the page has them from the server

@@ -1,5 +1,6 @@
 """Plans: a first estimate, and the search with what it has sampled."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -53,6 +54,7 @@ def estimate(task: Task) -> None:
             error_mm=found.error_mm,
             reached=found.reached,
             tip=found.tip_mm,
+            roll_deg=math.degrees(found.roll),
             seconds=found.seconds,
         )
     )
@@ -102,6 +104,7 @@ def plan_news(plan: Plan, revision: int) -> PlanNews:
         error_mm=plan.error_mm,
         energy_mj=plan.strain_energy_mj,
         flips=plan.flips,
+        roll_deg=math.degrees(plan.roll),
         cost=plan.cost,
         terms=plan.terms,
         history=[entry["best"] for entry in plan.history],

@@ -6,7 +6,6 @@ the reach there. Small searches find it from below, to some tenths of a millimet
 
 import cmath
 import math
-from collections.abc import Iterator
 from typing import Any
 
 from flexneedle.page.frames import Kind, Source, frame_of
@@ -30,10 +29,10 @@ _ONLY_THE_MISS: dict[str, Any] = {
 }
 _DIRECTIONS = 8
 _DEEPEST = 0.95
-"""Of the depth that a straight needle reaches; a bent one ends short of it."""
+"""Of the depth that a straight needle reaches; a bent one ends short of it, and is shown where it ends."""
 
-Outline = list[complex]
-"""y + iz (mm) in each direction."""
+Outline = list[Point]
+"""Ends (x, y, z) in mm in each direction."""
 
 
 def reach(task: Task) -> None:
@@ -47,16 +46,18 @@ def reach(task: Task) -> None:
         for depth, _ in passes[done : done + count]:
             if searched.get(depth) != size:
                 ends = [_end(task, size, depth, direction) for direction in directions]
-                known[depth] = _farther(scenario, depth, ends, known.get(depth, ends))
+                known[depth] = _farther(scenario, ends, known.get(depth, ends))
                 searched[depth] = size
             done += 1
             task.tell("running", done / len(passes), f"reach at {depth:.0f} mm")
         _show(task, known, angle)
 
 
-def _farther(scenario: Scenario, depth: float, one: Outline, other: Outline) -> Outline:
-    axis = scenario.entry.lateral(depth)
-    return [max(ends, key=lambda end: abs(end - axis)) for ends in zip(one, other, strict=True)]
+def _farther(scenario: Scenario, one: Outline, other: Outline) -> Outline:
+    def off(end: Point) -> float:
+        return abs(complex(*end[1:]) - scenario.entry.lateral(end[0]))
+
+    return [max(ends, key=off) for ends in zip(one, other, strict=True)]
 
 
 def _angle(scenario: Scenario) -> float:
@@ -72,8 +73,8 @@ def _turns(scenario: Scenario) -> list[float]:
     return [2.0 * math.pi * k / count for k in range(count)]
 
 
-def _end(task: Task, size: Size, depth: float, direction: complex) -> complex:
-    """The end y + iz (mm) of the best plan to the farthest target in a direction."""
+def _end(task: Task, size: Size, depth: float, direction: complex) -> Point:
+    """Where (mm) the best plan to the farthest target in a direction ends."""
     scenario = task.scenario
     axis, most = scenario.entry.lateral(depth), scenario.setup.max_lateral
     far = axis + direction * most / max(abs(direction.real), abs(direction.imag)) * (1.0 - 1e-9)
@@ -85,27 +86,25 @@ def _end(task: Task, size: Size, depth: float, direction: complex) -> complex:
         task.work.seed,
         progress=lambda _info: task.signals.check(),
     )
-    return complex(*found.tip_mm[1:])
+    return found.tip_mm
 
 
 def _show(task: Task, known: dict[float, Outline], angle: float) -> None:
-    depths = sorted(known)
+    ends = (
+        sorted(ends) for ends in zip(*known.values(), strict=True)
+    )  # of each direction, by the depth found
+    outlines = list(zip(*ends, strict=True))
     back = cmath.rect(1.0, -angle)
-    along = [(known[depth][0] * back, known[depth][len(known[depth]) // 2] * back) for depth in depths]
-    task.show(
-        frame_of(Kind.REACH, Source.SCENE, 0, *(list(_closed(depth, known[depth])) for depth in depths))
-    )
+
+    def along(end: Point) -> tuple[float, float]:
+        return end[0], (complex(*end[1:]) * back).real
+
+    task.show(frame_of(Kind.REACH, Source.SCENE, 0, *([*outline, outline[0]] for outline in outlines)))
     task.say(
         Reach(
             revision=task.work.revision,
-            depths=depths,
-            low=[low.real for _, low in along],
-            high=[high.real for high, _ in along],
+            low=[along(outline[len(outline) // 2]) for outline in outlines],
+            high=[along(outline[0]) for outline in outlines],
             angle_deg=math.degrees(angle),
         )
     )
-
-
-def _closed(depth: float, outline: Outline) -> Iterator[Point]:
-    for place in (*outline, outline[0]):
-        yield depth, place.real, place.imag

@@ -42,6 +42,4 @@ def scene_of(scenario: Scenario, revision: int) -> Scene:
             "slope": (slope.real, slope.imag),
         },
         target=scenario.target.position,
-        bevel={"angle_deg": 0.0, "offset_mm": needle.bevel.offset_mm},
-        travel={"lateral_mm": setup.max_lateral, "depth_mm": setup.max_depth},
     )

@@ -1,6 +1,7 @@
 // Draws the view along the axis: reach at the target's depth, paths, tips, guide, bevel, target.
 
 import { tipOf } from "../paths.js";
+import { rollOf } from "../planned.js";
 import { isStale, shownOf, shownRow } from "../shown.js";
 import { area, disc, grid, pointsOf, polyline } from "./pen.js";
 
@@ -18,7 +19,7 @@ export function drawAxial(pen, { width, height, map, scene, target, parts, store
   if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
   if (scene.guide) guide(pen, place(0, ...(row?.guide ?? scene.guide.slice(1))));
   const needle = parts.find(({ text }) => text === "needle");
-  if (needle) bevel(pen, place(...tipOf(needle.path)), scene, row);
+  if (needle) bevel(pen, place(...tipOf(needle.path)), rollOf(store, of));
   return reached;
 }
 
@@ -57,8 +58,8 @@ function guide(pen, [x, y]) {
   polyline(pen, [[x - 6, y - 6], [x + 6, y - 6], [x + 6, y + 6], [x - 6, y + 6], [x - 6, y - 6]], { tone: "--guide", width: 2 });
 }
 
-function bevel(pen, [x, y], scene, row) {
-  const angle = ((scene.bevel.angle_deg + (row?.roll_deg ?? 0)) * Math.PI) / 180; // from y to z
+function bevel(pen, [x, y], roll) {
+  const angle = (roll * Math.PI) / 180; // from y to z
   const toward = [Math.sin(angle), -Math.cos(angle)];
   const [tx, ty] = [x + BEVEL * toward[0], y + BEVEL * toward[1]];
   polyline(pen, [[x, y], [tx, ty]], { tone: "--ink", width: 1.75 });

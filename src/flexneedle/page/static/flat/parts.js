@@ -1,9 +1,9 @@
 // What moves, for views in two dimensions: {path, tone, width, alpha, dash, text, spread}, from back to front.
 
-import { first, fresh, last, pathOfRows, ranksOf } from "../paths.js";
-import { isStale, shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
+import { first, fresh, pathOfRows, ranksOf } from "../paths.js";
+import { foreseen, plannedPaths } from "../planned.js";
+import { shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
 
-const STRATEGIES = ["manipulation", "steering"];
 const STALE = 0.35;
 
 export function partsOf(store, scene) {
@@ -15,7 +15,7 @@ export function partsOf(store, scene) {
     { path: first(shape("channel")), tone: "--tissue", thick: 3 * radius, alpha: 0.5, text: "cut channel" },
     ...plans(store, of),
     ...tips(store, of),
-    foreseen(store, of, shape),
+    { ...foreseen(store, of), tone: "--predicted", width: 1.5, predicted: true },
     ...secondRun(store, radius),
     { path: first(shape("needle")), tone: "--needle", thick: 2 * radius, least: 2.5, text: "needle" },
     { path: first(shape("true")), tone: "--true", thick: 0.6 * radius, least: 1.25, text: "true needle" },
@@ -40,18 +40,9 @@ function samples(store, of) {
 }
 
 function plans(store, of) {
-  const chosen = store.get("session")?.strategy ?? STRATEGIES[0];
-  if (of !== "scene") return [{ path: first(shownShape(store, "path", of) ?? store.get(`shape path ${chosen}`) ?? null), tone: "--plan", width: 1.5, text: "planned path" }];
-  const estimate = store.get(`plan ${chosen}`) ? null : fresh(store, "estimate", "shape path scene");
-  const other = STRATEGIES.find((name) => name !== chosen);
-  const both = Boolean(store.get(`shape path ${other}`));
-  const planned = (name) => ({
-    path: first(store.get(`shape path ${name}`) ?? (name === chosen ? estimate : null) ?? null),
-    tone: both ? `--${name}` : "--plan", width: 1.75, dash: name !== chosen,
-    alpha: isStale(store, store.get(`plan ${name}`)) ? STALE : 1,
-    text: both ? `path by ${name}` : "planned path",
-  });
-  return [planned(other), planned(chosen)];
+  const { chosen, other } = plannedPaths(store, of);
+  const part = (planned, dash) => ({ ...planned, width: 1.75, dash, alpha: planned.stale ? STALE : 1 });
+  return [other && part(other, true), chosen && part(chosen, false)].filter(Boolean);
 }
 
 function tips(store, of) {
@@ -62,16 +53,6 @@ function tips(store, of) {
     { path: pathOfRows(rows, "estimate"), tone: "--estimate", width: 2, text: "estimated path of the tip", tip: true },
     { path: pathOfRows(rows, "true"), tone: "--true", width: 1.25, dash: true },
   ];
-}
-
-// The needle at the target: predicted with ± 2 sd during an insertion, the last of the plan before one.
-function foreseen(store, of, shape) {
-  const strategy = store.get("session")?.strategy;
-  const sweep = () => fresh(store, `plan ${strategy}`, `shape sweep ${strategy}`) ?? fresh(store, "estimate", "shape sweep scene") ?? null;
-  const path = of === "scene" ? last(sweep()) : first(shape("predicted"));
-  const spread = path && path.columns > 3 ? 2 : 0;
-  const text = spread ? "predicted needle ± 2 sd" : "needle at the target, planned";
-  return { path, tone: "--predicted", width: 1.5, spread, text, predicted: true };
 }
 
 function secondRun(store, radius) {

@@ -32,13 +32,15 @@ export function area(pen, points, tone, alpha) {
   pen.restore();
 }
 
+// radius: or two, across and up, of an ellipse.
 export function disc(pen, [x, y], radius, { tone, alpha = 1, open = false, width = 1.5 }) {
+  const [across, up = across] = [radius].flat();
   pen.save();
   pen.globalAlpha = alpha;
   pen.fillStyle = pen.strokeStyle = color(tone);
   pen.lineWidth = width;
   pen.beginPath();
-  pen.arc(x, y, radius, 0, 2 * Math.PI);
+  pen.ellipse(x, y, across, up, 0, 0, 2 * Math.PI);
   if (open) pen.stroke();
   else pen.fill();
   pen.restore();

@@ -32,12 +32,18 @@ export function lifted(plane, x, u, [fromX, fromY, fromZ]) {
   return [x, point[0] + slope[0] * x + u * e[0] - w * e[1], point[1] + slope[1] * x + u * e[1] + w * e[0]];
 }
 
+// "lateral ×3" where a mapping stretches the upward axis, else "".
+export function stretchIn({ sx, sy }) {
+  const times = Number((sy / sx).toFixed(1));
+  return times === 1 ? "" : `lateral ×${times}`;
+}
+
 // Mapping of millimetres (right, up) to pixels: {toX, toY, fromX, fromY, sx, sy}. box: {left, right, half}; stretch:
 // of the upward axis against the other.
 export function mappingOf({ left, right, half }, width, height, stretch, [side, foot] = [30, 18]) {
   const room = (height - foot) / 2;
   const sx = Math.min((width - side) / (right - left), room / half);
-  const sy = Math.min(sx * stretch, room / half);
+  const sy = Math.min(sx * stretch, room / half); // perhaps less than was asked for
   const middle = (width + side) / 2;
   const center = (left + right) / 2;
   return {

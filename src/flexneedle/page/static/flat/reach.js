@@ -9,30 +9,31 @@ export function reachIn(plane, reach, outlines) {
   const cuts = outlines ? cutsOf(plane, outlines) : [];
   const spans = cuts.length > 1 ? cuts : stripOf(plane, reach);
   if (spans.length < 2) return null;
-  return [...spans.map(({ x, low }) => [x, low]), ...spans.map(({ x, high }) => [x, high]).reverse()];
+  return [...spans.map(({ low }) => low), ...spans.map(({ high }) => high).reverse()];
 }
 
 function cutsOf(plane, { paths, points, columns, values }) {
   const spans = [];
   for (let path = 0; path < paths; path++) {
     const corners = Array.from({ length: points }, (_, at) => values.subarray((path * points + at) * columns, (path * points + at) * columns + 3));
-    const found = corners.flatMap((corner, at) => cutOf(plane, corner, corners[(at + 1) % points]));
-    if (found.length > 1) spans.push({ x: corners[0][0], low: Math.min(...found), high: Math.max(...found) });
+    const found = corners.flatMap((corner, at) => cutOf(plane, corner, corners[(at + 1) % points])).sort(([, u], [, v]) => u - v);
+    if (found.length > 1) spans.push({ low: found[0], high: found.at(-1) });
   }
   return spans;
 }
 
-// Lateral coordinate where an edge crosses the plane, if it does.
+// [[x, u]] where an edge crosses the plane, if it does.
 function cutOf(plane, a, b) {
   const [before, after] = [across(plane, ...a), across(plane, ...b)];
   if (before === after || (before > 0 && after > 0) || (before < 0 && after < 0)) return [];
   const share = before / (before - after);
   const [u, v] = [lateral(plane, ...a), lateral(plane, ...b)];
-  return [u + share * (v - u)];
+  return [[a[0] + share * (b[0] - a[0]), u + share * (v - u)]];
 }
 
-function stripOf({ e }, { depths, low, high, angle_deg: angle }) {
+function stripOf({ e }, { low, high, angle_deg: angle }) {
   const cosine = e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
   if (1 - Math.abs(cosine) > NEAR ** 2) return [];
-  return depths.map((x, at) => ({ x, low: Math.sign(cosine) * low[at], high: Math.sign(cosine) * high[at] }));
+  const turned = ([x, u]) => [x, Math.sign(cosine) * u];
+  return low.map((end, at) => ({ low: turned(end), high: turned(high[at]) }));
 }

@@ -1,12 +1,12 @@
 // Draws a section: tissue, grid, reach, guide, target, and what moves.
 
 import { isStale, shownOf, shownRow } from "../shown.js";
+import { shadeOf } from "../tissue.js";
 import { layersIn } from "./layers.js";
 import { area, disc, grid, pointsOf, polyline, words } from "./pen.js";
-import { lateral } from "./plane.js";
+import { lateral, stretchIn } from "./plane.js";
 import { reachIn } from "./reach.js";
 
-const [SOFT, STIFF] = [1, 30]; // kPa, between which the tissue's colour changes
 const GUIDE = [6, 3.2]; // mm, length and width
 const FOOT = 18; // px of labels
 const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" };
@@ -15,30 +15,36 @@ const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" 
 export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, parts, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
   tissue(pen, map, layers, width, height - FOOT);
-  grid(pen, map, width, height, ["x (mm)", UP[name]]);
+  grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
   const reached = reach(pen, map, plane, store);
   for (const part of parts) draw(pen, part, place, map);
   if (guide !== null) drawGuide(pen, map, plane, guide, scene, shownRow(store));
   const row = shownRow(store);
   if (row?.measured?.every((each) => each !== null)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
-  disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.85 });
+  drawTarget(pen, map, plane, target);
   return reached;
 }
 
 // The scene alone, before an insertion.
 export function drawScene(pen, { width, height, map, plane, name, scene }) {
   tissue(pen, map, layersIn(scene), width, height - FOOT);
-  grid(pen, map, width, height, ["x (mm)", UP[name]]);
+  grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
   if (scene.guide) drawGuide(pen, map, plane, scene.guide[0], scene, null);
-  const [x, y, z] = scene.target;
-  disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], Math.max(map.sx, 3), { tone: "--target", alpha: 0.85 });
+  drawTarget(pen, map, plane, scene.target);
+}
+
+const upward = (name, map) => [UP[name], stretchIn(map)].filter(Boolean).join(", ");
+
+// Its sphere of 1 mm, which is as high as the lateral axis has it.
+function drawTarget(pen, map, plane, [x, y, z]) {
+  const radii = [map.sx, map.sy].map((scale) => Math.max(scale, 3));
+  disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], radii, { tone: "--target", alpha: 0.85 });
 }
 
 function tissue(pen, map, layers, width, bottom) {
   for (const { name, top, bottom: end, modulus } of layers) {
-    const stiffness = Math.log(Math.min(Math.max(modulus, SOFT), STIFF) / SOFT) / Math.log(STIFF / SOFT);
     const [left, right] = [map.toX(top), end === null ? width : Math.min(map.toX(end), width)];
-    area(pen, [[left, 0], [right, 0], [right, bottom], [left, bottom]], "--tissue", 0.12 + 0.3 * stiffness);
+    area(pen, [[left, 0], [right, 0], [right, bottom], [left, bottom]], "--tissue", 0.12 + 0.3 * shadeOf(modulus));
     polyline(pen, [[left, 0], [left, bottom]], { tone: top === 0 ? "--skin" : "--tissue", width: top === 0 ? 2 : 1.25 });
     if (right - left > 30) words(pen, name, [(left + right) / 2, 24], { tone: "--skin" });
   }
@@ -71,7 +77,7 @@ function drawGuide(pen, map, plane, x, scene, row) {
   const u = lateral(plane, x, ...(row?.guide ?? [y, z]));
   const [length, width] = GUIDE;
   for (const side of [-1, 1]) {
-    const edge = [-1, 1].map((end) => [map.toX(x + (end * length) / 2), map.toY(u) + side * Math.max((width / 2) * map.sx, 5)]);
+    const edge = [-1, 1].map((end) => [map.toX(x + (end * length) / 2), map.toY(u) + side * Math.max((width / 2) * map.sy, 5)]);
     polyline(pen, edge, { tone: "--guide", width: 3 });
   }
 }

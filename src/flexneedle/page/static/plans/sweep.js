@@ -4,23 +4,26 @@ import { boxOf } from "../box.js";
 import { make } from "../dom.js";
 import { drawScene } from "../flat/section.js";
 import { pointsOf, polyline } from "../flat/pen.js";
-import { lateral, mappingOf, planeOf } from "../flat/plane.js";
+import { lateral, mappingOf, planeOf, stretchIn } from "../flat/plane.js";
 import { Stage } from "../flat/stage.js";
 import { isStale } from "../shown.js";
 
 const NEEDLES = 9;
 const FAINT = 0.15;
+const STRETCH = 3; // of the lateral axis
 
 export class SweepView {
   #store;
   #strategy;
   #stage;
+  #caption;
   #drawn = [];
 
   constructor(parent, store, strategy) {
     [this.#store, this.#strategy] = [store, strategy];
     const canvas = make("canvas", { role: "img", "aria-label": `Needle by ${strategy}, at steps of the plan` });
-    this.figure = make("figure", { hidden: true }, make("figcaption", {}, strategy), make("div.stage", {}, canvas));
+    this.#caption = make("figcaption", {}, strategy);
+    this.figure = make("figure", { hidden: true }, this.#caption, make("div.stage", {}, canvas));
     parent.append(this.figure);
     this.#stage = new Stage(canvas, (pen, { width, height }) => this.#draw(pen, width, height));
   }
@@ -45,7 +48,8 @@ export class SweepView {
     const [scene, sweep] = [this.#store.get("scene"), this.#sweep];
     if (!scene || !sweep) return;
     const plane = planeOf("target", scene, scene.target);
-    const map = mappingOf(boxOf(scene, scene.target), width, height, 3);
+    const map = mappingOf(boxOf(scene, scene.target), width, height, STRETCH);
+    this.#caption.textContent = [this.#strategy, stretchIn(map)].filter(Boolean).join(", ");
     const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
     drawScene(pen, { width, height, map, plane, name: "target", scene });
     for (const [order, step] of stepsOf(sweep.paths).entries()) {

@@ -15,7 +15,7 @@ export class Outlines {
     this.group.add(this.strip, this.#lines.object);
   }
 
-  // reach: depths, low, high (mm) and angle_deg of their plane about the axis, or null; shape: outlines, or null.
+  // reach: low, high, [depth, lateral] (mm), and angle_deg of their plane about the axis, or null; shape: outlines, or null.
   update(reach, shape, color) {
     this.group.visible = Boolean(reach);
     if (!reach) return;
@@ -26,10 +26,11 @@ export class Outlines {
   }
 }
 
-function stripOf({ depths, low, high, angle_deg: angle }) {
+function stripOf({ low, high, angle_deg: angle }) {
   const [c, s] = [Math.cos((angle * Math.PI) / 180), Math.sin((angle * Math.PI) / 180)];
-  const corners = depths.flatMap((x, at) => [x, c * low[at], s * low[at], x, c * high[at], s * high[at]]);
-  const faces = depths.slice(1).flatMap((_, at) => [2 * at, 2 * at + 1, 2 * at + 2, 2 * at + 1, 2 * at + 3, 2 * at + 2]);
+  const corner = ([x, u]) => [x, c * u, s * u];
+  const corners = low.flatMap((end, at) => [...corner(end), ...corner(high[at])]);
+  const faces = low.slice(1).flatMap((_, at) => [2 * at, 2 * at + 1, 2 * at + 2, 2 * at + 1, 2 * at + 3, 2 * at + 2]);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
   geometry.setIndex(faces);

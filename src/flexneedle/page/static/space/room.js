@@ -6,9 +6,9 @@ import {
 } from "../vendor/three.js";
 import { shown } from "../dom.js";
 import { color } from "../theme.js";
+import { shadeOf } from "../tissue.js";
 
 const STEP = 5; // mm
-const [SOFT, STIFF] = [1, 30]; // kPa, between which the tissue's colour changes
 
 export class Room {
   constructor(labels) {
@@ -32,9 +32,8 @@ export class Room {
   #addLayer({ name, top_mm: top, bottom_mm: bottom, shear_modulus_kpa: modulus }, { right, half }) {
     const end = Math.min(bottom ?? right, right);
     if (end <= top) return;
-    const stiffness = Math.log(Math.min(Math.max(modulus, SOFT), STIFF) / SOFT) / Math.log(STIFF / SOFT);
     const tissue = { color: color("--tissue"), transparent: true, depthWrite: false };
-    const walls = new MeshBasicMaterial({ ...tissue, opacity: 0.1 + 0.3 * stiffness, side: BackSide });
+    const walls = new MeshBasicMaterial({ ...tissue, opacity: 0.1 + 0.3 * shadeOf(modulus), side: BackSide });
     const solid = new BoxGeometry(end - top, 2 * half, 2 * half);
     const layer = new Mesh(solid, walls);
     layer.position.x = (top + end) / 2;

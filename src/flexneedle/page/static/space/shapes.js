@@ -3,25 +3,24 @@
 import {
   ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
 } from "../vendor/three.js";
-import { first, fresh, last, pathOfRows, ranksOf, tipOf } from "../paths.js";
+import { first, fresh, pathOfRows, ranksOf, tipOf } from "../paths.js";
+import { foreseen, plannedPaths, rollOf } from "../planned.js";
 import { isStale, shownRow, shownSecond, shownShape } from "../shown.js";
 import { Lines } from "./lines.js";
 import { Outlines } from "./outlines.js";
 import { paint } from "./room.js";
 import { Tube } from "./tube.js";
 
-const SDS = 2; // standard deviations that the tube of the predicted needle shows
 const PATH = 0.14; // mm, radius of a path
 const CHANNEL = 1.7; // radius of the channel by the needle's
 const STALE = 0.35; // opacity of a path that was planned for an earlier state of the scenario
 const [BEVEL, GUIDE] = [6, 6]; // mm, lengths
-const STRATEGIES = ["manipulation", "steering"];
 // Stretch of the tissue from low to high, distinguishable by lightness alone.
 const STRETCH = [[0.99, 0.88, 0.68], [0.90, 0.62, 0.0], [0.84, 0.37, 0.0], [0.45, 0.11, 0.0]];
 
 export class Shapes {
   #tubes = {};
-  #lines = { samples: new Lines(), ghosts: new Lines() };
+  #paths = new Lines(); // sampled ones
   #outlines = new Outlines();
   #theme = "";
   #seen = new Map(); // by part: what it was drawn from
@@ -37,8 +36,8 @@ export class Shapes {
     this.#addTube("predicted", translucent({ opacity: 0.24 }), "--predicted", 5);
     this.#addGuide();
     this.#addBevel();
-    this.#lines.samples.object.renderOrder = 2;
-    this.group.add(this.#lines.samples.object, this.#lines.ghosts.object, this.#outlines.group);
+    this.#paths.object.renderOrder = 2;
+    this.group.add(this.#paths.object, this.#outlines.group);
   }
 
   // Draw what the store has. Returns entries of the legend: {text, tone, form} and for the channel {text, ramp}.
@@ -51,7 +50,7 @@ export class Shapes {
     const entries = [
       this.#needle(scene, shape("needle")),
       this.#true(scene, shape("true")),
-      this.#predicted(scene, this.#foreseen(store, shape, of)),
+      this.#predicted(scene, foreseen(store, of)),
       this.#channel(scene, shape("channel")),
       ...this.#plans(store, of),
       this.#samples(store, of),
@@ -59,7 +58,7 @@ export class Shapes {
       this.#second(store, scene),
       this.#reach(store, of),
     ];
-    this.#place(scene, row, shape("needle"));
+    this.#place(scene, row, shape("needle"), rollOf(store, of));
     return entries.filter(Boolean);
   }
 
@@ -118,20 +117,11 @@ export class Shapes {
     return path && { text: "true needle", tone: "--true" };
   }
 
-  // The needle at the target: predicted during an insertion; before one, the last of the plan.
-  #foreseen(store, shape, of) {
-    if (of !== "scene") return first(shape("predicted"));
-    const strategy = store.get("session")?.strategy;
-    const sweep = fresh(store, `plan ${strategy}`, `shape sweep ${strategy}`) ?? fresh(store, "estimate", "shape sweep scene");
-    return sweep ? last(sweep) : null;
-  }
-
-  #predicted(scene, path) {
-    const spread = path && path.columns > 3 ? path : null;
+  #predicted(scene, { path, text, spread }) {
     const radius = scene.needle_radius_mm;
     this.#draw("foreseen", path, 0.5 * radius, { tone: "--estimate", opacity: 0.6 });
-    this.#draw("predicted", spread, (point) => radius + SDS * path.values[point * path.columns + 3]);
-    return path && { text: spread ? `predicted needle ± ${SDS} sd` : "needle at the target, planned", tone: "--predicted", form: "area" };
+    this.#draw("predicted", spread ? path : null, (point) => radius + spread * path.values[point * path.columns + 3]);
+    return path && { text, tone: "--predicted", form: "area" };
   }
 
   #channel(scene, path) {
@@ -143,22 +133,12 @@ export class Shapes {
     return cut && { text: `stretch of the tissue, 1 to ${most.toFixed(2)}`, ramp: STRETCH };
   }
 
-  // Planned paths of the tip: of the chosen strategy, and of the other beside it.
   #plans(store, of) {
-    const chosen = store.get("session")?.strategy ?? STRATEGIES[0];
-    const other = STRATEGIES.find((name) => name !== chosen);
-    const replanned = of === "scene" ? null : shownShape(store, "path", of);
-    const estimated = () => fresh(store, `plan ${chosen}`, `shape path ${chosen}`) ?? fresh(store, "estimate", "shape path scene");
-    const path = first(replanned ?? estimated() ?? store.get(`shape path ${chosen}`));
-    const second = of === "scene" ? first(store.get(`shape path ${other}`)) : null;
-    const stale = of === "scene" && !estimated() ? STALE : 1;
-    const otherStale = isStale(store, store.get(`plan ${other}`)) ? STALE : 1;
-    this.#draw("path", path, PATH, { tone: second ? `--${chosen}` : "--plan", opacity: stale });
-    this.#draw("other", second, PATH, { tone: `--${other}`, opacity: otherStale });
-    return [
-      path && { text: second ? `path by ${chosen}` : "planned path", tone: second ? `--${chosen}` : "--plan" },
-      second && { text: `path by ${other}`, tone: `--${other}` },
-    ];
+    const { chosen, other } = plannedPaths(store, of);
+    for (const [name, planned] of Object.entries({ path: chosen, other })) {
+      this.#draw(name, planned?.path ?? null, PATH, { tone: planned?.tone ?? "--plan", opacity: planned?.stale ? STALE : 1 });
+    }
+    return [chosen, other].map((planned) => planned && { text: planned.text, tone: planned.tone });
   }
 
   // Sampled paths: the cheaper, the stronger.
@@ -169,7 +149,7 @@ export class Shapes {
       : shownShape(store, "samples", of);
     if (this.#differs("samples", [shape])) {
       const rank = shape ? ranksOf(shape) : [];
-      this.#lines.samples.update(shape, paint("--estimate"), (path) => 0.55 - 0.45 * rank[path]);
+      this.#paths.update(shape, paint("--estimate"), (path) => 0.55 - 0.45 * rank[path]);
     }
     return shape && { text: `${shape.paths} sampled paths`, tone: "--estimate", form: "thin" };
   }
@@ -203,14 +183,14 @@ export class Shapes {
     return current && { text: "reach", tone: "--reach", form: "area" };
   }
 
-  #place(scene, row, needle) {
+  #place(scene, row, needle, roll) {
     this.guide.visible = Boolean(scene.guide);
     if (scene.guide) this.guide.position.set(scene.guide[0], ...(row?.guide ?? scene.guide.slice(1)));
     this.guide.material.color = paint("--guide");
     const tip = needle && tipOf(first(needle));
     this.bevel.visible = Boolean(tip);
     if (!tip) return;
-    const angle = ((scene.bevel.angle_deg + (row?.roll_deg ?? 0)) * Math.PI) / 180;
+    const angle = (roll * Math.PI) / 180; // from y to z
     this.bevel.position.set(...tip);
     this.bevel.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), new Vector3(0, Math.cos(angle), Math.sin(angle)));
     this.bevel.children[0].material.color = paint("--ink");
