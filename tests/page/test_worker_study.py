@@ -153,7 +153,7 @@ def test_a_row_is_reported_as_a_recording(made):
     assert needles.values.shape[0] == news.periods
     shares = [job.share for job in one.outbox.of("job")]
     assert len(shares) == news.periods
-    assert shares == sorted(shares)
+    assert shares[0] < 0.3 < 0.9 < shares[-1] <= 1.0
     assert one.outbox.of("job")[0].text == "small, row 6"
 
 
