@@ -8,7 +8,7 @@ export function showStudy(element, store, link) {
   const ask = (index) => link.ask({ type: "study", name: store.get("study").name, index });
   const worst = button("Worst first", () => ask(null));
   const from = make("form.tools", {}, worst, first, make("button", { type: "submit" }, "From this row"));
-  const list = make("ul", { "aria-label": "Rows of the study" });
+  const list = make("ul.study-rows", { "aria-label": "Rows of the study" });
   const details = make("details", { hidden: true, open: true }, title, from, list);
   element.append(details);
   from.addEventListener("submit", (event) => {
