@@ -108,10 +108,9 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
         }"""
     )
     live = [frame for period in range(3) for frame in period_frames(period)]
-    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2))
+    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2), session(seed=8))
     until(
-        page,
-        "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('iteration manipulation')",
+        page, "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('session').seed === 8"
     )
     page.wait_for_timeout(100)
     assert page.evaluate("window.changes") == 0
