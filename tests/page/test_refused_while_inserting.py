@@ -29,8 +29,6 @@ from flexneedle.page.worker.rows import row_of
 from flexneedle.runs.reading import load_insertion
 from page_clients import Client, port_of
 
-pytestmark = pytest.mark.long
-
 SEED, DEPTH_MM, LATERAL_MM = 3, 30.0, 2.0
 FLEXNEEDLE = (sys.executable, "-m", "flexneedle")
 TIMED = {"decide_ms"}
@@ -150,6 +148,7 @@ def test_a_period_that_is_missed_is_found():
     assert watched(in_time[:3], decide_ms=210.0).missed == [0, 1, 2]
 
 
+@pytest.mark.long
 def test_all_is_refused_and_the_insertion_is_not_disturbed(server, tmp_path, monkeypatch):
     monkeypatch.setattr(
         page_clients, "PATIENCE_S", 200.0

@@ -176,6 +176,7 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
     assert timing["ticks"]["count"] > 100
 
 
+@pytest.mark.slow
 def test_anybody_stops_it(tmp_path):
     with bench(tmp_path, **LONGER) as one, one.visitor() as watcher, one.visitor() as client:
         inserting(client.steer())

@@ -9,6 +9,7 @@ from recorded_page import WELCOME, inserting, insertion, opening, people, row, r
 pytestmark = pytest.mark.page
 
 PANEL = "[data-panel=insertion]"
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 @pytest.fixture
@@ -182,7 +183,7 @@ def test_a_check_lists_its_problems(rig_panel, server):
     page.click(".findings summary")
     server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
     until(page, "flexneedle.store.get('session').seed === 3")
-    page.wait_for_timeout(100)
+    page.evaluate(PAINTED)
     assert page.locator(".findings details[open]").count() == 1
     server.send(*opening(revision=2)[2:3])
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")

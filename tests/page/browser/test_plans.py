@@ -22,6 +22,7 @@ from recorded_page import (
 pytestmark = pytest.mark.page
 
 PLANS = "[data-panel=plans]"
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 INKED = """canvas => {
   const pen = canvas.getContext("2d");
   return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
@@ -115,12 +116,11 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
         }"""
     )
     live = [frame for period in range(3) for frame in period_frames(period)]
-    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2))
+    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2), session(seed=8))
     until(
-        page,
-        "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('iteration manipulation')",
+        page, "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('session').seed === 8"
     )
-    page.wait_for_timeout(100)
+    page.evaluate(PAINTED)
     assert page.evaluate("window.changes") == 0
     assert page.evaluate("window.table === document.querySelector('.plans table')")
     server.send(plan("steering"))

@@ -286,22 +286,22 @@ def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
         assert page.evaluate(at, period) == [second, second]
 
 
-def test_another_run_of_the_same_length_takes_the_place_of_the_last(player, server):
+def test_another_run_of_the_same_length_takes_the_place_of_the_last(player):
     page = player([*opening(), *recorded(), *recorded("second")])
     see_plots(page)
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     drawn = f"document.querySelector('{PLOTS} [aria-label^=Roll] canvas').toDataURL()"
     page.wait_for_timeout(300)
     before = page.evaluate(drawn)
-    server.send(
-        insertion("done", of="second", name="other", periods=50),
-        of_rows("second", lambda _: {"roll_deg": 45.0}),
-    )
-    until(page, f"{drawn} !== '{before}'")
-    server.send(
-        insertion("done", of="first", name="other", periods=50),
-        of_rows("first", lambda _: {"roll_deg": 30.0}),
-    )
+    for of, roll in (("second", 45.0), ("first", 30.0)):
+        run = [
+            insertion("done", of=of, name="other", periods=50),
+            of_rows(of, lambda _, roll=roll: {"roll_deg": roll}),
+        ]
+        at_once = "(run) => run.forEach((each) => flexneedle.store.receive(JSON.parse(each)))"
+        page.evaluate(at_once, [each.model_dump_json() for each in run])
+        until(page, f"{drawn} !== '{before}'")
+        before = page.evaluate(drawn)
     page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 9.8 s: roll 30.000']")
 
 
