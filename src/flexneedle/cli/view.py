@@ -26,9 +26,8 @@ def add_parser(commands: Commands) -> None:
         "view",
         "redraw the figures of a run, finished or not, or of a row of a study, or replay it in a browser",
         _view,
-        "flexneedle view runs/20260101T120000Z-phantom-0",
         "flexneedle view runs/mine --html",
-        "flexneedle view runs/accuracy --row 17 --html",
+        "flexneedle view runs/accuracy --row 17",
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run, or with --row of a study")
     parser.add_argument(
