@@ -112,14 +112,15 @@ def plan_frames(source=Source.MANIPULATION, sway=0.4):
 
 
 def iteration(number, strategy="manipulation"):
-    best = 2.0 / (1 + number) ** 2
+    best = [2.0 / (1 + k) ** 2 for k in range(number + 1)]
     return Iteration(
         revision=1,
         strategy=strategy,
         iteration=number,
         iterations=ITERATIONS,
         best=best,
-        quantiles=[best, 1.3 * best, 2.0 * best, 6.0 * best],
+        elite=[1.3 * cost for cost in best],
+        median=[2.0 * cost for cost in best],
     )
 
 
@@ -155,7 +156,7 @@ def plan(strategy="manipulation", **changes):
         "revision": 1, "seed": 0, "reached": True, "summary": "ends 0.001 mm off", "limit": "", "error_mm": 0.001,
         "energy_mj": 0.0021, "flips": 0, "roll_deg": 0.0, "cost": 0.19,
         "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
-        "history": [2.0 / (1 + k) ** 2 for k in range(ITERATIONS)], "tip": TARGET,
+        "tip": TARGET,
         "guide": [(0.02 * k, 0.01 * k) for k in range(PERIODS)], "seconds": 0.3, **changes,
     }  # fmt: skip
     return Plan(strategy=strategy, **given)

@@ -49,6 +49,7 @@ def _visited(
     page.add_init_script("localStorage.setItem('flexneedle tour', 'seen')")
     page.goto(address)
     _await(page, "window.flexneedle?.store.get('scene')")
+    _hide(page, "WebGL runs in software")  # as here, without a graphics card
     yield page
     context.close()
 
@@ -60,6 +61,11 @@ def _await(page: Page, condition: str) -> None:
             return
         page.wait_for_timeout(_POLL_MS)
     raise TimeoutError(condition)
+
+
+def _hide(page: Page, text: str) -> None:
+    for place in page.get_by_text(text).all():
+        place.evaluate("element => { element.hidden = true; }")
 
 
 def _press(page: Page, panel: str, name: str) -> None:
@@ -115,10 +121,12 @@ def _draw_disturbance(browser: Browser, folder: Path) -> None:
         page.locator("[aria-label=Pace]").select_option("2")
         _await(page, "flexneedle.store.get('rows live')?.length > 40")
         _press(page, "insertion", "Pause")
-        page.get_by_label("Force on the tip in N").fill("0.1")
+        page.get_by_label("Force on the tip in N").fill("0.02")
         _press(page, "insertion", "Push")
         page.locator("[aria-label=Pace]").select_option("20")
         _await(page, _ENDED)
+        page.locator("section.plots").scroll_into_view_if_needed()  # plots are drawn only on the screen
+        page.wait_for_timeout(_PAINTED_MS)
         page.locator("section.plots").screenshot(path=folder / "page-disturbed.png")
 
 

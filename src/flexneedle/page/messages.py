@@ -337,7 +337,7 @@ class Estimate(News):
 class Iteration(News):
     """An iteration of the search of a plan; its paths are the frame SAMPLES of the same number.
 
-    quantiles of the cost of the samples: least, elite, median, greatest; best cost so far.
+    best: least cost so far, after each iteration until now; elite, median: of the cost of each one's samples.
     """
 
     type: Literal["iteration"] = "iteration"
@@ -345,8 +345,9 @@ class Iteration(News):
     strategy: str
     iteration: int
     iterations: int
-    best: float
-    quantiles: list[float]
+    best: list[float]
+    elite: list[float]
+    median: list[float]
 
     @property
     def key(self) -> str:
@@ -355,7 +356,7 @@ class Iteration(News):
 
 
 class Plan(News):
-    """A plan that is found. history: best cost of each iteration; terms: weighted terms of the cost by name.
+    """A plan that is found. terms: weighted terms of the cost by name.
 
     roll_deg: at the start, of the bevel's direction about x from y to z.
     Its needles are a frame SWEEP, the tip's path a frame PATH.
@@ -374,7 +375,6 @@ class Plan(News):
     roll_deg: float
     cost: float
     terms: dict[str, float]
-    history: list[float]
     tip: Vector
     guide: list[tuple[float, float]]
     seconds: float

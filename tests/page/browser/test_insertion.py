@@ -66,7 +66,7 @@ def test_disturbances_are_sent_and_listed(panel, server):
     click(page, "Take away")
     page.wait_for_timeout(100)
     assert server.asked("disturb") == [
-        {"type": "disturb", "what": "push", "size": 0.25, "angle_deg": 90},
+        {"type": "disturb", "what": "push", "size": 0.25, "angle_deg": 0},
         {"type": "disturb", "what": "stiffen", "size": 2, "layer": 1},
         {"type": "disturb", "what": "drop", "size": 1},
         {"type": "disturb", "what": "plate", "size": 100},

@@ -1,6 +1,8 @@
 """Plans: a first estimate, and the search with what it has sampled."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -68,28 +70,49 @@ def plan(task: Task) -> None:
             task.scenario,
             strategy=strategy,
             seed=task.work.seed,
-            progress=partial(_show_iteration, task, strategy, index, len(strategies)),
+            progress=partial(
+                _show_iteration, task, strategy, Costs(), index / len(strategies), len(strategies)
+            ),
         )
         for frame in shapes_of(found, SOURCES[strategy]):
             task.show(frame)
         task.say(plan_news(found, task.work.revision))
 
 
-def _show_iteration(task: Task, strategy: str, index: int, count: int, info: dict[str, Any]) -> None:
+@dataclass
+class Costs:
+    """Costs of the iterations of a search: those of an iteration that a page has not got are in a later one's."""
+
+    best: list[float] = field(default_factory=list)
+    elite: list[float] = field(default_factory=list)
+    median: list[float] = field(default_factory=list)
+
+    def add(self, best: float, quantiles: Sequence[float]) -> None:
+        """Add an iteration."""
+        _, elite, median, _ = quantiles
+        for costs, cost in ((self.best, best), (self.elite, elite), (self.median, median)):
+            costs.append(cost)
+
+
+def _show_iteration(
+    task: Task, strategy: str, costs: Costs, share: float, count: int, info: dict[str, Any]
+) -> None:
     task.signals.check()
     done, usual = info["iteration"], info["iterations"]
+    costs.add(info["best"], info["cost_quantiles"])
     task.say(
         Iteration(
             revision=task.work.revision,
             strategy=strategy,
             iteration=done,
             iterations=usual,
-            best=info["best"],
-            quantiles=list(info["cost_quantiles"]),
+            best=list(costs.best),
+            elite=list(costs.elite),
+            median=list(costs.median),
         )
     )
     task.show(samples_of(info["samples"], SOURCES[strategy], done))
-    task.tell("running", (index + done / usual) / count, f"{strategy}: iteration {done} of {usual}")
+    task.tell("running", share + done / usual / count, f"{strategy}: iteration {done} of {usual}")
 
 
 def plan_news(plan: Plan, revision: int) -> PlanNews:
@@ -107,7 +130,6 @@ def plan_news(plan: Plan, revision: int) -> PlanNews:
         roll_deg=math.degrees(plan.roll),
         cost=plan.cost,
         terms=plan.terms,
-        history=[entry["best"] for entry in plan.history],
         tip=plan.tip_mm,
         guide=[(y, z) for y, z in plan.guide.tolist()],
         seconds=plan.seconds,

@@ -6,7 +6,7 @@ import { button, make } from "../dom.js";
 export function disturbForm(store, link) {
   const active = make("p.quiet", { role: "status" });
   const number = (label, value, more = {}) => make("input", { type: "number", min: "0", step: "any", value: String(value), "aria-label": label, ...more });
-  const [force, angle] = [number("Force on the tip in N", 0.1), number("Direction of the force in degrees", 90, { min: "-360", max: "360" })];
+  const [force, angle] = [number("Force on the tip in N", 0.02), number("Direction of the force in degrees", 0, { min: "-360", max: "360" })];
   const [layer, factor] = [make("select", { "aria-label": "Layer" }), number("Factor on its stiffness", 2)];
   const [seconds, distance] = [number("Seconds without the tracker", 1), number("Distance of the plate in mm", 100)];
   const disturb = (what, size, more = {}) => {
@@ -16,7 +16,7 @@ export function disturbForm(store, link) {
 
   const form = make(
     "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
-    line("Push the tip", force, "N at", angle, "°", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
+    line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
     line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
     line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
     line("Metal plate at", distance, "mm", button("Bring", () => disturb("plate", distance)), button("Take away", () => none("plate"))),

@@ -7,13 +7,11 @@ import { color } from "../theme.js";
 const HEIGHT = 150; // px
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
 const CAPTION = "Cost over iterations: best so far; elite: the worst sample that the next iteration is fitted to; median of the samples";
-const [ELITE, MEDIAN] = [1, 2]; // of the quantiles
 const positive = (value) => (value > 0 ? value : null); // the axis is logarithmic
 
 export class CostPlot {
   #store;
   #strategies;
-  #iterations = {}; // by strategy: by number
   #place;
   #legend;
   #chart = null;
@@ -29,46 +27,14 @@ export class CostPlot {
   }
 
   update() {
-    for (const strategy of this.#strategies) this.#take(strategy);
-    const known = this.#strategies.filter((strategy) => this.#best(strategy).length);
-    this.figure.hidden = !known.length;
-    if (!known.length) return;
-    const lines = known.flatMap((strategy) => this.#linesOf(strategy));
+    const lines = this.#strategies.flatMap((strategy) => linesOf(strategy, this.#store.get(`iteration ${strategy}`)));
+    this.figure.hidden = !lines.length;
+    if (!lines.length) return;
     const data = dataOf(lines);
     const drawn = `${this.#store.get("view theme")} ${lines.map(({ name }) => name)}`;
     if (drawn === this.#drawn) this.#chart.setData(data);
     else this.#make(lines, data);
     this.#drawn = drawn;
-  }
-
-  // Keep the newest iteration; those before it stay while it is the same search.
-  #take(strategy) {
-    const newest = this.#store.get(`iteration ${strategy}`);
-    const known = this.#iterations[strategy] ?? [];
-    if (!newest) delete this.#iterations[strategy];
-    else if (known.at(-1) !== newest) {
-      const goesOn = known.at(-1)?.revision === newest.revision && known.length <= newest.iteration;
-      const list = goesOn ? known : [];
-      list[newest.iteration] = newest;
-      this.#iterations[strategy] = list;
-    }
-  }
-
-  #best(strategy) {
-    const [list, plan] = [this.#iterations[strategy] ?? [], this.#store.get(`plan ${strategy}`)];
-    const running = list.at(-1)?.revision > (plan?.revision ?? -1);
-    return plan && !running ? plan.history : Array.from(list, (each) => each?.best ?? null);
-  }
-
-  #linesOf(strategy) {
-    const list = this.#iterations[strategy] ?? [];
-    const quantile = (at) => Array.from(list, (each) => each?.quantiles[at] ?? null);
-    const line = (name, values, form, dash) => ({ name: `${strategy}, ${name}`, tone: `--${strategy}`, values: values.map(positive), form, dash });
-    return [
-      line("best", this.#best(strategy), "line"),
-      line("elite", quantile(ELITE), "dashed", [6, 3]),
-      line("median", quantile(MEDIAN), "dotted", [2, 4]),
-    ];
   }
 
   #make(lines, data) {
@@ -80,7 +46,7 @@ export class CostPlot {
       scales: { x: { time: false }, y: { distr: 3 } },
       axes: [{ ...axis, size: 24, incrs: [1, 2, 5, 10, 20, 50] }, { ...axis, size: 50 }],
       series: [{}, ...lines.map(({ name, tone, dash }) => ({
-        label: name, stroke: color(tone), width: dash ? 1.25 : 2, dash, points: { show: false }, spanGaps: true,
+        label: name, stroke: color(tone), width: dash ? 1.25 : 2, dash, points: { show: false },
       }))],
     };
     this.#chart = new uPlot(options, data, this.#place);
@@ -90,6 +56,17 @@ export class CostPlot {
       return make("span", {}, swatch, name);
     }));
   }
+}
+
+// Lines of a strategy, of its newest iteration.
+function linesOf(strategy, newest) {
+  if (!newest) return [];
+  const line = (name, costs, form, dash) => ({ name: `${strategy}, ${name}`, tone: `--${strategy}`, values: costs.map(positive), form, dash });
+  return [
+    line("best", newest.best, "line"),
+    line("elite", newest.elite, "dashed", [6, 3]),
+    line("median", newest.median, "dotted", [2, 4]),
+  ];
 }
 
 function dataOf(lines) {
