@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-page slow bench bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo kernels test test-all test-page slow bench bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -31,14 +31,17 @@ $(STAMP): pyproject.toml
 demo: setup  ## plan and steer one insertion on the phantom
 	@$(BIN)/flexneedle insert phantom --seed 0
 
-test: setup  ## run the tests but the long ones, on all cores
+kernels: setup  ## compile the kernels, once before the tests start in several processes
+	@$(BIN)/python -c "from flexneedle.rig.kernels import compile_kernels; compile_kernels(1); compile_kernels(2)"
+
+test: kernels  ## run the tests but the long ones, on all cores
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGS)
 
-test-all: setup  ## run all tests but the slow ones and the page's: statistics over many draws, studies in several processes
+test-all: kernels  ## run all tests but the slow ones and the page's: statistics over many draws, studies in several processes
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not page" $(PYTEST_ARGS)
 
-test-page: setup  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
-	$(BIN)/python -m pytest -m page tests/page $(PYTEST_ARGS)
+test-page: kernels  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m page tests/page $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py
@@ -131,8 +134,8 @@ tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedl
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done
 
-slow: setup  ## the long tests: a thousand insertions each in the plane and in space against the reference
-	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+slow: kernels  ## the longest tests: a thousand insertions against the reference, every fault of a device, examples of the docs
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "slow and not page" $(PYTEST_ARGS)
 
 docs: setup  ## build the documentation site into site/; warnings are errors
 	$(BIN)/python tools/docs/scenario_reference.py

@@ -97,6 +97,10 @@ class Client:
         self.do("steer", take=True)
         return self
 
+    def listed(self) -> list[str]:
+        """Names of the runs, the newest first; none before they have come."""
+        return [run["name"] for run in self.newest.get("runs", {"runs": []})["runs"]]
+
     def answer_to(self, number: int) -> dict | None:
         answers = (self.newest.get("done"), self.newest.get("refused"))
         return next((answer for answer in answers if answer and answer["request"] == number), None)

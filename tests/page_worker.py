@@ -1,6 +1,7 @@
 """A worker of the page without physics: it answers every order at once with made-up news, and reports every signal.
 
 Seeds of a plan choose what goes wrong: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled.
+Row 15 of a study does that, too.
 An insertion that is cancelled still sends a row, and a run called SLOW is read only when it is cancelled.
 An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a fault then, 17 does
 not stop, 18 takes some beats of the server for its record.
@@ -164,6 +165,13 @@ def do(order, signals):
             insertion(order, of, "done", order["folder"])
             rows(of, 0, ROWS)
             write(frame(0, source=3 if of == "second" else 2))
+        case "study":
+            more = {"insertions": 3, "finished": 0, "index": order.get("row"), "rows": []}
+            say("study", name=order["name"], title=order["folder"], **more)
+        case "row":
+            if order["row"] == WORKS_ON:
+                return "cancelled" if signals.get().get("cancel") else "failed"
+            insertion(order, order.get("of", "first"), "done", json.dumps([order["folder"], order["row"]]))
         case "check":
             findings = [{"part": "driver", "item": "connection", "found": order["rig"], "problem": ""}]
             say("check", revision=order["revision"], findings=findings)

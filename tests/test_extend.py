@@ -99,7 +99,7 @@ def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
     assert (fine.returncode, fine.stderr) == (0, "")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_unused_controller_table_is_one_warning(lab):
     for argv in (["plan"], ["insert", "--force", "--controller", "open-loop", "--phantom", "model"]):
         done = command(lab, *argv, "quick.toml", "--out", f"other-{argv[0]}")
@@ -177,7 +177,7 @@ def test_a_study_loads_them_by_name_in_its_workers(lab):
     assert report.returncode == 0, report.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_study_is_not_resumed_with_an_edited_module(lab, tmp_path):
     for file in lab.glob("*.*"):
         (tmp_path / file.name).write_bytes(file.read_bytes())

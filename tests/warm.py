@@ -3,4 +3,4 @@
 import flexneedle.runs.recording  # noqa: F401
 from flexneedle.rig.kernels import compile_kernels
 
-compile_kernels()
+compile_kernels(1)

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import pytest
@@ -40,17 +41,16 @@ def events(monkeypatch, in_tmp, engine, ends):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_the_command_alone_reaches_the_supervisor_before_anything_else(number):
-    found, before = [], {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    found, numbers = [], (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(each) for each in numbers]
     signals = _Signals()
     signals.supervisor = SimpleNamespace(signal=found.append)
-    try:
-        signals.handle()
+    with ExitStack() as stack:
+        signals.handle(stack)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
     assert found == [number]
+    assert [signal.getsignal(each) for each in numbers] == before
 
 
 @pytest.fixture

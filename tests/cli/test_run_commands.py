@@ -150,9 +150,9 @@ def test_an_insertion_that_fails_is_recorded_with_its_controller(engine, capsys,
 
 def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     engine()
-    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: False)
+    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda _axes: False)
     assert "Compiling kernels (first run only) …" in run(capsys, "plan")[2]
-    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: True)
+    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda _axes: True)
     assert "Compiling" not in run(capsys, "plan")[2]
 
 

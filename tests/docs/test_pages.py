@@ -11,25 +11,18 @@ import pytest
 from flexneedle.cli.main import build_parser
 from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 
-# Pages that take more than about 5 s.
-LONG = {
-    "controllers.md",
-    "emulate.md",
-    "extend.md",
-    "index.md",
-    "needle-and-tissue.md",
-    "results.md",
-    "studies.md",
-    "targets.md",
-    "tutorial.md",
-}
+# Pages that take more than about 5 s, and the longest of them.
+LONG = {"emulate.md", "index.md", "tutorial.md"}
+SLOW = {"controllers.md", "extend.md", "needle-and-tissue.md", "results.md", "studies.md", "targets.md"}
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
 BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
 EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]
 
 
 def marked(name: str) -> object:
-    return pytest.param(name, marks=[pytest.mark.long] if Path(name).name in LONG else [], id=name)
+    page = Path(name).name
+    marks = [mark for mark, pages in ((pytest.mark.long, LONG), (pytest.mark.slow, SLOW)) if page in pages]
+    return pytest.param(name, marks=marks, id=name)
 
 
 @pytest.fixture

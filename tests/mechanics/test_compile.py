@@ -20,6 +20,11 @@ def twice(x: float) -> float:
 """
 
 
+def compiled(home):
+    """Whether kernels of the sources in a folder are in the cache."""
+    return any(Path(compiling.cache_folder(home)).rglob("*.nbi"))
+
+
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """An empty cache of its own."""
@@ -53,9 +58,9 @@ def package(tmp_path, cache, monkeypatch):
 
 def test_a_package_is_compiled_once_its_kernels_lie_in_the_cache(cache, package):
     module = package(2.0)
-    assert not compiling.compiled(package.home)
+    assert not compiled(package.home)
     assert module.twice(4.0) == 8.0
-    assert compiling.compiled(package.home)
+    assert compiled(package.home)
     assert list(cache.rglob("*.nbi"))
     assert str(cache) == config.CACHE_DIR  # decorating leaves Numba's own setting as it was
 
@@ -63,9 +68,9 @@ def test_a_package_is_compiled_once_its_kernels_lie_in_the_cache(cache, package)
 def test_an_edit_of_the_package_asks_for_its_kernels_anew(package):
     assert package(2.0).twice(4.0) == 8.0
     edited = package(3.0)
-    assert not compiling.compiled(package.home)
+    assert not compiled(package.home)
     assert edited.twice(4.0) == 12.0
-    assert compiling.compiled(package.home)
+    assert compiled(package.home)
 
 
 def test_other_columns_ask_for_the_kernels_anew(package, monkeypatch):
@@ -78,8 +83,8 @@ def test_other_columns_ask_for_the_kernels_anew(package, monkeypatch):
 def test_packages_have_folders_of_their_own(package):
     """Compiled kernels of one are none of another; all depend on the shared sources."""
     package(2.0).twice(4.0)
-    assert not compiling.compiled()
-    assert not compiling.compiled(Path(compiling.__file__).parent)
+    assert not compiled(compiling.HERE)
+    assert not compiled(Path(compiling.__file__).parent)
     assert compiling.cache_folder(package.home) != compiling.cache_folder(compiling.HERE)
 
 
@@ -90,10 +95,10 @@ def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_pa
     for source in compiling.HERE.glob("*.py"):
         (shared / source.name).write_bytes(source.read_bytes())
     monkeypatch.setattr(compiling, "HERE", shared)
-    assert compiling.compiled(package.home)  # the same sources elsewhere
+    assert compiled(package.home)  # the same sources elsewhere
     with (shared / "law.py").open("a") as file:
         file.write("# another law\n")
-    assert not compiling.compiled(package.home)
+    assert not compiled(package.home)
 
 
 def test_without_a_set_folder_the_cache_lies_beside_the_code_or_with_the_user(package, monkeypatch, tmp_path):

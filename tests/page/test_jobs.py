@@ -180,3 +180,59 @@ def test_a_page_that_is_loaded_again_keeps_the_work(tmp_path):
             job = client.job("reach", "running")["job"]
         with Client(server) as client:
             assert client.job("reach", "running")["job"] == job
+
+
+@pytest.fixture
+def with_study(planned, tmp_path):
+    """A client of a server with a study and a run."""
+    for name, file in (("many", "study.json"), ("one", "run.json")):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / file).write_text("{}")
+    return planned
+
+
+def open_row(client, **values):
+    """Begin with a row that is worked on until it is cancelled."""
+    client.do("open", name="many", row=WORKS_ON, **values)
+    return client.wait(lambda: running_number(client, "row"))
+
+
+def test_a_plan_sets_a_row_back_which_is_then_begun_again(with_study):
+    row = open_row(with_study)
+    with_study.do("start", work="plan")
+    with_study.job("plan", "done")
+    assert with_study.job("row", "running")["job"] == row
+
+
+def test_a_row_does_not_set_another_back(server, with_study):
+    first = open_row(with_study)
+    with_study.do("open", name="many", row=3, second=True)
+    running = server.desk._plans._running
+    assert (running.work.job, running.cancelled) == (first, False)
+    with_study.do("cancel", job=first)
+    with_study.job("row", "done")
+    assert "insertion second" in with_study.newest
+
+
+def test_a_recording_replaces_a_row_in_its_place(with_study):
+    open_row(with_study)
+    with_study.do("open", name="one")
+    with_study.job("row", "cancelled")
+    with_study.job("recording", "done")
+
+
+def test_a_row_that_waits_is_replaced_too(with_study):
+    start(with_study, WORKS_ON)
+    with_study.do("open", name="many", row=3)
+    with_study.job("row", "waiting")
+    with_study.do("open", name="one")
+    with_study.job("row", "cancelled")
+
+
+def test_closing_a_recording_cancels_the_row_that_would_replace_it(with_study):
+    open_row(with_study)
+    with_study.do("open", name=None)
+    with_study.job("row", "cancelled")
+    with_study.do("start", work="plan")
+    with_study.job("plan", "done")
+    assert "insertion first" not in with_study.newest

@@ -57,7 +57,11 @@ def test_a_plan_that_was_asked_for_is_not_replaced_by_that_at_rest(tmp_path):
         for name in ("one", "two"):  # each is listed after 0.05 s
             (tmp_path / "runs" / name).mkdir(parents=True)
             (tmp_path / "runs" / name / "run.json").write_text("{}")
-            client.wait(lambda name=name: name in {run["name"] for run in client.newest["runs"]["runs"]})
+            client.wait(
+                lambda name=name: (
+                    name in {run["name"] for run in client.newest.get("runs", {"runs": []})["runs"]}
+                )
+            )
         assert client.newest["job compare"]["state"] == "running"
 
 
@@ -85,6 +89,7 @@ STEERED = {
     "advance": {},
     "disturb": {"what": "drop", "size": 1.0},
     "open": {"name": None},
+    "study": {"name": "mine"},
     "save": {"name": "mine"},
 }
 

@@ -161,10 +161,9 @@ def test_pauses_periods_paces_and_disturbances_are_refused(client):
 @pytest.mark.parametrize("work", ["plan", "compare", "reach"])
 def test_nothing_is_searched_beside_an_insertion(client, so_far, work):
     so_far(client)
-    why = (
-        "an insertion is on the rig, and a search would take processor time from it: search when it has ended"
-    )
+    why = "an insertion is on the rig, and this would take processor time from it: wait for its end"
     assert client.refused("start", work=work) == why
+    assert client.refused("open", name="study", row=1, second=False) == why
     client.do("stop")
     client.wait(lambda: client.newest["rig"]["job"] is None)
     client.do("start", work=work)

@@ -176,6 +176,7 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
     assert timing["ticks"]["count"] > 100
 
 
+@pytest.mark.slow
 def test_anybody_stops_it(tmp_path):
     with bench(tmp_path, **LONGER) as one, one.visitor() as watcher, one.visitor() as client:
         inserting(client.steer())
@@ -192,6 +193,7 @@ def test_anybody_stops_it(tmp_path):
         assert "flexneedle rig retract" in watcher.newest["insertion live"]["summary"]
 
 
+@pytest.mark.slow
 def test_a_steering_client_that_is_silent_is_lost(tmp_path):
     """Its computer has crashed or its line is cut: the connection stays open, and brings nothing."""
     with bench(tmp_path, **LONGER) as one, one.visitor() as watcher:
@@ -208,7 +210,7 @@ def test_a_steering_client_that_is_silent_is_lost(tmp_path):
         client.socket.socket.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_without_its_server_the_rig_is_stopped(tmp_path, number):
     """Killed, or hanging: nobody could stop the rig any more."""
     with bench(tmp_path, **LONGER) as one, one.visitor() as client:
@@ -229,6 +231,7 @@ def test_without_its_server_the_rig_is_stopped(tmp_path, number):
             client.socket.socket.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.slow
 def test_without_its_worker_the_rig_is_stopped(tmp_path):
     with bench(tmp_path, **LONGER) as one, one.visitor() as client:
         inserting(client.steer())
@@ -243,6 +246,7 @@ def test_without_its_worker_the_rig_is_stopped(tmp_path):
         assert port_of(one.page) > 0
 
 
+@pytest.mark.slow
 def test_at_the_end_of_the_server_the_record_is_completed(tmp_path):
     with bench(tmp_path, **LONGER) as one:
         with one.visitor() as client:

@@ -131,7 +131,7 @@ def test_it_waits_with_what_will_move_until_it_may_go(calls, in_tmp):
 def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys, monkeypatch):
     one = going(order(in_tmp / "runs", seed=3, controller="ce-mpc"), calls)
     Insertions().insert(one)
-    monkeypatch.setattr("flexneedle.cli.insert._Signals.handle", lambda _self: None)
+    monkeypatch.setattr("flexneedle.cli.insert._Signals.handle", lambda _self, _stack: None)
     arguments = ("--seed", "3", "--controller", "ce-mpc", "--out", "command", "--yes")
     assert run(capsys, "insert", "phantom", "--rig", "rig.toml", *arguments)[0] == 0
     last = one.outbox.of("insertion")[-1]

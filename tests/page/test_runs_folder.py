@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import zipfile
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -81,6 +82,51 @@ def test_without_a_folder_there_are_no_runs(tmp_path):
     assert RunsFolder(tmp_path / "none").listed() == []
 
 
+@pytest.fixture
+def study(runs):
+    """A study in the folder of runs."""
+    (runs / "many").mkdir()
+    text = json.dumps({"study": {"title": "Many", "insertions": 150}})
+    (runs / "many" / "study.json").write_text(text)
+    os.utime(runs / "many" / "study.json", (0, 1767700000))
+    return runs / "many"
+
+
+@pytest.mark.usefixtures("study")
+def test_studies_are_listed_among_the_runs(runs):
+    first, *others = RunsFolder(runs).listed()
+    summary = "Many: 150 insertions"
+    assert first == {"name": "many", "kind": "study", "summary": summary, "made": 1767700000.0}
+    assert [entry["name"] for entry in others] == ["newer", "older"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"study": {"title": "x"}}', '{"study": {"title": 1, "insertions": []}}']
+)
+def test_a_damaged_study_is_listed_as_that(runs, study, text):
+    (study / "study.json").write_text(text)
+    (entry,) = (entry for entry in RunsFolder(runs).listed() if entry["name"] == "many")
+    assert (entry["kind"], entry["summary"]) == ("damaged", "study.json cannot be read")
+
+
+def test_a_run_is_no_study_and_a_study_no_run(runs, study):
+    folder = RunsFolder(runs)
+    assert folder.study("many") == study
+    with pytest.raises(Refusal, match="'many': no run of this name"):
+        folder.run("many")
+    with pytest.raises(Refusal, match="'older': no study of this name"):
+        folder.study("older")
+
+
+@pytest.mark.parametrize("file", ["run.json", "study.json"])
+def test_a_record_that_is_a_link_is_none(runs, file):
+    (runs / "no run" / file).symlink_to(runs.parent / "secret" / "run.json")
+    assert [entry["name"] for entry in RunsFolder(runs).listed()] == ["newer", "older"]
+    for found in (RunsFolder(runs).run, RunsFolder(runs).study):
+        with pytest.raises(Refusal, match="of this name"):
+            found("no run")
+
+
 NO_RUNS = [
     *("nonsense", "..", ".", "", "link", "no run", "file", "../secret", "older/../../secret"),
     *("/etc", "older/", "older\0", "OLDER", "~", "older/run.json", "..%2fsecret", "\\..\\secret", "a" * 200),
@@ -88,9 +134,10 @@ NO_RUNS = [
 
 
 @pytest.mark.parametrize("name", NO_RUNS)
-def test_no_other_name_is_a_run(runs, name):
-    with pytest.raises(Refusal, match="no run of this name"):
-        RunsFolder(runs).run(name)
+def test_no_other_name_is_a_run_or_a_study(runs, name):
+    for found in (RunsFolder(runs).run, RunsFolder(runs).study):
+        with pytest.raises(Refusal, match="of this name in the folder of runs"):
+            found(name)
 
 
 @pytest.mark.parametrize("name", ["..", "../x", "a/b", ".hidden", "", "a\0", "-rf", "a\nb"])
@@ -132,9 +179,11 @@ def test_a_run_with_a_link_is_not_opened(runs, client):
 
 
 def test_clients_get_the_runs_and_new_ones(runs, client):
-    client.wait(lambda: [run["name"] for run in client.newest["runs"]["runs"]] == ["newer", "older"])
+    client.wait(
+        lambda: [run["name"] for run in client.newest.get("runs", {"runs": []})["runs"]] == ["newer", "older"]
+    )
     write_run(runs / "newest", "2026-01-03T12:00:00Z")
-    client.wait(lambda: client.newest["runs"]["runs"][0]["name"] == "newest")
+    client.wait(lambda: client.listed()[0] == "newest")
 
 
 def test_a_run_is_opened_and_closed(runs, server, client):
@@ -157,6 +206,42 @@ def test_what_is_no_run_is_not_opened(client, name):
     assert client.refused("open", name=name) == f"{name!r}: no run of this name in the folder of runs"
 
 
+@pytest.mark.usefixtures("study")
+def test_rows_of_a_study_are_listed_for_all(runs, server, client):
+    client.do("study", name="many")
+    listed = client.wait(lambda: client.newest.get("study"))
+    assert (listed["name"], listed["title"], listed["index"]) == ("many", str(runs / "many"), None)
+    client.do("study", name="many", index=120)
+    with Client(server) as other:
+        other.wait(lambda: other.newest.get("study", {}).get("index") == 120)
+
+
+@pytest.mark.usefixtures("study")
+def test_a_row_of_a_study_is_opened(runs, client):
+    client.do("open", name="many", row=17, second=True)
+    client.wait(lambda: "insertion second" in client.newest)
+    assert json.loads(client.newest["insertion second"]["summary"]) == [str(runs / "many"), 17]
+    client.job("row", "done")
+
+
+@pytest.mark.usefixtures("study")
+@pytest.mark.parametrize("name", [name for name in NO_RUNS if name])
+def test_what_is_no_study_has_no_rows(client, name):
+    reason = f"{name!r}: no study of this name in the folder of runs"
+    assert client.refused("study", name=name) == reason
+    assert client.refused("open", name=name, row=3) == reason
+
+
+@pytest.mark.usefixtures("study")
+@pytest.mark.parametrize("index", [-1, 1_000_000, 1.5, "3", True])
+@pytest.mark.parametrize(("request_", "key"), [("study", "index"), ("open", "row")])
+def test_what_is_no_index_is_refused(client, request_, key, index):
+    client.send(request_, name="many", **{key: index})
+    refused = client.wait(lambda: client.newest.get("refused"))
+    assert refused["what"] == "message"
+    assert key in refused["reason"]
+
+
 def test_the_last_insertion_is_saved(runs, client):
     client.do("insert")
     client.wait(lambda: "insertion live" in client.newest)
@@ -166,7 +251,7 @@ def test_the_last_insertion_is_saved(runs, client):
     client.do("save", name="mine")
     client.job("save", "done")
     assert (runs / "mine" / "run.json").exists()
-    client.wait(lambda: any(run["name"] == "mine" for run in client.newest["runs"]["runs"]))
+    client.wait(lambda: "mine" in client.listed())
     assert client.refused("save", name="mine").startswith("mine: there is already something of this name")
 
 

@@ -262,7 +262,7 @@ def assert_trace_of_a_simulated_run(done, folder, without):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("dry", [False, True])
+@pytest.mark.parametrize("dry", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     scenario = PHANTOM.with_values({"target.depth_mm": 12.0, "target.lateral_mm": 1.0})
     plan = flexneedle.plan(scenario, seed=0)

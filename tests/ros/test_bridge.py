@@ -55,7 +55,7 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     assert events(insertion) == ["stop: ROS topic /flexneedle/stop"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_needle_of_the_emulated_rig_rests_after_a_stop(tmp_path):
     path, record = rig_file(tmp_path), tmp_path / "truth.csv"
     with emulated_rig(path, quick_scenario(tmp_path), "--seed", 3, "--truth", record) as rig:
@@ -108,7 +108,9 @@ def test_a_rig_is_armed_on_its_topic_and_stopped_when_it_is_disarmed(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("how", ["stop", "Ctrl-C", "loss of the node"])
+@pytest.mark.parametrize(
+    "how", ["stop", *(pytest.param(how, marks=pytest.mark.slow) for how in ("Ctrl-C", "loss of the node"))]
+)
 def test_what_ends_the_wait_for_an_arm_leaves_the_motors_off(tmp_path, how):
     with started(tmp_path, NEUTRAL, ros={"arm": True}) as insertion:
         peer = insertion.peer()
@@ -133,7 +135,7 @@ def test_what_ends_the_wait_for_an_arm_leaves_the_motors_off(tmp_path, how):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("arm", [False, True])
+@pytest.mark.parametrize("arm", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_node_that_is_killed_stops_a_rig_that_it_has_armed_and_no_other(tmp_path, arm):
     with started(tmp_path, NEUTRAL, "--yes", ros={"arm": arm}) as insertion:
         peer = insertion.peer(("state", "tip"), ("arm", "stop"))

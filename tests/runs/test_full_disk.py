@@ -71,7 +71,7 @@ def motors(monkeypatch):
         calls.append("apply")
         return apply(phantom, *given)
 
-    monkeypatch.setattr(kernels, "compile_kernels", lambda: None)  # moves a phantom of its own
+    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes: None)  # moves a phantom of its own
     monkeypatch.setattr(Phantom, "apply", applied)
     monkeypatch.setattr(Phantom, "stop", lambda _phantom: calls.append("stop"))
     return calls

@@ -16,7 +16,7 @@ from flexneedle.trace.columns import to_row
 from flexneedle.trace.reader import read_trace
 from flexneedle.types import Outcome
 
-TIMINGS = 6
+TIMINGS = 4
 LONGEST_S = 60.0
 QUICK = {
     "target.depth_mm": 3.0, "target.lateral_mm": 0.0, "plan.samples": 16, "plan.iterations": 2,

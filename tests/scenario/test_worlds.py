@@ -193,6 +193,7 @@ def rigs(number):
     return ("no-guide", "no-guide-half-turns")
 
 
+@pytest.mark.slow
 @given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
 @many_worlds
 def test_a_world_in_space_differs_in_driver_and_direction_of_its_target(number, case):

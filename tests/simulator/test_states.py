@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.errors import CommandError, InputError, StateError
+from flexneedle.mechanics import insertion
 from reference.cases import insert_to, numbers, repeat, with_number
 
 PHANTOM = load_scenario("phantom")
@@ -37,10 +38,12 @@ def same_future(one, other):
 )
 def test_copies_are_equal_and_go_on_the_same(state, duplicate):
     """Copied, deeply copied, pickled."""
+    kernels = len(insertion._rollout.signatures)
     twin = duplicate(state)
     assert twin == state
     assert hash(twin) == hash(state)
     assert same_future(twin, state)
+    assert len(insertion._rollout.signatures) == kernels  # none was compiled for the copy
 
 
 def test_states_compare_by_value(state):

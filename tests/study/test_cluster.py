@@ -46,7 +46,7 @@ def worker(address):
     return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp_path):
     counts = []
     with scheduler() as address, worker(address) as first, worker(address) as second:

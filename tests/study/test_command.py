@@ -60,7 +60,7 @@ def test_a_study_without_a_finished_insertion_prints_the_first_failure(capsys, q
     assert (status, err.splitlines()[-1]) == (1, line)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_with_a_finished_insertion_prints_no_failure(capsys, quick, tmp_path, monkeypatch):
     insert = rows.insert
@@ -123,7 +123,7 @@ def test_a_study_with_all_plans_shows_planning_as_complete(monkeypatch):
     assert progress_of(monkeypatch, [(0, 0, 1050, 0.0)])[0] == [("Planning", 1, 1, "0 of 0 plans")]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_cluster_without_workers_is_reported(capsys, quick, tmp_path, monkeypatch):
     def cluster(_address, on_no_workers):

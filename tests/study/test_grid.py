@@ -358,7 +358,7 @@ def test_an_unknown_study_is_rejected_with_the_valid_names():
         load_study("nope")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_shipped_studies_load():
     """Loading checks every scenario of the grid against all rules, including targets within the stroke."""
     sizes = {name: len(load_study(name)) for name in STUDIES.names()}

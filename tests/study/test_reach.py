@@ -84,7 +84,7 @@ def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
     assert reach(scenario, seed, "model") >= missing[seed]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_with_a_guide_the_reach_is_the_miss_of_a_long_search():
     """At most what ends the search with the full travel of the guide, larger with a limited one."""
     assert reach(GUIDED, 0, "model") < 0.05
@@ -105,7 +105,7 @@ def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
     assert math.isnan(reach(FREE, 0, "model"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_guide_that_steering_does_not_move_does_not_improve_the_reach():
     """A target within reach of guide and bevel but not of the bevel alone."""
     low, high = sorted(end(GUIDED, roll)[1] for roll in (math.pi, 0.0))

@@ -101,7 +101,7 @@ def test_one_plan_is_made_for_each_target_and_used_by_all_cases_and_plants(unint
     assert len(made) == 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_worker_writes_the_same_bytes_as_two(quick, uninterrupted, tmp_path):
     assert tables(run_study(quick, tmp_path / "one", workers=1)) == tables(uninterrupted)
 
@@ -144,6 +144,7 @@ def test_ctrl_c_keeps_the_finished_rows_and_prints_how_to_resume(quick, uninterr
 UNGUARDED = "from flexneedle import run_study\nrun_study({!r}, workers=1)\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kept",
     [(), *(pytest.param(kept, marks=pytest.mark.long) for kept in (("runs",), ("runs", "runs/other")))],
@@ -182,7 +183,7 @@ def test_a_plan_is_kept_when_a_study_fails_before_its_first_row(quick, tmp_path,
     assert runs(tmp_path / "study") == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_finished_study_is_not_repeated(quick, tmp_path, monkeypatch):
     out = run_study(quick, tmp_path / "again")
@@ -212,7 +213,7 @@ def test_a_resumed_study_does_not_repeat_its_plans(quick, tmp_path, monkeypatch)
     assert sorted(point.scenario.target.depth_mm for point in made) == [8.0, 10.0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_reports_its_progress(quick, tmp_path):
     reports = []
@@ -277,7 +278,7 @@ class Dying(Executor):
         return future
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, tmp_path, monkeypatch):
     @contextmanager
     def dying(_workers):
@@ -368,7 +369,7 @@ def test_a_folder_name_that_is_too_long_is_rejected(quick, tmp_path):
         run_study(quick, tmp_path / ("a" * 300))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_killed_before_its_start_is_started_by_resume(quick, uninterrupted, tmp_path):
     (tmp_path / "journal.jsonl").touch()

@@ -126,7 +126,7 @@ def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message
     assert message in str(caught.value)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_shipped_study_has_two_hundred_worlds_not_used_for_tuning():
     study = load_study("worlds")
     numbers = {point.world for point in study.points}
@@ -170,7 +170,7 @@ def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkey
         raise ZeroDivisionError("nowhere")
 
     monkeypatch.setattr(rows, "reach", reach)
-    monkeypatch.setattr(rows, "_insertion", lambda *_args: done)
+    monkeypatch.setattr(rows, "insertion_at", lambda *_args, **_options: done)
     monkeypatch.setattr(rows, "_times", lambda _insertion: {})
     (row,) = run_job(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
     assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
@@ -255,6 +255,7 @@ def test_a_rig_needs_an_axis_of_worlds(load):
         load(IN_SPACE.replace('"all"', '["three"]'))
 
 
+@pytest.mark.slow
 def test_the_shipped_worlds_in_space_have_every_rig_in_both_cases():
     study = load_study("worlds-space")
     guided = sum(world(number).setup.has_guide for number in range(100000, 100200))

@@ -130,9 +130,9 @@ def _insert(args: argparse.Namespace) -> int:
         return _list()
     choices = _choices(args)
     signals = _Signals()
-    if choices.rig is not None:
-        signals.handle()
     with ExitStack() as stack:
+        if choices.rig is not None:
+            signals.handle(stack)
         with _refusal_printed(args, choices):
             scenario = _scenario(args, choices)
         with _refusal_printed(args, choices, scenario):
@@ -142,7 +142,7 @@ def _insert(args: argparse.Namespace) -> int:
                 scenario = with_target(scenario, bridge.await_target())
             if _asks(args, choices):
                 require_terminal()  # before the time of planning is spent
-            compile_first()
+            compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
@@ -297,10 +297,10 @@ class _Signals:
     def __init__(self) -> None:
         self.supervisor: Supervisor | None = None
 
-    def handle(self) -> None:
-        """Take the signals of this process from now on."""
+    def handle(self, stack: ExitStack) -> None:
+        """Take the signals of this process until the stack closes."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._received)
+            stack.callback(signal.signal, number, signal.signal(number, self._received))
 
     def _received(self, number: int, frame: FrameType | None) -> None:
         if self.supervisor is not None:

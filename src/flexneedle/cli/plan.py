@@ -48,7 +48,7 @@ def _plan(args: argparse.Namespace) -> int:
     from flexneedle.trace.folder import Folder
 
     scenario = chosen_scenario(args)
-    compile_first()
+    compile_first(scenario.setup.axes)
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with problems_printed(folder), Progress() as progress:

@@ -76,7 +76,7 @@ def _study(args: argparse.Namespace) -> int:
         check_address(args.scheduler)
     study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
     folder = args.out or new_folder("study", study.name)
-    compile_first()
+    compile_first(*study.axes)
     begun = time.monotonic()
     try:
         with Progress() as progress:

@@ -126,15 +126,16 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def compile_first() -> None:
-    """Compile the kernels, with a progress line if they are not in the cache."""
+def compile_first(*axes: int) -> None:
+    """Compile the kernels for values of `setup.axes`, with a progress line if they are not in the cache."""
     from flexneedle.console.progress import Progress
     from flexneedle.rig.kernels import all_compiled, compile_kernels
 
     with Progress() as progress:
-        if not all_compiled():
+        if not all(map(all_compiled, axes)):
             progress.begin("Compiling kernels (first run only)")
-        compile_kernels()
+        for each in axes:
+            compile_kernels(each)
 
 
 def run_name(args: argparse.Namespace) -> str:

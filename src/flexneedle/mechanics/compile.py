@@ -38,11 +38,6 @@ def _columns() -> list[tuple[str, int]]:
     return [(name, value) for name, value in vars(types).items() if type(value) is int]
 
 
-def compiled(home: Path = HERE) -> bool:
-    """Whether kernels of the sources in the folder `home` are in the cache, so that a start needs no compilation."""
-    return any(Path(cache_folder(home)).rglob("*.nbi"))
-
-
 def inner(function: _Function) -> _Function:
     """Compile a function that only other kernels call, and that makes no array.
 

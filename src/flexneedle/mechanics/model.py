@@ -162,7 +162,8 @@ def adapted(model: Model, adaptation: Adaptation) -> Model:
         bevel_offset=model.bevel_offset * adaptation.bevel,
         nodes=changed,
         layers=layers,
-        curvature=2.0 * adaptation.bend / model.length**2,
+        # Of one type with and without an adaptation, so that kernels are compiled once.
+        curvature=type(model.curvature)(2.0 * adaptation.bend / model.length**2),
         # Below the tolerance of the solve the side that the needle bears on would be rounding.
         clearance=adaptation.clearance if adaptation.clearance > model.slide else 0.0,
     )

@@ -12,8 +12,22 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
 Seed = Annotated[int, Field(ge=0, le=2**53)]
+Index = Annotated[int, Field(ge=0, lt=1_000_000)]
 Value = float | int | bool | str | list[Any] | dict[str, Any] | None
 Strategy = Literal["manipulation", "steering"]
+JobKind = Literal[
+    "scene",
+    "estimate",
+    "plan",
+    "compare",
+    "reach",
+    "insertion",
+    "check",
+    "recording",
+    "study",
+    "row",
+    "save",
+]
 Vector = tuple[float, float, float]
 
 
@@ -160,11 +174,23 @@ class Disturb(Request):
 
 
 class Open(Request):
-    """Show a recorded run of the folder of runs, as the first or the second of two; name None closes it."""
+    """Show a recorded run of the folder of runs, as the first or the second of two; name None closes it.
+
+    row: of the study with this name, which is computed again.
+    """
 
     type: Literal["open"]
     name: Annotated[str, Field(min_length=1, max_length=200)] | None
     second: bool = False
+    row: Index | None = None
+
+
+class Study(Request):
+    """List rows of a study of the folder of runs: from an index on, or the worst first where it is None."""
+
+    type: Literal["study"]
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    index: Index | None = None
 
 
 class Save(Request):
@@ -201,6 +227,7 @@ AnyRequest = Annotated[
     | Stop
     | Disturb
     | Open
+    | Study
     | Save
     | RowsFrom,
     Field(discriminator="type"),
@@ -284,7 +311,7 @@ class Job(News):
 
     type: Literal["job"] = "job"
     job: int
-    kind: Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "check", "recording", "save"]
+    kind: JobKind
     state: Literal["waiting", "running", "done", "failed", "cancelled"]
     share: float | None = None
     text: str = ""
@@ -495,8 +522,39 @@ class RigCheck(News):
     findings: list[dict[str, str]]
 
 
+class StudyRow(Message):
+    """A finished row of a study. settings: of its case and its axes, but controller and target.
+
+    error_mm: of the true tip at the end, None if it is not known; opens: whether it has an insertion to show.
+    """
+
+    index: int
+    settings: str
+    controller: str
+    target: Vector
+    error_mm: float | None
+    outcome: str
+    reason: str
+    opens: bool
+
+
+class StudyRows(News):
+    """Rows of a study of the folder, at most 200: from `index` on, or the worst first where that is None.
+
+    insertions: number of rows of the study; finished: how many of them there are.
+    """
+
+    type: Literal["study"] = "study"
+    name: str
+    title: str
+    insertions: int
+    finished: int
+    index: int | None
+    rows: list[StudyRow]
+
+
 class Runs(News):
-    """Recorded runs of the folder, newest first: name, kind, summary, when it was made (s since 1970)."""
+    """Recorded runs and studies of the folder, newest first: name, kind, summary, when made (s since 1970)."""
 
     type: Literal["runs"] = "runs"
     runs: list[dict[str, Any]]

@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from flexneedle.page.messages import Disturb, Message, News, Strategy
+from flexneedle.page.messages import Disturb, JobKind, Message, News, Strategy
 
-Do = Literal["scene", "estimate", "plan", "reach", "insert", "check", "read", "save"]
-Kind = Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "check", "recording", "save"]
+Do = Literal["scene", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save"]
+Kind = JobKind
 
 
 BEAT_S = 0.25
@@ -32,8 +32,9 @@ class Work(Message):
 
     scenario: nested tables of the scenario called `name`, with the revision that the results repeat. An insertion makes
     its own plan, with this seed. rig: rig file, "" for a virtual one; paused: whether the insertion waits for its pace.
-    folder: of the run to read as the first or second recording, or to save the last insertion in; that in which an
-    insertion on a rig makes one for its record.
+    folder: of the run to read as the first or second recording, of a study, or to save the last insertion in; that in
+    which an insertion on a rig makes one for its record. row: of the study, to compute again; or the first of those to
+    list, None for the worst.
     """
 
     job: int
@@ -49,6 +50,7 @@ class Work(Message):
     rig: str = ""
     folder: str = ""
     of: Literal["first", "second"] = "first"
+    row: int | None = None
 
 
 class Signal(Message):

@@ -326,4 +326,5 @@ def _build_model(scenario: Scenario) -> model.Model:
         law.tables(laws),
         part=model.SKIN_PART * spacing,
         zone=model.SKIN_ZONE * spacing,
+        curvature=0.0 if scenario.setup.axes == 1 else 0j,
     )

@@ -79,6 +79,12 @@ class State:
     spring_energy: float
     roll: float
 
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Take the values of a copy or a pickle; for arrays that can be written to, kernels would be compiled again."""
+        self.__dict__.update(
+            {name: _frozen(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+        )
+
     @property
     def tip(self) -> Floats:
         """Tip pose x, y, z, θ, ψ, shape (5,)."""

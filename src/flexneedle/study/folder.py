@@ -6,21 +6,60 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, one_line
 from flexneedle.files import RUNS, new_folder, replace_file
 from flexneedle.scenario.dotted import flatten
-from flexneedle.scenario.problems import printable
-from flexneedle.study.grid import Study
-from flexneedle.study.journal import Journal
+from flexneedle.scenario.problems import printable, unexpected
+from flexneedle.study.grid import Study, StudyInsertion, recorded_study
+from flexneedle.study.journal import Journal, read_rows
 from flexneedle.trace.folder import STUDY_FILE, versions
 from flexneedle.trace.plain import to_text
 
 JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
 _SOURCE = "versions.source"
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A study in its folder, finished or not. versions: those it was made with; own: digests of its own modules;
+    rows: those that are finished, by index.
+    """
+
+    folder: Path
+    study: Study
+    versions: Mapping[str, str]
+    own: Mapping[str, str]
+    rows: Mapping[int, Mapping[str, Any]]
+
+    def insertion(self, index: int) -> StudyInsertion:
+        """Return the insertion of a row. Raises InputError if this version does not accept its settings."""
+        try:
+            return self.study.insertion(index)
+        except InputError as error:
+            raise InputError(f"{self.folder}: row {index}: {one_line(error)}") from None
+
+
+def read_folder(path: Path) -> Recorded:
+    """Return the study in a folder, also while it runs.
+
+    Raises InputError if there is none, if it is damaged, or if a module of its own is missing.
+    """
+    stored = _stored(path)
+    if stored["format"] != _FORMAT:
+        raise InputError(f"{path}: not a study of this version of flexneedle: format must be {_FORMAT}")
+    try:
+        study = recorded_study(stored["study"])
+        made_by = dict(stored["versions"]), dict(stored["study"]["own"])
+    except InputError as error:
+        raise InputError(f"{path}: {one_line(error)}") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path / STUDY_FILE}: damaged: {unexpected(error)}") from None
+    return Recorded(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
 
 
 @contextmanager
@@ -94,14 +133,20 @@ def _check(path: Path, study: Study, resume: bool) -> None:
 
 def _check_same(path: Path, study: Study) -> None:
     """Raise InputError, with the first difference, unless the folder contains this study with these versions."""
-    try:
-        values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
-        stored = {name: values[name] for name in ("format", "versions", "study")}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path / STUDY_FILE}: cannot be read: {error}") from None
-    key = _first_difference(stored, _identity(study))
+    key = _first_difference(_stored(path), _identity(study))
     if key is not None:
         raise InputError(f"{path}: cannot resume: {key}")
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """What `_identity` has returned for the study in a folder."""
+    try:
+        values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
+        return {name: values[name] for name in ("format", "versions", "study")}
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: contains no study: {STUDY_FILE} is missing") from None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path / STUDY_FILE}: cannot be read: {error}") from None
 
 
 def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:

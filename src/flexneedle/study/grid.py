@@ -3,9 +3,9 @@
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,14 @@ from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.own import is_own
 from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.sections.settings import Target
 from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
 from flexneedle.study.spec import (
     ALL,
     LARGEST_SEED,
     SEED,
     TARGET,
+    TARGET_KEYS,
     WORLD,
     WORLD_CASE,
     WORLD_RIG,
@@ -44,7 +46,6 @@ from flexneedle.study.spec import (
     settings_of,
 )
 from flexneedle.trace.plain import plain
-from flexneedle.types import Point
 
 _DEFAULTS = {
     "controller": DEFAULT,
@@ -61,6 +62,7 @@ _CHOICES = {
     WORLD_CASE: CASES,
     WORLD_RIG: RIGS,
 }
+_DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
 _OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
 _MAX_INSERTIONS = 1_000_000
 _KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
@@ -106,10 +108,15 @@ class Study:
     """An expanded study. definition: all its settings as plain values; seeds: values of an axis of seeds, else ()."""
 
     definition: Mapping[str, Any]
-    points: tuple[GridPoint, ...]
+    grid: "Grid"
     repeats: int
     first_seed: int
     seeds: tuple[int, ...]
+
+    @cached_property
+    def points(self) -> tuple[GridPoint, ...]:
+        """All points in their order. Raises InputError for one that is not valid."""
+        return tuple(map(self.grid.point, range(len(self.grid))))
 
     @property
     def name(self) -> str:
@@ -121,8 +128,13 @@ class Study:
         """Title of tables and reports."""
         return str(self.definition["title"])
 
+    @property
+    def axes(self) -> list[int]:
+        """Values of `setup.axes` in the study."""
+        return sorted({point.scenario.setup.axes for point in self.points})
+
     def __len__(self) -> int:
-        return len(self.points) * self.repeats
+        return len(self.grid) * self.repeats
 
     def insertion(self, index: int) -> StudyInsertion:
         """Return the insertion of a row.
@@ -131,7 +143,7 @@ class Study:
         other settings of the study: comparisons are paired.
         """
         number, repeat = divmod(index, self.repeats)
-        point = self.points[number]
+        point = self.grid.point(number)
         own = self.first_seed + point.target_number * self.repeats + repeat
         return StudyInsertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
 
@@ -151,41 +163,64 @@ def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None
         raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
 
 
+def recorded_study(definition: Mapping[str, Any]) -> Study:
+    """Return the study of a recorded `definition`; a point is made when it is needed, which may be one of thousands.
+
+    Raises InputError if this version makes another number of insertions of it, or for one of its parts that is missing;
+    KeyError, TypeError, ValueError or AttributeError for values that are no definition.
+    """
+    study = _study(definition, Scenario.from_record(definition["scenario"]))
+    if len(study) != definition["insertions"]:
+        rule = f"this version of flexneedle makes {len(study)} of it: its rows cannot be assigned"
+        raise InputError(to_line(Problem("insertions", definition["insertions"], rule)))
+    return study
+
+
 def _expanded(file: StudyFile, base: Scenario) -> Study:
     axes = {axis.key: _axis_values(axis) for axis in file.axes}
     seeds = tuple(axes.pop(SEED, ()))
     repeats = len(seeds) or file.repeats
     targets = {case.name: case.targets for case in file.cases if case.targets is not None}
-    reaching = [case.name for case in file.cases if case.reach]
     of_cases = sum(len(targets.get(case.name, [None])) for case in file.cases) or 1
     total = math.prod((of_cases, repeats, *map(len, axes.values())))
     if total > _MAX_INSERTIONS:
         raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
-    fixed = _DEFAULTS | settings_of(file.values)
-    cases = {case.name: settings_of(case.values) for case in file.cases}
-    names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
-    own = own_controllers(names["controller"])
-    base = checked(base, *own)
-    _check_without(file.without, base)
-    grid = _Grid(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, targets, reaching, axes, own)
-    points = tuple(_points(grid))
-    definition = {
+    settings = {
         "name": file.name,
         "title": file.title,
         "scenario": base.values(),
         "without": list(file.without),
-        "values": fixed,
-        "cases": cases,
+        "values": _DEFAULTS | settings_of(file.values),
+        "cases": {case.name: settings_of(case.values) for case in file.cases},
         "targets": targets,
-        "reach": reaching,
+        "reach": [case.name for case in file.cases if case.reach],
         "axes": axes,
         "repeats": repeats,
         "first_seed": file.first_seed,
-        "seeds": list(seeds),
-        "insertions": len(points) * repeats,
+        "seeds": seeds,
+    }
+    study = _study(settings, base)
+    _ = study.points  # which are checked before anything runs
+    return study
+
+
+def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
+    """The study of a definition, which may lack what follows from the rest of it. base: its scenario."""
+    fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
+    names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
+    own = own_controllers(names["controller"])
+    base = checked(base, *own)
+    _check_without(settings["without"], base)
+    left_out, targets, reaching = (settings[key] for key in ("without", "targets", "reach"))
+    parts = _Parts(base, dict.fromkeys(left_out), fixed, cases or {"": {}}, targets, reaching, axes, own)
+    grid, repeats = Grid(parts), settings["repeats"]
+    definition = {
+        **settings,
+        "scenario": base.values(),
+        "insertions": len(grid) * repeats,
         "own": digests(name for of_key in names.values() for name in of_key),
     }
-    return Study(plain(definition), points, repeats, file.first_seed, seeds)
+    return Study(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 
 
 def _values_of(
@@ -207,14 +242,14 @@ def _axis_values(axis: Axis) -> list[Any]:
     return list(axis.values)
 
 
-def _check_without(keys: tuple[str, ...], base: Scenario) -> None:
+def _check_without(keys: Sequence[str], base: Scenario) -> None:
     for key in keys:
         if key not in base.flat():
             raise InputError(f"without = {json.dumps(key)}: not a key of the scenario")
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _Parts:
     """The parts of a grid: targets: those of a case by its name; reaching: cases with a reach."""
 
     base: Scenario
@@ -235,34 +270,80 @@ class _Grid:
                 yield case, dict(zip(axes, values, strict=True))
 
 
-def _points(grid: _Grid) -> Iterator[GridPoint]:
-    """Yield the points; later settings override earlier ones."""
-    targets: dict[Point, int] = {}
-    worlds = cache(world)  # the same worlds for every controller
-    for case, chosen in grid.choices():
-        settings = {**grid.fixed, **grid.cases[case], **settings_of(chosen)}
-        named = {"case": case, **chosen} if case else chosen
-        at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+@dataclass(frozen=True)
+class _Choice:
+    """Settings of a point, of which its scenario has not been made. chosen: values of the axes; kind: of a world."""
+
+    case: str
+    chosen: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    run: Mapping[str, Any]
+    world: int | None
+    kind: Mapping[str, str]
+    target_number: int
+
+
+class Grid:
+    """The points of a study by number. Each is made when it is first asked for, and is the same from then on."""
+
+    def __init__(self, parts: _Parts) -> None:
+        self._parts, self._worlds = parts, cache(world)  # the same worlds for every controller
+        self._choices = tuple(_choices(parts, self._worlds))
+        self._made = dict[int, GridPoint]()
+
+    def __len__(self) -> int:
+        return len(self._choices)
+
+    def point(self, number: int) -> GridPoint:
+        """Return a point. Raises InputError if its settings are not valid."""
+        if number not in self._made:
+            self._made[number] = _point(self._parts, self._choices[number], self._worlds)
+        return self._made[number]
+
+
+def _choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choice]:
+    """Yield the settings of the points; later settings override earlier ones."""
+    numbers: dict[Any, int] = {}
+    start = _DEFAULT_TARGET | {
+        key: value
+        for key, value in parts.base.flat().items()
+        if key in TARGET_KEYS and key not in parts.left_out
+    }
+    for case, chosen in parts.choices():
+        settings = {**parts.fixed, **parts.cases[case], **settings_of(chosen)}
         run = {key: settings.pop(key) for key in _DEFAULTS}
         number = settings.pop(WORLD, None)
         kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}
         _check_run(run | kind)
         if number is not None and _is_skipped(worlds(number), run["controller"], *kind.values()):
             continue
-        start = grid.base if number is None else worlds(number, *kind.values())
-        scenario = _varied(start, {**grid.left_out, **settings}, grid.own, at)
-        _check_guide(run, scenario, at)
-        if number is None:
-            number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
-        else:
-            of_world = {WORLD: number, **kind}
-        varied = {
-            key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")
-        }
-        with_reach = bool(of_world) or case in grid.reaching
-        yield GridPoint(
-            scenario, case, **run, target_number=number, varied=varied, **of_world, with_reach=with_reach
-        )
+        own = numbers.setdefault(_place(start | settings), len(numbers)) if number is None else number
+        yield _Choice(case, chosen, settings, run, number, kind, own)
+
+
+def _place(settings: Mapping[str, Any]) -> tuple[float | str, ...]:
+    """The target by which its number is found; one that is not valid is refused with its scenario."""
+    values = (settings[key] for key in TARGET_KEYS)
+    return tuple(value if isinstance(value, int | float) else repr(value) for value in values)
+
+
+def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> GridPoint:
+    case, chosen, kind = choice.case, choice.chosen, choice.kind
+    named = {"case": case, **chosen} if case else chosen
+    at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+    start = parts.base if choice.world is None else worlds(choice.world, *kind.values())
+    scenario = _varied(start, {**parts.left_out, **choice.settings}, parts.own, at)
+    _check_guide(choice.run, scenario, at)
+    of_world: dict[str, Any] = {} if choice.world is None else {WORLD: choice.world, **kind}
+    return GridPoint(
+        scenario,
+        case,
+        **choice.run,
+        target_number=choice.target_number,
+        varied={key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")},
+        **of_world,
+        with_reach=bool(of_world) or case in parts.reaching,
+    )
 
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:

@@ -4,7 +4,7 @@ import fcntl
 import json
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,6 +16,8 @@ from flexneedle.study.rows import TIMES
 from flexneedle.trace.results import RESULT_COLUMNS
 
 _KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
+_READ = ("true_error_mm", "outcome", "reason")
+"""Columns that whoever reads rows needs; those of another version may lack others."""
 _LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # in a column
 
 
@@ -64,14 +66,37 @@ class Journal:
     def _read(self) -> None:
         self._file.seek(0)
         data = self._file.read()
-        whole = data.rfind(b"\n") + 1
-        for number, line in enumerate(data[:whole].splitlines(), 1):
-            row = _parsed(line)
-            fault = _fault(row, self._size)
-            if fault is not None:
-                raise InputError(f"{self._path}: damaged at line {number}: {fault}")
-            self.rows[row["index"]] = row
-        self._file.truncate(whole)
+        self.rows = _rows_of(data, self._path, self._size, tuple(RESULT_COLUMNS))
+        self._file.truncate(_whole(data))
+
+
+def read_rows(path: Path, size: int) -> dict[int, dict[str, Any]]:
+    """Return the rows of a journal by index, also while a study writes to it. size: number of rows of the study.
+
+    Raises InputError if it cannot be read or is damaged.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    return _rows_of(data, path, size, _READ)
+
+
+def _rows_of(data: bytes, path: Path, size: int, needed: Sequence[str]) -> dict[int, dict[str, Any]]:
+    """The rows of the complete lines of a journal."""
+    rows = {}
+    for number, line in enumerate(data[: _whole(data)].splitlines(), 1):
+        row = _parsed(line)
+        fault = _fault(row, size, needed)
+        if fault is not None:
+            raise InputError(f"{path}: damaged at line {number}: {fault}")
+        rows[row["index"]] = row
+    return rows
+
+
+def _whole(data: bytes) -> int:
+    """Length of the complete lines."""
+    return data.rfind(b"\n") + 1
 
 
 def _parsed(line: bytes) -> Any:
@@ -81,17 +106,18 @@ def _parsed(line: bytes) -> Any:
         return None
 
 
-def _fault(row: Any, size: int) -> str | None:
-    """Return why a value is not a row of a study of this size, or None for a valid row."""
+def _fault(row: Any, size: int, needed: Sequence[str]) -> str | None:
+    """Return why a value is not a row with the needed columns of a study of this size, or None for a valid row."""
     if not isinstance(row, dict):
         return "not a row in JSON"
     index = row.get("index")
     if not (isinstance(index, int) and _fits(index, int) and 0 <= index < size):
         return to_line(Problem("index", index, f"must be a whole number from 0 to {size - 1}"))
-    missing = next((name for name in RESULT_COLUMNS if name not in row), None)
+    missing = next((name for name in needed if name not in row), None)
     if missing is not None:
         return f"{missing}: missing"
-    wrong = next((name for name, kind in _KINDS.items() if not _fits(row.get(name), kind)), None)
+    known = ((name, kind) for name, kind in _KINDS.items() if name in row)
+    wrong = next((name for name, kind in known if not _fits(row[name], kind)), None)
     return None if wrong is None else to_line(Problem(wrong, row[wrong], "wrong type, or too large"))
 
 

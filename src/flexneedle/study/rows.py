@@ -1,13 +1,10 @@
 """Jobs of a worker: plan, or run insertions and return a row for each. A failure is a row, too."""
 
-import fcntl
-import os
-import tempfile
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import RunError, ScenarioWarning
@@ -19,7 +16,7 @@ from flexneedle.study.reach import reach
 from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import plain, plan_values
 from flexneedle.trace.results import RESULT_COLUMNS, insertion_row, plan_row
-from flexneedle.types import Insertion, Plan
+from flexneedle.types import Insertion, Period, Plan
 
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""
@@ -58,7 +55,7 @@ class JobResult:
 
 def make_plan(point: GridPoint) -> PlanResult:
     """Plan for a point, on one thread."""
-    _compile_once()
+    _compile_once(point.scenario.setup.axes)
     try:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
     except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
@@ -68,7 +65,7 @@ def make_plan(point: GridPoint) -> PlanResult:
 
 def run_job(job: Job) -> JobResult:
     """Run the insertions of a job, on one thread."""
-    _compile_once()
+    _compile_once(job.point.scenario.setup.axes)
     return JobResult([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
 
 
@@ -80,7 +77,7 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
     if job.plan is not None:
         results |= plan_row(job.plan)
         try:
-            insertion = _insertion(job, job.plan, seed)
+            insertion = insertion_at(job.point, job.plan, seed, threads=1)
         except RunError as error:
             results |= {"outcome": "refused", "reason": str(error)}
         except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
@@ -104,8 +101,15 @@ def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
         return None, f"no reach: {_error_text(error)}"
 
 
-def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
-    point = job.point
+def insertion_at(
+    point: GridPoint,
+    made: Plan,
+    seed: int,
+    *,
+    threads: int | None = None,
+    on_period: Callable[[Period], None] | None = None,
+) -> Insertion:
+    """Return an insertion of a point, as `flexneedle.insert` does; threads and on_period are as there."""
     with warnings.catch_warnings():
         # The study has checked all tables; a table of another of its controllers is not unused.
         warnings.simplefilter("ignore", ScenarioWarning)
@@ -116,7 +120,8 @@ def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
             controller=point.controller,
             phantom=point.plant,
             tracker=point.tracker,
-            threads=1,
+            threads=threads,
+            on_period=on_period,
         )
 
 
@@ -133,9 +138,7 @@ def _error_text(error: Exception) -> str:
 
 
 @cache
-def _compile_once() -> None:
-    """Compile the kernels once per process; locked, since parallel compilation could corrupt the cache."""
+def _compile_once(axes: int) -> None:
+    """Compile the kernels once per process."""
     versions()  # digest of the source, read now while the files are still those that were imported
-    with (Path(tempfile.gettempdir()) / f"flexneedle-{os.getuid()}.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        compile_kernels()
+    compile_kernels(axes)

@@ -79,7 +79,8 @@ def run_study(
         engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
         try:
             if len(journal.rows) < len(study):
-                compile_kernels()  # before the workers: compiling in many at once is slow and has crashed
+                for axes in study.axes:
+                    compile_kernels(axes)  # before the workers, which would wait for each other
                 engine.run(pool, chunk)
         finally:
             if is_new and not journal.rows and not (folder / PLANS_FOLDER).exists():

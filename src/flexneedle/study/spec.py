@@ -23,7 +23,7 @@ SEED, ALL = "seed", "all"
 WORLD, WORLD_CASE, WORLD_RIG = "world", "world_case", "world_rig"
 NAMED = ("controller", "plant", "strategy", WORLD_CASE, WORLD_RIG)
 TARGET = "target"
-_TARGET_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
+TARGET_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 STUDIES = Library("a study file", "study", files(__package__) / "studies")
 _MAX_VALUES = 100_000
 LARGEST_SEED = 2**62
@@ -144,13 +144,13 @@ def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     flat = {current_key(key): value for key, value in flatten(values).items()}
     if TARGET in flat:
         x, y, z = (*flat.pop(TARGET), 0.0)[:3]
-        flat |= dict(zip(_TARGET_KEYS, (x, y, z), strict=True))
+        flat |= dict(zip(TARGET_KEYS, (x, y, z), strict=True))
     return flat
 
 
 def _keys_of(key: str) -> tuple[str, ...]:
     """Return the scenario keys of an axis."""
-    return _TARGET_KEYS if key == TARGET else (key,)
+    return TARGET_KEYS if key == TARGET else (key,)
 
 
 def _value_problems(key: str, values: Any, name: str = "values") -> Iterator[Problem]:
@@ -200,7 +200,7 @@ def _target_problems(key: str, value: Any) -> Iterator[Problem]:
 def _target_twice(values: Mapping[str, Any]) -> Iterator[Problem]:
     """Targets of a case that its values set, too."""
     for key in settings_of(values):
-        if key in _TARGET_KEYS:
+        if key in TARGET_KEYS:
             yield Problem(f"values.{key}", None, "also set by targets")
 
 
@@ -231,7 +231,7 @@ def _key_problems(study: StudyFile) -> Iterator[Problem]:
         for key in settings_of(case.values):
             if key in axes:
                 yield Problem(f"cases.{number}.values", key, "also set by an axis")
-        if case.targets is not None and axes.keys() & {*_TARGET_KEYS, WORLD}:
+        if case.targets is not None and axes.keys() & {*TARGET_KEYS, WORLD}:
             yield Problem(f"cases.{number}.targets", None, "also set by an axis")
 
 

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -20,30 +21,30 @@ def test_state_is_shown_without_a_click(visit):
     page = visit()
     page.wait_for_selector("text=Connected")
     assert "Two-layer tissue phantom in space · seed 0" in page.inner_text("#title")
-    assert "1 person here, nobody steers" in page.inner_text(STATUS)
+    assert "1 person connected, nobody is in control" in page.inner_text(STATUS)
 
 
 def test_steering_is_taken_and_released_visibly(visit, server):
     page = visit()
-    page.click("text=Take the steering")
-    page.wait_for_selector("text=you steer")
-    page.click("text=Release")
-    page.wait_for_selector("text=nobody steers")
+    page.click("text=Take control")
+    page.wait_for_selector("text=you are in control")
+    page.click("text=Release control")
+    page.wait_for_selector("text=nobody is in control")
     assert server.asked("steer") == [{"type": "steer", "take": True}, {"type": "steer", "take": False}]
 
 
 def test_what_needs_steering_takes_it_where_nobody_steers(visit, server):
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     page.evaluate("window.flexneedle.link.edit({'target.depth_mm': 35})")
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     until(page, "flexneedle.store.get('scene').target[0] === 35 && !flexneedle.store.get('draft')")
     assert server.asked("edit") == [{"type": "edit", "values": {"target.depth_mm": 35}}]
 
 
 def test_edits_are_merged_and_sent_at_most_twenty_times_a_second(visit, server):
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     seconds = page.evaluate(
         """async () => {
           const start = performance.now();
@@ -63,7 +64,7 @@ def test_edits_are_merged_and_sent_at_most_twenty_times_a_second(visit, server):
 def test_a_refusal_is_shown_in_words(visit, server):
     server.answers["steer"] = Refused(what="steer", reason="Person 2 steers: ask for the steering.")
     page = visit()
-    page.click("text=Take the steering")
+    page.click("text=Take control")
     page.wait_for_selector("[role=alert] >> text=Person 2 steers")
     page.click("[role=alert] >> text=Close")
     page.wait_for_selector("text=Person 2 steers", state="detached")
@@ -78,6 +79,25 @@ def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     server.send(Job(job=7, kind="plan", state="cancelled"))
     page.wait_for_selector("text=Plan: iteration", state="detached")
     assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
+
+
+def test_work_of_every_kind_has_a_name(visit, server):
+    page = visit()
+    kinds = get_args(Job.model_fields["kind"].annotation)
+    server.send(*(Job(job=number, kind=kind, state="running") for number, kind in enumerate(kinds)))
+    page.wait_for_selector(f"{STATUS} .job >> nth={len(kinds) - 1}")
+    assert "undefined" not in page.inner_html(STATUS)
+
+
+@pytest.mark.parametrize("state", ["waiting", "planning", "ready", "running", "paused", "holding"])
+def test_an_insertion_is_stopped_from_the_bar_in_every_state(visit, server, state):
+    page = visit()
+    server.send(insertion(state, rig="Bench"))
+    page.click(f"{STATUS} >> text=Stop the insertion")
+    page.wait_for_timeout(100)
+    assert server.asked("stop") == [{"type": "stop"}]
+    server.send(insertion("interrupted", rig="Bench"))
+    page.wait_for_selector(f"{STATUS} >> text=Stop the insertion", state="hidden")
 
 
 def test_work_that_runs_or_has_failed_before_is_shown(visit, server):
@@ -95,10 +115,10 @@ def test_work_that_runs_or_has_failed_before_is_shown(visit, server):
 
 def test_a_lost_connection_recovers_the_state(visit, server):
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     server.news = [*planned()[:1], people(clients=3), session(revision=9, seed=4)]
     server.drop()
-    page.wait_for_selector("text=3 people here")
+    page.wait_for_selector("text=3 people connected")
     assert "seed 4" in page.inner_text("#title")
     assert page.evaluate("[flexneedle.store.get('scene'), flexneedle.store.get('plan steering')]") == [
         None,
@@ -108,7 +128,7 @@ def test_a_lost_connection_recovers_the_state(visit, server):
 
 def test_the_reason_of_a_lost_connection_is_shown(visit, server):
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     page.evaluate("() => { window.WebSocket = class { close() {} }; }")  # no other attempt succeeds
     server.drop("64 pages are connected, which is the limit")
     page.wait_for_selector("text=No connection; trying again… (64 pages are connected, which is the limit)")
@@ -116,7 +136,7 @@ def test_the_reason_of_a_lost_connection_is_shown(visit, server):
 
 def test_another_insertion_and_a_closed_recording_are_forgotten(visit, server):
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     for of, source in (("live", Source.LIVE), ("first", Source.FIRST)):
         server.send(insertion("done", of=of), rows(0, 3, of), *period_frames(2, source))
     until(page, "flexneedle.store.track('needle', 'first') && flexneedle.store.track('needle', 'live')")
@@ -134,7 +154,7 @@ def test_another_insertion_and_a_closed_recording_are_forgotten(visit, server):
 def test_rows_that_are_missing_are_asked_for(visit, server):
     server.answers["rows_from"] = lambda request: [rows(request["index"], 10)]
     page = visit()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     server.send(rows(0, 3))
     server.send(rows(8, 2))
     until(page, "flexneedle.store.get('rows live').length === 13")
@@ -172,7 +192,7 @@ def test_the_page_fits_its_width(visit, server, size, scheme):
     server.news = planned()
     width, height = SIZES[size]
     page = visit(width, height, scheme)
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=Path(folder) / f"base-{size}-{scheme}.png")

@@ -1,10 +1,11 @@
-"""Presets, scenario files, links, recorded runs."""
+"""Presets, scenario files, links, recorded runs, rows of studies."""
 
 import numpy as np
 import pytest
 
 from fake_page import until
 from flexneedle.page.frames import Source
+from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
 from recorded_page import insertion, period_frames, rows
 
 pytestmark = pytest.mark.page
@@ -19,7 +20,7 @@ def files(visit, server):
 
     def opened(**how):
         page = visit(ready=f"{FILES} li", **how)
-        page.wait_for_selector("text=nobody steers")
+        page.wait_for_selector("text=nobody is in control")
         return page
 
     return opened
@@ -39,7 +40,7 @@ def test_a_file_is_loaded(files, server):
     page = files()
     payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
     page.set_input_files(f"{FILES} input[type=file]", payload)
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     page.wait_for_timeout(100)
     assert server.asked("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
 
@@ -52,20 +53,50 @@ def test_a_file_that_is_too_large_is_not_sent(files, server):
     assert not server.asked("load")
 
 
+CLIPBOARD = """
+  const writeText = async (text) => { window.copied = text; };
+  Object.defineProperty(navigator, "clipboard", { value: { writeText } });
+"""
+NO_CLIPBOARD = "Object.defineProperty(navigator, 'clipboard', { value: undefined });"
+
+
 def test_a_link_reproduces_scenario_and_options(files, server):
-    page = files()
+    page = files(before=CLIPBOARD)
     page.click("text=Copy a link")
-    until(page, "location.hash.startsWith('#state=')")
-    address = page.url
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    address = page.evaluate("window.copied")
+    assert address.startswith(f"{server.url}#state=")
     page.goto("about:blank")
     page.goto(address)
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     until(page, "!location.hash")
     page.wait_for_timeout(200)
     assert server.asked("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
     assert server.asked("options") == [
         {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
     ]
+
+
+def test_copying_a_link_leaves_the_address_so_a_reload_keeps_later_changes(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    assert page.url == server.url
+    page.reload()
+    page.wait_for_selector("text=nobody is in control")
+    page.wait_for_timeout(200)
+    assert not server.asked("load")
+
+
+def test_without_a_clipboard_the_link_is_shown_to_be_copied(files, server):
+    page = files(before=NO_CLIPBOARD)
+    assert not page.is_visible("[aria-label='Link to copy']")
+    page.click("text=Copy a link")
+    page.wait_for_selector("text=The clipboard is not available")
+    assert page.input_value("[aria-label='Link to copy']").startswith(f"{server.url}#state=")
+    selected = "(({ value, selectionStart, selectionEnd }) => value.slice(selectionStart, selectionEnd))"
+    assert page.evaluate(f"{selected}(document.activeElement)").startswith(f"{server.url}#state=")
+    assert page.url == server.url
 
 
 def test_a_damaged_link_is_reported(files, server):
@@ -90,6 +121,82 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
         {"type": "open", "name": "first", "second": True},
         {"type": "open", "name": None, "second": False},
     ]
+
+
+MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
+
+
+def study_row(index, **changes):
+    given = {
+        "settings": "base", "controller": "adaptive-mpc", "target": (40.0, 5.0, 0.0), "error_mm": 0.2214,
+        "outcome": "done", "reason": "", "opens": True, **changes,
+    }  # fmt: skip
+    return StudyRow(index=index, **given)
+
+
+REFUSED = study_row(
+    9, target=(40.0, 5.0, 3.0), error_mm=None, outcome="refused", reason="plan misses", opens=False
+)
+
+
+def listing(request):
+    """What the server sends of the rows of a study."""
+    index = request.get("index")
+    found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
+    about = {"title": "Many targets", "insertions": 150, "finished": 149}
+    return [StudyRows(name=request["name"], index=index, rows=found, **about)]
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width):
+    server.news[-1] = Runs(runs=[MANY])
+    server.answers["study"] = listing
+    page = files(width=width)
+    assert not page.is_visible("text=Worst first")
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=many: Many targets, 149 of 150 rows")
+    entries = page.locator("[aria-label='Rows of the study'] li").all_inner_texts()
+    assert entries[0].split("\n")[:2] == ["Row 17", "done, 0.221 mm off: base, adaptive-mpc, target 40, 5 mm"]
+    refused = ["Row 9", "refused: base, adaptive-mpc, target 40, 5, 3 mm", "plan misses"]
+    assert entries[2].split("\n") == refused
+    assert entries[3] == "3 of 149 finished rows: choose the first row for others"
+    assert page.locator("[aria-label='Open row 9']").count() == 0
+    pictures(page.locator(FILES), f"study-{width}")
+    page.click("[aria-label='Open row 17']")
+    page.click("[aria-label='Compare with row 3']")
+    page.fill("[aria-label='First row']", "120")
+    page.click("text=From this row")
+    page.wait_for_selector("text=Row 120")
+    page.click("text=Worst first")
+    page.wait_for_selector("text=Row 17")
+    assert server.asked("open") == [
+        {"type": "open", "name": "many", "row": 17, "second": False},
+        {"type": "open", "name": "many", "row": 3, "second": True},
+    ]
+    assert server.asked("study") == [
+        {"type": "study", "name": "many"},
+        {"type": "study", "name": "many", "index": 120},
+        {"type": "study", "name": "many", "index": None},
+    ]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_a_study_without_finished_rows_is_named_so(files, server):
+    server.news[-1] = Runs(runs=[MANY])
+    about = {"title": "Many", "insertions": 150, "finished": 0}
+    server.answers["study"] = lambda _: [StudyRows(name="many", index=None, rows=[], **about)]
+    page = files()
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=No row is finished yet")
+
+
+def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
+    page = files()
+    server.send(Job(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
+    page.wait_for_selector("text=Computing again: many, row 17")
+    page.click("[aria-label='Cancel: Computing again']")
+    page.wait_for_timeout(100)
+    assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
 
 def test_an_insertion_that_has_ended_is_saved(files, server):
@@ -152,13 +259,13 @@ def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
     page = files()
     page.click("text=GIF")
     page.wait_for_selector("text=A GIF needs an insertion")
-    server.send(insertion("done", of="first"), rows(0, 12, "first"), *frames_of(12))
-    until(page, "flexneedle.store.get('rows first')?.length === 12")
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
     with page.expect_download() as download:
         page.click("text=GIF")
     download.value.save_as(tmp_path / "made.gif")
     frames = page.evaluate(DECODED, list((tmp_path / "made.gif").read_bytes()))
-    assert len(frames) == 12
+    assert len(frames) == 4
     assert frames[0] != frames[-1]
     assert page.evaluate("flexneedle.store.get('view period')") is None
 

@@ -9,6 +9,7 @@ from recorded_page import WELCOME, inserting, insertion, opening, people, row, r
 pytestmark = pytest.mark.page
 
 PANEL = "[data-panel=insertion]"
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def click(page, text):
 def test_it_is_started_paced_and_stopped(panel, server):
     page = panel()
     click(page, "Insert")
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     server.send(insertion("running", periods=3), rows(0, 3))
     click(page, "Pause")
     server.send(insertion("paused", periods=3, pace=0.0))
@@ -106,7 +107,7 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     page = rig_panel()
     assert shown_buttons(page) == {"Check": True, "Prepare": True}
     click(page, "Prepare")
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     server.send(insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7))
     page.wait_for_selector("text=is ready; nothing moves before it is armed and started")
     assert page.locator(".rig .moves li").all_inner_texts() == MOVES
@@ -124,7 +125,7 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     assert [each["type"] for each in server.requests[-4:]] == ["steer", "prepare", "arm", "go"]
     assert server.asked("arm") == [{"type": "arm", "armed": True, "job": 7}]
     assert shown_buttons(page) == {}
-    for what in (".disturb", "[aria-label=Pace]", "text=Pause", "text=One period"):
+    for what in (".disturb", "[aria-label=Pace]", "button[data-next]", "text=One period"):
         assert not page.locator(PANEL).locator(what).is_visible()
     click(page, "Stop")
     server.send(
@@ -168,7 +169,7 @@ def test_who_does_not_steer_can_only_stop_a_rig(rig_panel, server):
 def test_a_check_lists_its_problems(rig_panel, server):
     page = rig_panel()
     click(page, "Check")
-    page.wait_for_selector("text=you steer")
+    page.wait_for_selector("text=you are in control")
     server.send(Job(job=9, kind="check", state="running", text="each device is read, nothing moves"))
     page.wait_for_selector("text=Checking: each device is read, nothing moves …")
     findings = [
@@ -179,6 +180,11 @@ def test_a_check_lists_its_problems(rig_panel, server):
     page.wait_for_selector("text=The check has found 1 problem.")
     assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
     assert page.locator(".findings details li").count() == 2
+    page.click(".findings summary")
+    server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
+    until(page, "flexneedle.store.get('session').seed === 3")
+    page.evaluate(PAINTED)
+    assert page.locator(".findings details[open]").count() == 1
     server.send(*opening(revision=2)[2:3])
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
 

@@ -4,11 +4,25 @@ import pytest
 
 from fake_page import until
 from flexneedle.page.messages import Estimate, Job
-from recorded_page import TARGET, iteration, opening, people, plan, plan_frames, planned, samples, session
+from recorded_page import (
+    TARGET,
+    insertion,
+    iteration,
+    opening,
+    people,
+    period_frames,
+    plan,
+    plan_frames,
+    planned,
+    rows,
+    samples,
+    session,
+)
 
 pytestmark = pytest.mark.page
 
 PLANS = "[data-panel=plans]"
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 INKED = """canvas => {
   const pen = canvas.getContext("2d");
   return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
@@ -20,7 +34,7 @@ def plans(visit, server):
     def opened(news=None, **how):
         server.news = news or server.news
         page = visit(ready=f"{PLANS} button:visible", **how)
-        page.wait_for_selector("text=steers")
+        page.wait_for_selector("text=in control")
         return page
 
     return opened
@@ -66,7 +80,7 @@ def test_strategies_are_side_by_side_with_their_terms(plans):
     assert cells["Cost: accuracy"] == ["0.020", "4.000"]
     assert cells["Cost: energy"] == ["0.120", "–"]
     assert cells["Cost"] == ["0.190", "4.200"]
-    assert cells["Flips"] == ["0", "2"]
+    assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
     page.wait_for_timeout(200)
     assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
@@ -85,9 +99,33 @@ def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, s
     server.send(
         session(2), Estimate(revision=2, error_mm=0.31, reached=False, tip=TARGET, roll_deg=0.0, seconds=0.1)
     )
-    page.wait_for_selector(f"{PLANS} >> text=First estimate: ends 0.31 mm off, out of reach.")
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
+
+
+def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server):
+    page = plans([*opening(), plan(), *plan_frames()])
+    page.wait_for_selector(f"{PLANS} table")
+    page.evaluate(
+        """() => {
+          window.changes = 0;
+          const count = (records) => { window.changes += records.length; };
+          new MutationObserver(count).observe(document.querySelector(".words"), { childList: true, subtree: true });
+          window.table = document.querySelector(".plans table");
+        }"""
+    )
+    live = [frame for period in range(3) for frame in period_frames(period)]
+    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2), session(seed=8))
+    until(
+        page, "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('session').seed === 8"
+    )
+    page.evaluate(PAINTED)
+    assert page.evaluate("window.changes") == 0
+    assert page.evaluate("window.table === document.querySelector('.plans table')")
+    server.send(plan("steering"))
+    page.wait_for_selector(f"{PLANS} >> text=Steering: ends 0.001 mm off.")
+    assert page.evaluate("window.changes") > 0
 
 
 def test_nothing_is_started_while_another_steers(plans):

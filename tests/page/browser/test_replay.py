@@ -105,9 +105,9 @@ def test_plots_follow_and_choose_the_period(replay):
     page.locator(PLOTS).scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
     at(page, 20)
-    page.wait_for_selector(f"{PLOTS} [aria-label^='Error (mm) at 4.0 s']")
+    page.wait_for_selector(f"{PLOTS} [aria-label^='Error from the planned path (mm) at 4.0 s']")
     label = page.get_attribute(f"{PLOTS} [aria-label^='Error']", "aria-label")
-    assert label == f"Error (mm) at 4.0 s: error {row(20).error_mm:.3f}"
+    assert label == f"Error from the planned path (mm) at 4.0 s: true tip {row(20).error_mm:.3f}"
     plot = page.locator(f"{PLOTS} .u-over").first
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()

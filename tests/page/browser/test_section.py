@@ -57,6 +57,9 @@ def drag(page, element, right, up=0):
 
 def edited(page, server):
     until(page, "!flexneedle.store.get('draft')")
+    page.evaluate(
+        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )  # drawn
     return server.asked("edit")[-1]["values"]
 
 

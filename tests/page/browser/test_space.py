@@ -34,7 +34,12 @@ CANVAS = f"{SPACE} canvas"
 SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
 REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 STATES = {"opening": opening, "planned": lambda: [*planned(), REACH], "inserting": inserting}
-NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
+NO_WEBGL = """{
+  const context = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+    return kind.startsWith("webgl") ? null : context.call(this, kind, ...more);
+  };
+}"""
 
 VIEW = "const { spaceView } = await import('/static/space.js'); const view = spaceView();"
 
@@ -304,4 +309,4 @@ def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):
     page = visit(before=NO_WEBGL, ready=f"{SPACE} [role=note]")
     assert "no WebGL" in page.inner_text(f"{SPACE} [role=note]")
     assert not page.locator(CANVAS).count()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")

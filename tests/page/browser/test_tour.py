@@ -5,6 +5,8 @@ import pytest
 pytestmark = pytest.mark.page
 
 CARD = "[role=dialog][aria-label=Tour]"
+FOCUS = "document.activeElement.innerText"
+NO_STORAGE = "Object.defineProperty(window, 'localStorage', { get() { throw new Error('refused'); } });"
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -16,7 +18,7 @@ def test_it_is_shown_once(visit, pictures, width):
     assert not page.is_visible(CARD)
     assert not page.locator(".toured").count()
     page.reload()
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=nobody is in control")
     assert not page.is_visible(CARD)
 
 
@@ -28,6 +30,24 @@ def test_it_is_followed_by_keys_to_its_end(visit):
         stops.append(page.evaluate("document.querySelector('.toured').className || 'settings'"))
         page.keyboard.press("Enter")
     assert len(stops) == 6
+    assert page.evaluate(FOCUS) == "Tour"
     page.click("text=Tour")
     page.keyboard.press("Escape")
     assert not page.is_visible(CARD)
+    assert page.evaluate(FOCUS) == "Tour"
+
+
+def test_its_end_leaves_the_focus_that_is_elsewhere(visit):
+    page = visit(tour=True, ready=f"{CARD}:visible")
+    page.focus("#theme")
+    page.dispatch_event(f"{CARD} >> text=Skip", "click")
+    assert not page.is_visible(CARD)
+    assert page.evaluate("document.activeElement.id") == "theme"
+
+
+def test_a_browser_that_keeps_nothing_shows_it_at_each_visit(visit):
+    page = visit(tour=True, before=NO_STORAGE, ready=f"{CARD}:visible")
+    page.click(f"{CARD} >> text=Skip")
+    assert not page.is_visible(CARD)
+    page.reload()
+    page.wait_for_selector(f"{CARD}:visible")

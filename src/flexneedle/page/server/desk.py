@@ -26,7 +26,7 @@ from flexneedle.scenario.preset import PRESETS
 
 _SEARCHES: tuple[Kind, ...] = ("plan", "compare", "reach")
 _RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
-_WORK: tuple[Kind, ...] = ("scene", "estimate", *_SEARCHES, "recording")
+_WORK: tuple[Kind, ...] = ("scene", "estimate", *_SEARCHES, "recording", "study", "row")
 _RECORDINGS: dict[bool, tuple[Literal["first", "second"], Source]] = {
     False: ("first", Source.FIRST),
     True: ("second", Source.SECOND),
@@ -156,6 +156,8 @@ class Desk:
                 outbox.rows_from("rows live", request.index)
             case m.Open():
                 self._open(request)
+            case m.Study():
+                self._list_rows(request)
             case m.Save():
                 self._save(request.name)
             case m.Stop():
@@ -188,7 +190,7 @@ class Desk:
             case m.Prepare():
                 work = self._work("insert", "insertion").model_copy(update={"folder": str(self.runs.path)})
                 self.live.prepare(work)
-                self._plans.cancel(*_SEARCHES)
+                self._plans.cancel(*_SEARCHES, "row")
             case m.Arm() if request.armed:
                 self.rig.arm(request.job)
             case m.Arm():
@@ -229,10 +231,10 @@ class Desk:
         return self.session.with_options(options)
 
     def _require_processor(self) -> None:
-        """Raise Refusal while an insertion is on the rig, whose loop a search would take time from."""
+        """Raise Refusal while an insertion is on the rig, whose loop a long computation would take time from."""
         if self.rig.active:
             raise Refusal(
-                "an insertion is on the rig, and a search would take processor time from it: search when it has ended"
+                "an insertion is on the rig, and this would take processor time from it: wait for its end"
             )
 
     def _order(self, do: Do, kind: Kind) -> None:
@@ -266,15 +268,24 @@ class Desk:
     def _open(self, request: m.Open) -> None:
         of, source = _RECORDINGS[request.second]
         work = Work(job=0, do="read", kind="recording", name=request.name or "", of=of)
-        if request.name is not None:
+        if request.name is not None and request.row is not None:
+            self._require_processor()
+            folder = str(self.runs.study(request.name))
+            work = work.model_copy(update={"do": "row", "kind": "row", "row": request.row, "folder": folder})
+        elif request.name is not None:
             work = work.model_copy(update={"folder": str(self.runs.run(request.name))})
-        self._plans.cancel("recording", of=of)
+        self._plans.cancel_slot("recording", of)
         self.hub.forget((f"rows {of}", f"insertion {of}"))
         self.hub.forget_frames(source)
         if request.name is None:
             self.hub.publish(m.Closed(of=of))
         else:
             self._plans.add(work)
+
+    def _list_rows(self, request: m.Study) -> None:
+        folder = str(self.runs.study(request.name))
+        work = Work(job=0, do="study", kind="study", name=request.name, folder=folder, row=request.index)
+        self._plans.add(work)
 
     def _save(self, name: str) -> None:
         self.live.require_ended()

@@ -1,20 +1,22 @@
-"""The folder of runs: what is in it, and its files for download. A client names a run, never a path."""
+"""The folder of runs: runs and studies in it, and their files for download. A client names one, never a path."""
 
 import asyncio
 import io
 import json
 import os
 import re
+import stat
 import sys
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from flexneedle.page.server.refusal import Refusal
 from flexneedle.page.server.worker import kill_process
-from flexneedle.trace.folder import RUN_FILE
+from flexneedle.trace.folder import RUN_FILE, STUDY_FILE
 
 _NAME = re.compile(r"[\w][\w .+-]*")
 _MOST_RUNS = 1_000
@@ -24,30 +26,30 @@ FIGURES = ("insertion.png", "plan.png")
 
 
 class RunsFolder:
-    """The runs in a folder, which need not exist yet."""
+    """The runs and studies in a folder, which need not exist yet."""
 
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
-        self._read = dict[str, tuple[tuple[int, int], dict[str, Any]]]()
+        self._read = dict[Path, tuple[tuple[int, int], dict[str, Any]]]()
 
     def listed(self) -> list[dict[str, Any]]:
-        """Name, kind, summary and time (s since 1970) of each run, the newest first."""
-        found = [(name, stat) for name in self._names() if (stat := self._stat(name)) is not None]
-        found.sort(key=lambda item: item[1].st_mtime, reverse=True)
+        """Name, kind, summary and time (s since 1970) of each run and study, the newest first."""
+        held = ((name, self._held(name)) for name in self._names())
+        found = [(name, *record) for name, record in held if record is not None]
+        found.sort(key=lambda item: item[2].st_mtime, reverse=True)
         return sorted(
-            (self._entry(name, stat) for name, stat in found[:_MOST_RUNS]),
+            (self._entry(*item) for item in found[:_MOST_RUNS]),
             key=lambda entry: float(entry["made"]),
             reverse=True,
         )
 
     def run(self, name: str) -> Path:
         """The folder of a run. Raises Refusal for a name that is not one of this folder, and for one with links."""
-        if name not in self._names() or self._stat(name) is None:
-            raise Refusal(f"{name!r}: no run of this name in the folder of runs")
-        for path in (self.path / name).iterdir():
-            if path.is_symlink():
-                raise Refusal(f"{name}: {path.name} is a link, which may lead elsewhere")
-        return self.path / name
+        return self._folder(name, RUN_FILE, "run")
+
+    def study(self, name: str) -> Path:
+        """The folder of a study. Raises Refusal for a name that is not one of this folder, and for one with links."""
+        return self._folder(name, STUDY_FILE, "study")
 
     def new(self, name: str) -> Path:
         """The folder of a run that is to be saved. Raises Refusal if there is something of this name."""
@@ -58,6 +60,15 @@ class RunsFolder:
             raise Refusal(f"{name}: there is already something of this name: choose another")
         return folder
 
+    def _folder(self, name: str, file: str, what: str) -> Path:
+        held = self._held(name) if name in self._names() else None
+        if held is None or held[0] != file:
+            raise Refusal(f"{name!r}: no {what} of this name in the folder of runs")
+        for path in (self.path / name).iterdir():
+            if path.is_symlink():
+                raise Refusal(f"{name}: {path.name} is a link, which may lead elsewhere")
+        return self.path / name
+
     def _names(self) -> list[str]:
         """Names of the folders here; links, which may lead elsewhere, are none."""
         try:
@@ -67,28 +78,35 @@ class RunsFolder:
             return []
         return [name for name in names if _NAME.fullmatch(name)]
 
-    def _stat(self, name: str) -> os.stat_result | None:
-        try:
-            return (self.path / name / RUN_FILE).stat()
-        except OSError:
-            return None
+    def _held(self, name: str) -> tuple[str, os.stat_result] | None:
+        """The file that makes a folder that of a run or of a study, and its state; a link is none."""
+        for file in (RUN_FILE, STUDY_FILE):
+            with suppress(OSError):
+                found = (self.path / name / file).lstat()
+                if stat.S_ISREG(found.st_mode):
+                    return file, found
+        return None
 
-    def _entry(self, name: str, stat: os.stat_result) -> dict[str, Any]:
-        version = (stat.st_mtime_ns, stat.st_size)
-        known = self._read.get(name)
+    def _entry(self, name: str, file: str, found: os.stat_result) -> dict[str, Any]:
+        path, version = self.path / name / file, (found.st_mtime_ns, found.st_size)
+        known = self._read.get(path)
         if known is None or known[0] != version:
-            known = (version, _entry_of(self.path / name / RUN_FILE, name, stat.st_mtime))
-            self._read[name] = known
+            known = (version, _entry_of(path, name, found.st_mtime))
+            self._read[path] = known
         return known[1]
 
 
 def _entry_of(path: Path, name: str, changed: float) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        kind, made = str(values["kind"]), datetime.fromisoformat(values["timing"]["started"]).timestamp()
-        summary = _summary(values)
+        if path.name == STUDY_FILE:
+            study = values["study"]
+            kind, made, summary = "study", changed, f"{study['title']}: {int(study['insertions'])} insertions"
+        else:
+            kind, made = str(values["kind"]), datetime.fromisoformat(values["timing"]["started"]).timestamp()
+            summary = _summary(values)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        kind, made, summary = "damaged", changed, f"{RUN_FILE} cannot be read"
+        kind, made, summary = "damaged", changed, f"{path.name} cannot be read"
     return {"name": name, "kind": kind, "summary": summary, "made": made}
 
 

@@ -12,12 +12,23 @@ from flexneedle.page.server.hub import Hub
 from flexneedle.page.server.limits import Limits
 from flexneedle.page.server.worker import Worker
 
-_URGENCY: dict[Kind, int] = {"scene": 0, "estimate": 1, "recording": 2, "plan": 3, "compare": 3, "reach": 9}
+_URGENCY: dict[Kind, int] = {
+    "scene": 0,
+    "estimate": 1,
+    "recording": 2,
+    "study": 2,
+    "plan": 3,
+    "compare": 3,
+    "row": 4,
+    "reach": 9,
+}
 _OTHER = 5
 _FINISHED: frozenset[Kind] = frozenset(("scene", "estimate"))
 """Short ones, which are not cancelled by a newer one: so a target that is dragged has estimates all along."""
-_BACKGROUND: frozenset[Kind] = frozenset(("reach",))
-"""Those that are set back for any other."""
+_BACKGROUND: frozenset[Kind] = frozenset(("row", "reach"))
+"""Those that are set back for more urgent ones."""
+_SLOTS: dict[Kind, Kind] = {"compare": "plan", "row": "recording"}
+"""Kinds that replace another one, and are replaced by it."""
 _FOR_THE_SERVER = ("rig_report",)
 """Types of a worker's messages that no client gets."""
 _ENDS = ("done", "failed", "cancelled")
@@ -34,7 +45,7 @@ class Job:
     @property
     def slot(self) -> tuple[str, str]:
         """Jobs of the same slot replace each other."""
-        return "plan" if self.work.kind == "compare" else self.work.kind, self.work.of
+        return _SLOTS.get(self.work.kind, self.work.kind), self.work.of
 
     @property
     def urgency(self) -> tuple[int, int]:
@@ -75,7 +86,10 @@ class Jobs:
     def add(self, work: Work) -> int:
         """Add a job, with a number that it gets here, and return that. It replaces an older one of its kind."""
         job = Job(work.model_copy(update={"job": next(self._numbers)}))
-        self._waiting = [other for other in self._waiting if other.slot != job.slot]
+        for other in [other for other in self._waiting if other.slot == job.slot]:
+            self._waiting.remove(other)
+            if other.work.kind != job.work.kind:  # whose state is not replaced by that of the new one
+                self._finish(other, "cancelled", "")
         self._waiting.append(job)
         self._publish(job, "waiting")
         running = self._running
@@ -83,15 +97,20 @@ class Jobs:
             if running.work.kind not in _FINISHED:
                 running.again = False
                 self._cancel_running()
-        elif running is not None and running.work.kind in _BACKGROUND and not running.cancelled:
+        elif running is not None and _gives_way(running, job):
             running.again = True
             self._cancel_running()
         self._next()
         return job.work.job
 
-    def cancel(self, *kinds: Kind, of: str | None = None) -> None:
-        """Cancel the jobs of kinds. of: the recordings that are this one of the two alone."""
-        for job in [job for job in self._all() if job.work.kind in kinds and of in (None, job.work.of)]:
+    def cancel(self, *kinds: Kind) -> None:
+        """Cancel the jobs of kinds."""
+        for job in [job for job in self._all() if job.work.kind in kinds]:
+            self.cancel_job(job.work.job)
+
+    def cancel_slot(self, kind: Kind, of: str) -> None:
+        """Cancel what would replace a job of a kind."""
+        for job in [job for job in self._all() if job.slot == (kind, of)]:
             self.cancel_job(job.work.job)
 
     def cancel_job(self, number: int) -> None:
@@ -184,3 +203,9 @@ class Jobs:
     def _publish(self, job: Job, state: str, text: str = "") -> None:
         values = {"job": job.work.job, "kind": job.work.kind, "state": state, "text": text}
         self._hub.publish(JobNews.model_validate(values))
+
+
+def _gives_way(running: Job, other: Job) -> bool:
+    """Whether a job that runs is set back for another."""
+    background = running.work.kind in _BACKGROUND and not running.cancelled
+    return background and other.urgency[0] < running.urgency[0]

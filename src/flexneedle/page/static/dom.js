@@ -18,6 +18,11 @@ export function make(name, properties = {}, ...children) {
 
 export const button = (text, click, properties = {}) => make("button", { type: "button", click, ...properties }, text);
 
+// Replace the children of an element where their text differs: a screen reader announces what is replaced.
+export function renew(element, children) {
+  if (children.map(({ textContent }) => textContent).join("") !== element.textContent) element.replaceChildren(...children);
+}
+
 // A number for people: digits after the point, with a true minus sign; "–" if it is unknown.
 export function shown(value, digits = 2) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";

@@ -18,12 +18,13 @@ export function mount(element, store, link) {
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
   const status = make("span.quiet", { role: "status" });
-  const copy = button("Copy a link", () => copyLink(store, status), { title: "A link to this scenario with seed, strategy and controller" });
+  const address = make("input", { type: "text", readonly: true, "aria-label": "Link to copy", hidden: true });
+  const copy = button("Copy a link", () => copyLink(store, status, address), { title: "A link to this scenario with seed, strategy and controller" });
   const picture = button("Picture", savePng, { title: "The scene in space as PNG" });
   const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
-  element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), runs);
+  element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), address, runs);
 
   file.addEventListener("change", () => loadFile(file, link, status));
   acceptDrops(element, link, status);
@@ -79,14 +80,18 @@ function acceptDrops(element, link, status) {
   });
 }
 
-async function copyLink(store, status) {
-  const address = await linkOf(store);
-  history.replaceState(null, "", address);
+// A browser may refuse the clipboard; it has none for a page that another computer serves without encryption.
+async function copyLink(store, status, field) {
+  field.value = await linkOf(store);
   try {
-    await navigator.clipboard.writeText(address);
+    await navigator.clipboard.writeText(field.value);
     status.textContent = "Copied";
+    field.hidden = true;
   } catch {
-    status.textContent = "The link is in the address bar";
+    status.textContent = "The clipboard is not available: copy the link below";
+    field.hidden = false;
+    field.focus();
+    field.select();
   }
 }
 

@@ -8,7 +8,7 @@ import { inWords } from "./insertion/words.js";
 import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const NONE = "No insertion yet: the plan is made first, if there is none.";
+const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 
 export function mount(element, store, link) {
   const state = make("p", { role: "status" });

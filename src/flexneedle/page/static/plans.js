@@ -1,6 +1,6 @@
 // Plans: search, both strategies side by side with their costs, as in the paper's figure, reach; cost over iterations.
 
-import { button, make, shown } from "./dom.js";
+import { button, make, renew, shown } from "./dom.js";
 import { CostPlot } from "./plans/cost.js";
 import { SweepView } from "./plans/sweep.js";
 import { termsTable } from "./plans/terms.js";
@@ -33,10 +33,14 @@ export function mount(element, store, link) {
     if ((job?.share ?? null) === null) progress.removeAttribute("value");
     else progress.value = job.share;
   });
-  store.subscribe(["session", "scene", "estimate", "plan ", "iteration ", "shape ", "view theme"], () => {
-    words.replaceChildren(...lines(store).map(([text, stale]) => make("li", { class: stale ? "quiet" : "" }, text)));
-    plot.update();
+  store.subscribe(["session", "estimate", "plan "], () => {
+    renew(words, lines(store).map(([text, stale]) => make("li", { class: stale ? "quiet" : "" }, text)));
+  });
+  store.subscribe(["plan ", "iteration ", "view theme"], () => plot.update());
+  store.subscribe(["session", "scene", "plan ", ...STRATEGIES.map((strategy) => `shape sweep ${strategy}`), "view theme"], () => {
     for (const sweep of sweeps) sweep.update();
+  });
+  store.subscribe(["plan "], () => {
     table.replaceChildren(...termsTable(STRATEGIES.map((strategy) => store.get(`plan ${strategy}`)).filter(Boolean)));
   });
 }
@@ -49,7 +53,7 @@ function lines(store) {
   const estimate = store.get("estimate");
   const plans = STRATEGIES.map((strategy) => store.get(`plan ${strategy}`)).filter(Boolean);
   if (estimate && !isStale(store, estimate) && plans.every((plan) => isStale(store, plan))) {
-    found.push([`First estimate: ends ${shown(estimate.error_mm, 2)} mm off${estimate.reached ? "" : ", out of reach"}.`, false]);
+    found.push([`First estimate: error at the target ${shown(estimate.error_mm, 2)} mm${estimate.reached ? "" : ", out of reach"}.`, false]);
   }
   for (const plan of plans) {
     const stale = isStale(store, plan);

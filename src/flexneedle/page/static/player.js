@@ -2,7 +2,7 @@
 // Keys within the panel: space plays, , and . step, Home and End, < and > change the speed.
 
 import { button, make, shown } from "./dom.js";
-import { SHOWN, shownOf, shownPeriod } from "./shown.js";
+import { SHOWN, shownOf, shownPeriod, startOf } from "./shown.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const NAMES = { scene: "Plan", live: "Insertion", first: "Recorded run" };
@@ -15,7 +15,7 @@ export function mount(element, store) {
   const on = button("›", () => player.step(1), { "aria-label": "One period on", "aria-keyshortcuts": "." });
   const slower = button("Slower", () => player.change(-1), { "aria-keyshortcuts": "<" });
   const faster = button("Faster", () => player.change(1), { "aria-keyshortcuts": ">" });
-  const newest = button("Newest", () => player.follow());
+  const newest = button("Latest period", () => player.follow(), { title: "Show the latest period, and each new one" });
   const [speed, place] = [make("span.number"), make("span.number.quiet")];
   const scrub = make("input", { type: "range", min: "0", step: "1", "aria-label": "Period", input: () => player.show(Number(scrub.value)) });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, slower, speed, faster, newest, place);
@@ -39,7 +39,7 @@ export function mount(element, store) {
     if (!some) return;
     scrub.max = String(rows.length - 1);
     scrub.value = String(period);
-    const time = `${shown(rows[period]?.time, 1)} s`;
+    const time = `${shown(rows[period].time - startOf(store, of), 1)} s`;
     scrub.setAttribute("aria-valuetext", `period ${period + 1} of ${rows.length}, ${time}`);
     place.textContent = `${time} · period ${period + 1} of ${rows.length}`;
     play.textContent = store.get("view playing") ? "Pause" : "Play";
@@ -52,6 +52,7 @@ class Player {
   #store;
   #frame = 0;
   #time = 0; // s of the insertion
+  #period = 0; // that it has shown last
   #before = 0; // ms of the last paint
 
   constructor(store) {
@@ -113,9 +114,10 @@ class Player {
     if (!rows.length) return;
     const at = shownPeriod(this.#store);
     const start = at >= rows.length - 1 ? 0 : at;
+    this.#time = rows[start].time;
+    this.#period = start;
     this.#store.set("view period", start);
     this.#store.set("view playing", true);
-    this.#time = rows[start]?.time ?? 0;
     this.#before = performance.now();
     this.#frame = requestAnimationFrame((now) => this.#tick(now));
   }
@@ -125,14 +127,18 @@ class Player {
     this.#store.set("view playing", undefined);
   }
 
+  // Playing ends at the end, and where another period was chosen, such as by a click on a plot.
   #tick(now) {
+    if (this.#store.get("view period") !== this.#period) {
+      this.#pause();
+      return;
+    }
     this.#time += (this.speed * Math.max(now - this.#before, 0)) / 1000;
     this.#before = now;
     const rows = this.#rows;
-    let period = this.#store.get("view period") ?? 0;
-    while (period < rows.length - 1 && (rows[period + 1]?.time ?? 0) <= this.#time) period += 1;
-    this.#store.set("view period", period);
-    if (period >= rows.length - 1) this.#pause();
+    while (this.#period < rows.length - 1 && rows[this.#period + 1].time <= this.#time) this.#period += 1;
+    this.#store.set("view period", this.#period);
+    if (this.#period >= rows.length - 1) this.#pause();
     else this.#frame = requestAnimationFrame((next) => this.#tick(next));
   }
 }

@@ -1,20 +1,23 @@
 // Plots over time: error, guide, roll, indicator, tissue energy, predicted miss; the line is the player's period.
+// The error is that of the true tip, which only a virtual rig has; on a rig it is that of the estimated one.
 
 import { make } from "./dom.js";
 import { PlotView } from "./plots/plot.js";
-import { SHOWN, shownOf, shownPeriod } from "./shown.js";
+import { SHOWN, shownOf, shownRow, startOf } from "./shown.js";
 
 const EVERY = 100; // ms between drawings
 const distance = (parts) => (parts.some((each) => each === null) ? null : Math.hypot(...parts));
-const lower = (row) => (row.miss_sd_mm === null ? null : Math.max(0, (distance(row.miss_mm) ?? 0) - 2 * row.miss_sd_mm));
-const upper = (row) => (row.miss_sd_mm === null || distance(row.miss_mm) === null ? null : distance(row.miss_mm) + 2 * row.miss_sd_mm);
+const bound = (sign) => ({ miss_mm: miss, miss_sd_mm: sd }) => (distance([...miss, sd]) === null ? null : Math.max(0, distance(miss) + sign * 2 * sd));
 
 const PLOTS = [
-  { title: "Error (mm)", lines: [{ name: "error", tone: "--true", of: (row) => row.error_mm }] },
-  { title: "Predicted miss (mm)", lines: [
+  { title: "Error from the planned path (mm)", lines: [
+    { name: "true tip", tone: "--true", of: (row) => (row.true ? row.error_mm : null) },
+    { name: "estimated tip", tone: "--estimate", of: (row) => (row.true ? null : row.error_mm) },
+  ] },
+  { title: "Predicted miss at the target (mm)", lines: [
     { name: "miss", tone: "--estimate", of: (row) => distance(row.miss_mm) },
-    { name: "+ 2 sd", tone: "--predicted", of: upper, thin: true },
-    { name: "− 2 sd", tone: "--predicted", of: lower, thin: true },
+    { name: "+ 2 standard deviations", tone: "--predicted", of: bound(1), thin: true },
+    { name: "− 2 standard deviations", tone: "--predicted", of: bound(-1), thin: true },
   ] },
   { title: "Guide (mm)", lines: [
     { name: "y", tone: "--guide", of: (row) => row.guide[0] },
@@ -25,7 +28,7 @@ const PLOTS = [
     { name: "estimated", tone: "--estimate", of: (row) => row.energy_mj },
     { name: "true", tone: "--true", of: (row) => row.true_energy_mj, dash: true },
   ] },
-  { title: "Indicator", lines: [{ name: "indicator", tone: "--measured", of: (row) => row.indicator }] },
+  { title: "Tracker's distortion indicator", lines: [{ name: "indicator", tone: "--measured", of: (row) => row.indicator }] },
 ];
 
 export function mount(element, store) {
@@ -34,24 +37,21 @@ export function mount(element, store) {
   element.append(nothing, grid);
   const choose = (period) => store.set("view period", period);
   let plots = null;
-  let [timer, last, onScreen, drawn] = [0, 0, true, null];
+  let [timer, last, onScreen, drawn] = [0, 0, true, []];
 
   function draw() {
     timer = 0;
     last = performance.now();
     const of = shownOf(store);
-    const rows = (store.get(`rows ${of}`) ?? []).filter(Boolean);
+    const rows = store.get(`rows ${of}`) ?? [];
     nothing.hidden = rows.length > 0;
     grid.hidden = !rows.length;
     if (!rows.length || !onScreen) return;
     plots ??= PLOTS.map((plot) => new PlotView(grid, plot, choose));
-    const second = store.get("rows second")?.filter(Boolean) ?? null;
-    const [period, theme] = [shownPeriod(store, of), store.get("view theme")];
-    const same = drawn && drawn.of === of && drawn.count === rows.length && drawn.first === rows[0] &&
-      drawn.second === second?.length && drawn.theme === theme;
-    if (!same) for (const plot of plots) plot.update(rows, second, theme);
-    drawn = { of, count: rows.length, first: rows[0], second: second?.length, theme };
-    for (const plot of plots) plot.point(rows[period]?.time ?? null);
+    const data = [rows, store.get("rows second") ?? null, startOf(store, of), store.get("view theme")];
+    if (data.some((each, at) => each !== drawn[at])) for (const plot of plots) plot.update(...data);
+    drawn = data;
+    for (const plot of plots) plot.point(shownRow(store, of));
   }
   function schedule() {
     timer ||= setTimeout(draw, Math.max(0, last + EVERY - performance.now()));

@@ -1,12 +1,14 @@
 // What the views show: the scene before an insertion, the running insertion, or a recorded one, at a period.
 //   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
 //   "view period": the period that is shown; undefined: the newest
+// An insertion that begins, and a recording that is opened, makes both undefined (store.js).
 
-const ACTIVE = ["planning", "ready", "running", "paused", "holding"];
+const RUNS = ["waiting", "planning", "ready", "running", "paused", "holding"];
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
+const SAME = 1e-3; // s, by which times of the same period may differ
 
 // Whether an insertion (news "insertion", or none) runs or waits.
-export const runs = (live) => live?.state === "waiting" || ACTIVE.includes(live?.state);
+export const runs = (live) => RUNS.includes(live?.state);
 
 // Keys to subscribe to for all that this module gives.
 export const SHOWN = [
@@ -19,7 +21,7 @@ export function shownOf(store) {
   const [live, first] = [store.get("insertion live"), store.get("insertion first")];
   const chosen = store.get("view of");
   if (chosen === "scene" || (chosen === "live" && live) || (chosen === "first" && first)) return chosen;
-  if (live && ACTIVE.includes(live.state)) return "live";
+  if (runs(live)) return "live";
   if (first) return "first";
   const current = store.get("session")?.revision;
   return live && (!live.scene || live.scene.revision === current) ? "live" : "scene";
@@ -44,11 +46,19 @@ export function shownShape(store, kind, of = shownOf(store)) {
   return before ? store.get(`shape ${kind} scene`) ?? null : store.track(kind, of, period ?? Infinity);
 }
 
-// The second recorded run, {row, shape(kind)}, at the period that is shown, or null.
+// Time (s) from which the times of an insertion's rows are shown: a rig's clock begins long before its first period.
+export function startOf(store, of) {
+  return store.get(`insertion ${of}`)?.rig ? store.get(`rows ${of}`)?.[0]?.time ?? 0 : 0;
+}
+
+// The second recorded run, {row, shape(kind)}, as long after its first period as what is shown; or null.
 export function shownSecond(store) {
   if (!store.get("insertion second")) return null;
-  const period = shownPeriod(store, "second") ?? Infinity;
-  return { row: shownRow(store, "second"), shape: (kind) => store.track(kind, "second", period) };
+  const of = shownOf(store);
+  const [rows, row] = [store.get("rows second") ?? [], shownRow(store, of)];
+  const since = row ? row.time - store.get(`rows ${of}`)[0].time : Infinity;
+  const period = rows.findLastIndex(({ time }) => time - rows[0].time <= since + SAME);
+  return { row: rows[period] ?? null, shape: (kind) => store.track(kind, "second", period) };
 }
 
 // Scene of what is shown, or null before the first has come.
@@ -74,7 +84,7 @@ export function targetEdit(store, point) {
   return Object.fromEntries(keys.map((key, axis) => [key, Math.round(point[axis] * 100) / 100]));
 }
 
-// Whether this client steers or can take the steering.
+// Whether this client is in control of the page (messages.py: it steers), or can take control.
 export function maySteer(store) {
   const [people, welcome] = [store.get("people"), store.get("welcome")];
   return Boolean(people) && (people.steering === null || people.steering === welcome?.client);

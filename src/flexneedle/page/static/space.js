@@ -63,6 +63,6 @@ function inWords(store) {
   const [target, row] = [shownTarget(store), shownRow(store)];
   const parts = [];
   if (target) parts.push(`Target at ${point(target)} mm.`);
-  if (row) parts.push(`Tip at ${point(row.estimate)} mm, error ${shown(row.error_mm)} mm.`);
+  if (row) parts.push(`Estimated tip at ${point(row.estimate)} mm. Error from the planned path ${shown(row.error_mm)} mm.`);
   return parts.join(" ");
 }

@@ -1,6 +1,7 @@
-// The bar at the bottom: connection, who is here and who steers, work with progress and cancel, refusals in words.
+// The bar at the bottom: connection, who is connected and in control, work with progress and cancel, refusals in words.
 
 import { button, make } from "./dom.js";
+import { runs } from "./shown.js";
 
 const CONNECTIONS = {
   connecting: "Connecting…",
@@ -9,9 +10,13 @@ const CONNECTIONS = {
 };
 const JOBS = {
   scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
-  insertion: "Insertion", recording: "Recorded run", save: "Saving",
+  insertion: "Insertion", check: "Check of the rig", recording: "Recorded run", study: "Study", row: "Computing again",
+  save: "Saving",
 };
-const STEPS_IN = ["waiting", "planning", "running", "paused"];
+const CONTROL = {
+  take: "To change the scenario, plan and insert. Anyone can stop an insertion.",
+  release: "So that another page can take control. An insertion on a rig is then held.",
+};
 const SHOWN_FOR = 12_000; // ms
 const SHORT = 1_000; // ms: work that ends sooner is not shown
 
@@ -26,7 +31,7 @@ export function mount(element, store, link) {
   store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
   store.subscribe(["people", "welcome", "connection"], () => showSteering(steering, store, link));
   store.subscribe(["insertion live"], () => {
-    stop.hidden = !STEPS_IN.includes(store.get("insertion live")?.state);
+    stop.hidden = !runs(store.get("insertion live"));
   });
   store.subscribe(["session"], () => showTitle(store.get("session")));
   followJobs(jobs, store, link);
@@ -51,9 +56,10 @@ function showSteering(element, store, link) {
   element.replaceChildren();
   if (!people || !welcome || store.get("connection") !== "open") return;
   const mine = people.steering === welcome.client;
-  const who = people.steering === null ? "nobody steers" : mine ? "you steer" : `person ${people.steering} steers`;
-  const text = `${people.clients} ${people.clients === 1 ? "person" : "people"} here, ${who}`;
-  const change = button(mine ? "Release" : "Take the steering", () => link.ask({ type: "steer", take: !mine }));
+  const who = people.steering === null ? "nobody is" : mine ? "you are" : `person ${people.steering} is`;
+  const text = `${people.clients} ${people.clients === 1 ? "person" : "people"} connected, ${who} in control`;
+  const [name, title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
+  const change = button(name, () => link.ask({ type: "steer", take: !mine }), { title });
   element.append(make("span", {}, text));
   if (mine || people.steering === null) element.append(change);
 }

@@ -1,6 +1,6 @@
 // State of the page by key. A message of the server is the state of its key (as `News.key` in page/messages.py):
 //   "session", "scene", "people", "job plan", "iteration steering", "plan manipulation", "insertion live", …
-//   "rows live" | "rows first" | "rows second": all rows so far, by index (a gap is undefined)
+//   "rows live" | "rows first" | "rows second": all rows so far, by index
 //   "shape KIND SOURCE", such as "shape needle live": the newest frame; `track` has those of all periods
 // What only this browser knows has keys that begin with "view ", and "connection", "refusals", "draft".
 //
@@ -13,7 +13,8 @@ const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
 const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of" };
 const BEFORE_ROWS = ["waiting", "planning"];
 const STAY = ["samples", "channel"];
-const INSERTIONS = ["live", "first", "second"];
+const RECORDED = ["first", "second"];
+const INSERTIONS = ["live", ...RECORDED];
 const OWN = /^(view |connection|refusals$|draft$)/;
 const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (path|samples|reach|sweep) scene)$/;
 
@@ -26,6 +27,7 @@ export function keyOf(message) {
 export class Store {
   #values = new Map();
   #tracks = new Map(); // "needle live" → array of paths by period
+  #before = new Map(); // by key: insertions of the connection that was lost
   #listeners = new Set();
   #changed = new Set();
   #frame = 0;
@@ -56,25 +58,13 @@ export class Store {
     return () => this.#listeners.delete(entry);
   }
 
-  // Keep `key` the result of `compute(store)`, computed when one of the keys has changed. Values are compared as JSON.
-  derived(key, keys, compute) {
-    let before;
-    return this.subscribe(keys, () => {
-      const value = compute(this);
-      const text = JSON.stringify(value);
-      if (text === before) return;
-      before = text;
-      this.set(key, value);
-    });
-  }
-
   // Take a message of the server. Returns the index of the first row that is missing, or null.
   receive(message) {
     if (message.type === "rows") return this.#receiveRows(message);
     if (message.type === "closed") return this.#close(message);
     const key = keyOf(message);
     const earlier = this.get(key);
-    if (message.type === "insertion" && this.#isAnother(message, earlier)) this.#forget(message.of);
+    if (message.type === "insertion") this.#announce(key, message);
     if (message.type === "welcome") this.#forgetAll();
     if (message.type === "session" && message.name !== earlier?.name) this.#forgetPlans();
     this.set(key, message);
@@ -121,19 +111,25 @@ export class Store {
     return null;
   }
 
-  #isAnother(message, earlier) {
-    if (!earlier) return false;
-    const begins = BEFORE_ROWS.includes(message.state) && !BEFORE_ROWS.includes(earlier.state);
-    return begins || message.periods < earlier.periods || message.name !== earlier.name;
+  // An insertion that begins, or a recording that is opened, takes the place of the last one, and is shown. After a
+  // lost connection all are announced again: one that is known leaves what is shown as it is.
+  #announce(key, message) {
+    const known = this.get(key);
+    const earlier = known ?? this.#before.get(key);
+    this.#before.delete(key);
+    const opened = Boolean(known) && RECORDED.includes(message.of);
+    if (!earlier || opened || isAnother(message, earlier)) this.#forget(message.of);
   }
 
   #close({ of }) {
+    this.#before.delete(`insertion ${of}`);
     this.#forget(of);
     this.set(`insertion ${of}`, undefined);
     return null;
   }
 
   #forget(of) {
+    if (of !== "second") for (const key of ["view of", "view period"]) this.set(key, undefined);
     this.set(`rows ${of}`, undefined);
     for (const kind of KINDS) {
       this.#tracks.delete(`${kind} ${of}`);
@@ -143,6 +139,7 @@ export class Store {
 
   // A connection begins: the server sends all that there is.
   #forgetAll() {
+    for (const key of this.keys("insertion ")) this.#before.set(key, this.get(key));
     this.#tracks.clear();
     for (const key of [...this.#values.keys()]) if (!OWN.test(key)) this.set(key, undefined);
   }
@@ -164,23 +161,24 @@ export class Store {
     });
   }
 
-  // Twice, so that what is derived is shown in the same paint.
   #notify() {
-    for (let round = 0; round < 2; round++) {
-      const changed = this.#changed;
-      this.#changed = new Set();
-      for (const entry of this.#listeners) {
-        if (!entry.first && !concerns(entry.keys, changed)) continue;
-        entry.first = false;
-        try {
-          entry.listener();
-        } catch (error) {
-          reportError(error); // and the other panels go on
-        }
+    const changed = this.#changed;
+    this.#changed = new Set();
+    for (const entry of this.#listeners) {
+      if (!entry.first && !concerns(entry.keys, changed)) continue;
+      entry.first = false;
+      try {
+        entry.listener();
+      } catch (error) {
+        reportError(error); // and the other panels go on
       }
     }
-    if (this.#changed.size) this.#schedule();
   }
+}
+
+function isAnother(message, earlier) {
+  const begins = BEFORE_ROWS.includes(message.state) && !BEFORE_ROWS.includes(earlier.state);
+  return begins || message.periods < earlier.periods || message.name !== earlier.name;
 }
 
 function concerns(keys, changed) {

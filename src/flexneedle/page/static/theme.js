@@ -1,9 +1,11 @@
 // Light or dark: as the system prefers, or as chosen by the switch, which this browser remembers.
 
+import { remember, remembered } from "./memory.js";
+
 const CHOICE = "flexneedle theme";
 const colors = new Map(); // by name, in the present theme
 const system = matchMedia("(prefers-color-scheme: dark)");
-let choice = remembered();
+let choice = remembered(CHOICE);
 
 // Keep store key "view theme" ("light", "dark") and the attribute data-theme of the document; `button` switches.
 export function followTheme(store, button) {
@@ -17,7 +19,7 @@ export function followTheme(store, button) {
   };
   button.addEventListener("click", () => {
     choice = store.get("view theme") === "dark" ? "light" : "dark";
-    remember();
+    remember(CHOICE, choice);
     apply();
   });
   system.addEventListener("change", apply);
@@ -29,23 +31,6 @@ export function followTheme(store, button) {
 export function color(name) {
   if (!colors.has(name)) colors.set(name, computed(name));
   return colors.get(name);
-}
-
-// A browser may refuse to keep anything, above all for a page from a file: the choice is then that of this visit.
-function remembered() {
-  try {
-    return localStorage.getItem(CHOICE);
-  } catch {
-    return null;
-  }
-}
-
-function remember() {
-  try {
-    localStorage.setItem(CHOICE, choice);
-  } catch {
-    // as above
-  }
 }
 
 function computed(name) {

@@ -20,6 +20,7 @@ from flexneedle.page.worker.recording import read
 from flexneedle.page.worker.rig import check
 from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
+from flexneedle.page.worker.study import row, rows
 from flexneedle.page.worker.task import Task
 from flexneedle.page.worker.warm import warm_up
 from flexneedle.scenario.problems import unexpected
@@ -46,6 +47,8 @@ def main() -> int:
         "plan": plan,
         "reach": reach,
         "read": read,
+        "study": rows,
+        "row": row,
         "insert": insertions.insert,
         "check": check,
         "save": insertions.save,

@@ -19,9 +19,13 @@ _SOURCES = {"first": Source.FIRST, "second": Source.SECOND}
 
 def read(task: Task) -> None:
     """Report a recorded insertion, all at once. Raises InputError or RunError for a folder that has none."""
-    work = task.work
-    insertion, lacking = load_insertion(Path(work.folder))
-    for one in recorded(insertion, work.name, work.of, lacking):
+    insertion, lacking = load_insertion(Path(task.work.folder))
+    report(task, insertion, task.work.name, lacking)
+
+
+def report(task: Task, insertion: Insertion, name: str, note: str) -> None:
+    """Report an insertion as the recording of the order. note: what is to be known of it, or ""."""
+    for one in recorded(insertion, name, task.work.of, note):
         task.signals.check()
         if isinstance(one, ShapeFrame):
             task.show(one)

@@ -8,5 +8,6 @@ from flexneedle.scenario.files import load_scenario
 
 def warm_up() -> None:
     """Compile all kernels, or load them from the cache, and make a small plan."""
-    compile_kernels()
+    for axes in (1, 2):
+        compile_kernels(axes)
     plan(smaller(load_scenario("phantom"), 16, 1))

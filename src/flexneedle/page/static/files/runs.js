@@ -1,6 +1,7 @@
-// Recorded runs: open one, a second to compare, download; save the insertion that has ended last.
+// Recorded runs and studies: open a run or a row, a second to compare, download; save the insertion that has ended last.
 
 import { button, make } from "../dom.js";
+import { showStudy } from "./study.js";
 
 const DOWNLOADS = [["Figure", "figure.png"], ["CSV", "trace.csv"], ["Run folder", "run.zip"], ["Replay as HTML", "replay.html"]];
 const NAME = /^[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}$/;
@@ -13,7 +14,9 @@ export function showRuns(element, store, link) {
   const list = make("ul", { "aria-label": "Recorded runs" });
   const opened = make("div.opened");
   const save = saveForm(store, link);
-  element.append(save, opened, make("details", { open: true }, make("summary", {}, "Recorded runs"), search, list));
+  const study = make("div");
+  element.append(save, opened, study, make("details", { open: true }, make("summary", {}, "Recorded runs and studies"), search, list));
+  showStudy(study, store, link);
   const show = () => showList(list, search.value.trim().toLowerCase(), store, link);
   search.addEventListener("input", show);
   store.subscribe(["runs"], show);
@@ -28,14 +31,20 @@ function showList(list, text, store, link) {
 }
 
 function entryOf({ name, kind, summary, made }, link) {
-  const open = (second) => link.ask({ type: "open", name, second });
   const when = new Date(1000 * made).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
-  const tools = REPLAYED.includes(kind)
+  const tools = make("div.tools", {}, ...(kind === "study" ? toolsOfStudy : toolsOfRun)(name, kind, link));
+  return make("li.run", {}, make("strong", {}, name), make("span.quiet", {}, `${kind}, ${when}: ${summary}`), tools);
+}
+
+const toolsOfStudy = (name, kind, link) => [button("Rows", () => link.ask({ type: "study", name }), { "aria-label": `Rows of ${name}` })];
+
+function toolsOfRun(name, kind, link) {
+  const open = (second) => link.ask({ type: "open", name, second });
+  const shows = REPLAYED.includes(kind)
     ? [button("Open", () => open(false), { "aria-label": `Open ${name}` }), button("Compare", () => open(true), { "aria-label": `Compare with ${name}` })]
     : [];
   const downloads = DOWNLOADS.map(([text, file]) => make("a", { href: addressOf(name, file), download: `${name}-${file}`, "aria-label": `${text} of ${name}` }, text));
-  const more = make("details", {}, make("summary", {}, "Download"), make("div.tools", {}, ...downloads));
-  return make("li.run", {}, make("strong", {}, name), make("span.quiet", {}, `${kind}, ${when}: ${summary}`), make("div.tools", {}, ...tools, more));
+  return [...shows, make("details", {}, make("summary", {}, "Download"), make("div.tools", {}, ...downloads))];
 }
 
 const addressOf = (name, file) => `/runs/${encodeURIComponent(name)}/${file}`;

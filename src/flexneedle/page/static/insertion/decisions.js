@@ -1,7 +1,7 @@
 // What the controller decided, in words: the decision of the shown period, and all changes of it.
 
 import { button, make, shown } from "../dom.js";
-import { SHOWN, shownOf, shownPeriod, shownRow } from "../shown.js";
+import { SHOWN, shownOf, shownPeriod, shownRow, startOf } from "../shown.js";
 
 const MOST = 100; // entries: the newest
 
@@ -16,9 +16,10 @@ export function followDecisions(element, store) {
     const rows = store.get(`rows ${of}`) ?? [];
     const row = shownRow(store, of);
     now.hidden = list.hidden = !row;
-    now.textContent = row ? inWords(row) : "";
+    const start = startOf(store, of);
+    now.textContent = row ? inWords(row, row.time - start) : "";
     if (made.of !== of || made.first !== rows[0] || rows.length < made.count) restart(of, rows[0]);
-    for (let at = made.count; at < rows.length && rows[at]; at++) add(rows[at]);
+    for (let at = made.count; at < rows.length; at++) add(rows[at], rows[at].time - start);
     mark(shownPeriod(store, of));
   });
 
@@ -28,12 +29,12 @@ export function followDecisions(element, store) {
   }
 
   // An entry where the words differ from those of the period before.
-  function add(row) {
+  function add(row, time) {
     made.count = row.index + 1;
     const text = textOf(row);
     if (text === made.text) return;
     made.text = text;
-    const go = button(`${shown(row.time, 1)} s`, () => store.set("view period", row.index), { "aria-label": `Show period ${row.index + 1}` });
+    const go = button(`${shown(time, 1)} s`, () => store.set("view period", row.index), { "aria-label": `Show period ${row.index + 1}` });
     const entry = make("li", {}, go, make("span", { class: row.warning || row.late ? "bad" : "" }, text));
     list.prepend(entry);
     made.buttons.push({ index: row.index, entry });
@@ -58,8 +59,9 @@ function textOf({ decision, verdict, warning, late }) {
   return parts.join("; ");
 }
 
-function inWords(row) {
+function inWords(row, time) {
   const miss = row.miss_mm.filter((each) => each !== null);
-  const predicted = miss.length ? `, predicted miss ${shown(Math.hypot(...miss))} mm ± ${shown(row.miss_sd_mm)}` : "";
-  return `Period ${row.index + 1}, ${shown(row.time, 1)} s: ${textOf(row)} (error ${shown(row.error_mm)} mm${predicted}).`;
+  const predicted = miss.length ? `, predicted miss ${shown(Math.hypot(...miss))} mm, standard deviation ${shown(row.miss_sd_mm)} mm` : "";
+  const error = `error from the planned path ${shown(row.error_mm)} mm`;
+  return `Period ${row.index + 1}, ${shown(time, 1)} s: ${textOf(row)} (${error}${predicted}).`;
 }

@@ -1,6 +1,6 @@
 // The connected rig: check it, prepare an insertion, arm it once what will move is confirmed, and let it go.
 
-import { button, make } from "../dom.js";
+import { button, make, renew } from "../dom.js";
 import { isStale, maySteer, runs } from "../shown.js";
 
 const STATES = {
@@ -49,7 +49,7 @@ export function rigForm(store, link) {
   };
   free.addEventListener("change", show);
   store.subscribe(["rig", "welcome", "people", "insertion live"], show);
-  store.subscribe(["check", "session", "job check"], () => findings.replaceChildren(...inLines(store)));
+  store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
   return form;
 }
 

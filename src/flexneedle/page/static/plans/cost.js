@@ -6,6 +6,7 @@ import { color } from "../theme.js";
 
 const HEIGHT = 150; // px
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
+const CAPTION = "Cost over iterations: best so far; elite: the worst sample that the next iteration is fitted to; median of the samples";
 const [ELITE, MEDIAN] = [1, 2]; // of the quantiles
 const positive = (value) => (value > 0 ? value : null); // the axis is logarithmic
 
@@ -22,7 +23,7 @@ export class CostPlot {
     [this.#store, this.#strategies] = [store, strategies];
     this.#place = make("div.plot", { role: "img", "aria-label": "Cost over iterations" });
     this.#legend = make("p.legend");
-    this.figure = make("figure", { hidden: true }, make("figcaption", {}, "Cost over iterations"), this.#place, this.#legend);
+    this.figure = make("figure", { hidden: true }, make("figcaption", {}, CAPTION), this.#place, this.#legend);
     parent.append(this.figure);
     new ResizeObserver(([{ contentRect }]) => this.#chart?.setSize({ width: contentRect.width, height: HEIGHT })).observe(this.#place);
   }

@@ -3,9 +3,9 @@
 import { make, shown } from "../dom.js";
 
 const ROWS = [
-  ["Ends off the target (mm)", ({ error_mm: error }) => shown(error, 3)],
+  ["Error at the target (mm)", ({ error_mm: error }) => shown(error, 3)],
   ["Tissue energy (mJ)", ({ energy_mj: energy }) => shown(energy, 4)],
-  ["Flips", ({ flips }) => String(flips)],
+  ["Flips (half-turns of the bevel)", ({ flips }) => String(flips)],
   ["Found in (s)", ({ seconds }) => shown(seconds, 2)],
 ];
 

@@ -6,6 +6,7 @@ import { color } from "../theme.js";
 
 const HEIGHT = 130; // px
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
+const EXPAND = 2; // of uPlot.join: a gap ends at the known values of its own run, not at times of the other
 
 export class PlotView {
   #spec;
@@ -15,7 +16,9 @@ export class PlotView {
   #chart = null;
   #theme;
   #compared;
+  #lines = [];
   #rows = [];
+  #start = 0;
   #time = null;
 
   // spec: {title, lines: [{name, tone, of, dash, thin}]}; choose: called with the index of the row that is clicked.
@@ -27,35 +30,42 @@ export class PlotView {
     new ResizeObserver(([{ contentRect }]) => this.#chart?.setSize({ width: contentRect.width, height: HEIGHT })).observe(this.#place);
   }
 
-  // Rows of the shown insertion and of the second run (or null).
-  update(rows, second, theme) {
-    this.#rows = rows;
+  // Rows of the shown insertion, one at least, whose times count from `start`, and of the second run (or null), which
+  // begins where that does.
+  update(rows, second, start, theme) {
+    [this.#rows, this.#start] = [rows, start];
     const compared = Boolean(second?.length);
     if (theme !== this.#theme || compared !== this.#compared) this.#make(theme, compared);
-    this.#chart.setData(this.#dataOf(rows, second));
+    const one = this.#columnsOf(rows, start);
+    const data = compared ? joined(one, this.#columnsOf(second, second[0].time - one[0][0])) : one;
+    this.#chart.setData(data);
+    this.#showLegend(data);
   }
 
-  // Move the line to a time.
-  point(time) {
-    if (time === this.#time) return;
-    this.#time = time;
-    this.#chart?.redraw(false);
-    this.#place.setAttribute("aria-label", `${this.#spec.title}${this.#inWords(time)}`);
+  // Move the line to a row.
+  point(row) {
+    const time = row.time - this.#start;
+    if (time !== this.#time) {
+      this.#time = time;
+      this.#chart.redraw(false);
+    }
+    const values = this.#spec.lines.map(({ name, of }) => [name, of(row)]).filter(([, value]) => value !== null);
+    const words = values.map(([name, value]) => `${name} ${shown(value, 3)}`).join(", ") || "unknown";
+    const label = `${this.#spec.title} at ${shown(time, 1)} s: ${words}`;
+    if (label !== this.#place.getAttribute("aria-label")) this.#place.setAttribute("aria-label", label);
   }
 
-  #inWords(time) {
-    const row = this.#rows.findLast((each) => each.time <= time);
-    if (!row) return "";
-    return ` at ${shown(time, 1)} s: ${this.#spec.lines.map(({ name, of }) => `${name} ${shown(of(row), 3)}`).join(", ")}`;
+  #columnsOf(rows, start) {
+    return [rows.map(({ time }) => time - start), ...this.#spec.lines.map(({ of }) => rows.map(of))];
   }
 
-  #dataOf(rows, second) {
-    const { lines } = this.#spec;
-    const one = [rows.map(({ time }) => time), ...lines.map(({ of }) => rows.map(of))];
-    if (!second?.length) return one;
-    const later = (rows[0]?.time ?? 0) - second[0].time; // a rig's clock begins before its first period
-    const two = [second.map(({ time }) => time + later), ...lines.map(({ of }) => second.map(of))];
-    return uPlot.join([one, two]);
+  // Of several lines, those that have a value.
+  #showLegend(data) {
+    const drawn = this.#lines.length > 1 ? this.#lines.filter((_, at) => data[at + 1].some((value) => (value ?? null) !== null)) : [];
+    const names = drawn.map(({ name }) => name).join();
+    if (this.#legend.dataset.names === names) return;
+    this.#legend.dataset.names = names;
+    this.#legend.replaceChildren(...drawn.map(entryOf));
   }
 
   #make(theme, compared) {
@@ -64,6 +74,7 @@ export class PlotView {
     const lines = compared
       ? [...this.#spec.lines, ...this.#spec.lines.map((line) => ({ ...line, name: `${line.name}, second`, tone: "--second" }))]
       : this.#spec.lines;
+    this.#lines = lines;
     const axis = { stroke: color("--quiet"), font: FONT, grid: { stroke: color("--edge"), width: 1 }, ticks: { show: false } };
     const options = {
       width: this.#place.clientWidth || 300,
@@ -78,13 +89,11 @@ export class PlotView {
     };
     this.#chart = new uPlot(options, [[], ...lines.map(() => [])], this.#place);
     this.#chart.over.addEventListener("click", () => this.#click());
-    this.#legend.replaceChildren(...(lines.length > 1 ? lines.map(entryOf) : []));
   }
 
   #click() {
-    const time = this.#chart.posToVal(this.#chart.cursor.left, "x");
-    const at = this.#rows.findIndex((row) => row.time >= time);
-    this.#choose(this.#rows.at(at)?.index ?? 0);
+    const time = this.#chart.posToVal(this.#chart.cursor.left, "x") + this.#start;
+    this.#choose(this.#rows.at(this.#rows.findIndex((row) => row.time >= time)).index); // the last one beyond the end
   }
 
   #drawTime({ ctx, bbox, valToPos }) {
@@ -102,10 +111,25 @@ export class PlotView {
   }
 }
 
+// Columns of two runs as those of one chart.
+function joined(one, two) {
+  const modes = one.map(() => EXPAND);
+  return uPlot.join([one, two], [modes, modes]);
+}
+
 function seriesOf({ name, tone, dash, thin }) {
-  return {
-    label: name, stroke: color(tone), width: thin ? 1 : 1.75, dash: dash ? [5, 3] : undefined, points: { show: false }, spanGaps: true,
-  };
+  const stroke = color(tone);
+  const points = { show: false, filter: alone, size: 4, fill: stroke };
+  return { label: name, stroke, width: thin ? 1 : 1.75, dash: dash ? [5, 3] : undefined, points };
+}
+
+// Indices of values between unknown ones, which are points since no line has them. What is undefined is at a time of
+// the other run.
+function alone({ data }, series) {
+  const values = data[series];
+  const own = Array.from(values.keys()).filter((at) => values[at] !== undefined);
+  const known = (place) => (values[own[place]] ?? null) !== null;
+  return own.filter((_, place) => known(place) && !known(place - 1) && !known(place + 1));
 }
 
 function entryOf({ name, tone, dash, thin }) {

@@ -21,6 +21,7 @@ from flexneedle.rig.emulator.coupled.needle import DrivenNeedle, SensorOfTip
 from flexneedle.rig.emulator.coupled.stream import Record, Sink, Source, StreamEnded
 from flexneedle.rig.emulator.coupled.truth import Row, TruthWriter
 from flexneedle.rig.emulator.galil.controller import AXES as CHANNELS
+from flexneedle.rig.kernels import compile_kernels
 from flexneedle.rig.phantom.draw import Truth, draw
 from flexneedle.rig.virtual import Seeds, registration_error, to_stage
 
@@ -109,6 +110,7 @@ def main(job: Job, descriptors: list[int]) -> None:
     with ExitStack() as stack:
         axes = [name for name, _ in job.rig.axes.items()]
         truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
+        compile_kernels(job.scenario.setup.axes)  # not while the motors turn
         world = World(job, sink, truth)
         world.begin()
         gc.collect()
