@@ -97,6 +97,8 @@ def test_a_plan_of_an_earlier_state_stays_where_there_is_no_estimate(views):
     page = views([*opening(), plan(), *plan_frames(), session(2), scene(2)])
     until(page, "document.querySelector('[data-panel=space] .legend li')")
     assert legends(page) == [{"planned path", "needle", "target, 1 mm"}] * 3
+    stale = "(await import('/static/planned.js')).plannedPaths(flexneedle.store, 'scene').chosen.stale"
+    assert page.evaluate(f"async () => {stale}")
 
 
 DRAWN = """async (stretch) => {
