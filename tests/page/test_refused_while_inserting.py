@@ -153,7 +153,7 @@ def test_a_period_that_is_missed_is_found():
     assert watched(in_time[:3], decide_ms=210.0).missed == [0, 1, 2]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_is_refused_and_the_insertion_is_not_disturbed(server, tmp_path, monkeypatch):
     monkeypatch.setattr(
         page_clients, "PATIENCE_S", 200.0
