@@ -48,9 +48,8 @@ class FakePage:
     """
 
     def __init__(self, schema=b"{}"):
-        self.news, self.requests, self.answers = opening(), [], {}
-        self.files = {"/schema.json": schema, "/scenario.toml": ""}
-        self._sockets, self._revision, self._target = [], 1, list(TARGET)
+        self._schema, self._sockets = schema, []
+        self._begin()
         routes = [
             Route("/", lambda _: FileResponse(STATIC / "index.html")),
             *(Route(path, self._file) for path in self.files),
@@ -80,6 +79,11 @@ class FakePage:
         self.drop()
         self._thread.join(20.0)
 
+    def begin_anew(self):
+        """Wait until all clients have left, and forget them and what they were sent."""
+        asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(20.0)
+        self._begin()
+
     def send(self, *news):
         """Send news and frames to all clients."""
         asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(20.0)
@@ -95,6 +99,11 @@ class FakePage:
             for each in self.requests
             if each["type"] == kind
         ]
+
+    def _begin(self):
+        self.news, self.requests, self.answers = opening(), [], {}
+        self.files = {"/schema.json": self._schema, "/scenario.toml": ""}
+        self._revision, self._target = 1, list(TARGET)
 
     def _file(self, request):
         return Response(self.files[request.url.path])
@@ -154,6 +163,10 @@ class FakePage:
                 await socket.send_text(each.model_dump_json())
             else:
                 await socket.send_bytes(each)
+
+    async def _left(self):
+        while self._sockets:
+            await asyncio.sleep(0.005)
 
     async def _drop(self, reason):
         for socket in list(self._sockets):

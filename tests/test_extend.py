@@ -150,7 +150,7 @@ def test_a_plan_is_executed_on_the_bench(lab, imported, monkeypatch):
     assert done.periods[-1].true_tip is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_study_loads_them_by_name_in_its_workers(lab):
     done = command(lab, "study", "own.toml", "--workers", "2", "--out", "study", "--json")
     assert done.returncode == 0, done.stderr

@@ -12,8 +12,16 @@ from flexneedle.cli.main import build_parser
 from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 
 # Pages that take more than about 5 s, and the longest of them.
-LONG = {"emulate.md", "index.md", "tutorial.md"}
-SLOW = {"controllers.md", "extend.md", "needle-and-tissue.md", "results.md", "studies.md", "targets.md"}
+LONG = {"emulate.md", "index.md"}
+SLOW = {
+    "controllers.md",
+    "extend.md",
+    "needle-and-tissue.md",
+    "results.md",
+    "studies.md",
+    "targets.md",
+    "tutorial.md",
+}
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
 BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
 EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]

@@ -234,7 +234,7 @@ TARGETS = {"near": (40.0, 5.0), "shallow, lateral": (20.5, -12.375), "deep": (95
 
 
 CROSSED = [
-    pytest.param(make, target, id=f"{name}-{where}", marks=[] if k % 3 == j else pytest.mark.long)
+    pytest.param(make, target, id=f"{name}-{where}", marks=[] if k % 3 == j else pytest.mark.slow)
     for k, (name, make) in enumerate(SCENARIOS.items())
     for j, (where, target) in enumerate(TARGETS.items())
 ]

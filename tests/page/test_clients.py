@@ -21,7 +21,7 @@ def test_two_clients_share_the_session_and_one_steers(server):
         other.wait(lambda: other.newest["people"] == {"type": "people", "clients": 2, "steering": one.number})
         assert (
             other.refused("steer", take=True)
-            == f"client {one.number} steers: it must release the steering first"
+            == f"client {one.number} is in control: it must release it first"
         )
         assert other.refused("steer", take=False).startswith(f"client {one.number} steers")
         one.do("steer", take=False)

@@ -97,9 +97,9 @@ STEERED = {
 @pytest.mark.parametrize("request_", STEERED)
 def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
     with Client(shared_server) as one, Client(shared_server) as other:
-        assert one.refused(request_, **STEERED[request_]) == "nobody steers: take the steering first"
+        assert one.refused(request_, **STEERED[request_]) == "nobody is in control: take control first"
         other.steer()
-        reason = f"client {other.number} steers: ask for the steering first"
+        reason = f"client {other.number} is in control: ask for it first"
         assert one.refused(request_, **STEERED[request_]) == reason
         other.do("steer", take=False)
 

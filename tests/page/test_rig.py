@@ -12,7 +12,7 @@ from page_clients import QUICK, Client, served
 from page_worker import FAULTY, RECORDS, UNSTOPPABLE, WORKS_ON
 
 RIG = ConnectedRig("Bench", "bench.toml")
-WITHOUT_ANYBODY = "nobody steers: who steered is gone"
+WITHOUT_ANYBODY = "nobody is in control: the connection was lost"
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_it_is_disarmed_on_request(client):
         ("edit", {"values": {"target.depth_mm": 35.0}}, "the scenario or an option was changed"),
         ("preset", {"name": "phantom3d"}, "the scenario or an option was changed"),
         ("options", {"seed": 3}, "the scenario or an option was changed"),
-        ("steer", {"take": False}, "nobody steers: the steering was released"),
+        ("steer", {"take": False}, "nobody is in control: it was released"),
     ],
 )
 def test_what_is_prepared_ends_when_it_is_not_what_is_shown_or_nobody_steers(
@@ -235,7 +235,7 @@ def test_it_is_held_when_the_steering_client_is_lost_and_nothing_goes_on_by_itse
     assert held(server, watcher)["begun"]
     assert watcher.newest["rig"]["moves"] == ["wait 2"]
     watcher.wait(lambda: watcher.newest["people"]["steering"] is None)
-    assert watcher.refused("go") == "nobody steers: take the steering first"
+    assert watcher.refused("go") == "nobody is in control: take control first"
     watcher.steer()
     assert watcher.refused("go") == "Bench is not armed: arm it first"
     assert rig_is(watcher, "holding")
@@ -251,7 +251,7 @@ def test_a_rig_that_is_armed_after_a_hold_is_disarmed_when_steering_ends_again(s
     watcher.do("arm", armed=True, job=watcher.newest["rig"]["job"])
     rig_is(watcher, "armed")
     watcher.do("steer", take=False)
-    rig_is(watcher, "holding", why="nobody steers: the steering was released")
+    rig_is(watcher, "holding", why="nobody is in control: it was released")
     watcher.steer()
     assert watcher.refused("go") == "Bench is not armed: arm it first"
 

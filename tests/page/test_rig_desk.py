@@ -99,8 +99,8 @@ def test_nobody_steers_before_it_has_begun(on_loop, state):
         bench.starts()
         bench.reports(state)
         assert bench.shown == "starting"
-        bench.lost("nobody steers")
-        assert bench.jobs.signals[1:] == [{"stop": "nobody steers"}]
+        bench.lost("nobody is in control")
+        assert bench.jobs.signals[1:] == [{"stop": "nobody is in control"}]
 
     on_loop(test)
 
@@ -110,8 +110,8 @@ def test_nobody_steers_after_it_has_begun(on_loop, state, signals):
     def test(bench):
         bench.starts()
         bench.reports(state)
-        bench.lost("nobody steers")
-        assert bench.jobs.signals[1:] == [{"hold": "nobody steers"}] * signals
+        bench.lost("nobody is in control")
+        assert bench.jobs.signals[1:] == [{"hold": "nobody is in control"}] * signals
 
     on_loop(test)
 
@@ -122,7 +122,7 @@ def test_nobody_steers_before_the_insertion_has_gone_on(on_loop, times):
 
     def test(bench):
         bench.starts()
-        bench.reports("holding", why="nobody steers", waits=2)
+        bench.reports("holding", why="nobody is in control", waits=2)
         bench.arm(JOB)
         bench.go()
         assert bench.shown == "holding"
@@ -141,7 +141,7 @@ def test_nobody_steers_just_after_the_insertion_has_gone_on(on_loop):
     def test(bench):
         bench.starts()
         bench.reports("inserting")
-        bench.lost("nobody steers")
+        bench.lost("nobody is in control")
         with pytest.raises(Refusal, match="not ready"):
             bench.arm(JOB)
         bench.reports("holding", waits=2)

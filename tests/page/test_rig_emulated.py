@@ -151,7 +151,7 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
             assert "is for virtual insertions" in client.refused("disturb", what="push", size=0.1)
             lost = monotonic()
         held = rig_is(watcher, "holding")
-        assert held["why"] == "nobody steers: who steered is gone"
+        assert held["why"] == "nobody is in control: the connection was lost"
         Event().wait(1.0)
         assert one.moved_after(lost + PERIOD_S) < 0.005
         assert watcher.newest["rig"]["state"] == "holding"

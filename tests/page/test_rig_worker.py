@@ -156,12 +156,12 @@ def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys, monkeypatch):
 def test_it_is_held_between_two_periods_and_goes_on_when_it_may(calls, in_tmp):
     def then(news):
         if news.type == "rows" and news.first == 4:
-            one.signals.take(Signal(job=1, hold="nobody steers"))
+            one.signals.take(Signal(job=1, hold="nobody is in control"))
 
     one = going(order(in_tmp, Reported(then)), calls)
     Insertions().insert(one)
     assert states(one) == ["planning", "ready", "running", "holding", "running", "done"]
-    assert one.outbox.of("insertion")[3].summary == "nobody steers"
+    assert one.outbox.of("insertion")[3].summary == "nobody is in control"
     assert one.outbox.of("insertion")[3].periods == 5
     assert reports(one) == [("idle", 1, 5), ("idle", 0, 0), ("idle", 2, 4), ("idle", 0, 0)]
     assert one.outbox.of("rig_report")[2].moves == MOVES

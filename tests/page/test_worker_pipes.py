@@ -171,9 +171,9 @@ def test_a_rig_is_held_until_it_may_go_and_again_when_it_is_asked():
     assert signals.held == "not armed"
     signals.take(Signal(job=1, go=True))
     assert signals.held == ""
-    signals.take(Signal(job=1, hold="nobody steers"))
+    signals.take(Signal(job=1, hold="nobody is in control"))
     signals.take(Signal(job=1, alive=True))
-    assert signals.held == "nobody steers"
+    assert signals.held == "nobody is in control"
 
 
 class Clock:

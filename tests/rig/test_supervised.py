@@ -173,9 +173,12 @@ def opened(monkeypatch):
 def test_the_loop_asks_its_watchers_for_holds(monkeypatch):
     rest = Resting()
     monkeypatch.setattr("flexneedle.rig.supervised.Supervisor", rest)
-    plan, watchers = make_plan("manipulation", (40.0, 5.0, 0.0), 0), Watchers(hold=lambda: "nobody steers")
+    plan, watchers = (
+        make_plan("manipulation", (40.0, 5.0, 0.0), 0),
+        Watchers(hold=lambda: "nobody is in control"),
+    )
     with supervised(rest.rig, PHANTOM, plan, watchers) as ports:
-        assert ports.hold() == "nobody steers"
+        assert ports.hold() == "nobody is in control"
     with supervised(rest.rig, PHANTOM, plan, Watchers()) as ports:
         assert ports.hold() == ""
 

@@ -157,7 +157,7 @@ def test_a_node_that_is_killed_stops_a_rig_that_it_has_armed_and_no_other(tmp_pa
         assert f"flexneedle: {line}" in errors
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_run(tmp_path):
     one, other = tmp_path / "dry", tmp_path / "simulated"
     one.mkdir(), other.mkdir()

@@ -20,7 +20,7 @@ def random_insertion(seed, every):
 
 
 @pytest.mark.parametrize(
-    "seed", [*range(8), *(pytest.param(k, marks=pytest.mark.long) for k in range(8, 25))]
+    "seed", [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 25))]
 )
 def test_random_insertions_agree(seed):
     """90 random steps each: 1e-9 to 1 mm, retractions, all inputs, flips, layers, with and without guide."""

@@ -23,7 +23,7 @@ def random_insertion(seed):
 
 
 @pytest.mark.parametrize(
-    "seed", [*range(6), *(pytest.param(k, marks=pytest.mark.long) for k in range(6, 25))]
+    "seed", [*range(6), *(pytest.param(k, marks=pytest.mark.slow) for k in range(6, 25))]
 )
 def test_random_insertions_agree(seed):
     """40 random steps of up to 2 mm each: all inputs, retractions, layers, a guide on two axes, on one, or none."""

@@ -7,6 +7,12 @@ import pytest
 
 from chromium import ARGUMENTS, CHROMIUM
 
+TOUR_SEEN = "if (origin !== 'null') localStorage.setItem('flexneedle tour', 'seen')"
+# In software each drawing of the view in space takes as long as the rest of a test.
+DRAWS_NOTHING = """for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
+  WebGL2RenderingContext.prototype[name] = () => {};
+}"""
+
 
 @pytest.fixture(scope="session")
 def browser():
@@ -19,13 +25,20 @@ def browser():
         browser.close()
 
 
-@pytest.fixture
-def server():
+@pytest.fixture(scope="session")
+def kept_server():
     from fake_page import FakePage
     from flexneedle.page.server.catalog import SCHEMA
 
     with FakePage(SCHEMA) as server:
         yield server
+
+
+@pytest.fixture
+def server(kept_server):
+    """A server of the page's files; a test that has one before its tabs ends with nobody connected."""
+    yield kept_server
+    kept_server.begin_anew()
 
 
 @pytest.fixture
@@ -39,10 +52,66 @@ def pictures():
     return kept
 
 
+@pytest.fixture(scope="session")
+def kept_tabs():
+    """Tabs that one test leaves to the next, by whether WebGL draws: to start one takes longer than most tests."""
+    return {}
+
+
 @pytest.fixture
-def visit(browser, server):
-    """A function that opens the page and returns it. Errors on the page, in `errors`, fail the test at its end."""
-    contexts, errors = [], []
+def tab(browser, kept_tabs):
+    """A function that opens an empty tab. Errors on its pages, in `errors`, fail the test at its end.
+
+    before: a script that runs before those of a page; tour: whether the tour is shown, as on a first visit; draws:
+    whether WebGL draws.
+    """
+    kept, fresh, errors = [], [], []
+
+    def failed(error):
+        errors.append(str(error))
+
+    def printed(message):
+        if message.type == "error":
+            errors.append(message.text)
+
+    def made(before, tour, draws):
+        page = browser.new_context().new_page()
+        page.set_default_timeout(20_000)
+        for script in ("" if tour else TOUR_SEEN, "" if draws else DRAWS_NOTHING, before):
+            if script:
+                page.add_init_script(script)
+        return page
+
+    def opened(width, height, scheme, before=None, tour=False, draws="SCREENSHOTS" in os.environ):
+        if before or tour or any(draws == as_kept for as_kept, _ in kept):
+            page = made(before, tour, draws)
+            fresh.append(page)
+        else:
+            page = kept_tabs.pop(draws, None) or made(None, tour, draws)
+            kept.append((draws, page))
+        page.on("pageerror", failed)
+        page.on("console", printed)
+        page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=scheme)
+        return page
+
+    opened.errors = errors
+    yield opened
+    for page in fresh:
+        page.context.close()
+    for draws, page in kept:
+        page.evaluate("localStorage.clear()")
+        page.goto("about:blank")
+        page.mouse.move(0, 0)
+        page.remove_listener("pageerror", failed)
+        page.remove_listener("console", printed)
+        kept_tabs[draws] = page
+    assert not errors
+
+
+@pytest.fixture
+def visit(server, tab):
+    """A function that opens the page and returns it; before: a script that runs first, tour: as on a first visit."""
 
     def opened(
         width=1280,
@@ -51,23 +120,12 @@ def visit(browser, server):
         before=None,
         tour=False,
         ready="[data-panel=status] .connection",
+        **how,
     ):
-        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(20_000)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        if not tour:
-            page.add_init_script("if (origin !== 'null') localStorage.setItem('flexneedle tour', 'seen')")
-        if before:
-            page.add_init_script(before)
+        page = tab(width, height, scheme, before, tour, **how)
         page.goto(server.url)
         page.wait_for_selector(ready)
         return page
 
-    opened.errors = errors
-    yield opened
-    for context in contexts:
-        context.close()
-    assert not errors
+    opened.errors = tab.errors
+    return opened

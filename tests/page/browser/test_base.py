@@ -62,12 +62,12 @@ def test_edits_are_merged_and_sent_at_most_twenty_times_a_second(visit, server):
 
 
 def test_a_refusal_is_shown_in_words(visit, server):
-    server.answers["steer"] = Refused(what="steer", reason="Person 2 steers: ask for the steering.")
+    server.answers["steer"] = Refused(what="steer", reason="Person 2 is in control: ask for it first.")
     page = visit()
     page.click("text=Take control")
-    page.wait_for_selector("[role=alert] >> text=Person 2 steers")
+    page.wait_for_selector("[role=alert] >> text=Person 2 is in control")
     page.click("[role=alert] >> text=Close")
-    page.wait_for_selector("text=Person 2 steers", state="detached")
+    page.wait_for_selector("text=Person 2 is in control", state="detached")
 
 
 def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):

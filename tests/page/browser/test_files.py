@@ -1,5 +1,7 @@
 """Presets, scenario files, links, recorded runs, rows of studies."""
 
+from base64 import b64decode, b64encode
+
 import numpy as np
 import pytest
 
@@ -219,20 +221,33 @@ def test_a_picture_of_the_scene_is_saved(files):
     assert download.value.suggested_filename == "flexneedle.png"
 
 
-DECODED = """
-async (bytes) => {
-  const decoder = new ImageDecoder({ data: Uint8Array.from(bytes).buffer, type: "image/gif" });
+# Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.
+CODED = """
+const coded = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+"""
+DECODED = f"""
+async (gif) => {{
+  {CODED}
+  const decoder = new ImageDecoder({{ data: decoded(gif).buffer, type: "image/gif" }});
   await decoder.tracks.ready;
   const frames = [];
-  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {
-    const { image } = await decoder.decode({ frameIndex: at });
+  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {{
+    const {{ image }} = await decoder.decode({{ frameIndex: at }});
     const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close();
-    frames.push([...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]);
-  }
+    frames.push(coded(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data));
+  }}
   return frames;
-}
+}}
+"""
+MADE = f"""
+async ([width, height, frames]) => {{
+  {CODED}
+  const {{ gifOf }} = await import("/static/files/gif.js");
+  return coded(gifOf(width, height, frames.map(decoded), 0.1));
+}}
 """
 
 
@@ -244,19 +259,13 @@ def test_a_gif_has_the_pixels_of_its_frames(files, size):
     frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
     frames[..., 3] = 255
     frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs
-    made = page.evaluate(
-        """async ([width, height, frames]) => {
-          const { gifOf } = await import("/static/files/gif.js");
-          return [...gifOf(width, height, frames, 0.1)];
-        }""",
-        [*size, [frame.ravel().tolist() for frame in frames]],
-    )
-    shown = np.array(page.evaluate(DECODED, made)).reshape(frames.shape)
-    assert np.max(np.abs(shown - frames.astype(int))) <= 26
+    made = page.evaluate(MADE, [*size, [b64encode(frame.tobytes()).decode() for frame in frames]])
+    shown = np.array([np.frombuffer(b64decode(frame), np.uint8) for frame in page.evaluate(DECODED, made)])
+    assert np.max(np.abs(shown.reshape(frames.shape).astype(int) - frames)) <= 26
 
 
 def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
-    page = files()
+    page = files(draws=True)
     page.click("text=GIF")
     page.wait_for_selector("text=A GIF needs an insertion")
     server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
@@ -264,7 +273,7 @@ def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
     with page.expect_download() as download:
         page.click("text=GIF")
     download.value.save_as(tmp_path / "made.gif")
-    frames = page.evaluate(DECODED, list((tmp_path / "made.gif").read_bytes()))
+    frames = page.evaluate(DECODED, b64encode((tmp_path / "made.gif").read_bytes()).decode())
     assert len(frames) == 4
     assert frames[0] != frames[-1]
     assert page.evaluate("flexneedle.store.get('view period')") is None

@@ -141,8 +141,8 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
 def test_a_rig_that_is_held_has_to_be_confirmed_again(rig_panel, server):
     page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7))
     page.check("#rig-free")
-    server.send(rig("holding", "Bench: further", job=7, begun=True, why="nobody steers"))
-    page.wait_for_selector("text=It holds: the needle rests where it is: nobody steers.")
+    server.send(rig("holding", "Bench: further", job=7, begun=True, why="nobody is in control"))
+    page.wait_for_selector("text=It holds: the needle rests where it is: nobody is in control.")
     assert not page.is_checked("#rig-free")
     assert shown_buttons(page) == {"Arm": False, "Go on": False}
     page.check("#rig-free")

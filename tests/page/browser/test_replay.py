@@ -30,35 +30,31 @@ def record(of="first", **changes):
 
 
 @pytest.fixture
-def replay(browser, tmp_path):
+def replay(tab, tmp_path):
     """A function that opens a replay from the disk; what it asks the network for, and errors, fail the test."""
-    contexts, asked, errors = [], [], []
+    pages, asked = [], []
 
-    def opened(records=None, width=1280, height=900, scheme="light", before=None, ready=DRAWN):
+    def note(request):
+        asked.append(request.url)
+
+    def opened(records=None, width=1280, height=900, scheme="light", before=None, ready=DRAWN, **how):
         path = tmp_path / "replay.html"
         path.write_text(document("mine", records or record()), encoding="utf-8")
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, color_scheme=scheme, offline=True
-        )
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(20_000)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda request: asked.append(request.url))
-        if before:
-            page.add_init_script(before)
+        page = tab(width, height, scheme, before, **how)
+        page.context.set_offline(True)
+        page.on("request", note)
+        pages.append(page)
         page.goto(path.as_uri())
         page.wait_for_selector(f"{SCRUB}:visible")
         page.wait_for_selector(ready)
         return page
 
     yield opened
-    for context in contexts:
-        context.close()
-    assert not errors
+    for page in pages:
+        page.remove_listener("request", note)
+        page.context.set_offline(False)
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
-    assert len([url for url in asked if url.startswith("file:")]) == len(contexts)
+    assert len([url for url in asked if url.startswith("file:")]) == len(pages)
 
 
 def at(page, period):
@@ -89,7 +85,7 @@ def test_it_begins_at_the_end_of_the_run_with_what_happened_in_words(replay):
 
 
 def test_scrubbing_by_keys_shows_another_period_in_all_views(replay):
-    page = replay()
+    page = replay(draws=True)
     last = pictures_at(page, PERIODS - 1)
     page.focus(SCRUB)
     page.keyboard.press("Home")

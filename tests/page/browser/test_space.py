@@ -74,7 +74,7 @@ def settled(page):
 @pytest.mark.parametrize("state", STATES)
 def test_the_scene_is_drawn_at_each_size(space, state, size, scheme):
     width, height = SIZES[size]
-    page = space(STATES[state](), width=width, height=height, scheme=scheme)
+    page = space(STATES[state](), width=width, height=height, scheme=scheme, draws=True)
     settled(page)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     colors = on_view(page, COLORS)

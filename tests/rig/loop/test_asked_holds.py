@@ -9,7 +9,7 @@ from flexneedle.control.interface import Decision, Method
 from insertions import PHANTOM, READING, Tank, run
 from tanks import STRAIGHT
 
-WHY = "nobody steers"
+WHY = "nobody is in control"
 
 
 class Asked:

@@ -161,7 +161,7 @@ def test_an_unreachable_target_is_held_unless_forced(plan):
     assert not forced.reached
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_with_a_perfect_model_it_ends_at_the_target(number):
     """Worlds whose plant is the model, with the tracker's noise, and no warning."""

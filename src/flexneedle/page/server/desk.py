@@ -126,7 +126,7 @@ class Desk:
         self.people.leave(client)
         self.hub.publish(self.people.news())
         if steered:
-            self.rig.lost("nobody steers: who steered is gone")
+            self.rig.lost("nobody is in control: the connection was lost")
         if not self.people.clients:
             self._start_timer("alone", self.limits.alone_s, self._alone)
 
@@ -205,7 +205,7 @@ class Desk:
         self.people.steer(client, take)
         self.hub.publish(self.people.news())
         if before == client and not take:
-            self.rig.lost("nobody steers: the steering was released")
+            self.rig.lost("nobody is in control: it was released")
 
     def _begin(self, session: Session) -> None:
         """Go on with a changed session: what is computed for the old one is cancelled.
