@@ -23,7 +23,7 @@ def test_two_clients_share_the_session_and_one_steers(server):
             other.refused("steer", take=True)
             == f"client {one.number} is in control: it must release it first"
         )
-        assert other.refused("steer", take=False).startswith(f"client {one.number} steers")
+        assert other.refused("steer", take=False).startswith(f"client {one.number} is in control")
         one.do("steer", take=False)
         other.steer()
         one.wait(lambda: one.newest["people"]["steering"] == other.number)

@@ -212,7 +212,11 @@ class Ahead:
             angle = angle if half else np.where(made, angle + turn, angle)
             last = np.where(made, at, last)
         roll = turned[:, :m]
-        return depth, np.pi * (np.rint(roll / np.pi) % 2.0) if half else roll
+        if half:
+            return depth, np.pi * (np.rint(roll / np.pi) % 2.0)
+        # Rolls that share the last boundary are one, the short way.
+        roll[:, -1] = shortest(self.setup, self.state.roll + roll[:, :-1].sum(axis=1), roll[:, -1])
+        return depth, roll
 
     def _guide(self, corrections: Floats, depth: Floats, axis: int) -> Floats:
         """Guide positions (N, m + 1) on an axis within the limits, for corrections (N, k) at the knots."""

@@ -157,7 +157,7 @@ def test_rows_that_are_missing_are_asked_for(visit, server):
     page.wait_for_selector("text=nobody is in control")
     server.send(rows(0, 3))
     server.send(rows(8, 2))
-    until(page, "flexneedle.store.get('rows live').length === 13")
+    until(page, "flexneedle.store.get('rows live')?.length === 13")
     assert server.asked("rows_from") == [{"type": "rows_from", "index": 3}]
 
 

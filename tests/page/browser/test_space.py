@@ -195,7 +195,7 @@ def test_it_draws_only_when_something_has_changed(space, server):
     page.wait_for_timeout(400)
     assert on_view(page, count) == before
     server.send(rows(11, 1), *period_frames(11))
-    until(page, "flexneedle.store.get('rows live').length === 12")
+    until(page, "flexneedle.store.get('rows live')?.length === 12")
     settled(page)
     assert before < on_view(page, count) <= before + 4
 
