@@ -40,7 +40,7 @@ def job(order, state, text=""):
     say("job", job=order["job"], kind=order["kind"], state=state, text=text)
 
 
-def insertion(order, of, state, summary="", pace=0.0, periods=0):
+def insertion(order, of, state, summary="", pace=0.0, periods=0, row=None):
     say(
         "insertion",
         of=of,
@@ -53,6 +53,7 @@ def insertion(order, of, state, summary="", pace=0.0, periods=0):
         periods=periods,
         pace=pace,
         rig=order.get("rig", ""),
+        row=row,
         folder="recorded" if order.get("rig") else "",
     )
 
@@ -171,13 +172,14 @@ def do(order, signals):
         case "row":
             if order["row"] == WORKS_ON:
                 return "cancelled" if signals.get().get("cancel") else "failed"
-            insertion(order, order.get("of", "first"), "done", json.dumps([order["folder"], order["row"]]))
+            shown = json.dumps([order["folder"], order["row"]])
+            insertion(order, order.get("of", "first"), "done", shown, row=order["row"])
         case "check":
             findings = [{"part": "driver", "item": "connection", "found": order["rig"], "problem": ""}]
             say("check", revision=order["revision"], findings=findings)
-        case "save":
+        case "save" | "save_row":
             Path(order["folder"]).mkdir()
-            (Path(order["folder"]) / "run.json").write_text("{}")
+            (Path(order["folder"]) / "run.json").write_text(json.dumps(order))
     return "done"
 
 

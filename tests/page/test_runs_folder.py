@@ -222,6 +222,17 @@ def test_a_row_of_a_study_is_opened(runs, client):
     client.wait(lambda: "insertion second" in client.newest)
     assert json.loads(client.newest["insertion second"]["summary"]) == [str(runs / "many"), 17]
     client.job("row", "done")
+    assert (
+        client.refused("save", name="kept", of="first") == "no row of a study is shown there: open one first"
+    )
+    client.do("save", name="kept", of="second")
+    client.job("save", "done")
+    order = json.loads((runs / "kept" / "run.json").read_text())
+    assert (order["do"], order["of"]) == ("save_row", "second")
+    assert client.refused("save", name="kept", of="second").startswith("kept: there is already something of")
+    client.do("open", name="older", second=True)
+    client.job("recording", "done")
+    assert client.refused("save", name="other", of="second").startswith("no row of a study is shown there")
 
 
 @pytest.mark.usefixtures("study")

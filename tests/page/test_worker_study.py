@@ -14,7 +14,7 @@ from flexneedle.page.orders import Signal
 from flexneedle.page.worker import study as worker
 from flexneedle.page.worker.__main__ import carry_out
 from flexneedle.page.worker.recording import recorded
-from flexneedle.page.worker.study import row, rows
+from flexneedle.page.worker.study import Rows, rows
 from flexneedle.study import pools
 from flexneedle.study.recompute import recompute
 from flexneedle.study.runner import run_study
@@ -135,7 +135,7 @@ def test_no_more_rows_than_the_limit_are_sent(made, monkeypatch):
 
 def test_a_row_is_reported_as_a_recording(made):
     one = task("row", folder=str(made), row=6, of="second")
-    row(one)
+    Rows().row(one)
     insertion = recompute(made, 6).insertion
     (news,) = one.outbox.of("insertion")
     assert (news.of, news.name, news.state) == ("second", "small, row 6", "done")
@@ -155,11 +155,30 @@ def test_a_row_is_reported_as_a_recording(made):
     assert len(shares) == news.periods
     assert shares[0] < 0.3 < 0.9 < shares[-1] <= 1.0
     assert one.outbox.of("job")[0].text == "small, row 6"
+    assert news.row == 6
+
+
+def test_a_row_that_is_shown_is_saved_as_a_run(made, tmp_path):
+    again, folder, untimed = Rows(), tmp_path / "saved", {"decide_ms"}
+    one = task("row", folder=str(made), row=6, of="second")
+    again.row(one)
+    again.save(task("save_row", "save", folder=str(folder), of="second"))
+    with pytest.raises(InputError, match="no row to save"):
+        again.save(task("save_row", "save", folder=str(tmp_path / "other"), of="first"))
+    other = task("read", "recording", folder=str(folder), of="second")
+    again.read(other)
+    assert [row.model_dump(exclude=untimed) for row in other.outbox.rows] == [
+        row.model_dump(exclude=untimed) for row in one.outbox.rows
+    ]
+    assert other.outbox.of("insertion")[0].row is None
+    with pytest.raises(InputError, match="no row to save"):
+        again.save(task("save_row", "save", folder=str(tmp_path / "other"), of="second"))
+    assert not (tmp_path / "other").exists()
 
 
 def test_what_differs_from_the_recorded_row_is_in_the_summary(changed):
     one = task("row", folder=str(changed(row_6={"flips": 99})), row=6)
-    row(one)
+    Rows().row(one)
     (news,) = one.outbox.of("insertion")
     assert "; recomputed with the study's code, and not the same: flips " in news.summary
 
@@ -170,13 +189,13 @@ def test_a_row_is_cancelled_between_two_periods(made):
             one.signals.take(Signal(job=1, cancel=True))
 
     one = task("row", folder=str(made), row=0, reported=Reported(then))
-    carry_out(one, {"row": row})
+    carry_out(one, {"row": Rows().row})
     assert one.outbox.of("insertion") == []
     assert [job.state for job in one.outbox.of("job")] == ["running", "cancelled"]
 
 
 def test_errors_name_the_study_and_no_path(made, tmp_path):
     with pytest.raises(InputError, match=r"^small: row = 8: must be from 0 to 7$"):
-        row(task("row", folder=str(made), row=SIZE))
+        Rows().row(task("row", folder=str(made), row=SIZE))
     with pytest.raises(InputError, match=r"^small: contains no study: study\.json is missing$"):
         rows(task("study", folder=str(tmp_path)))

@@ -194,10 +194,11 @@ class Study(Request):
 
 
 class Save(Request):
-    """Save the insertion that has ended last under a name in the folder of runs."""
+    """Save the insertion that has ended last, or the row that is shown as a recording, in the folder of runs."""
 
     type: Literal["save"]
     name: Name
+    of: Literal["live", "first", "second"] = "live"
 
 
 class RowsFrom(Request):
@@ -450,7 +451,8 @@ class Insertion(News):
     """State of an insertion, or how it has ended. of: as for `Rows`; source: scenario and seed of a recording.
 
     state: waiting, planning, running, paused, done, held, failed, interrupted, refused; on a rig also ready, before it
-    begins, and holding. rig: its name, "" of a virtual one; folder: name of the run that records it, "" without one.
+    begins, and holding. rig: its name, "" of a virtual one; folder: name of the run that records it, "" without one;
+    row: of the study, of one that was computed again, which can be saved as a run.
     A new insertion or recording is announced before its rows and frames: the browser then forgets those of the last.
     """
 
@@ -467,6 +469,7 @@ class Insertion(News):
     error_mm: float | None = None
     rig: str = ""
     folder: str = ""
+    row: int | None = None
     scene: Scene | None = None
 
     @property

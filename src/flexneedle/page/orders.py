@@ -11,7 +11,9 @@ from pydantic import Field
 
 from flexneedle.page.messages import Disturb, JobKind, Message, News, Strategy
 
-Do = Literal["scene", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save"]
+Do = Literal[
+    "scene", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save", "save_row"
+]
 Kind = JobKind
 
 
@@ -32,9 +34,9 @@ class Work(Message):
 
     scenario: nested tables of the scenario called `name`, with the revision that the results repeat. An insertion makes
     its own plan, with this seed. rig: rig file, "" for a virtual one; paused: whether the insertion waits for its pace.
-    folder: of the run to read as the first or second recording, of a study, or to save the last insertion in; that in
-    which an insertion on a rig makes one for its record. row: of the study, to compute again; or the first of those to
-    list, None for the worst.
+    folder: of the run to read as the first or second recording, of a study, or to save the last insertion in, or the
+    row that is shown as such a recording; that in which an insertion on a rig makes one for its record. row: of the
+    study, to compute again; or the first of those to list, None for the worst.
     """
 
     job: int

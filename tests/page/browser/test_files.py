@@ -210,7 +210,23 @@ def test_an_insertion_that_has_ended_is_saved(files, server):
     page.fill("[aria-label='Name of the run to save']", "my run")
     page.click("text=Save the insertion")
     page.wait_for_timeout(100)
-    assert server.asked("save") == [{"type": "save", "name": "my run"}]
+    assert server.asked("save") == [{"type": "save", "name": "my run", "of": "live"}]
+
+
+def test_a_row_that_is_shown_is_saved_as_a_run(files, server):
+    page = files()
+    server.send(
+        insertion("done", of="first", name="mine"),
+        insertion("done", of="second", name="many, row 17", row=17),
+    )
+    page.wait_for_selector("text=Compared with: many, row 17")
+    assert page.locator("text=Save as a run").count() == 1
+    name = page.locator("[aria-label='Name to save many row 17 as']")
+    assert name.input_value() == "many row 17"
+    name.fill("worst")
+    page.click("text=Save as a run")
+    until(page, "!document.querySelector('.opened form input').value")
+    assert server.asked("save") == [{"type": "save", "name": "worst", "of": "second"}]
 
 
 def test_a_picture_of_the_scene_is_saved(files):

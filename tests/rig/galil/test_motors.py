@@ -331,6 +331,18 @@ def test_a_refusal_without_a_reason_is_still_one(answer, reason):
             motors.set_speed("A", 100, 1024)
 
 
+def test_who_only_reads_stops_no_motion_of_another():
+    with driven(timeout_ms=100) as (motors, device):
+        device.damage = lambda _line, _true: b"garbage"
+        for _ in range(2):
+            with pytest.raises(DriverError, match="start again"):
+                motors.read()
+            device.damage = None
+            motors.reconnect()
+            device.damage = lambda _line, _true: b"garbage"
+        assert not [line for line in device.lines if line.startswith(("ST", "AB"))]
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -347,6 +359,7 @@ def test_a_refusal_without_a_reason_is_still_one(answer, reason):
 )
 def test_after_a_reply_that_is_none_nothing_goes_over_the_connection_until_it_is_renewed(damage):
     with driven(timeout_ms=100) as (motors, device):
+        motors.stop()
         device.damage = damage
         with pytest.raises(DriverError, match=r"; check the power, .* start again$"):
             motors.read()

@@ -159,7 +159,7 @@ class Desk:
             case m.Study():
                 self._list_rows(request)
             case m.Save():
-                self._save(request.name)
+                self._save(request)
             case m.Stop():
                 self.live.stop(f"person {client} on the page")
             case m.Check() | m.Prepare() | m.Arm() | m.Go():
@@ -287,10 +287,20 @@ class Desk:
         work = Work(job=0, do="study", kind="study", name=request.name, folder=folder, row=request.index)
         self._plans.add(work)
 
-    def _save(self, name: str) -> None:
-        self.live.require_ended()
-        folder = self.runs.new(name)
-        self._insertions.add(Work(job=0, do="save", kind="save", name=name, folder=str(folder)))
+    def _save(self, request: m.Save) -> None:
+        work = Work(job=0, do="save", kind="save", name=request.name)
+        if request.of == "live":
+            self.live.require_ended()
+        else:
+            self._require_row(request.of)
+            work = work.model_copy(update={"do": "save_row", "of": request.of})
+        work = work.model_copy(update={"folder": str(self.runs.new(request.name))})
+        (self._insertions if request.of == "live" else self._plans).add(work)
+
+    def _require_row(self, of: str) -> None:
+        newest = self.hub.newest(f"insertion {of}")
+        if newest is None or json.loads(newest).get("row") is None:
+            raise Refusal("no row of a study is shown there: open one first")
 
     # What happens by itself
 

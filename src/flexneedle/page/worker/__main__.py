@@ -16,11 +16,10 @@ from flexneedle.page.worker.insertion import Insertions
 from flexneedle.page.worker.outbox import Outbox
 from flexneedle.page.worker.plans import estimate, plan
 from flexneedle.page.worker.reach import reach
-from flexneedle.page.worker.recording import read
 from flexneedle.page.worker.rig import check
 from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
-from flexneedle.page.worker.study import row, rows
+from flexneedle.page.worker.study import Rows, rows
 from flexneedle.page.worker.task import Task
 from flexneedle.page.worker.warm import warm_up
 from flexneedle.scenario.problems import unexpected
@@ -40,18 +39,19 @@ def main() -> int:
     inbox, outbox = Inbox(os.fdopen(os.dup(0), "rb")), Outbox(partial(_write, out))
     warm_up()
     _write(out, channel.packed(Ready().model_dump_json()))
-    insertions = Insertions()
+    insertions, again = Insertions(), Rows()
     actions: Actions = {
         "scene": scene,
         "estimate": estimate,
         "plan": plan,
         "reach": reach,
-        "read": read,
+        "read": again.read,
         "study": rows,
-        "row": row,
+        "row": again.row,
         "insert": insertions.insert,
         "check": check,
         "save": insertions.save,
+        "save_row": again.save,
     }
     while (order := inbox.next()) is not None:
         carry_out(Task(*order, outbox), actions)

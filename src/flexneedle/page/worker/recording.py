@@ -23,9 +23,9 @@ def read(task: Task) -> None:
     report(task, insertion, task.work.name, lacking)
 
 
-def report(task: Task, insertion: Insertion, name: str, note: str) -> None:
-    """Report an insertion as the recording of the order. note: what is to be known of it, or ""."""
-    for one in recorded(insertion, name, task.work.of, note):
+def report(task: Task, insertion: Insertion, name: str, note: str, row: int | None = None) -> None:
+    """Report an insertion as the recording of the order. note: what is to be known of it, or ""; row: of its study."""
+    for one in recorded(insertion, name, task.work.of, note, row):
         task.signals.check()
         if isinstance(one, ShapeFrame):
             task.show(one)
@@ -33,8 +33,10 @@ def report(task: Task, insertion: Insertion, name: str, note: str) -> None:
             task.say(one)
 
 
-def recorded(insertion: Insertion, name: str, of: Of, lacking: str) -> Iterator[News | ShapeFrame]:
-    """News and frames of a recorded insertion. lacking: what its record lacks, or ""."""
+def recorded(
+    insertion: Insertion, name: str, of: Of, lacking: str, row: int | None = None
+) -> Iterator[News | ShapeFrame]:
+    """News and frames of a recorded insertion. lacking: what its record lacks, or ""; row: of the study it is of."""
     plan, source, error = insertion.plan, _SOURCES[of], insertion.error_mm
     yield messages.Insertion(
         of=of,
@@ -48,6 +50,7 @@ def recorded(insertion: Insertion, name: str, of: Of, lacking: str) -> Iterator[
         pace=0.0,
         error_mm=error if error == error else None,
         rig=insertion.rig,
+        row=row,
         scene=scene_of(scenario_of(insertion), 0),
     )
     yield frame_of(Kind.PATH, source, 0, plan.tips[:, :3])

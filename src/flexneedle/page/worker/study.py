@@ -8,11 +8,13 @@ from typing import Any
 from flexneedle.errors import InputError, one_line
 from flexneedle.page.messages import StudyRow, StudyRows
 from flexneedle.page.orders import Work
-from flexneedle.page.worker.recording import report
+from flexneedle.page.worker.recording import read, report
 from flexneedle.page.worker.task import Task
+from flexneedle.runs.saving import save
 from flexneedle.study.folder import read_folder
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.recompute import WITHOUT, recompute
+from flexneedle.types import Insertion
 
 MOST_ROWS = 200
 _LONGEST_REASON = 300
@@ -38,18 +40,38 @@ def rows(task: Task) -> None:
     )
 
 
-def row(task: Task) -> None:
-    """Compute a row of a study again, and report it. Raises InputError or RunError for a row that has no insertion."""
-    work = task.work
-    name = f"{work.name}, row {work.row}"
+class Rows:
+    """Rows of studies that were computed again and are shown as recordings, until others are: they can be saved."""
 
-    def on_share(share: float) -> None:
-        task.signals.check()
-        task.tell("running", share, name)
+    def __init__(self) -> None:
+        self._shown = dict[str, Insertion]()
 
-    with _named(work):
-        again = recompute(Path(work.folder), work.row or 0, on_share)
-    report(task, again.insertion, name, again.note)
+    def row(self, task: Task) -> None:
+        """Compute a row again, and report it. Raises InputError or RunError for a row that has no insertion."""
+        work = task.work
+        self._shown.pop(work.of, None)
+        name = f"{work.name}, row {work.row}"
+
+        def on_share(share: float) -> None:
+            task.signals.check()
+            task.tell("running", share, name)
+
+        with _named(work):
+            again = recompute(Path(work.folder), work.row or 0, on_share)
+        report(task, again.insertion, name, again.note, work.row)
+        self._shown[work.of] = again.insertion
+
+    def read(self, task: Task) -> None:
+        """Report a recorded run in the place of a row."""
+        self._shown.pop(task.work.of, None)
+        read(task)
+
+    def save(self, task: Task) -> None:
+        """Save the row that is shown as a recording in the folder of the order. Raises InputError without one."""
+        insertion = self._shown.get(task.work.of)
+        if insertion is None:
+            raise InputError("there is no row to save: open a row of a study first")
+        save(insertion, task.work.folder)
 
 
 def _worst(found: Mapping[int, Mapping[str, Any]]) -> list[int]:

@@ -1,4 +1,4 @@
-// Recorded runs and studies: open a run or a row, a second to compare, download; save the insertion that has ended last.
+// Recorded runs and studies: open a run or a row, a second to compare, download; save the last insertion or a row as a run.
 
 import { button, make } from "../dom.js";
 import { showStudy } from "./study.js";
@@ -13,14 +13,17 @@ export function showRuns(element, store, link) {
   const search = make("input", { type: "search", placeholder: "Search the runs", "aria-label": "Search the runs" });
   const list = make("ul", { "aria-label": "Recorded runs" });
   const opened = make("div.opened");
-  const save = saveForm(store, link);
+  const save = saveForm(link, "live", "", "Save the insertion");
+  store.subscribe(["insertion live"], () => {
+    save.hidden = !ENDED.includes(store.get("insertion live")?.state);
+  });
   const study = make("div");
   element.append(save, opened, study, make("details", { open: true }, make("summary", {}, "Recorded runs and studies"), search, list));
   showStudy(study, store, link);
   const show = () => showList(list, search.value.trim().toLowerCase(), store, link);
   search.addEventListener("input", show);
   store.subscribe(["runs"], show);
-  store.subscribe(["insertion first", "insertion second", "runs"], () => showOpened(opened, store, link));
+  store.subscribe(["insertion first", "insertion second"], () => showOpened(opened, store, link));
 }
 
 function showList(list, text, store, link) {
@@ -54,22 +57,21 @@ function showOpened(element, store, link) {
     const insertion = store.get(`insertion ${of}`);
     if (!insertion) return [];
     const close = button("Close", () => link.ask({ type: "open", name: null, second }), { "aria-label": `Close ${insertion.name}` });
-    return [make("p.tools", {}, make("span", {}, `${what}: ${insertion.name} (${insertion.controller}, seed ${insertion.seed})`), close)];
+    const line = make("p.tools", {}, make("span", {}, `${what}: ${insertion.name} (${insertion.controller}, seed ${insertion.seed})`), close);
+    return insertion.row === null ? [line] : [line, saveForm(link, of, insertion.name.replaceAll(",", ""), "Save as a run")];
   });
   element.replaceChildren(...lines);
 }
 
-function saveForm(store, link) {
-  const name = make("input", { type: "text", maxlength: "80", placeholder: "Name of the run", "aria-label": "Name of the run to save" });
-  const form = make("form.tools", { hidden: true }, name, make("button", { type: "submit" }, "Save the insertion"));
+// What is saved: the insertion that has ended last, or the row of a study that is shown.
+function saveForm(link, of, proposed, text) {
+  const name = make("input", { type: "text", maxlength: "80", value: proposed, placeholder: "Name of the run", "aria-label": proposed ? `Name to save ${proposed} as` : "Name of the run to save" });
+  const form = make("form.tools", {}, name, make("button", { type: "submit" }, text));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const valid = NAME.test(name.value.trim());
     name.setAttribute("aria-invalid", valid ? "false" : "true");
-    if (valid && (await link.ask({ type: "save", name: name.value.trim() })).done) name.value = "";
-  });
-  store.subscribe(["insertion live"], () => {
-    form.hidden = !ENDED.includes(store.get("insertion live")?.state);
+    if (valid && (await link.ask({ type: "save", name: name.value.trim(), of })).done) name.value = "";
   });
   return form;
 }

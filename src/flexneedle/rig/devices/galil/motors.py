@@ -43,8 +43,9 @@ class GalilMotors:
     """Motors by channel, the axis letters A to H. Positions are whole counts: targets are rounded to the nearest.
 
     Connecting enables no motor and moves none. Each call takes at most the reply timeout. Where a reply is missing, or
-    is not one to what was asked, the motors are sent one more stop and the connection is closed until `reconnect`. Use
-    it as a context manager, or call `close`. Not for several threads.
+    is not one to what was asked, the connection is closed until `reconnect`, after one more stop for the motors if this
+    object has commanded anything: who only reads stops nobody's motion. Use it as a context manager, or call `close`.
+    Not for several threads.
 
     settings, channels: see `factory`. Raises DriverError if the controller cannot be reached or is not fit: a stepper,
     whose position is not measured, or a format of positions (PF) other than the default.
@@ -63,6 +64,7 @@ class GalilMotors:
         self._rates: dict[str, int] = {}
         self._slowing: dict[str, float] = {}
         self._stopping: float | None = None
+        self._farewell = ""
         self.identity = ""
         """Model and revision of the firmware."""
         self.address = self._link.address
@@ -85,7 +87,12 @@ class GalilMotors:
         except DriverError as error:
             self._link.close(str(error))
             raise
-        self._link.farewell = f"ST{self._letters}"
+        self._link.farewell = self._farewell
+
+    def _do(self, commands: Sequence[str], deadline: float) -> None:
+        """Have commands carried out; from the first on a connection in doubt is left with a stop of the motors."""
+        self._farewell = self._link.farewell = f"ST{self._letters}"
+        self._dialogue.do(commands, deadline)
 
     def _greet(self, deadline: float) -> None:
         """Find out what is there. Raises DriverError if it is not a controller that can be read as it is."""
@@ -188,7 +195,7 @@ class GalilMotors:
         # it: it moves again only after its stop was reported to the caller.
         entering = {letter: 1 for letter in targets if not self._channels[letter].tracking}
         commands = [_assigned("PT", entering)] if entering else []
-        self._dialogue.do([*commands, *_in_lines("PA", targets)], deadline)
+        self._do([*commands, *_in_lines("PA", targets)], deadline)
         for letter, target in targets.items():
             self._channels[letter] = self._channels[letter].follows(target, tracking=True)
 
@@ -202,7 +209,7 @@ class GalilMotors:
             self._channels[letter] = replace(self._channels[letter], target=wanted[letter], waiting=True)
         now = {letter: target for letter, target in wanted.items() if letter not in moving}
         if now:
-            self._dialogue.do([*_in_lines("PA", now), f"BG{''.join(sorted(now))}"], deadline)
+            self._do([*_in_lines("PA", now), f"BG{''.join(sorted(now))}"], deadline)
         for letter, target in now.items():
             self._channels[letter] = self._channels[letter].follows(target, tracking=False)
 
@@ -217,7 +224,7 @@ class GalilMotors:
         began = self._stopping = monotonic() if self._stopping is None else self._stopping
         self._stopped(STOPPED)
         try:
-            self._dialogue.do([f"ST{self._letters}"], deadline)
+            self._do([f"ST{self._letters}"], deadline)
         except DriverError:
             if self._link.is_open:  # refused
                 self._abort(deadline)
@@ -227,7 +234,7 @@ class GalilMotors:
 
     def _abort(self, deadline: float) -> None:
         self._stopped(STOPPED, ABORTED)
-        self._dialogue.do(["AB 1"], deadline)
+        self._do(["AB 1"], deadline)
 
     def _stopped(self, *codes: int) -> None:
         self._channels = {k: channel.rests(*codes) for k, channel in self._channels.items()}
@@ -249,7 +256,7 @@ class GalilMotors:
         commands = [f"SP{channel}={pace}"]
         if self._rates.pop(channel, None) != rate:
             commands = [f"DC{channel}={rate}", f"AC{channel}={rate}", *commands]
-        self._dialogue.do(commands, self._deadline())
+        self._do(commands, self._deadline())
         self._rates[channel] = rate
         self._slowing[channel] = pace / rate
 
@@ -258,14 +265,14 @@ class GalilMotors:
         target = self._target(channel, position)
         deadline = self._deadline()
         self._rest(channel, deadline)
-        self._dialogue.do([f"DP{channel}={target}"], deadline)
+        self._do([f"DP{channel}={target}"], deadline)
 
     def power(self, channel: str, on: bool) -> None:
         """Switch a motor at rest on or off. Switched on, it is held where it is."""
         self._known(channel)
         deadline = self._deadline()
         self._rest(channel, deadline)
-        self._dialogue.do([f"{'SH' if on else 'MO'}{channel}"], deadline)
+        self._do([f"{'SH' if on else 'MO'}{channel}"], deadline)
 
     def _rest(self, letter: str, deadline: float) -> None:
         """End the position tracking of a channel at rest, in which the controller refuses other commands."""
@@ -273,7 +280,7 @@ class GalilMotors:
             self._reports(deadline)
             if self._reports(deadline)[letter].moving:  # the second one: see `seen`
                 raise DriverError(f"{self._link.name}: {letter} is in motion")
-            self._dialogue.do([f"ST{letter}"], deadline)
+            self._do([f"ST{letter}"], deadline)
             while self._moving(letter, deadline):
                 pass
         self._channels[letter] = self._channels[letter].rests(STOPPED)
