@@ -8,7 +8,7 @@ parser      replies to the driver, as bytes: read, or refused with GarbledError;
 controller  lines to the emulated controller: each command is answered, the state stays valid, and an axis begins to
             move only by BG, or by PA in position tracking, with its motor on
 driver      calls of `GalilMotors` on a controller that answers by damaged, partial, huge, late, no or true replies: a
-            state that is what was sent, or DriverError; never later than the reply timeout
+            state that is what was sent, or DriverError; never later than the reply timeout; no motion but by `follow`
 
 Prints the inputs and the largest times; at the first failure its seed and input, and exit status 1.
 """
@@ -37,6 +37,7 @@ FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
 RECOVERY_S = 20.0
 LETTERS = "AB"
+MOVES = re.compile(r"(^|;)\s*(BG|PA|PR|PT|JG)(?![A-H]*\?)")
 
 
 # The parser
@@ -160,9 +161,11 @@ class Server:
     device: Device = field(default_factory=Device)
     damage: Callable[[bytes], bytes | None] | None = None
     sent: bytes = b""
+    lines: list[str] = field(default_factory=list)
 
     def answer(self, line: str) -> bytes | None:
         """Return what to send; None: nothing, b"": the connection is closed."""
+        self.lines.append(line)
         self.device, true = reply(advanced(self.device, 2), line)
         complete = true.encode()
         found = complete if self.damage is None else self.damage(complete)
@@ -248,6 +251,7 @@ def damages(random: Random) -> Callable[[bytes], bytes | None] | None:
 def called(motors: GalilMotors, server: Server, name: str, random: Random) -> float:
     """Make a call with damaged replies; return how long it took. Raises Failure."""
     server.damage = damages(random)
+    server.lines.clear()
     begun = monotonic()
     try:
         found = ACTIONS[name](motors, random)
@@ -263,6 +267,8 @@ def called(motors: GalilMotors, server: Server, name: str, random: Random) -> fl
     server.damage = None
     if not connected(motors):
         recover(motors)
+    if name != "follow" and (moves := [line for line in server.lines if MOVES.search(line)]):
+        raise Failure(f"{name} answered by {server.sent!r} sent {moves}")
     return took
 
 

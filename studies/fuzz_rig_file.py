@@ -3,8 +3,9 @@
     python studies/fuzz_rig_file.py [--inputs N] [--seconds S] [--seed N]
 
 Each input is a valid rig file with a few random changes: values, lines, tables, bytes, its end. It is read from the
-disk as `flexneedle rig check` does. Ends after N inputs (default: a million) or S seconds (default: 600), whichever is
-first. Prints the inputs; at the first failure its seed and input, and exit status 1.
+disk as `flexneedle rig check` does, with the settings of a Galil and an Aurora; no device is opened. Ends after N inputs
+(default: a million) or S seconds (default: 600), whichever is first. Prints the inputs; at the first failure its seed and
+input, and exit status 1.
 """
 
 import math
@@ -19,7 +20,9 @@ from time import process_time
 from fuzzing import Failure, main
 
 from flexneedle.errors import RigError
-from flexneedle.scenario.rig import RigFile, load_rig
+from flexneedle.rig.devices.galil.settings import checked
+from flexneedle.rig.devices.trackers import AuroraSettings
+from flexneedle.scenario.rig import RigFile, load_rig, settings_of
 
 VALID = b"""\
 name = "Bench"
@@ -211,11 +214,17 @@ def unusable(rig: RigFile) -> str:
 
 def outcome(path: Path) -> str:
     """Read a file: "rig", "refused", or what is wrong."""
+    start = f"{path}: "
     try:
         rig = load_rig(path)
+        start = ""  # the settings are named without the file
+        if rig.driver.kind == "galil":
+            checked(rig.driver.settings, [axis.channel for _, axis in rig.axes.items()])
+        if rig.tracker.kind == "aurora":
+            settings_of(AuroraSettings, rig.tracker.settings)
     except RigError as error:
         lines = error.problems
-        good = lines and all(line.startswith(f"{path}: ") and line.isprintable() for line in lines)
+        good = lines and all(line.startswith(start) and line.isprintable() for line in lines)
         return "refused" if good else f"bad lines: {lines!r}"
     except Exception as error:  # noqa: BLE001 - what the study searches
         return f"{type(error).__name__}: {error}"

@@ -136,3 +136,31 @@ def test_a_dry_run_moves_nothing_and_asks_nothing(capsys, monkeypatch, events):
     status, _, err = run(capsys, *INSERT, "--dry-run")
     assert (status, events) == (0, ["opened", "inserted"])
     assert "[y/N]" not in err
+
+
+REGISTRATION = {
+    "rotation": [0.5, 0.5, 0.5, 0.5],
+    "translation_mm": [220.0, 0.0, 0.0],
+    "fiducials_mm": [[0.0, -40.0, 0.0], [0.0, 40.0, 0.0], [60.0, 0.0, 40.0]],
+    "localisation_mm": 0.3,
+}
+
+
+@pytest.mark.parametrize("dry", [False, True])
+def test_the_registration_of_the_rig_file_is_recorded_where_it_is_used(capsys, events, in_tmp, dry):
+    (in_tmp / "rig.toml").write_text(tomli_w.dumps(values(KINDS | {"registration": REGISTRATION})))
+    status, out, _ = run(capsys, *INSERT, *(["--dry-run"] if dry else ["--yes"]))
+    assert (status, "inserted" in events) == (0, True)
+    assert ("expected registration error" in out) is not dry
+    stored = json.loads((in_tmp / "run/run.json").read_text())["scenario"]["tracker"].get("registration")
+    assert stored == (None if dry else REGISTRATION)
+
+
+def test_two_registrations_are_refused(capsys, events, in_tmp):
+    (in_tmp / "rig.toml").write_text(tomli_w.dumps(values(KINDS | {"registration": REGISTRATION})))
+    (in_tmp / "registration.toml").write_text(tomli_w.dumps({"tracker": {"registration": REGISTRATION}}))
+    status, _, err = run(capsys, *INSERT, "--yes", "--registration", "registration.toml")
+    assert (status, events) == (2, [])
+    assert err == (
+        "flexneedle: --registration: not with a rig whose file has a section [registration]: remove one\n"
+    )

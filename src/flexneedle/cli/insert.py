@@ -180,8 +180,18 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
     from flexneedle.rig.parts import own_controllers
     from flexneedle.scenario.files import load_registration
 
-    scenario = chosen_scenario(args, *own_controllers([choices.controller]))
-    return scenario if args.registration is None else load_registration(args.registration, scenario)
+    rig, scenario = choices.rig, chosen_scenario(args, *own_controllers([choices.controller]))
+    if args.registration is not None:
+        if rig is not None and rig.registration is not None:
+            raise InputError(
+                "--registration: not with a rig whose file has a section [registration]: remove one"
+            )
+        return load_registration(args.registration, scenario)
+    if rig is None or choices.dry_run:
+        return scenario
+    from flexneedle.rig.supervised import registered
+
+    return registered(rig, scenario)
 
 
 def _execute(

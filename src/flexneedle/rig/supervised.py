@@ -245,6 +245,13 @@ def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
         raise RigError(*problems)
 
 
+def registered(rig: RigFile, scenario: Scenario) -> Scenario:
+    """The scenario with the registration of the rig file, if that has one."""
+    if rig.registration is None:
+        return scenario
+    return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
+
+
 @contextmanager
 def supervised(
     rig: RigFile, scenario: Scenario, plan: Plan, watchers: Watchers, *, dry: bool = False
@@ -255,9 +262,7 @@ def supervised(
     Raises RigError if the rig does not fit the scenario or has no room for the insertion from where its axes are,
     DriverError or RunError if a device fails, StoppedError if it is stopped.
     """
-    settings = scenario.tracker
-    if rig.registration is not None:
-        scenario = scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
+    settings, scenario = scenario.tracker, registered(rig, scenario)
     task = Task(
         rig,
         monotonic(),

@@ -16,7 +16,7 @@ from flexneedle.rig.emulator.galil.controller import Device, reply
 from flexneedle.rig.ports import MotorSetup
 from galil_peer import CLOSE, peer
 
-HELLO = ["EO 0", "\x12\x16", "MG _PF;MG _MTA,_MTB", "TPAB;RPAB;TSAB;SCAB"]
+HELLO = ["EO 0", "\x12\x16", "MG _PF,_TM;MG _MTA,_MTB", "TPAB;RPAB;TSAB;SCAB"]
 
 
 @contextmanager
@@ -64,9 +64,18 @@ def test_a_controller_without_an_echo_to_switch_off_is_accepted():
     ("query", "answer", "problem"),
     [
         ("\x12\x16", b" RIO47162 Rev 1.1l\r\n:", "not a Galil motion controller: RIO47162 Rev 1.1l"),
-        ("MG _PF;MG _MTA", b" 7.0000\r\n: 1.0000\r\n:", "positions have the format PF 7: set PF 10"),
-        ("MG _PF;MG _MTA", b" 10.0000\r\n: -2.5000\r\n:", "A is no servo motor"),
-        ("MG _PF;MG _MTA", b"??", r"MG _PF; MG _MTA refused: 0"),
+        (
+            "MG _PF,_TM;MG _MTA",
+            b" 7.0000 1000.0000\r\n: 1.0000\r\n:",
+            "positions have the format PF 7: set PF 10",
+        ),
+        (
+            "MG _PF,_TM;MG _MTA",
+            b" 10.0000 500.0000\r\n: 1.0000\r\n:",
+            "the sample time is TM 500: set TM 1000",
+        ),
+        ("MG _PF,_TM;MG _MTA", b" 10.0000 1000.0000\r\n: -2.5000\r\n:", "A is no servo motor"),
+        ("MG _PF,_TM;MG _MTA", b"??", r"MG _PF,_TM; MG _MTA refused: 0"),
     ],
 )
 def test_a_device_that_is_not_fit_is_refused(query, answer, problem):

@@ -48,7 +48,7 @@ class GalilMotors:
     Not for several threads.
 
     settings, channels: see `factory`. Raises DriverError if the controller cannot be reached or is not fit: a stepper,
-    whose position is not measured, or a format of positions (PF) other than the default.
+    whose position is not measured, or a format of positions (PF) or sample time (TM) other than the default.
     """
 
     paces = _PACES
@@ -100,10 +100,13 @@ class GalilMotors:
         self.identity = self._dialogue.text(_REVISION, deadline)
         if "DMC" not in self.identity:
             raise self._unfit(f"not a Galil motion controller: {self.identity}")
-        queries = ["MG _PF", f"MG {facts.operands('MT', self._letters)}"]
-        (form,), kinds = self._dialogue.numbers(queries, [1, len(self._letters)], deadline)
+        queries = ["MG _PF,_TM", f"MG {facts.operands('MT', self._letters)}"]
+        (form, sample), kinds = self._dialogue.numbers(queries, [2, len(self._letters)], deadline)
         if form != facts.POSITION_FORMAT:
             raise self._unfit(f"positions have the format PF {form:g}: set PF {facts.POSITION_FORMAT:g}")
+        if sample != facts.SAMPLE_TIME:
+            rule = f"set TM {facts.SAMPLE_TIME:g}, with which speeds are in counts/s"
+            raise self._unfit(f"the sample time is TM {sample:g}: {rule}")
         for letter, kind in zip(self._letters, kinds, strict=True):
             if abs(kind) not in facts.SERVOS:
                 raise self._unfit(f"{letter} is no servo motor (MT {kind:g}): its position is not measured")

@@ -1,0 +1,13 @@
+"""The command with a count of its control periods, for a process of its own."""
+
+from flexneedle.cli import insert, main
+
+
+def counted(arguments, made):
+    """Run the command; made: counts its periods, each once it has ended and is recorded."""
+
+    def period(*_):
+        made.value += 1
+
+    insert._InsertProgress.period = period  # in this process alone
+    main.main(arguments)
