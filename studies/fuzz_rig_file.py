@@ -3,9 +3,9 @@
     python studies/fuzz_rig_file.py [--inputs N] [--seconds S] [--seed N]
 
 Each input is a valid rig file with a few random changes: values, lines, tables, bytes, its end. It is read from the
-disk as `flexneedle rig check` does, with the settings of a Galil and an Aurora; no device is opened. Ends after N inputs
-(default: a million) or S seconds (default: 600), whichever is first. Prints the inputs; at the first failure its seed and
-input, and exit status 1.
+disk as `flexneedle rig check` does, with the settings of a Galil and an Aurora; no device is opened. Ends after N
+inputs (default: a million) or S seconds (default: 600), whichever is first. Prints the inputs; at the first failure its
+seed and input, and exit status 1.
 """
 
 import math
