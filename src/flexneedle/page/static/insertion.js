@@ -33,17 +33,17 @@ export function mount(element, store, link) {
     const live = store.get("insertion live");
     const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
+    const signalled = steers && live?.state !== "waiting"; // one that waits can only be stopped
     state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;
     for (const each of [pause, step, pace]) each.hidden = !runs || real;
-    pause.disabled = pace.disabled = !steers;
-    step.disabled = !steers || !paused;
+    pause.disabled = pace.disabled = disturb.disabled = !signalled;
+    step.disabled = !signalled || !paused;
     pause.dataset.next = paused ? "go" : "pause";
     pause.textContent = paused ? "Continue" : "Pause";
     if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
-    disturb.disabled = !steers;
   });
 }
 
