@@ -82,7 +82,8 @@ class Live:
             raise Refusal(f"layer = {disturb.layer}: must be below {self._layers}, the number of layers")
         if disturb.what == "plate" and not self._in_a_field:
             raise Refusal(
-                "the tracker of this scenario has no field that metal distorts: set tracker.environment"
+                "the tracker of this scenario has no field that metal distorts: "
+                "set tracker.environment to ideal or noisy"
             )
         self._signal("a disturbance", disturb=disturb.model_copy(update={"request": None}))
 
