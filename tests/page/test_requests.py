@@ -101,7 +101,7 @@ def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
     with Client(shared_server) as one, Client(shared_server) as other:
         assert one.refused(request_, **STEERED[request_]) == "nobody is in control: take control first"
         other.steer()
-        reason = f"client {other.number} is in control: ask for it first"
+        reason = f"person {other.number} is in control: ask for it first"
         assert one.refused(request_, **STEERED[request_]) == reason
         other.do("steer", take=False)
 
@@ -242,7 +242,9 @@ NEVER_READY = (sys.executable, "-c", "input()")
 """A worker that imports and compiles for ever."""
 
 
-@pytest.mark.parametrize(("rig", "request_"), [(None, "insert"), (ConnectedRig("Bench", "b.toml"), "prepare")])
+@pytest.mark.parametrize(
+    ("rig", "request_"), [(None, "insert"), (ConnectedRig("Bench", "b.toml"), "prepare")]
+)
 def test_an_insertion_that_waits_for_its_worker_is_shown_and_stopped_by_anybody(tmp_path, rig, request_):
     with served(tmp_path, workers=(STUB, NEVER_READY), rig=rig) as server, Client(server) as client:
         client.steer().do(request_)
