@@ -34,6 +34,7 @@ export function mount(element, store, link) {
     const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
     const signalled = steers && live?.state !== "waiting"; // one that waits can only be stopped
+    const focused = document.activeElement;
     state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;
@@ -44,6 +45,7 @@ export function mount(element, store, link) {
     pause.textContent = paused ? "Continue" : "Pause";
     if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
+    if (element.contains(focused) && focused.closest("[hidden]")) (runs ? stop : start).focus();
   });
 }
 
