@@ -127,17 +127,23 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
 
 def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
     page, held = files(), []
-    page.route("**/runs/first/*", held.append)
+    page.route("**/runs/first/*", lambda route, _request: held.append(route))
+
+    def requested():
+        while not held:
+            page.wait_for_timeout(20)
+        return held.pop()
+
     page.click("summary:has-text('Download')")
     page.click("[aria-label='CSV of first']")
     page.wait_for_selector("text=CSV of first is being made…")
-    held.pop().fulfill(status=404, body="the run has no trace\n")
+    requested().fulfill(status=404, body="the run has no trace\n")
     page.wait_for_selector("text=CSV of first: the run has no trace")
     page.click("[aria-label='Run folder of first']")
     page.wait_for_selector("text=Run folder of first is being made…")
     assert not page.is_visible("text=the run has no trace")
     with page.expect_download() as download:
-        held.pop().fulfill(body=b"PK")
+        requested().fulfill(body=b"PK")
     assert download.value.suggested_filename == "first-run.zip"
     page.wait_for_selector("text=is being made…", state="detached")
     assert len(visit.errors) == 1  # the browser's own line of the refusal
