@@ -21,9 +21,9 @@ def test_two_clients_share_the_session_and_one_steers(server):
         other.wait(lambda: other.newest["people"] == {"type": "people", "clients": 2, "steering": one.number})
         assert (
             other.refused("steer", take=True)
-            == f"client {one.number} is in control: it must release it first"
+            == f"person {one.number} is in control: it must release it first"
         )
-        assert other.refused("steer", take=False).startswith(f"client {one.number} is in control")
+        assert other.refused("steer", take=False).startswith(f"person {one.number} is in control")
         one.do("steer", take=False)
         other.steer()
         one.wait(lambda: one.newest["people"]["steering"] == other.number)

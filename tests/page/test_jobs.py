@@ -97,6 +97,23 @@ def broken(script):
     return (sys.executable, "-c", script)
 
 
+def test_until_the_worker_is_ready_its_first_job_says_so(tmp_path):
+    """The others do not repeat it; after an edit the first is the scene again."""
+    with served(tmp_path, workers=(broken("input()"), STUB)) as server, Client(server) as client:
+        scene, estimate, plan = (client.job(kind, "waiting") for kind in ("scene", "estimate", "plan"))
+        assert "the first time after installation this takes about a minute" in scene["text"]
+        assert estimate["text"] == plan["text"] == ""
+        client.steer().do("edit", values={"target.depth_mm": 35.0})
+        client.wait(lambda: client.newest["job scene"]["job"] > scene["job"])
+        assert client.newest["job scene"]["text"] == scene["text"]
+
+
+def test_what_waits_for_another_job_does_not_say_that_its_worker_starts(planned):
+    start(planned, WORKS_ON)
+    planned.do("start", work="reach")
+    assert planned.job("reach", "waiting")["text"] == ""
+
+
 @pytest.mark.parametrize(
     "script",
     [

@@ -261,7 +261,7 @@ def paths(server):
             assert not any(word in body for word in SERVER), (place, way, body)
     with Member(server) as client:
         for name in ("../secret.txt", "..", "/etc", "alone/../..", "alone\0"):
-            assert client.refused("open", name=name).startswith(f"client {steering(client)} steers")
+            assert client.refused("open", name=name).startswith(f"person {steering(client)} is in control")
 
 
 def steering(client):
@@ -278,7 +278,7 @@ def not_steering(server):
     )  # fmt: skip
     with Member(server) as client:
         for type_, values in requests:
-            assert client.refused(type_, **values).startswith(f"client {steering(client)} steers")
+            assert client.refused(type_, **values).startswith(f"person {steering(client)} is in control")
 
 
 def malformed(server):

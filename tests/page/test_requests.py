@@ -1,13 +1,15 @@
 """Each request over a real socket: what it does, and why it is refused."""
 
 import json
+import sys
 from dataclasses import replace
 
 import pytest
 
 from flexneedle.page import messages as m
+from flexneedle.page.server.rig import ConnectedRig
 from flexneedle.scenario.files import dump_scenario, load_scenario
-from page_clients import QUICK, Client, get, served
+from page_clients import QUICK, STUB, Client, get, served
 from page_worker import ROWS, WORKS_ON
 
 
@@ -99,7 +101,7 @@ def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
     with Client(shared_server) as one, Client(shared_server) as other:
         assert one.refused(request_, **STEERED[request_]) == "nobody is in control: take control first"
         other.steer()
-        reason = f"client {other.number} is in control: ask for it first"
+        reason = f"person {other.number} is in control: ask for it first"
         assert one.refused(request_, **STEERED[request_]) == reason
         other.do("steer", take=False)
 
@@ -234,6 +236,27 @@ def test_anybody_may_stop(server, client):
         other.wait(lambda: other.newest.get("insertion live", {}).get("state") == "interrupted")
     client.job("insertion", "done")
     assert client.refused("stop") == "no insertion runs: start one first"
+
+
+NEVER_READY = (sys.executable, "-c", "input()")
+"""A worker that imports and compiles for ever."""
+
+
+@pytest.mark.parametrize(
+    ("rig", "request_"), [(None, "insert"), (ConnectedRig("Bench", "b.toml"), "prepare")]
+)
+def test_an_insertion_that_waits_for_its_worker_is_shown_and_stopped_by_anybody(tmp_path, rig, request_):
+    with served(tmp_path, workers=(STUB, NEVER_READY), rig=rig) as server, Client(server) as client:
+        client.steer().do(request_)
+        with Client(server) as other:
+            shown = other.wait(lambda: other.newest.get("insertion live"))
+            assert (shown["state"], shown["rig"]) == ("waiting", "Bench" if rig else "")
+            assert shown["target"] == [40.0, 5.0, 0.0]
+            other.do("stop")
+            other.wait(lambda: other.newest["insertion live"]["state"] == "interrupted")
+        client.job("insertion", "cancelled")
+        assert client.refused("stop") == "no insertion runs: start one first"
+        assert client.refused("save", name="mine") == "there is no insertion to save: start one first"
 
 
 def test_a_newer_virtual_insertion_replaces_the_older(client):

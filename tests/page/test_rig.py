@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.page.server.rig import ConnectedRig
-from page_clients import QUICK, Client, served
+from page_clients import QUICK, Client, get, served
 from page_worker import FAULTY, RECORDS, UNSTOPPABLE, WORKS_ON
 
 RIG = ConnectedRig("Bench", "bench.toml")
@@ -83,6 +83,16 @@ def test_it_gets_the_session_the_rig_file_and_the_folder_of_runs(client, tmp_pat
 def summary(client):
     """What the worker of insertions has got last."""
     return json.loads(client.newest["insertion live"]["summary"])
+
+
+def test_downloads_that_compute_are_refused_from_its_preparation_on(server, client, tmp_path):
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "run.json").write_text("{}")
+    prepared(client)
+    for file in ("trace.csv", "replay.html"):
+        status, text, _headers = get(server, f"/runs/mine/{file}")
+        assert (status, text.startswith("an insertion is on the rig, and this would take")) == (404, True)
+    assert get(server, "/runs/mine/run.zip")[0] == 200
 
 
 def test_it_is_armed_for_one_start(client):

@@ -1,11 +1,13 @@
 """Recorded runs: what is listed, opened, saved and downloaded, and that nothing else is."""
 
+import asyncio
 import io
 import json
 import os
 import zipfile
 from contextlib import contextmanager
 from http.client import HTTPConnection
+from threading import Event
 
 import pytest
 
@@ -14,7 +16,7 @@ from commands import run
 from flexneedle.page.server import app
 from flexneedle.page.server.folder import RunsFolder, zipped
 from flexneedle.page.server.refusal import Refusal
-from page_clients import Client, get, port_of
+from page_clients import PATIENCE_S, Client, get, port_of, served
 from page_worker import ROWS
 from replays import insertion
 
@@ -307,7 +309,26 @@ def test_two_downloads_are_made_at_once_and_no_more(runs, server):
     downloads = app.Downloads(server.desk)
     downloads._busy = 2
     with pytest.raises(Refusal, match="two downloads are being made"):
-        downloads._one_at_a_time(None, runs).send(None)
+        downloads._two_at_once(None, runs).send(None)
+
+
+def test_a_download_ends_when_its_browser_has_gone(runs, monkeypatch):
+    began, ended = Event(), Event()
+
+    async def endless(_folder):
+        began.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(app, "trace_csv", endless)
+    with served(runs) as server:
+        connection = HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
+        connection.request("GET", "/runs/older/trace.csv")
+        assert began.wait(PATIENCE_S)
+        connection.close()
+        assert ended.wait(PATIENCE_S)
 
 
 PATHS = [

@@ -70,6 +70,22 @@ def test_a_refusal_is_shown_in_words(visit, server):
     page.wait_for_selector("text=Person 2 is in control", state="detached")
 
 
+def test_taking_and_releasing_control_keeps_the_focus(visit):
+    page = visit()
+    page.click("text=Take control")
+    page.wait_for_selector("text=you are in control")
+    assert page.evaluate("document.activeElement.textContent") == "Release control"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=nobody is in control")
+    assert page.evaluate("document.activeElement.textContent") == "Take control"
+
+
+def test_a_worker_that_starts_is_named(visit, server):
+    page = visit()
+    server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
+    page.wait_for_selector(f"{STATUS} >> text=Scene: the computation starts")
+
+
 def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     page = visit()
     server.send(Job(job=7, kind="plan", state="running", share=0.25, text="iteration 5 of 20"))

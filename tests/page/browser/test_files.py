@@ -125,6 +125,46 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
     ]
 
 
+def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
+    page, held = files(), []
+    page.route("**/runs/first/*", lambda route, _request: held.append(route))
+
+    def requested():
+        while not held:
+            page.wait_for_timeout(20)
+        return held.pop()
+
+    page.click("summary:has-text('Download')")
+    page.click("[aria-label='CSV of first']")
+    page.wait_for_selector("text=CSV of first is being made…")
+    requested().fulfill(status=404, body="the run has no trace\n")
+    page.wait_for_selector("text=CSV of first: the run has no trace")
+    page.click("[aria-label='Run folder of first']")
+    page.wait_for_selector("text=Run folder of first is being made…")
+    assert not page.is_visible("text=the run has no trace")
+    with page.expect_download() as download:
+        requested().fulfill(body=b"PK")
+    assert download.value.suggested_filename == "first-run.zip"
+    page.wait_for_selector("text=is being made…", state="detached")
+    assert len(visit.errors) == 1  # the browser's own line of the refusal
+    visit.errors.clear()
+
+
+def test_news_of_runs_leave_open_what_is_open_and_the_focus(files, server):
+    page = files()
+    page.click("summary:has-text('Download')")
+    page.focus("[aria-label='CSV of first']")
+    first = {"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}
+    server.send(Runs(runs=[MANY, first | {"summary": "changed"}]))
+    page.wait_for_selector("text=changed")
+    names = page.locator(".run strong").all_inner_texts()
+    assert names == ["many", "first"]
+    assert page.is_visible("[aria-label='CSV of first']")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
+    server.send(Runs(runs=[MANY]))
+    page.wait_for_selector("text=changed", state="detached")
+
+
 MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
 
 
@@ -261,8 +301,10 @@ async (gif) => {{
 MADE = f"""
 async ([width, height, frames]) => {{
   {CODED}
-  const {{ gifOf }} = await import("/static/files/gif.js");
-  return coded(gifOf(width, height, frames.map(decoded), 0.1));
+  const {{ Gif }} = await import("/static/files/gif.js");
+  const gif = new Gif(width, height, 0.1);
+  for (const frame of frames) gif.add(decoded(frame));
+  return coded(gif.bytes());
 }}
 """
 

@@ -4,7 +4,7 @@ import pytest
 
 from fake_page import until
 from flexneedle.page.messages import Disturbances, Job, RigCheck, RigState
-from recorded_page import WELCOME, inserting, insertion, opening, people, row, rows
+from recorded_page import WELCOME, inserting, insertion, opening, people, row, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -55,8 +55,47 @@ def test_single_periods_only_while_it_is_paused(panel, server):
     until(page, f"!document.querySelector('{PANEL} button[title^=Carry]').disabled")
 
 
-def test_disturbances_are_sent_and_listed(panel, server):
+FOCUSED = "document.activeElement.textContent"
+
+
+def test_the_focus_goes_from_insert_to_stop_and_back(panel, server):
+    page = panel()
+    click(page, "Insert")
+    server.send(insertion("waiting", periods=0, pace=0.0))
+    until(page, f"{FOCUSED} === 'Stop'")
+    server.send(insertion("interrupted", periods=0, pace=0.0))
+    until(page, f"{FOCUSED} === 'Insert'")
+
+
+def in_a_field():
+    """A session whose tracker has a field."""
+    given = session()
+    return given.model_copy(update={"values": {**given.values, "tracker.environment.name": "noisy"}})
+
+
+def test_a_plate_is_offered_only_to_a_tracker_with_a_field(panel, server):
     page = panel([*opening(), insertion("running")])
+    why = page.locator(f"{PANEL} >> text=The tracker of this scenario has no field that metal distorts")
+    bring = page.locator(PANEL).get_by_role("button", name="Bring", exact=True)
+    assert (why.is_visible(), bring.is_enabled()) == (True, False)
+    server.send(in_a_field())
+    why.wait_for(state="hidden")
+    assert bring.is_enabled()
+
+
+def test_one_that_waits_for_its_worker_can_be_stopped_and_nothing_else(panel, server):
+    page = panel([*opening(), insertion("waiting", periods=0, pace=0.0)])
+    page.wait_for_selector("text=Waiting for the computation")
+    buttons = page.locator(f"{PANEL} button:visible:enabled").all_inner_texts()
+    assert buttons == ["Stop"]
+    assert page.is_disabled("[aria-label=Pace]")
+    click(page, "Stop")
+    page.wait_for_timeout(100)
+    assert server.asked("stop") == [{"type": "stop"}]
+
+
+def test_disturbances_are_sent_and_listed(panel, server):
+    page = panel([*opening(), in_a_field(), insertion("running")])
     page.fill("[aria-label='Force on the tip in N']", "0.25")
     click(page, "Push")
     page.select_option("[aria-label=Layer]", "1")
@@ -112,7 +151,7 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     page.wait_for_selector("text=is ready; nothing moves before it is armed and started")
     assert page.locator(".rig .moves li").all_inner_texts() == MOVES
     assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
-    assert page.locator(PANEL).get_by_role("button", name="Stop", exact=True).is_visible()
+    assert page.evaluate(FOCUSED) == "Stop"
     page.check("#rig-free")
     assert shown_buttons(page) == {"Arm": True, "Insert on the rig": False}
     click(page, "Arm")

@@ -196,6 +196,16 @@ def test_the_error_is_that_of_the_true_tip_and_on_a_rig_of_the_estimated_one(pla
     assert figure.locator(".legend").inner_text() == "estimated tip"
 
 
+def test_a_tracker_without_an_indicator_is_named_so(player, server):
+    page = player()
+    see_plots(page)
+    figure = page.locator(f"{PLOTS} figure").last
+    page.wait_for_selector(f"{PLOTS} [aria-label^='Tracker']")
+    assert figure.locator(".legend").inner_text() == ""
+    server.send(of_rows("first", lambda _: {"indicator": None}))
+    figure.locator("text=This tracker has no indicator.").wait_for()
+
+
 def test_times_of_a_rig_count_from_its_first_period(player):
     later = of_rows("first", lambda k: {"time": 0.2 * k + 60.0})
     page = player([*opening(), insertion("done", of="first", periods=50, rig="Bench"), later])

@@ -5,7 +5,7 @@ import pytest
 
 from fake_page import until
 from flexneedle.page.frames import Source
-from flexneedle.page.messages import Reach
+from flexneedle.page.messages import Reach, Rows
 from recorded_page import (
     TARGET,
     estimate,
@@ -16,6 +16,7 @@ from recorded_page import (
     plan,
     plan_frames,
     planned,
+    row,
     scene,
     session,
 )
@@ -72,10 +73,33 @@ def test_the_legend_names_what_is_drawn(views):
     }  # fmt: skip
 
 
+def test_a_finger_scrolls_over_a_drawing_and_drags_its_handles(views):
+    page = views()
+    action = "(element) => getComputedStyle(element).touchAction"
+    for panel in (SECTION, AXIAL):
+        assert page.eval_on_selector(f"{panel} canvas", action) == "auto"
+        assert page.eval_on_selector(f"{panel} .stage", action) == "auto"
+        assert page.eval_on_selector(f"{panel} .handle", action) == "none"
+    assert page.eval_on_selector("[data-panel=space] canvas", action) == "none"
+
+
 def legends(page):
     """Names in the legends of section, view along the axis, and view in space."""
     panels = (SECTION, AXIAL, "[data-panel=space]")
     return [set(page.locator(f"{panel} .legend li").all_inner_texts()) for panel in panels]
+
+
+def test_during_an_insertion_all_views_name_the_true_and_the_measured_tip(views, server):
+    page = views(inserting())
+    until(page, "document.querySelector('[data-panel=space] .legend li')")
+    both = {"true path of the tip", "measured tip"}
+    assert [both & names for names in legends(page)] == [both] * 3
+    blind = [row(k).model_copy(update={"measured": None, "true": None}) for k in range(3)]
+    server.send(
+        insertion("planning", periods=0), insertion(rig="Bench"), Rows(of="live", first=0, rows=blind)
+    )
+    until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
+    assert [both & names for names in legends(page)] == [set()] * 3
 
 
 def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):

@@ -1,8 +1,10 @@
 """The addresses of the server."""
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 from anyio import to_thread
 from starlette.applications import Starlette
@@ -64,7 +66,7 @@ class Downloads:
 
     def __init__(self, desk: Desk) -> None:
         self._desk = desk
-        self._made: dict[str, tuple[str, Callable[[Path], Awaitable[bytes]]]] = {
+        self._made: dict[str, tuple[str, Callable[[Path], Coroutine[Any, Any, bytes]]]] = {
             "trace.csv": ("text/csv", trace_csv),
             "run.zip": ("application/zip", _zipped),
             "replay.html": ("text/html", replay_html),
@@ -87,11 +89,14 @@ class Downloads:
                 choices = ", ".join(("figure.png", *self._made))
                 raise Refusal(f"{file!r}: must be one of {choices}")
             media, make = self._made[file]
-            return _file(await self._one_at_a_time(make, folder), media, f"{name}-{file}")
+            if make is not _zipped:
+                self._desk.require_processor()
+            made = await _unless_gone(request, self._two_at_once(make, folder))
+            return Response() if made is None else _file(made, media, f"{name}-{file}")
         except Refusal as refusal:
             raise HTTPException(404, refusal.reason) from None
 
-    async def _one_at_a_time(self, make: Callable[[Path], Awaitable[bytes]], folder: Path) -> bytes:
+    async def _two_at_once(self, make: Callable[[Path], Coroutine[Any, Any, bytes]], folder: Path) -> bytes:
         if self._busy >= 2:
             raise Refusal("two downloads are being made: try again in a moment")
         self._busy += 1
@@ -99,6 +104,24 @@ class Downloads:
             return await make(folder)
         finally:
             self._busy -= 1
+
+
+async def _unless_gone(request: Request, making: Coroutine[Any, Any, bytes]) -> bytes | None:
+    """What is made, or None if the browser has gone, at which the making is cancelled."""
+    task = asyncio.create_task(making)
+    gone = asyncio.create_task(_gone(request))
+    try:
+        await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
+        return await task if task.done() else None
+    finally:
+        for each in (task, gone):
+            each.cancel()
+        await asyncio.gather(task, gone, return_exceptions=True)
+
+
+async def _gone(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 async def _zipped(folder: Path) -> bytes:

@@ -148,7 +148,7 @@ class Desk:
             case m.Options():
                 self._begin(self._with_options(request))
             case m.Start():
-                self._require_processor()
+                self.require_processor()
                 self._order("reach" if request.work == "reach" else "plan", request.work)
             case m.Cancel():
                 self._cancel(request.job)
@@ -230,7 +230,7 @@ class Desk:
             raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
         return self.session.with_options(options)
 
-    def _require_processor(self) -> None:
+    def require_processor(self) -> None:
         """Raise Refusal while an insertion is on the rig, whose loop a long computation would take time from."""
         if self.rig.active:
             raise Refusal(
@@ -269,7 +269,7 @@ class Desk:
         of, source = _RECORDINGS[request.second]
         work = Work(job=0, do="read", kind="recording", name=request.name or "", of=of)
         if request.name is not None and request.row is not None:
-            self._require_processor()
+            self.require_processor()
             folder = str(self.runs.study(request.name))
             work = work.model_copy(update={"do": "row", "kind": "row", "row": request.row, "folder": folder})
         elif request.name is not None:

@@ -28,21 +28,24 @@ class Live:
         self._pace = 1.0
         self._layers, self._in_a_field = 0, False
         self._news: dict[str, Any] | None = None
+        """What the worker has reported last, None before it has begun."""
+        self._waiting: Insertion | None = None
+        """What is shown until then."""
 
     def start(self, work: Work) -> None:
         """Start a virtual insertion; it replaces another virtual one. Raises Refusal."""
         if self._rig.active:
             raise Refusal("an insertion runs on the rig: stop it first")
-        self._begin(work)
+        self._begin(work, "")
         self._pace = 0.0 if work.paused else 1.0
         self._job = self._jobs().add(work)
 
     def prepare(self, work: Work) -> None:
         """Prepare an insertion on the rig. Raises Refusal."""
-        source = self._rig.connected.source
+        rig = self._rig.connected
         self.require_none("stop it first")
-        self._begin(work)
-        self._rig.prepare(work.model_copy(update={"rig": source}))
+        self._begin(work, rig.name)
+        self._rig.prepare(work.model_copy(update={"rig": rig.source}))
 
     def stop(self, why: str) -> None:
         """Stop the insertion. Raises Refusal if none runs."""
@@ -79,7 +82,8 @@ class Live:
             raise Refusal(f"layer = {disturb.layer}: must be below {self._layers}, the number of layers")
         if disturb.what == "plate" and not self._in_a_field:
             raise Refusal(
-                "the tracker of this scenario has no field that metal distorts: set tracker.environment"
+                "the tracker of this scenario has no field that metal distorts: "
+                "set tracker.environment to ideal or noisy"
             )
         self._signal("a disturbance", disturb=disturb.model_copy(update={"request": None}))
 
@@ -102,16 +106,17 @@ class Live:
         elif work.job != self._job:  # it was replaced
             return
         self._job = None
-        if self._news is None:
+        if self._waiting is None:
             return
+        news = self._waiting.model_dump() if self._news is None else self._news
         rows = len(self._hub.rows(_ROWS).texts)
-        periods = max(rows, self._news["periods"])  # which may be older than the newest row
+        periods = max(rows, news["periods"])  # which may be older than the newest row
         if state == "failed" and work.rig and periods:
             text = "; ".join((text, STILL_IN.format(rig=work.rig)))
-        if state != "done" and self._news["state"] in _RUNS:
+        if state != "done" and news["state"] in _RUNS:
             outcome = "failed" if state == "failed" else "interrupted"
             over = {"state": outcome, "summary": text or outcome, "pace": 0.0, "periods": periods}
-            self._hub.publish(Insertion.model_validate(self._news | over))
+            self._hub.publish(Insertion.model_validate(news | over))
 
     def require_none(self, why: str) -> None:
         """Raise Refusal if an insertion runs or waits."""
@@ -126,11 +131,26 @@ class Live:
         if self._news["rig"]:
             raise Refusal(f"an insertion on a rig is recorded as it runs, this one as {self._news['folder']}")
 
-    def _begin(self, work: Work) -> None:
+    def _begin(self, work: Work, rig: str) -> None:
+        """Forget the last insertion, and show that one waits, which anybody may stop. rig: its name, "" without one."""
         self._layers, self._news = len(work.scenario["tissue"]), None
         self._in_a_field = work.scenario.get("tracker", {}).get("environment") is not None
         self._hub.forget((_ROWS, "disturbances"))
         self._hub.forget_frames(Source.LIVE)
+        target = work.scenario["target"]
+        self._waiting = Insertion(
+            of="live",
+            name=work.name,
+            state="waiting",
+            summary="",
+            controller=work.controller,
+            seed=work.seed,
+            target=(target["depth_mm"], target["lateral_mm"], target["lateral_z_mm"]),
+            periods=0,
+            pace=0.0,
+            rig=rig,
+        )
+        self._hub.publish(self._waiting)
 
     def _signal(self, what: str, **change: Any) -> None:
         if not self._jobs().signal(self._require_virtual(what), **change):

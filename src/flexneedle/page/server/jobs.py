@@ -32,6 +32,8 @@ _SLOTS: dict[Kind, Kind] = {"compare": "plan", "row": "recording"}
 _FOR_THE_SERVER = ("rig_report",)
 """Types of a worker's messages that no client gets."""
 _ENDS = ("done", "failed", "cancelled")
+_STARTS = "the computation starts; the first time after installation this takes about a minute"
+"""Of the job that a worker does first, until it is ready."""
 
 
 @dataclass(eq=False)
@@ -91,7 +93,8 @@ class Jobs:
             if other.work.kind != job.work.kind:  # whose state is not replaced by that of the new one
                 self._finish(other, "cancelled", "")
         self._waiting.append(job)
-        self._publish(job, "waiting")
+        first = min(self._waiting, key=lambda other: other.urgency) is job
+        self._publish(job, "waiting", "" if self.worker.ready or not first else _STARTS)
         running = self._running
         if running is not None and running.slot == job.slot:
             if running.work.kind not in _FINISHED:

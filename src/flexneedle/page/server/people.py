@@ -27,7 +27,7 @@ class People:
     def steer(self, client: int, take: bool) -> None:
         """Take or release the steering. Raises Refusal if another client steers."""
         if self.steering not in (None, client):
-            raise Refusal(f"client {self.steering} is in control: it must release it first")
+            raise Refusal(f"person {self.steering} is in control: it must release it first")
         self.steering = client if take else None
 
     def require(self, client: int) -> None:
@@ -35,7 +35,7 @@ class People:
         if self.steering is None:
             raise Refusal("nobody is in control: take control first")
         if self.steering != client:
-            raise Refusal(f"client {self.steering} is in control: ask for it first")
+            raise Refusal(f"person {self.steering} is in control: ask for it first")
 
     def news(self) -> PeopleNews:
         """Who is here."""

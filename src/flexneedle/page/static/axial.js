@@ -4,7 +4,7 @@ import { make, shown } from "./dom.js";
 import { drawAxial } from "./flat/axial.js";
 import { KEYS, Handles } from "./flat/handles.js";
 import { legendOf } from "./flat/legend.js";
-import { partsOf } from "./flat/parts.js";
+import { measuredTip, partsOf } from "./flat/parts.js";
 import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
@@ -26,7 +26,7 @@ export function mount(element, store, link) {
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
     const reached = drawAxial(pen, { width, height, map, scene, target, parts, store });
-    legendOf(legend, parts, reached);
+    legendOf(legend, [...parts, ...measuredTip(store)], reached);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, "people", "welcome"], () => stage.schedule());

@@ -23,6 +23,15 @@ export function renew(element, children) {
   if (children.map(({ textContent }) => textContent).join("") !== element.textContent) element.replaceChildren(...children);
 }
 
+// Make elements the children of an element. Those that are its children already stay in place where their order allows
+// it, and keep the focus.
+export function arrange(element, children) {
+  for (const child of [...element.children]) if (!children.includes(child)) child.remove();
+  children.forEach((child, at) => {
+    if (element.children[at] !== child) element.insertBefore(child, element.children[at] ?? null);
+  });
+}
+
 // A number for people: digits after the point, with a true minus sign; "–" if it is unknown.
 export function shown(value, digits = 2) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";

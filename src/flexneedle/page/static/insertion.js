@@ -8,6 +8,7 @@ import { inWords } from "./insertion/words.js";
 import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
+const SHOWN_BY = ["insertion live", "people", "welcome", "rig"];
 const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 
 export function mount(element, store, link) {
@@ -20,6 +21,10 @@ export function mount(element, store, link) {
   const pace = make("select", { "aria-label": "Pace", change: () => link.ask({ type: "pace", pace: Number(pace.value) }) });
   pace.append(...PACES.map((each) => make("option", { value: String(each) }, `${each}×`)));
   pace.value = "1";
+  let focused = null;
+  store.subscribe(SHOWN_BY, () => {
+    focused = document.activeElement; // before the forms hide it
+  });
   const [rig, disturb] = [rigForm(store, link), disturbForm(store, link)];
   const decisions = make("div.decisions");
   element.append(
@@ -29,21 +34,22 @@ export function mount(element, store, link) {
   );
   followDecisions(decisions, store);
 
-  store.subscribe(["insertion live", "people", "welcome"], () => {
+  store.subscribe(SHOWN_BY, () => {
     const live = store.get("insertion live");
     const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
+    const signalled = steers && live?.state !== "waiting"; // one that waits can only be stopped
     state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;
     for (const each of [pause, step, pace]) each.hidden = !runs || real;
-    pause.disabled = pace.disabled = !steers;
-    step.disabled = !steers || !paused;
+    pause.disabled = pace.disabled = disturb.disabled = !signalled;
+    step.disabled = !signalled || !paused;
     pause.dataset.next = paused ? "go" : "pause";
     pause.textContent = paused ? "Continue" : "Pause";
     if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
-    disturb.disabled = !steers;
+    if (element.contains(focused) && focused.matches(":disabled, [hidden], [hidden] *")) (runs ? stop : start).focus();
   });
 }
 

@@ -42,7 +42,7 @@ export function mount(element, store) {
     const time = `${shown(rows[period].time - startOf(store, of), 1)} s`;
     scrub.setAttribute("aria-valuetext", `period ${period + 1} of ${rows.length}, ${time}`);
     place.textContent = `${time} · period ${period + 1} of ${rows.length}`;
-    play.textContent = store.get("view playing") ? "Pause" : "Play";
+    play.textContent = store.get("view playing") ? "Pause playback" : "Play";
     speed.textContent = `${player.speed}×`;
     newest.hidden = store.get("view period") === undefined;
   });

@@ -28,7 +28,10 @@ const PLOTS = [
     { name: "estimated", tone: "--estimate", of: (row) => row.energy_mj },
     { name: "true", tone: "--true", of: (row) => row.true_energy_mj, dash: true },
   ] },
-  { title: "Tracker's distortion indicator", lines: [{ name: "indicator", tone: "--measured", of: (row) => row.indicator }] },
+  {
+    title: "Tracker's distortion indicator", none: "This tracker has no indicator.",
+    lines: [{ name: "indicator", tone: "--measured", of: (row) => row.indicator }],
+  },
 ];
 
 export function mount(element, store) {

@@ -5,7 +5,7 @@ import { button, make, shown } from "./dom.js";
 import { KEYS, Handles } from "./flat/handles.js";
 import { boundaryEdit, guideEdit, guideOf, layersOf } from "./flat/layers.js";
 import { legendOf } from "./flat/legend.js";
-import { partsOf } from "./flat/parts.js";
+import { measuredTip, partsOf } from "./flat/parts.js";
 import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
 import { drawSection } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
@@ -71,7 +71,7 @@ class SectionView {
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
     const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, store: this.#store });
-    legendOf(this.#legend, parts, reached);
+    legendOf(this.#legend, [...parts, ...measuredTip(this.#store)], reached);
     this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
   }
 

@@ -39,6 +39,9 @@ export function shownRow(store, of = shownOf(store)) {
   return store.get(`rows ${of}`)?.[shownPeriod(store, of)] ?? null;
 }
 
+// Whether the tip was measured at the period of a row.
+export const isMeasured = (row) => Boolean(row?.measured?.every((part) => part !== null));
+
 // Shape (paths, points, columns, values) of a kind, such as "needle", of what is shown; or null.
 export function shownShape(store, kind, of = shownOf(store)) {
   const period = of === "scene" ? null : shownPeriod(store, of);

@@ -1,6 +1,6 @@
 // The bar at the bottom: connection, who is connected and in control, work with progress and cancel, refusals in words.
 
-import { button, make } from "./dom.js";
+import { button, make, renew } from "./dom.js";
 import { runs } from "./shown.js";
 
 const CONNECTIONS = {
@@ -22,14 +22,14 @@ const SHORT = 1_000; // ms: work that ends sooner is not shown
 
 export function mount(element, store, link) {
   const connection = make("span.connection", { role: "status" });
-  const steering = make("span.steering", { "aria-live": "polite" });
+  const steering = make("span.steering");
   const jobs = make("span.jobs");
   const stop = button("Stop the insertion", () => link.ask({ type: "stop" }), { class: "danger", hidden: true });
   const refusals = make("div.refusals", { role: "alert" });
   element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
 
   store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
-  store.subscribe(["people", "welcome", "connection"], () => showSteering(steering, store, link));
+  followSteering(steering, store, link);
   store.subscribe(["insertion live"], () => {
     stop.hidden = !runs(store.get("insertion live"));
   });
@@ -51,17 +51,22 @@ function showTitle(session) {
   document.title = session ? `${session.values.name} – flexneedle` : "flexneedle";
 }
 
-function showSteering(element, store, link) {
-  const [people, welcome] = [store.get("people"), store.get("welcome")];
-  element.replaceChildren();
-  if (!people || !welcome || store.get("connection") !== "open") return;
-  const mine = people.steering === welcome.client;
-  const who = people.steering === null ? "nobody is" : mine ? "you are" : `person ${people.steering} is`;
-  const text = `${people.clients} ${people.clients === 1 ? "person" : "people"} connected, ${who} in control`;
-  const [name, title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
-  const change = button(name, () => link.ask({ type: "steer", take: !mine }), { title });
-  element.append(make("span", {}, text));
-  if (mine || people.steering === null) element.append(change);
+// Who is in control, and a button that takes it or releases it, which keeps the focus.
+function followSteering(element, store, link) {
+  let mine = false;
+  const words = make("span", { "aria-live": "polite" });
+  const change = button("", () => link.ask({ type: "steer", take: !mine }));
+  element.append(words, change);
+  store.subscribe(["people", "welcome", "connection"], () => {
+    const [people, welcome] = [store.get("people"), store.get("welcome")];
+    element.hidden = !people || !welcome || store.get("connection") !== "open";
+    if (element.hidden) return;
+    mine = people.steering === welcome.client;
+    const who = people.steering === null ? "nobody is" : mine ? "you are" : `person ${people.steering} is`;
+    renew(words, [make("span", {}, `${people.clients} ${people.clients === 1 ? "person" : "people"} connected, ${who} in control`)]);
+    [change.textContent, change.title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
+    change.hidden = !mine && people.steering !== null;
+  });
 }
 
 // Work that takes longer than a second has a bar; what has failed stays until the next of its kind begins.

@@ -235,7 +235,7 @@ class TrackerSettings(Section):
     field_seed: AnySeed | None = None
     """Seed of the environment's error field. Not set: each insertion draws a field of its own from its seed."""
     environment: Annotated[Environment | None, BeforeValidator(expanded)] = None
-    """Name of a shipped environment, or a table with the values of your own. "none" or not set: white noise only."""
+    """A shipped environment, "ideal" or "noisy", or a table with values of your own. "none" or not set: white noise."""
 
     registration: Registration | None = None
     """Rigid map from the tracker's frame to the frame of the insertion. Not set: the two frames are the same."""

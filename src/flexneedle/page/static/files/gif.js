@@ -7,25 +7,37 @@ const LAST_CODE = 4095;
 
 const PALETTE = paletteOf();
 
-// Bytes of a GIF. width, height: px; frames: pixels of each (RGBA, as of getImageData); delay: s of each.
-export function gifOf(width, height, frames, delay) {
-  const bytes = [];
-  text(bytes, "GIF89a");
-  words(bytes, width, height);
-  bytes.push(0xf7, 0, 0, ...PALETTE.flat());
-  bytes.push(0x21, 0xff, 11);
-  text(bytes, "NETSCAPE2.0");
-  bytes.push(3, 1, 0, 0, 0); // for ever
-  for (const pixels of frames) {
+export class Gif {
+  #bytes = [];
+  #delay;
+
+  // width, height: px; delay: s of each frame.
+  constructor(width, height, delay) {
+    [this.width, this.height, this.#delay] = [width, height, delay];
+    const bytes = this.#bytes;
+    text(bytes, "GIF89a");
+    words(bytes, width, height);
+    bytes.push(0xf7, 0, 0, ...PALETTE.flat(), 0x21, 0xff, 11);
+    text(bytes, "NETSCAPE2.0");
+    bytes.push(3, 1, 0, 0, 0); // for ever
+  }
+
+  // Encode a frame. pixels: RGBA, as of getImageData.
+  add(pixels) {
+    const bytes = this.#bytes;
     bytes.push(0x21, 0xf9, 4, 0);
-    words(bytes, Math.max(2, Math.round(100 * delay)));
+    words(bytes, Math.max(2, Math.round(100 * this.#delay)));
     bytes.push(0, 0, 0x2c);
-    words(bytes, 0, 0, width, height);
+    words(bytes, 0, 0, this.width, this.height);
     bytes.push(0, CODE_BITS);
     blocks(bytes, compressed(indices(pixels)));
   }
-  bytes.push(0x3b);
-  return new Uint8Array(bytes);
+
+  // The file, to which no frame is added any more.
+  bytes() {
+    this.#bytes.push(0x3b);
+    return Uint8Array.from(this.#bytes);
+  }
 }
 
 function paletteOf() {

@@ -2,7 +2,8 @@
 
 import { make } from "../dom.js";
 import { shownOf } from "../shown.js";
-import { gifOf } from "./gif.js";
+import { download } from "./download.js";
+import { Gif } from "./gif.js";
 
 const FRAMES = 60; // of a GIF at most
 const [WIDTH, DELAY] = [640, 0.1]; // px at most, s
@@ -14,24 +15,23 @@ export async function savePng() {
   picture.toBlob((blob) => download(blob, "flexneedle.png"));
 }
 
-// Save a GIF of the shown insertion; progress(share) is called with each frame. Returns false where there is none.
+// Save a GIF of the shown insertion; progress(share) is called with each frame, which is then encoded. Returns false where there is none.
 export async function saveGif(store, progress) {
   const rows = store.get(`rows ${shownOf(store)}`) ?? [];
   if (!rows.length) return false;
   const before = store.get("view period");
-  const frames = [];
   const count = Math.min(FRAMES, rows.length);
-  let size = [0, 0];
+  let gif = null;
   for (let at = 0; at < count; at++) {
     store.set("view period", count === 1 ? 0 : Math.round((at * (rows.length - 1)) / (count - 1)));
     await painted();
     const picture = copyOf(await drawing(), WIDTH);
-    size = [picture.width, picture.height];
-    frames.push(picture.getContext("2d").getImageData(0, 0, ...size).data);
+    gif ??= new Gif(picture.width, picture.height, DELAY);
+    gif.add(picture.getContext("2d").getImageData(0, 0, gif.width, gif.height).data);
     progress((at + 1) / count);
   }
   store.set("view period", before);
-  download(new Blob([gifOf(...size, frames, DELAY)], { type: "image/gif" }), "flexneedle.gif");
+  download(new Blob([gif.bytes()], { type: "image/gif" }), "flexneedle.gif");
   return true;
 }
 
@@ -52,9 +52,3 @@ function copyOf(canvas, widest) {
 }
 
 const painted = () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
-
-function download(blob, name) {
-  const address = URL.createObjectURL(blob);
-  make("a", { href: address, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(address), 10_000);
-}

@@ -1,6 +1,7 @@
 // Recorded runs and studies: open a run or a row, a second to compare, download; save the last insertion or a row as a run.
 
-import { button, make } from "../dom.js";
+import { arrange, button, make } from "../dom.js";
+import { fetched } from "./download.js";
 import { showStudy } from "./study.js";
 
 const DOWNLOADS = [["Figure", "figure.png"], ["CSV", "trace.csv"], ["Run folder", "run.zip"], ["Replay as HTML", "replay.html"]];
@@ -20,23 +21,39 @@ export function showRuns(element, store, link) {
   const study = make("div");
   element.append(save, opened, study, make("details", { open: true }, make("summary", {}, "Recorded runs and studies"), search, list));
   showStudy(study, store, link);
-  const show = () => showList(list, search.value.trim().toLowerCase(), store, link);
+  const entries = new Map(); // by name
+  const show = () => showList(list, entries, search.value.trim().toLowerCase(), store, link);
   search.addEventListener("input", show);
   store.subscribe(["runs"], show);
   store.subscribe(["insertion first", "insertion second"], () => showOpened(opened, store, link));
 }
 
-function showList(list, text, store, link) {
+// What is shown stays where it is: with its focus, and an open list of downloads.
+function showList(list, entries, text, store, link) {
   const found = (store.get("runs")?.runs ?? []).filter(({ name, summary, kind }) => `${name} ${kind} ${summary}`.toLowerCase().includes(text));
-  list.replaceChildren(...found.slice(0, MOST).map((run) => entryOf(run, link)));
-  if (!found.length) list.append(make("li.quiet", {}, text ? "No run has this in its name or summary" : "No recorded runs yet"));
-  if (found.length > MOST) list.append(make("li.quiet", {}, `${found.length - MOST} more: search for them`));
+  const shown = found.slice(0, MOST).map((run) => {
+    const known = entries.get(run.name);
+    const entry = known?.kind === run.kind ? known : entryOf(run, link);
+    entry.about.textContent = aboutOf(run);
+    return [run.name, entry];
+  });
+  entries.clear();
+  for (const [name, entry] of shown) entries.set(name, entry);
+  const remarks = [];
+  if (!found.length) remarks.push(text ? "No run has this in its name or summary" : "No recorded runs yet");
+  if (found.length > MOST) remarks.push(`${found.length - MOST} more: search for them`);
+  arrange(list, [...shown.map(([, { element }]) => element), ...remarks.map((remark) => make("li.quiet", {}, remark))]);
 }
 
-function entryOf({ name, kind, summary, made }, link) {
-  const when = new Date(1000 * made).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+function entryOf({ name, kind }, link) {
+  const about = make("span.quiet");
   const tools = make("div.tools", {}, ...(kind === "study" ? toolsOfStudy : toolsOfRun)(name, kind, link));
-  return make("li.run", {}, make("strong", {}, name), make("span.quiet", {}, `${kind}, ${when}: ${summary}`), tools);
+  return { kind, about, element: make("li.run", {}, make("strong", {}, name), about, tools) };
+}
+
+function aboutOf({ kind, summary, made }) {
+  const when = new Date(1000 * made).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+  return `${kind}, ${when}: ${summary}`;
 }
 
 const toolsOfStudy = (name, kind, link) => [button("Rows", () => link.ask({ type: "study", name }), { "aria-label": `Rows of ${name}` })];
@@ -46,8 +63,18 @@ function toolsOfRun(name, kind, link) {
   const shows = REPLAYED.includes(kind)
     ? [button("Open", () => open(false), { "aria-label": `Open ${name}` }), button("Compare", () => open(true), { "aria-label": `Compare with ${name}` })]
     : [];
-  const downloads = DOWNLOADS.map(([text, file]) => make("a", { href: addressOf(name, file), download: `${name}-${file}`, "aria-label": `${text} of ${name}` }, text));
-  return [...shows, make("details", {}, make("summary", {}, "Download"), make("div.tools", {}, ...downloads))];
+  const status = make("div", { role: "status" });
+  const downloads = DOWNLOADS.map(([text, file]) => downloadOf(name, file, text, status));
+  return [...shows, make("details", {}, make("summary", {}, "Download"), make("div.tools", {}, ...downloads), status)];
+}
+
+function downloadOf(name, file, text, status) {
+  const [href, what] = [addressOf(name, file), `${text} of ${name}`];
+  const click = (event) => {
+    event.preventDefault();
+    fetched(href, `${name}-${file}`, what, status);
+  };
+  return make("a", { href, download: `${name}-${file}`, "aria-label": what, click }, text);
 }
 
 const addressOf = (name, file) => `/runs/${encodeURIComponent(name)}/${file}`;

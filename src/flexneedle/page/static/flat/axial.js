@@ -2,7 +2,7 @@
 
 import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
-import { isStale, shownOf, shownRow } from "../shown.js";
+import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
 import { area, disc, grid, pointsOf, polyline } from "./pen.js";
 
 const READINGS = 40; // measured positions that are shown
@@ -50,7 +50,7 @@ function reach(pen, place, store, depth) {
 
 function readings(pen, place, rows) {
   for (const each of rows) {
-    if (each?.measured?.every((part) => part !== null)) disc(pen, place(...each.measured), 1.5, { tone: "--measured", alpha: 0.7 });
+    if (isMeasured(each)) disc(pen, place(...each.measured), 1.5, { tone: "--measured", alpha: 0.7 });
   }
 }
 

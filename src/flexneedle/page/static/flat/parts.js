@@ -2,7 +2,7 @@
 
 import { first, fresh, pathOfRows, ranksOf } from "../paths.js";
 import { foreseen, plannedPaths } from "../planned.js";
-import { shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
+import { isMeasured, shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
 
 const STALE = 0.35;
 
@@ -51,8 +51,15 @@ function tips(store, of) {
   const rows = store.get(`rows ${of}`).slice(0, row.index + 1);
   return [
     { path: pathOfRows(rows, "estimate"), tone: "--estimate", width: 2, text: "estimated path of the tip", tip: true },
-    { path: pathOfRows(rows, "true"), tone: "--true", width: 1.25, dash: true },
+    { path: pathOfRows(rows, "true"), tone: "--true", width: 1.25, dash: true, text: "true path of the tip" },
   ];
+}
+
+// Entry of the legend for the measured tip, where one was measured until the shown period.
+export function measuredTip(store) {
+  const row = shownRow(store);
+  const some = row && store.get(`rows ${shownOf(store)}`).slice(0, row.index + 1).some(isMeasured);
+  return some ? [{ text: "measured tip", tone: "--measured", disc: true }] : [];
 }
 
 function secondRun(store, radius) {

@@ -1,6 +1,6 @@
 // Draws a section: tissue, grid, reach, guide, target, and what moves.
 
-import { isStale, shownOf, shownRow } from "../shown.js";
+import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
 import { shadeOf } from "../tissue.js";
 import { layersIn } from "./layers.js";
 import { area, disc, grid, pointsOf, polyline, words } from "./pen.js";
@@ -20,7 +20,7 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
   for (const part of parts) draw(pen, part, place, map);
   if (guide !== null) drawGuide(pen, map, plane, guide, scene, shownRow(store));
   const row = shownRow(store);
-  if (row?.measured?.every((each) => each !== null)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
+  if (isMeasured(row)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
   drawTarget(pen, map, plane, target);
   return reached;
 }

@@ -2,29 +2,43 @@
 
 import { button, make } from "../dom.js";
 
+const NO_FIELD = "The tracker of this scenario has no field that metal distorts. To have one, set its environment to ideal or noisy.";
+
 // A form whose requests act at once; what is active is listed.
 export function disturbForm(store, link) {
   const active = make("p.quiet", { role: "status" });
   const number = (label, value, more = {}) => make("input", { type: "number", min: "0", step: "any", value: String(value), "aria-label": label, ...more });
   const [force, angle] = [number("Force on the tip in N", 0.02), number("Direction of the force in degrees", 0, { min: "-360", max: "360" })];
   const [layer, factor] = [make("select", { "aria-label": "Layer" }), number("Factor on its stiffness", 2)];
-  const [seconds, distance] = [number("Seconds without the tracker", 1), number("Distance of the plate in mm", 100)];
+  const seconds = number("Seconds without the tracker", 1);
   const disturb = (what, size, more = {}) => {
     if (Number.isFinite(size.valueAsNumber)) link.ask({ type: "disturb", what, size: size.valueAsNumber, ...more });
   };
   const none = (what) => link.ask({ type: "disturb", what, size: 0 });
+
+  const plate = [
+    number("Distance of the plate from the center of the tracker's workspace in mm", 100),
+    button("Bring", () => disturb("plate", plate[0])),
+    button("Take away", () => none("plate")),
+  ];
+  const why = make("span.quiet", {}, NO_FIELD);
 
   const form = make(
     "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
     line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
     line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
     line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
-    line("Metal plate at", distance, "mm", button("Bring", () => disturb("plate", distance)), button("Take away", () => none("plate"))),
+    line("Metal plate at", plate[0], "mm from the center of the tracker's workspace", plate[1], plate[2], why),
     active,
   );
   store.subscribe(["disturbances"], () => {
     const list = store.get("disturbances")?.active ?? [];
     active.textContent = list.length ? `Active: ${list.join("; ")}` : "";
+  });
+  store.subscribe(["session"], () => {
+    const field = hasField(store.get("session"));
+    for (const each of plate) each.disabled = !field;
+    why.hidden = field;
   });
   store.subscribe(["insertion live", "scene"], () => chooseLayers(layer, store));
   return form;
@@ -32,6 +46,8 @@ export function disturbForm(store, link) {
 
 const line = (...parts) => make("div.tools", {}, ...parts);
 const angleOf = (input) => (Number.isFinite(input.valueAsNumber) ? { angle_deg: input.valueAsNumber } : {});
+
+const hasField = (session) => Object.keys(session?.values ?? {}).some((key) => key.startsWith("tracker.environment."));
 
 function chooseLayers(select, store) {
   const layers = (store.get("insertion live")?.scene ?? store.get("scene"))?.layers ?? [];

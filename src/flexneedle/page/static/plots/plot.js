@@ -21,7 +21,7 @@ export class PlotView {
   #start = 0;
   #time = null;
 
-  // spec: {title, lines: [{name, tone, of, dash, thin}]}; choose: called with the index of the row that is clicked.
+  // spec: {title, lines: [{name, tone, of, dash, thin}], none: words where no line has a value}; choose: called with the index of the row that is clicked.
   constructor(parent, spec, choose) {
     [this.#spec, this.#choose] = [spec, choose];
     this.#place = make("div.plot", { role: "img", "aria-label": spec.title });
@@ -59,13 +59,15 @@ export class PlotView {
     return [rows.map(({ time }) => time - start), ...this.#spec.lines.map(({ of }) => rows.map(of))];
   }
 
-  // Of several lines, those that have a value.
+  // Of several lines, those that have a value; or that there is none.
   #showLegend(data) {
-    const drawn = this.#lines.length > 1 ? this.#lines.filter((_, at) => data[at + 1].some((value) => (value ?? null) !== null)) : [];
-    const names = drawn.map(({ name }) => name).join();
-    if (this.#legend.dataset.names === names) return;
-    this.#legend.dataset.names = names;
-    this.#legend.replaceChildren(...drawn.map(entryOf));
+    const known = this.#lines.filter((_, at) => data[at + 1].some((value) => (value ?? null) !== null));
+    const none = known.length ? "" : this.#spec.none ?? "";
+    const drawn = this.#lines.length > 1 ? known : [];
+    const text = [none, ...drawn.map(({ name }) => name)].join();
+    if (this.#legend.dataset.text === text) return;
+    this.#legend.dataset.text = text;
+    this.#legend.replaceChildren(none, ...drawn.map(entryOf));
   }
 
   #make(theme, compared) {

@@ -1,11 +1,12 @@
 // What moves: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
 
 import {
-  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
+  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, SphereGeometry,
+  Vector3,
 } from "../vendor/three.js";
 import { first, fresh, pathOfRows, ranksOf, tipOf } from "../paths.js";
 import { foreseen, plannedPaths, rollOf } from "../planned.js";
-import { isStale, shownRow, shownSecond, shownShape } from "../shown.js";
+import { isMeasured, isStale, shownRow, shownSecond, shownShape } from "../shown.js";
 import { Lines } from "./lines.js";
 import { Outlines } from "./outlines.js";
 import { paint } from "./room.js";
@@ -36,6 +37,9 @@ export class Shapes {
     this.#addTube("predicted", translucent({ opacity: 0.24 }), "--predicted", 5);
     this.#addGuide();
     this.#addBevel();
+    this.measured = new Mesh(new SphereGeometry(0.35), new MeshBasicMaterial({ depthTest: false, transparent: true }));
+    this.measured.renderOrder = 7;
+    this.group.add(this.measured);
     this.#paths.object.renderOrder = 2;
     this.group.add(this.#paths.object, this.#outlines.group);
   }
@@ -55,6 +59,7 @@ export class Shapes {
       ...this.#plans(store, of),
       this.#samples(store, of),
       ...this.#tips(store, of, row),
+      this.#measured(row),
       this.#second(store, scene),
       this.#reach(store, of),
     ];
@@ -162,7 +167,18 @@ export class Shapes {
       this.#draw("estimated", pathOfRows(rows, "estimate"), PATH, { tone: "--estimate" });
       this.#draw("truth", pathOfRows(rows, "true"), PATH, { tone: "--true" });
     }
-    return count > 1 ? [{ text: "estimated path of the tip", tone: "--estimate" }] : [];
+    const estimated = { text: "estimated path of the tip", tone: "--estimate" };
+    const truth = rows.some((each) => each?.true) && { text: "true path of the tip", tone: "--true" };
+    return count > 1 ? [estimated, truth] : [];
+  }
+
+  // Where the tip was measured at the shown period.
+  #measured(row) {
+    this.measured.visible = isMeasured(row);
+    if (!this.measured.visible) return null;
+    this.measured.position.set(...row.measured);
+    this.measured.material.color = paint("--measured");
+    return { text: "measured tip", tone: "--measured", form: "disc" };
   }
 
   #second(store, scene) {

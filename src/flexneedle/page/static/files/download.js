@@ -1,0 +1,26 @@
+// Files that the browser saves.
+
+import { make } from "../dom.js";
+
+export function download(blob, name) {
+  const address = URL.createObjectURL(blob);
+  make("a", { href: address, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 10_000);
+}
+
+// Get a file of the server, which may take its time to make it or refuse it, and save it. what: its name in words;
+// status: an element, with a line until it is there, or why it is not.
+export async function fetched(address, name, what, status) {
+  const line = make("p.quiet", {}, `${what} is being made…`);
+  for (const earlier of status.querySelectorAll(".bad")) earlier.remove();
+  status.append(line);
+  try {
+    const answer = await fetch(address, { cache: "no-store" });
+    if (!answer.ok) throw new Error(await answer.text());
+    download(await answer.blob(), name);
+    line.remove();
+  } catch (error) {
+    line.className = "bad";
+    line.textContent = `${what}: ${error instanceof TypeError ? "the server does not answer" : error.message}`;
+  }
+}
