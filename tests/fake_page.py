@@ -1,11 +1,13 @@
 """A small server of the page's files, without flexneedle behind it: sends what it is given, records requests."""
 
 import asyncio
+import json
 import threading
 from contextlib import suppress
 from pathlib import Path
 
 import uvicorn
+from pydantic import ValidationError
 from starlette.applications import Starlette
 from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -13,7 +15,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import flexneedle.page
-from flexneedle.page.messages import Done, News, Refused
+from flexneedle.page.messages import REQUESTS, Done, News, Refused
 from recorded_page import TARGET, opening, people, scene, scene_frames, session
 
 STATIC = Path(flexneedle.page.__file__).parent / "static"
@@ -42,13 +44,14 @@ class Guarded:
 class FakePage:
     """The server in a thread of its own, on a free port.
 
-    news: what a client gets when it comes; requests: all that clients asked; answers: by type of a request, a
-    `Refused`, or a function of the request that returns news and frames for that client before `Done`; files: what
-    is served by path.
+    news: what a client gets when it comes; requests: all that clients asked; invalid: what is wrong with those that
+    the page's server would not take; answers: by type of a request, a `Refused`, or a function of the request that
+    returns news and frames for that client before `Done`; files: what is served by path.
     """
 
     def __init__(self, schema=b"{}"):
         self._schema, self._sockets = schema, []
+        self._heard = threading.Condition()
         self._begin()
         routes = [
             Route("/", lambda _: FileResponse(STATIC / "index.html")),
@@ -80,9 +83,11 @@ class FakePage:
         self._thread.join(20.0)
 
     def begin_anew(self):
-        """Wait until all clients have left, and forget them and what they were sent."""
+        """Wait until all clients have left, and forget them and what they were sent; returns what was invalid."""
         asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(20.0)
+        invalid = self.invalid
         self._begin()
+        return invalid
 
     def send(self, *news):
         """Send news and frames to all clients."""
@@ -100,8 +105,14 @@ class FakePage:
             if each["type"] == kind
         ]
 
+    def wait_for(self, kind, count=1):
+        """Wait until clients have asked for something so many times; returns these requests."""
+        with self._heard:
+            assert self._heard.wait_for(lambda: len(self.asked(kind)) >= count, 20.0), self.requests
+        return self.asked(kind)
+
     def _begin(self):
-        self.news, self.requests, self.answers = opening(), [], {}
+        self.news, self.requests, self.invalid, self.answers = opening(), [], [], {}
         self.files = {"/schema.json": self._schema, "/scenario.toml": ""}
         self._revision, self._target = 1, list(TARGET)
 
@@ -128,10 +139,20 @@ class FakePage:
         await self._send_to(socket, self.news)
         with suppress(WebSocketDisconnect):
             while True:
-                request = await socket.receive_json()
-                self.requests.append(request)
+                request = self._taken(await socket.receive_text())
                 await self._answer(socket, request)
         self._sockets.remove(socket)
+
+    def _taken(self, text):
+        """A request that is kept, with what the page's server finds wrong with it."""
+        try:
+            REQUESTS.validate_json(text)
+        except ValidationError as error:
+            self.invalid.append(f"{text}: {error}")
+        with self._heard:
+            self.requests.append(json.loads(text))
+            self._heard.notify_all()
+        return self.requests[-1]
 
     async def _answer(self, socket, request):
         given = self.answers.get(request["type"])

@@ -36,9 +36,12 @@ def kept_server():
 
 @pytest.fixture
 def server(kept_server):
-    """A server of the page's files; a test that has one before its tabs ends with nobody connected."""
+    """A server of the page's files; a test that has one before its tabs ends with nobody connected.
+
+    A request that the page's server would refuse as no request fails the test.
+    """
     yield kept_server
-    kept_server.begin_anew()
+    assert kept_server.begin_anew() == []
 
 
 @pytest.fixture

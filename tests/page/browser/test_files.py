@@ -4,7 +4,9 @@ from base64 import b64decode, b64encode
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
@@ -220,7 +222,7 @@ def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures,
         {"type": "study", "name": "many", "index": 120},
         {"type": "study", "name": "many", "index": None},
     ]
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert too_wide(page) == []
 
 
 def test_a_study_without_finished_rows_is_named_so(files, server):
@@ -269,12 +271,26 @@ def test_a_row_that_is_shown_is_saved_as_a_run(files, server):
     assert server.asked("save") == [{"type": "save", "name": "worst", "of": "second"}]
 
 
-def test_a_picture_of_the_scene_is_saved(files):
+def test_the_scenario_is_saved(files, tmp_path):
     page = files()
+    with page.expect_download() as download:
+        page.click("text=Save the scenario")
+    assert download.value.suggested_filename == "scenario.toml"
+    download.value.save_as(tmp_path / "saved.toml")
+    assert (tmp_path / "saved.toml").read_text() == TEXT
+
+
+def test_a_picture_of_the_scene_is_saved(files, tmp_path):
+    page = files(draws=True)
     page.wait_for_selector("[data-panel=space] .legend li")
     with page.expect_download() as download:
         page.click("text=Picture")
     assert download.value.suggested_filename == "flexneedle.png"
+    download.value.save_as(tmp_path / "made.png")
+    picture = imread(tmp_path / "made.png")
+    shape = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
+    assert list(picture.shape[:2]) == shape
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
 
 
 # Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.

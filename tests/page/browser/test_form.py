@@ -2,6 +2,7 @@
 
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Refused, Session
 from flexneedle.scenario.files import load_scenario
@@ -143,9 +144,7 @@ def test_options_and_doubts(form, server):
     page.select_option("#option-strategy", "steering")
     page.click("[aria-label='Next seed']")
     page.select_option("#option-controller", "ce-mpc")
-    until(page, "true")
-    page.wait_for_timeout(100)
-    assert server.asked("options") == [
+    assert server.wait_for("options", 3) == [
         {"type": "options", "strategy": "steering"},
         {"type": "options", "seed": 1},
         {"type": "options", "controller": "ce-mpc"},
@@ -163,5 +162,5 @@ def test_it_fits_its_width(form, pictures, size, scheme):
     page = form([*opening(), session()], width=size[0], height=size[1], scheme=scheme)
     page.wait_for_selector("#field-target-depth_mm")
     page.locator("#field-target-depth_mm").focus()
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"form-{size[0]}-{scheme}")

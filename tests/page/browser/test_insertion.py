@@ -2,6 +2,7 @@
 
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Disturbances, Job, RigCheck, RigState
 from recorded_page import WELCOME, inserting, insertion, opening, people, row, rows, session
@@ -46,6 +47,12 @@ def test_it_is_started_paced_and_stopped(panel, server):
     ]  # fmt: skip
     server.send(insertion("done", periods=3, pace=0.0, error_mm=0.0161))
     page.wait_for_selector("text=The tip ended 0.016 mm from the target.")
+
+
+def test_it_is_started_paused(panel, server):
+    page = panel()
+    click(page, "Start paused")
+    assert server.wait_for("insert") == [{"type": "insert", "paused": True}]
 
 
 def test_single_periods_only_while_it_is_paused(panel, server):
@@ -98,14 +105,15 @@ def test_disturbances_are_sent_and_listed(panel, server):
     page = panel([*opening(), in_a_field(), insertion("running")])
     page.fill("[aria-label='Force on the tip in N']", "0.25")
     click(page, "Push")
+    page.click("[aria-label='Let go of the tip']")
     page.select_option("[aria-label=Layer]", "1")
     click(page, "Stiffen")
     click(page, "Drop")
     click(page, "Bring")
     click(page, "Take away")
-    page.wait_for_timeout(100)
-    assert server.asked("disturb") == [
+    assert server.wait_for("disturb", 6) == [
         {"type": "disturb", "what": "push", "size": 0.25, "angle_deg": 0},
+        {"type": "disturb", "what": "push", "size": 0},
         {"type": "disturb", "what": "stiffen", "size": 2, "layer": 1},
         {"type": "disturb", "what": "drop", "size": 1},
         {"type": "disturb", "what": "plate", "size": 100},
@@ -177,6 +185,16 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     assert shown_buttons(page) == {"Check": True, "Prepare": True}
 
 
+def test_an_armed_rig_is_disarmed(rig_panel, server):
+    page = rig_panel(insertion("ready", rig="Bench"), rig("armed", *MOVES, job=7))
+    click(page, "Disarm")
+    assert server.wait_for("arm") == [{"type": "arm", "armed": False, "job": 7}]
+    server.send(rig("ready", *MOVES, job=7))
+    page.wait_for_selector(f"{PANEL} >> text=is ready; nothing moves")
+    assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
+    assert not page.is_checked("#rig-free")
+
+
 def test_a_rig_that_is_held_has_to_be_confirmed_again(rig_panel, server):
     page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7))
     page.check("#rig-free")
@@ -234,7 +252,7 @@ def test_a_rig_fits_its_width(rig_panel, pictures, size, scheme):
     waits = rig("ready", *MOVES, "The motors of all axes are switched on first." * 3, job=7)
     page = rig_panel(insertion("ready", rig="Bench"), waits, width=size[0], height=size[1], scheme=scheme)
     page.locator(f"{PANEL} .rig").scroll_into_view_if_needed()
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"rig-{size[0]}-{scheme}")
 
 
@@ -263,5 +281,5 @@ def test_anybody_can_stop_and_only_who_steers_can_do_more(panel, server):
 def test_it_fits_its_width(panel, pictures, size, scheme):
     page = panel(inserting(), width=size[0], height=size[1], scheme=scheme)
     page.locator(PANEL).scroll_into_view_if_needed()
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"insertion-{size[0]}-{scheme}")

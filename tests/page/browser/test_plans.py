@@ -1,7 +1,9 @@
 """Plans: started, watched and cancelled; both strategies side by side with the terms of their cost."""
 
+import numpy as np
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Estimate, Job
 from recorded_page import (
@@ -60,7 +62,33 @@ def test_work_is_started_and_cancelled(plans, server):
     assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
 
 
+COST = """async ([tone, shares]) => {
+  const { color } = await import("/static/theme.js");
+  const wanted = color(tone).match(/[0-9]+/g).slice(0, 3).map(Number);
+  const [canvas, over] = [".cost canvas", ".cost .u-over"].map((each) => document.querySelector(each));
+  const scale = canvas.width / canvas.clientWidth;
+  const is = (data, at) => data[at + 3] > 60 && wanted.every((value, part) => Math.abs(data[at + part] - value) < 40);
+  const columns = shares.map((share) => {
+    const x = Math.round((over.offsetLeft + share * over.clientWidth) * scale) - (share === 1 ? 1 : 0);
+    const { data } = canvas.getContext("2d").getImageData(x, 0, 1, canvas.height);
+    const found = Array.from({ length: canvas.height }, (_, y) => y).filter((y) => is(data, 4 * y));
+    return found.map((y) => 1 - (y / scale - over.offsetTop) / over.clientHeight);
+  });
+  return [columns, over.clientHeight];
+}"""
+"""Where a tone is at shares of the width of the plot of the cost, from 0 at its foot to 1; its height in pixels."""
+DECADES = (-1, 1)
+"""Of the plot's axis, which ends at powers of ten, for costs from 0.125 to 4."""
+
+
+def share_of(cost):
+    """Where a cost is in the plot, from 0 at its foot to 1."""
+    low, high = DECADES
+    return (np.log10(cost) - low) / (high - low)
+
+
 def test_cost_falls_with_each_iteration(plans, server):
+    """The lowest line is the best cost so far, on an axis that is logarithmic; the others are above it."""
     page = plans()
     for number in range(4):
         server.send(iteration(number), samples(number))
@@ -71,6 +99,14 @@ def test_cost_falls_with_each_iteration(plans, server):
         "manipulation, elite",
         "manipulation, median",
     ]
+    page.locator(f"{PLANS} .cost").scroll_into_view_if_needed()
+    page.evaluate(PAINTED)
+    shares = [*np.linspace(0.0, 1.0, 4), *np.linspace(0.0, 0.03, 24)]
+    columns, height = page.evaluate(COST, ["--manipulation", shares])
+    lowest = [min(column) for column in columns[:4]]
+    highest = max(max(column) for column in columns[4:])  # of dots, near the first iteration
+    np.testing.assert_allclose(lowest, [share_of(cost) for cost in iteration(3).best], atol=3.0 / height)
+    assert highest == pytest.approx(share_of(iteration(3).median[0]), abs=4.0 / height)
 
 
 def test_strategies_are_side_by_side_with_their_terms(plans):
@@ -139,5 +175,5 @@ def test_it_is_drawn_at_each_size(plans, pictures, size, scheme):
     page = plans(planned(), width=size[0], height=size[1], scheme=scheme)
     page.evaluate("document.querySelector('.panel.plans').scrollIntoView()")
     page.wait_for_timeout(300)
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"plans-{size[0]}-{scheme}")

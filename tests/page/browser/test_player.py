@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Kind, Source, frame_of, packed
 from flexneedle.page.messages import Closed
@@ -76,6 +77,14 @@ def test_it_plays_at_a_speed_and_ends_at_the_end(player):
     until(page, f"{PERIOD} === 49 && !flexneedle.store.get('view playing')")
     seconds = (page.evaluate("performance.now()") - start) / 1000
     assert seconds >= 49 * 0.2 / 10 - 0.05
+
+
+def test_it_is_made_slower_and_faster(player):
+    page = player()
+    speed = page.locator(f"{PLAYER} .tools .number").first
+    for text, factor in (("Slower", "0.5×"), ("Slower", "0.25×"), ("Faster", "0.5×")):
+        page.click(f"{PLAYER} >> text={text}")
+        speed.locator(f"text={factor}").wait_for()
 
 
 def test_playing_pauses(player):
@@ -359,6 +368,22 @@ def test_unknown_values_are_gaps_and_two_runs_are_lines(player, server):
     assert drawn("--second", 7.95, 8.5, 9.1) == [False] * 3
 
 
+def test_plots_grow_while_rows_come(player, server):
+    """The newest row is at the right end."""
+    page = player([*opening(), insertion("running"), rows(0, 10)])
+    see_plots(page)
+    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 1.8 s: roll 27.000']")
+    before = page.evaluate(DRAWN, ["Roll", "--needle", [0.25, 0.5, 0.95]])
+    assert before == [True] * 3
+    drawn = f"document.querySelector('{PLOTS} [aria-label^=Roll] canvas').toDataURL()"
+    picture = page.evaluate(drawn)
+    server.send(rows(10, 10))
+    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 3.8 s: roll 57.000']")
+    until(page, f"{drawn} !== '{picture}'")
+    page.wait_for_timeout(150)
+    assert page.evaluate(DRAWN, ["Roll", "--needle", [0.25, 0.5, 0.95]]) == [True] * 3
+
+
 def test_a_period_without_a_shape_shows_none(player):
     path = np.zeros((1, 3), np.float32)
     shapes = frame_of(Kind.PREDICTED, Source.FIRST, 2, path + 2, path + np.nan, path + 4)
@@ -373,5 +398,5 @@ def test_it_fits_its_width(player, pictures, size, scheme):
     page = player(inserting(), width=size[0], height=size[1], scheme=scheme)
     see_plots(page)
     page.wait_for_timeout(200)
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"plots-{size[0]}-{scheme}")

@@ -2,6 +2,7 @@
 
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Source, unpacked
 from flexneedle.page.replay.document import document
@@ -175,4 +176,4 @@ def test_it_fits_its_width(replay, pictures, size, scheme):
         page.locator(f"[data-panel={name}]").scroll_into_view_if_needed()
         page.wait_for_timeout(300)
         pictures(page, f"replay-{size[0]}-{scheme}-{name}")
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Reach, Rows
@@ -13,6 +14,7 @@ from recorded_page import (
     insertion,
     opening,
     people,
+    period_frames,
     plan,
     plan_frames,
     planned,
@@ -205,6 +207,68 @@ def test_a_boundary_is_moved_and_those_below_it_stay(views, server):
     assert edited(page, server) == {"tissue.1.thickness_mm": 18.5}
 
 
+def test_the_pointer_moves_a_boundary(views, server):
+    page = views()
+    drag(page, handle(page, "boundary-0"), 30)
+    values = edited(page, server)
+    assert values.keys() == {"tissue.0.thickness_mm"}
+    assert 21.0 < values["tissue.0.thickness_mm"] < TARGET[0]
+
+
+def test_in_the_plane_of_x_and_z_the_target_is_moved_along_z(views, server):
+    page = views()
+    page.click(f"{SECTION} >> text=x–z")
+    assert page.get_attribute(f"{SECTION} [data-plane='x–z']", "aria-pressed") == "true"
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    drag(page, handle(page, "target"), 20, 10)
+    values = edited(page, server)
+    right, up = values["target.depth_mm"] - TARGET[0], values["target.lateral_z_mm"] - TARGET[2]
+    assert right == pytest.approx(2 * up, abs=0.03)
+    assert right > 1.0
+    assert values["target.lateral_mm"] == TARGET[1]
+
+
+def test_the_pointer_moves_the_target_along_the_axis_view(views, server):
+    page = views()
+    drag(page, handle(page, "target", AXIAL), 20, 10)
+    values = edited(page, server)
+    right, up = values["target.lateral_z_mm"] - TARGET[2], values["target.lateral_mm"] - TARGET[1]
+    assert right == pytest.approx(2 * up, abs=0.03)
+    assert right > 0.5
+    assert values["target.depth_mm"] == TARGET[0]
+
+
+OF_TONE = """async (tone) => {
+  const { color } = await import("/static/theme.js");
+  const wanted = color(tone).match(/[0-9]+/g).slice(0, 3).map(Number);
+  return ["section", "axial"].map((panel) => {
+    const canvas = document.querySelector(`[data-panel=${panel}] canvas`);
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let at = 0; at < data.length; at += 4) {
+      if (wanted.every((value, part) => Math.abs(data[at + part] - value) < 12)) count++;
+    }
+    return count;
+  });
+}"""
+"""Number of pixels of a tone in the section, and in the view along the axis."""
+
+
+def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
+    """In the section that of the period, along the axis also those before."""
+    known = [row(k) for k in range(10)]
+    measured = Rows(of="live", first=0, rows=known)
+    page = views([*opening(), insertion("running", periods=10), measured, *period_frames(9)])
+    section, axial = page.evaluate(OF_TONE, "--measured")
+    assert section > 8
+    assert axial > 8
+    unknown = [each.model_copy(update={"measured": None}) for each in known]
+    server.send(measured.model_copy(update={"rows": unknown}))
+    until(page, "flexneedle.store.get('rows live')[9].measured === null")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert page.evaluate(OF_TONE, "--measured") == [0, 0]
+
+
 def test_the_target_is_moved_along_the_axis_view(views, server):
     page = views()
     handle(page, "target", AXIAL).focus()
@@ -231,5 +295,5 @@ def test_it_is_drawn_at_each_size(views, pictures, size, scheme, state):
     page.wait_for_timeout(200)
     for panel in (SECTION, AXIAL):
         assert page.eval_on_selector(f"{panel} canvas", COLORS) > 30
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert too_wide(page) == []
     pictures(page, f"section-{state}-{size[0]}-{scheme}")

@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Reach
 from recorded_page import (
+    NODES,
     PERIODS,
     TARGET,
     estimate,
@@ -76,7 +78,7 @@ def test_the_scene_is_drawn_at_each_size(space, state, size, scheme):
     width, height = SIZES[size]
     page = space(STATES[state](), width=width, height=height, scheme=scheme, draws=True)
     settled(page)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert too_wide(page) == []
     colors = on_view(page, COLORS)
     assert colors > 50
     if folder := os.environ.get("SCREENSHOTS"):
@@ -167,6 +169,46 @@ def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, n
     np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
 
 
+TUBE = """
+const tube = view.shapes.group.children.find((each) => each.isMesh && each.visible && each.renderOrder === ORDER);
+const { position, color } = tube.geometry.attributes;
+return [position, color].map((each) => (each ? [...each.array] : []));
+"""
+SIDES = 10
+CHANNEL, PREDICTED = 4, 5
+
+
+def tube(page, order, points):
+    """Rings (points, sides, 3) of a tube that is drawn in an order, and their colours."""
+    parts = on_view(page, TUBE.replace("ORDER", str(order)))
+    return [np.reshape(part, (-1, SIDES, 3))[1 : points + 1] for part in parts]  # ring 0 closes the end
+
+
+def test_the_predicted_needle_is_as_wide_as_it_is_uncertain(space):
+    """Two standard deviations around the needle's radius, at each of its points."""
+    page = space(inserting(20))
+    settled(page)
+    rings, _ = tube(page, PREDICTED, NODES)
+    sd = 0.2 + 1.2 * np.linspace(0.0, 1.0, NODES) * (1 - 20 / PERIODS)
+    middle = rings.mean(axis=1, keepdims=True)
+    radius = np.linalg.norm(rings - middle, axis=2)
+    np.testing.assert_allclose(radius, np.tile(0.41 + 2.0 * sd, (SIDES, 1)).T, atol=1e-3)
+    np.testing.assert_allclose(middle[:, 0], needle(TARGET[0], sway=0.1), atol=1e-3)
+
+
+def test_the_cut_channel_is_the_darker_the_more_it_is_stretched(space):
+    page = space(inserting(60))
+    settled(page)
+    _, colors = tube(page, CHANNEL, 24)
+    cut = np.linspace(0.0, -28.5 + 68.5 * 61 / PERIODS, 24)
+    stretch = np.sin(np.pi * cut / (TARGET[0] + 5.0))
+    green = colors[:, 0, 1]
+    np.testing.assert_array_equal(colors, np.repeat(colors[:, :1], SIDES, axis=1))
+    assert np.all(np.diff(green[np.argsort(stretch)]) <= 0.0)
+    np.testing.assert_allclose(colors[0, 0], (0.99, 0.88, 0.68), atol=1e-6)  # not stretched
+    np.testing.assert_allclose(colors[np.argmax(stretch), 0], (0.45, 0.11, 0.0), atol=1e-6)  # the most
+
+
 def test_sampled_paths_narrow_with_each_iteration(space, server):
     page = space()
     spreads = []
@@ -247,6 +289,20 @@ def test_the_pointer_turns_the_view_and_the_scene_stays(space, server):
         > 5.0
     )
     assert not server.asked("edit")
+
+
+def test_the_wheel_zooms(space):
+    page = space()
+    distance = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
+    box = page.locator(CANVAS).bounding_box()
+    page.mouse.move(box["x"] + 60, box["y"] + 40)
+    distances = [on_view(page, distance)]
+    for turn in (-200, 400):
+        page.mouse.wheel(0, turn)
+        settled(page)
+        distances.append(on_view(page, distance))
+    assert distances[1] < 0.95 * distances[0]
+    assert distances[2] > 1.05 * distances[0]
 
 
 def drag_target(page, pixels):

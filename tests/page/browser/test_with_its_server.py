@@ -1,0 +1,87 @@
+"""The page in a browser with its server and workers behind it, as `flexneedle serve` runs them."""
+
+import csv
+import sys
+import zipfile
+from dataclasses import replace
+
+import pytest
+
+import page_clients
+from fake_page import until
+from flexneedle.page.server.limits import Limits
+from page_clients import served
+
+pytestmark = pytest.mark.page
+
+PLANS, INSERTION, PLAYER = (f"[data-panel={name}]" for name in ("plans", "insertion", "player"))
+WORKER = (sys.executable, "-m", "flexneedle.page.worker")
+LIMITS = replace(
+    Limits(), rest_s=60.0, runs_s=0.2
+)  # a changed scenario keeps its estimate until it is planned
+PATIENCE_MS = 100_000
+"""Workers take their time to start where many run."""
+
+
+@pytest.fixture
+def address(tmp_path, monkeypatch):
+    monkeypatch.setattr(page_clients, "PATIENCE_S", PATIENCE_MS / 1000)
+    with served(
+        tmp_path / "runs", limits=LIMITS, workers=((*WORKER, "plans"), (*WORKER, "insertion"))
+    ) as server:
+        yield server.address
+
+
+def see(page, selector):
+    """Wait for what a worker has computed."""
+    page.wait_for_selector(selector, timeout=PATIENCE_MS)
+
+
+def downloaded(page, name, path):
+    """What a link downloads."""
+    with page.expect_download(timeout=PATIENCE_MS) as download:
+        page.click(f"[aria-label='{name}']")
+    download.value.save_as(path)
+    return path
+
+
+def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
+    page = tab(1280, 800, "light")
+    page.goto(address)
+    see(page, f"{PLANS} >> text=Manipulation:")
+    depth = page.evaluate("flexneedle.store.get('scene').target[0]")
+
+    page.focus("[data-panel=section] [data-handle=target]")
+    page.keyboard.press("ArrowRight")
+    see(page, f"{PLANS} >> text=First estimate: error at the target")
+    until(page, f"flexneedle.store.get('scene').target[0] === {depth + 0.5}")
+    page.click(f"{PLANS} [data-work=plan]")
+    see(page, f"{PLANS} .words:not(:has-text('earlier state')) >> text=Manipulation:")
+
+    page.locator(INSERTION).get_by_role("button", name="Insert", exact=True).click()
+    see(page, f"{INSERTION} .decisions .now:has-text('Period')")
+    page.select_option("[aria-label=Pace]", "2")
+    page.locator(INSERTION).get_by_role("button", name="Push", exact=True).click()
+    page.wait_for_selector(f"{INSERTION} >> text=Active: push of 0.02 N at 0°")
+    page.select_option("[aria-label=Pace]", "20")
+    see(page, f"{INSERTION} >> text=Ended: adaptive-mpc, seed 0,")
+    periods = page.evaluate("flexneedle.store.get('insertion live').periods")
+    assert periods > 30
+    assert page.evaluate("flexneedle.store.get('rows live').map(({ index }) => index)") == list(
+        range(periods)
+    )
+
+    page.fill("[aria-label='Name of the run to save']", "mine")
+    page.click("text=Save the insertion")
+    page.click("[aria-label='Open mine']")
+    see(
+        page,
+        f"{PLAYER}:has([aria-pressed=true][data-of=first]) [aria-valuetext^='period {periods} of {periods},']",
+    )
+
+    page.click("summary:has-text('Download')")
+    with downloaded(page, "CSV of mine", tmp_path / "trace.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == periods
+    with zipfile.ZipFile(downloaded(page, "Run folder of mine", tmp_path / "run.zip")) as archive:
+        assert {"mine/run.json", "mine/trace.mcap"} <= set(archive.namelist())
+        assert archive.testzip() is None
