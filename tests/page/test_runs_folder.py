@@ -257,7 +257,7 @@ def test_what_is_no_index_is_refused(client, request_, key, index):
 
 def test_the_last_insertion_is_saved(runs, client):
     client.do("insert")
-    client.wait(lambda: "insertion live" in client.newest)
+    client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "running")
     assert client.refused("save", name="mine") == "an insertion runs: it can be saved when it has ended"
     client.do("stop")
     client.job("insertion", "done")
