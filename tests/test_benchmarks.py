@@ -5,8 +5,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import bench
+import pytest
 
 
+@pytest.mark.slow
 def test_plane_space_and_the_banded_matrix_agree():
     found = bench.measure_step(repeats=1)
     assert found["space_differs_from_plane_mm"] < 1e-5

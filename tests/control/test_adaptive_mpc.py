@@ -348,7 +348,7 @@ def test_deciding_changes_nothing_of_belief_plan_and_memory(quick_plan, along):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [31, 68])
+@pytest.mark.parametrize("number", [31, pytest.param(68, marks=pytest.mark.slow)])
 def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number):
     """There the tip moves by millimetres within a step, and a reading is not on the chord of its move."""
     scenario = world(number, "perfect")

@@ -122,7 +122,7 @@ def test_a_killed_study_resumes_and_ends_with_the_same_bytes(quick, uninterrupte
     assert tables(out) == tables(uninterrupted)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_ctrl_c_keeps_the_finished_rows_and_prints_how_to_resume(quick, uninterrupted, tmp_path):
     out = tmp_path / "stopped"

@@ -77,7 +77,7 @@ def taken(truth, numbers, times, positions):
 
 
 @pytest.mark.parametrize(
-    ("scenario", "turn"), [("phantom", 18_000), pytest.param("phantom3d", 7_000, marks=pytest.mark.long)]
+    ("scenario", "turn"), [("phantom", 18_000), pytest.param("phantom3d", 7_000, marks=pytest.mark.slow)]
 )
 def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_path):
     """Through 50 mm with the guide in two axes, and a roll; what is left between reading and truth is jitter."""
@@ -172,7 +172,7 @@ def gone(processes):
 
 
 @pytest.mark.parametrize(
-    "how", [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+    "how", [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
 def test_no_process_and_no_link_is_left(how, tmp_path):
     """Also where the process that has started them is killed, and cannot end them."""

@@ -31,7 +31,7 @@ START = 114  # steps of 0.25 mm to the skin
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("layers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
     """Two formulations with the same limit: the distance of the tips is cubic in the angle."""
     meshes = {2.0: SMALL, 1.0: SMALL, 0.5: FINE, 0.25: FINE}

@@ -70,7 +70,7 @@ def wander(scenario, seed, periods):
     return steps, lost
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ten_thousand_random_steps_of_extreme_phantoms_converge():
     """Tissue × 0.3 to 2.5, bevel × 0 to 2, at least twice the default imperfections; any position of guide and base."""
     counts = np.array([wander(EXTREME, seed, 80) for seed in range(52)]).sum(axis=0)
