@@ -1,12 +1,12 @@
 """Whether a page in a browser fits its width."""
 
 TOO_WIDE = """() => {
-  const places = [document.documentElement, ...document.querySelectorAll("main, aside, .status, .panel, [data-panel]")];
+  const boxes = [document.documentElement, ...document.querySelectorAll("main, aside, .status, .panel, [data-panel]")];
   const name = ({ tagName, className, dataset }) => [tagName, className, dataset.panel].filter(Boolean).join(" ");
-  return places.filter(({ scrollWidth, clientWidth }) => scrollWidth > clientWidth).map(name);
+  return boxes.filter(({ scrollWidth, clientWidth }) => scrollWidth > clientWidth).map(name);
 }"""
 
 
 def too_wide(page):
-    """Parts of a page that are wider than their place: document, columns, which scroll by themselves, panels."""
+    """Parts of a page that are wider than their box: document, columns, which scroll by themselves, panels."""
     return page.evaluate(TOO_WIDE)

@@ -57,6 +57,8 @@ class Scripted:
             case say.Reset() if self._next:
                 self._line.send(say.Refused(0, "motors have not come to rest yet", State.STOPPED))
                 self._report(self._requests, rests=False)
+                # As the supervisor's own, its number of requests never falls, also if a late client sends heartbeats.
+                self._next = [(self._requests, rests) for _, rests in self._next]
             case say.Reset():
                 self._line.send(say.Report(0.0, State.IDLE, requests=self._requests))
 
