@@ -88,7 +88,11 @@ def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
     page.keyboard.press("Enter")
     assert server.wait_for("insert") == [{"type": "insert"}]
     server.send(people(steering=1), insertion("running", periods=3), rows(0, 3))
-    until(page, "document.querySelector('[data-panel=insertion] .danger:not([hidden])')")
-    tab_to(page, "Stop")
+    until(page, "document.querySelector('[data-panel=insertion] [role=toolbar] .danger:not([hidden])')")
+    assert tab_to(page, "Stop") == []  # in place of the button that started it
     page.keyboard.press(" ")
     assert server.wait_for("stop") == [{"type": "stop"}]
+    page.evaluate("document.getElementById('main').scrollTop = 0")
+    server.send(insertion("done", periods=3))
+    until(page, "document.activeElement.innerText === 'Insert'")
+    assert page.evaluate("document.getElementById('main').scrollTop") == 0  # what is looked at stays in view

@@ -49,7 +49,7 @@ export function mount(element, store, link) {
     pause.textContent = paused ? "Continue" : "Pause";
     if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
-    if (element.contains(focused) && focused.matches(":disabled, [hidden], [hidden] *")) (runs ? stop : start).focus();
+    if (element.contains(focused) && focused.matches(":disabled, [hidden], [hidden] *")) (runs ? stop : start).focus({ preventScroll: true });
   });
 }
 
