@@ -122,6 +122,9 @@ def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
     shows(page, "live")
     server.send(insertion("running"), rows(0, 4))
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 4 of 4']")
+    server.send(insertion("done", periods=4))
+    page.wait_for_selector("[data-panel=insertion] button:visible:text-is('Insert')")
+    shows(page, "live")  # and not the run that was opened before
 
 
 @pytest.mark.parametrize("name", ["phantom3d", "other"])

@@ -1,5 +1,6 @@
 // What the views show: the scene before an insertion, the running insertion, or a recorded one, at a period.
 //   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
+//   "view newest": "live" or "first", which of both began, or was opened, last
 //   "view period": the period that is shown; undefined: the newest
 // An insertion that begins, and a recording that is opened, makes both undefined (store.js).
 
@@ -22,7 +23,7 @@ export function shownOf(store) {
   const chosen = store.get("view of");
   if (chosen === "scene" || (chosen === "live" && live) || (chosen === "first" && first)) return chosen;
   if (runs(live)) return "live";
-  if (first) return "first";
+  if (first && !(live && store.get("view newest") === "live")) return "first";
   const current = store.get("session")?.revision;
   return live && (!live.scene || live.scene.revision === current) ? "live" : "scene";
 }

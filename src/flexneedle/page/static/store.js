@@ -7,6 +7,7 @@
 // Who subscribes is called once before the next paint, however many of its keys have changed by then.
 
 import { Kind, Source, pathOf } from "./frames.js";
+import { runs } from "./shown.js";
 
 const KINDS = Object.keys(Kind).map((name) => name.toLowerCase());
 const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
@@ -118,7 +119,9 @@ export class Store {
     const earlier = known ?? this.#before.get(key);
     this.#before.delete(key);
     const opened = Boolean(known) && RECORDED.includes(message.of);
-    if (!earlier || opened || isAnother(message, earlier)) this.#forget(message.of);
+    if (earlier && !opened && !isAnother(message, earlier)) return;
+    this.#forget(message.of);
+    if (message.of === "first" || (message.of === "live" && runs(message))) this.set("view newest", message.of);
   }
 
   #close({ of }) {
