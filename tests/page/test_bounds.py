@@ -132,6 +132,15 @@ def taken(name, *given):
 
 
 @pytest.mark.parametrize("name", SCHEMAS)
+def test_each_number_has_two_bounds_and_each_text_a_longest(name):
+    for part, schema in parts_of(name).items():
+        if schema["type"] in ("integer", "number"):
+            assert "minimum" in schema and NUMBERS & schema.keys() - {"minimum"}, part
+        elif schema["type"] == "string":
+            assert {"enum", "maxLength", "const"} & schema.keys(), part
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
 def test_what_is_at_a_bound_is_taken(name):
     assert taken(name)
     some = [(part, value) for part, schema in parts_of(name).items() for value in inside(schema)]

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
-Seed = Annotated[int, Field(ge=0, le=2**53)]
+Whole = Annotated[int, Field(ge=0, le=2**53)]  # what JavaScript has without rounding
 Index = Annotated[int, Field(ge=0, lt=1_000_000)]
 Value = float | int | bool | str | list[Any] | dict[str, Any] | None
 Strategy = Literal["manipulation", "steering"]
@@ -44,7 +44,7 @@ class Request(Message):
 
     steering: ClassVar[bool] = True
 
-    request: Annotated[int, Field(ge=0, le=2**53)] | None = None
+    request: Whole | None = None
 
 
 class Steer(Request):
@@ -82,7 +82,7 @@ class Options(Request):
     """Change what is not in the scenario; what is None stays."""
 
     type: Literal["options"]
-    seed: Seed | None = None
+    seed: Whole | None = None
     strategy: Strategy | None = None
     controller: Annotated[str, Field(max_length=60, pattern=r"^[a-z][a-z0-9-]*$")] | None = None
 
@@ -98,7 +98,7 @@ class Cancel(Request):
     """Cancel a job."""
 
     type: Literal["cancel"]
-    job: Annotated[int, Field(ge=0)]
+    job: Whole
 
 
 class Insert(Request):
@@ -128,7 +128,7 @@ class Arm(Request):
 
     type: Literal["arm"]
     armed: bool
-    job: Annotated[int, Field(ge=0)]
+    job: Whole
 
 
 class Go(Request):
@@ -207,7 +207,7 @@ class RowsFrom(Request):
     steering = False
 
     type: Literal["rows_from"]
-    index: Annotated[int, Field(ge=0)]
+    index: Whole
 
 
 AnyRequest = Annotated[
