@@ -148,7 +148,7 @@ def test_a_position_that_is_no_number_is_a_fault(bench):
     bench.stage.motors["C"].position = math.nan
     bench.tick()
     assert bench.core.state is State.FAULT
-    assert bench.core.why.startswith("guide_y: the controller reports position nan")
+    assert bench.core.why.startswith("guide_y: the motor controller reports position nan")
 
 
 def test_a_motor_beyond_its_range_is_a_fault():

@@ -61,7 +61,7 @@ def fail_on_the_way(bench, change):
         (lambda stage: setattr(stage.motors["A"], "on", False), "insertion: the motor is off"),
         (
             lambda stage: setattr(stage.motors["A"], "high", 400.0),
-            "insertion: the motor was stopped by its contr",
+            "insertion: stopped by the motor controller: ",
         ),
         (lambda stage: stage.define("A", 0.0), "insertion: the position went back by 0."),
         (lambda stage: setattr(stage, "refuses", True), "PAA=5: ? 22 Begin not possible due to limit switch"),

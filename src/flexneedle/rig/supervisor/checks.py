@@ -11,16 +11,14 @@ _STILL = 2.0  # times the tolerance of its goal a motor at rest may move
 
 
 def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
-    """A motor that is off, was stopped by its controller since the reading before, or does not follow."""
+    """A motor that is off, was stopped by the motor controller since the reading before, or does not follow."""
     error = drive.error(state)
     if not math.isfinite(error):
-        return (
-            f"{drive.name}: the controller reports position {state.position:g}, commanded {state.commanded:g}"
-        )
+        return f"{drive.name}: the motor controller reports position {state.position:g}, commanded {state.commanded:g}"
     if not state.on:
         return f"{drive.name}: the motor is off{_because(state.stopped)}"
     if state.stopped and state.stopped != before.stopped:
-        return f"{drive.name}: the motor was stopped by its controller: {state.stopped}"
+        return f"{drive.name}: stopped by the motor controller: {state.stopped}"
     if abs(error) > drive.axis.max_error:
         limit = drive.shown(drive.axis.max_error)
         return f"{drive.name}: the motor does not follow: {drive.shown(abs(error))} off, limit {limit}"
