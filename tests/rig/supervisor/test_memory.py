@@ -1,0 +1,60 @@
+"""The supervisor collects no garbage while it ticks, so it may make no cycles, and keep nothing of the past."""
+
+import gc
+import tracemalloc
+from contextlib import contextmanager
+from itertools import count
+
+import pytest
+
+from flexneedle.rig.supervisor import messages as say
+from stages import Bench
+
+WARM, MANY = 20, 200
+
+
+@pytest.fixture
+def bench():
+    return Bench().armed()
+
+
+@contextmanager
+def no_collection():
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+def moved(bench, numbers, steps):
+    """Move forth and back in steps, and forget what the bench has of them."""
+    for number, _ in zip(numbers, range(steps), strict=False):
+        way = 0.5 if number % 2 else -0.5
+        bench.core.request(say.Step(number, 0.0, {"insertion": way, "guide_y": 0.2 * way}, 0.1, None))
+        bench.until(number)
+        for kept in (bench.sent, bench.reports, bench.stage.calls):
+            kept.clear()
+
+
+def test_ticks_make_no_cycles(bench):
+    numbers = count(1)
+    moved(bench, numbers, WARM)
+    with no_collection():
+        moved(bench, numbers, MANY)
+        assert gc.collect() == 0
+
+
+def test_ticks_keep_no_memory(bench):
+    numbers = count(1)
+    moved(bench, numbers, WARM)
+    tracemalloc.start()
+    try:
+        moved(bench, numbers, WARM)
+        before, _ = tracemalloc.get_traced_memory()
+        moved(bench, numbers, MANY)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 20.0 * MANY  # bytes: less than one number each step
