@@ -153,19 +153,16 @@ def reach_frame():
 
 def plan(strategy="manipulation", **changes):
     given = {
-        "revision": 1, "seed": 0, "reached": True, "summary": "ends 0.001 mm off", "limit": "", "error_mm": 0.001,
+        "revision": 1, "reached": True, "summary": "ends 0.001 mm off", "error_mm": 0.001,
         "energy_mj": 0.0021, "flips": 0, "roll_deg": 0.0, "cost": 0.19,
         "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
-        "tip": TARGET,
-        "guide": [(0.02 * k, 0.01 * k) for k in range(PERIODS)], "seconds": 0.3, **changes,
+        "seconds": 0.3, **changes,
     }  # fmt: skip
     return Plan(strategy=strategy, **given)
 
 
 def estimate(revision=1, roll_deg=0.0):
-    return Estimate(
-        revision=revision, error_mm=0.31, reached=True, tip=TARGET, roll_deg=roll_deg, seconds=0.1
-    )
+    return Estimate(revision=revision, error_mm=0.31, reached=True, roll_deg=roll_deg)
 
 
 def row(index):
@@ -174,11 +171,10 @@ def row(index):
     return Row(
         index=index, time=0.2 * index, action="advance", decision="advance as planned", verdict="ok",
         measured=(x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
-        estimate=(x, y, z), true=tuple(true), path=tuple(curve([x])[0]), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
-        guide=(0.02 * index, 0.01 * index), base=(x - LENGTH, 0.0, 0.0), roll_deg=3.0 * index, indicator=0.1,
-        energy_mj=2e-5 * index, true_energy_mj=2.1e-5 * index, stretch=1.0 + 0.004 * index,
-        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05, cost=0.2,
-        decide_ms=12.0, late=False,
+        estimate=(x, y, z), true=tuple(true), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
+        guide=(0.02 * index, 0.01 * index), roll_deg=3.0 * index, indicator=0.1,
+        energy_mj=2e-5 * index, true_energy_mj=2.1e-5 * index,
+        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05, decide_ms=12.0, late=False,
     )  # fmt: skip
 
 

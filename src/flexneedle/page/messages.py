@@ -330,9 +330,7 @@ class Estimate(News):
     revision: int
     error_mm: float
     reached: bool
-    tip: Vector
     roll_deg: float
-    seconds: float
 
 
 class Iteration(News):
@@ -366,18 +364,14 @@ class Plan(News):
     type: Literal["plan"] = "plan"
     revision: int
     strategy: str
-    seed: int
     reached: bool
     summary: str
-    limit: str
     error_mm: float
     energy_mj: float
     flips: int
     roll_deg: float
     cost: float
     terms: dict[str, float]
-    tip: Vector
-    guide: list[tuple[float, float]]
     seconds: float
 
     @property
@@ -416,18 +410,14 @@ class Row(Message):
     measured: tuple[float | None, float | None, float | None] | None
     estimate: Vector
     true: Vector | None
-    path: Vector
     error_mm: float | None
     guide: tuple[float, float]
-    base: Vector
     roll_deg: float
     indicator: float | None
     energy_mj: float
     true_energy_mj: float | None
-    stretch: float | None
     miss_mm: tuple[float | None, float | None]
     miss_sd_mm: float | None
-    cost: float | None
     decide_ms: float
     late: bool
     warning: str = ""

@@ -259,9 +259,11 @@ def test_a_rig_fits_its_width(rig_panel, pictures, size, scheme):
 def test_decisions_are_listed_where_they_change_and_show_their_period(panel, server):
     page = panel([*opening(), insertion("running", periods=10), rows(0, 10)])
     assert page.locator(".decisions li").count() == 1
-    held = row(10).model_copy(update={"decision": "hold", "verdict": "held: no reading", "late": True})
+    held = row(10).model_copy(
+        update={"decision": "hold", "verdict": "held: no reading", "late": True, "decide_ms": 312.0}
+    )
     server.send(rows(0, 10).model_copy(update={"first": 10, "rows": [held]}))
-    page.wait_for_selector("text=hold; measurement held: no reading; decided late")
+    page.wait_for_selector("text=hold; measurement held: no reading; decided late, after 312 ms")
     page.click(".decisions li:last-child button")
     until(page, "flexneedle.store.get('view period') === 0")
     page.wait_for_selector(".decisions .now >> text=Period 1, 0.0 s: advance as planned")

@@ -55,9 +55,7 @@ def estimate(task: Task) -> None:
             revision=work.revision,
             error_mm=found.error_mm,
             reached=found.reached,
-            tip=found.tip_mm,
             roll_deg=math.degrees(found.roll),
-            seconds=found.seconds,
         )
     )
 
@@ -120,18 +118,14 @@ def plan_news(plan: Plan, revision: int) -> PlanNews:
     return PlanNews(
         revision=revision,
         strategy=plan.strategy,
-        seed=plan.seed,
         reached=plan.reached,
         summary=plan.summary,
-        limit=plan.limit,
         error_mm=plan.error_mm,
         energy_mj=plan.strain_energy_mj,
         flips=plan.flips,
         roll_deg=math.degrees(plan.roll),
         cost=plan.cost,
         terms=plan.terms,
-        tip=plan.tip_mm,
-        guide=[(y, z) for y, z in plan.guide.tolist()],
         seconds=plan.seconds,
     )
 

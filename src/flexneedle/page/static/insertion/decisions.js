@@ -51,10 +51,10 @@ export function followDecisions(element, store) {
   }
 }
 
-function textOf({ decision, verdict, warning, late }) {
+function textOf({ decision, verdict, warning, late, decide_ms: decided }) {
   const parts = [decision];
   if (verdict && verdict !== "ok") parts.push(`measurement ${verdict}`);
-  if (late) parts.push("decided late");
+  if (late) parts.push(`decided late, after ${shown(decided, 0)} ms`);
   if (warning) parts.push(warning);
   return parts.join("; ");
 }
