@@ -174,7 +174,8 @@ def row(index):
         estimate=(x, y, z), true=tuple(true), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
         guide=(0.02 * index, 0.01 * index), roll_deg=3.0 * index, indicator=0.1,
         energy_mj=2e-5 * index, true_energy_mj=2.1e-5 * index,
-        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05, decide_ms=12.0, late=False,
+        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05,
+        decide_ms=12.0, late=False,
     )  # fmt: skip
 
 
