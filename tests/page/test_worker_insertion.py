@@ -71,7 +71,7 @@ def test_each_period_has_its_frames(inserted, by_command):
     for kind in (Kind.NEEDLE, Kind.TRUE, Kind.PREDICTED):
         assert [frame.number for frame in reported.shapes(kind, Source.LIVE)] == list(range(count))
     decided = {frame.number for frame in reported.shapes(Kind.SAMPLES, Source.LIVE)}
-    assert decided == {row.index for row in reported.rows if not math.isnan(row.cost)}
+    assert decided == {period.index for period in by_command.periods if not math.isnan(period.cost)}
     channel = reported.shapes(Kind.CHANNEL, Source.LIVE)[-1].values[0]
     assert channel[0, 0] < 1.0 < channel[-1, 0]
     assert (channel[:, 3] >= 1.0).all()

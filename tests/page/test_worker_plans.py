@@ -8,6 +8,7 @@ import pytest
 import flexneedle
 from flexneedle.page.frames import Kind, Source, packed, unpacked
 from flexneedle.page.orders import Signal
+from flexneedle.page.worker import plans
 from flexneedle.page.worker.__main__ import carry_out
 from flexneedle.page.worker.plans import estimate, plan, samples_of
 from flexneedle.page.worker.reach import _DEEPEST, reach
@@ -34,9 +35,8 @@ def test_a_scene_is_that_of_the_scenario():
 def test_an_estimate_ends_near_the_target():
     reported = done(estimate, task("estimate"))
     (news,) = reported.of("estimate")
-    assert math.dist(news.tip, short().target.position) == pytest.approx(news.error_mm)
     (path,) = reported.shapes(Kind.PATH, Source.SCENE)
-    assert path.values[0, -1] == pytest.approx(news.tip, abs=1e-4)
+    assert math.dist(path.values[0, -1], short().target.position) == pytest.approx(news.error_mm, abs=1e-4)
     assert reported.shapes(Kind.SWEEP, Source.SCENE)[0].values.shape[0] == path.values.shape[1]
 
 
@@ -49,11 +49,12 @@ def test_an_estimate_of_few_elites():
 
 
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
-def test_a_plan_is_that_of_the_command_with_each_iteration(strategy):
+def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch):
+    monkeypatch.setattr(plans, "BETWEEN_S", 0.0)
     reported = done(plan, task("plan", strategy=strategy, seed=2))
     made = flexneedle.plan(short(), strategy=strategy, seed=2)
     (news,) = reported.of("plan")
-    assert (news.tip, news.cost, news.terms, news.seed) == (made.tip_mm, made.cost, made.terms, 2)
+    assert (news.error_mm, news.cost, news.terms) == (made.error_mm, made.cost, made.terms)
     assert news.roll_deg == math.degrees(made.roll)
     iterations = reported.of("iteration")
     assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
@@ -68,6 +69,19 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy):
         assert len(one.best) == len(one.elite) == len(one.median) == one.iteration
     assert (np.diff(iterations[-1].best) <= 0.0).all()
     assert reported.shapes(Kind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
+
+
+def test_a_fast_search_shows_its_first_and_last_iteration_and_all_costs(monkeypatch):
+    monkeypatch.setattr(plans, "BETWEEN_S", 60.0)
+    reported = done(plan, task("plan", seed=2))
+    made = flexneedle.plan(short(), seed=2)
+    first, last = reported.of("iteration")
+    assert (first.iteration, last.iteration) == (1, made.iterations)
+    assert last.best == [entry["best"] for entry in made.history]
+    assert [frame.number for frame in reported.shapes(Kind.SAMPLES, Source.MANIPULATION)] == [
+        1,
+        made.iterations,
+    ]
 
 
 @pytest.mark.parametrize(("action", "kind"), [(plan, "plan"), (estimate, "estimate")])

@@ -1,9 +1,7 @@
 """Plans: a first estimate, and the search with what it has sampled."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,8 @@ from flexneedle.types import Plan
 _ESTIMATE = (24, 4)
 """Samples and iterations of an estimate."""
 _LEAST_ELITE = 2
+BETWEEN_S = 0.1
+"""Between iterations that are shown, at least: to draw their samples takes time from the search."""
 _MOST_PATHS, _MOST_POINTS = 64, 48
 """Of a frame of samples."""
 SOURCES: dict[str, Source] = {"manipulation": Source.MANIPULATION, "steering": Source.STEERING}
@@ -47,6 +47,7 @@ def estimate(task: Task) -> None:
         strategy=work.strategy,
         seed=work.seed,
         progress=lambda _info: task.signals.check(),
+        threads=1,  # so few samples are not faster on two; the browser gets the other cores
     )
     for frame in shapes_of(found, Source.SCENE):
         task.show(frame)
@@ -64,53 +65,57 @@ def plan(task: Task) -> None:
     """Report the search of a plan, and the plan; of both strategies for the kind "compare"."""
     strategies = STRATEGIES if task.work.kind == "compare" else (task.work.strategy,)
     for index, strategy in enumerate(strategies):
-        found = make_plan(
-            task.scenario,
-            strategy=strategy,
-            seed=task.work.seed,
-            progress=partial(
-                _show_iteration, task, strategy, Costs(), index / len(strategies), len(strategies)
-            ),
-        )
+        search = _Search(task, strategy, index, len(strategies))
+        found = make_plan(task.scenario, strategy=strategy, seed=task.work.seed, progress=search.add)
+        search.show()
         for frame in shapes_of(found, SOURCES[strategy]):
             task.show(frame)
         task.say(plan_news(found, task.work.revision))
 
 
-@dataclass
-class Costs:
-    """Costs of the iterations of a search: those of an iteration that a page has not got are in a later one's."""
+class _Search:
+    """Iterations of a search, shown at most every `BETWEEN_S`, and the last; each with the costs of all until then."""
 
-    best: list[float] = field(default_factory=list)
-    elite: list[float] = field(default_factory=list)
-    median: list[float] = field(default_factory=list)
+    def __init__(self, task: Task, strategy: str, index: int, count: int) -> None:
+        """index: of the strategy, of so many that are planned."""
+        self._task, self._strategy, self._index, self._count = task, strategy, index, count
+        self._best: list[float] = []
+        self._elite: list[float] = []
+        self._median: list[float] = []
+        self._newest: dict[str, Any] | None = None  # not shown yet
+        self._due = -math.inf
 
-    def add(self, best: float, quantiles: Sequence[float]) -> None:
-        """Add an iteration."""
-        _, elite, median, _ = quantiles
-        for costs, cost in ((self.best, best), (self.elite, elite), (self.median, median)):
+    def add(self, info: dict[str, Any]) -> None:
+        """Add an iteration, and show it if it is time."""
+        self._task.signals.check()
+        _, elite, median, _ = info["cost_quantiles"]
+        for costs, cost in ((self._best, info["best"]), (self._elite, elite), (self._median, median)):
             costs.append(cost)
+        self._newest = info
+        if monotonic() >= self._due:
+            self.show()
 
-
-def _show_iteration(
-    task: Task, strategy: str, costs: Costs, share: float, count: int, info: dict[str, Any]
-) -> None:
-    task.signals.check()
-    done, usual = info["iteration"], info["iterations"]
-    costs.add(info["best"], info["cost_quantiles"])
-    task.say(
-        Iteration(
-            revision=task.work.revision,
-            strategy=strategy,
-            iteration=done,
-            iterations=usual,
-            best=list(costs.best),
-            elite=list(costs.elite),
-            median=list(costs.median),
+    def show(self) -> None:
+        """Show the newest iteration, if it was not."""
+        if self._newest is None:
+            return
+        task, strategy = self._task, self._strategy
+        done, usual = self._newest["iteration"], self._newest["iterations"]
+        task.say(
+            Iteration(
+                revision=task.work.revision,
+                strategy=strategy,
+                iteration=done,
+                iterations=usual,
+                best=list(self._best),
+                elite=list(self._elite),
+                median=list(self._median),
+            )
         )
-    )
-    task.show(samples_of(info["samples"], SOURCES[strategy], done))
-    task.tell("running", share + done / usual / count, f"{strategy}: iteration {done} of {usual}")
+        task.show(samples_of(self._newest["samples"], SOURCES[strategy], done))
+        share = (self._index + done / usual) / self._count
+        task.tell("running", share, f"{strategy}: iteration {done} of {usual}")
+        self._newest, self._due = None, monotonic() + BETWEEN_S
 
 
 def plan_news(plan: Plan, revision: int) -> PlanNews:

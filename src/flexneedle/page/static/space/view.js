@@ -17,6 +17,7 @@ export class SpaceView {
   #canvas;
   #legend;
   #frame = 0;
+  #later = 0;
   #onScreen = true;
   #room = "";
   #entries = "";
@@ -52,7 +53,10 @@ export class SpaceView {
       { text: "target, 1 mm", tone: "--target", form: "disc" },
     ]);
     this.target.update();
-    if (this.#onScreen) this.#render();
+    this.#later ||= requestAnimationFrame(() => {
+      this.#later = 0;
+      this.#schedule();
+    }); // in the frame after that of the flat views, so that none has too much to do
   }
 
   #updateRoom(scene) {
