@@ -132,9 +132,7 @@ def test_strategies_are_side_by_side_with_their_terms(plans):
 def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
     page = plans([*opening(), plan(), *plan_frames()])
     page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
-    server.send(
-        session(2), Estimate(revision=2, error_mm=0.31, reached=False, tip=TARGET, roll_deg=0.0, seconds=0.1)
-    )
+    server.send(session(2), Estimate(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
     page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
