@@ -7,7 +7,6 @@ from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Estimate, Job
 from recorded_page import (
-    TARGET,
     insertion,
     iteration,
     opening,
