@@ -83,6 +83,7 @@ class Motor:
     lag: float = 0.0  # time constant of the servo (s)
     low: float = -math.inf
     high: float = math.inf
+    coasts: float = 0.0  # time (s) that it takes to rest at a limit switch
 
     def step(self, seconds):
         left = self.target - self.commanded
@@ -100,7 +101,12 @@ class Motor:
             self.target = self.commanded + 1e6
         self.position += {"stall": 0.0, "reversed": -moved, "overshoot": 1.2 * moved}.get(self.fault, moved)
         outwards = (self.position < self.low and moved < 0) or (self.position > self.high and moved > 0)
-        if outwards:
+        if outwards and self.coasts:
+            if self.stopped != "limit switch":
+                self.target = self.commanded + 0.5 * self.velocity * self.coasts
+                self.acceleration = abs(self.velocity) / self.coasts
+            self.stopped = "limit switch"
+        elif outwards:
             self.position = min(self.high, max(self.low, self.position))
             self.halt("limit switch")
 

@@ -7,7 +7,7 @@ import pytest
 from flexneedle.rig.moves import homings
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
-from stages import Bench, rig_file
+from stages import TICK_S, Bench, rig_file
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -29,6 +29,32 @@ def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(hom
     bench.armed()
     bench.core.request(say.Go(2, "guide_y", 0.0, 5.0))
     assert bench.until(2).why == ""
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize("seconds", [0.005, 0.03, 0.1])
+def test_an_axis_that_slows_down_at_its_switch_is_called_home_where_it_rests(seconds, phase):
+    """The motor controller reports the stop some ticks before the axis rests, and refuses targets meanwhile."""
+    speed = 1.0
+    bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})).armed()
+    motor = bench.stage.motors["C"]
+    motor.coasts, motor.high = seconds, 500.0 * (2.0 + speed * TICK_S * phase)
+    bench.core.request(say.Home(1, "guide_y"))
+    done = bench.until(1, most=20_000)
+    assert (done.why, done.state) == ("", State.IDLE)
+    (defined,) = [call for call in bench.stage.calls if call[0] == "define"]
+    assert defined == ("define", "C", 500.0 * 15.5)
+    assert 500.0 * 15.5 - motor.high == pytest.approx(500.0 * speed * seconds / 2.0, abs=2.0)
+
+
+def test_an_axis_that_never_rests_at_its_switch_is_a_fault():
+    bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})).armed()
+    motor = bench.stage.motors["C"]
+    motor.coasts, motor.high = 1e3, 1000.0
+    bench.core.request(say.Home(1, "guide_y"))
+    done = bench.until(1, most=20_000)
+    assert done.state is State.FAULT
+    assert motor.position < 1000.0 + 500.0 * 33.0
 
 
 def test_a_search_moves_as_it_is_announced():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.ports import Clock, MotorPaces, Motors, MotorState
-from flexneedle.rig.supervisor.checks import at_home, misplaced, rests
+from flexneedle.rig.supervisor.checks import at_home, at_switch, misplaced, rests
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import AxisState
 from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
@@ -79,6 +79,10 @@ class RigAxes:
     def at_home(self, drive: Drive) -> bool:
         """Whether an axis is at the limit switch of its home, and rests there."""
         return at_home(drive, self.state(drive))
+
+    def at_switch(self, drive: Drive) -> bool:
+        """Whether an axis is at the limit switch of its home, and perhaps not at rest yet."""
+        return at_switch(drive, self.state(drive))
 
     def goal(self, name: str) -> float:
         """Where an axis was last sent, or where it was when it last was stopped (mm or rad)."""

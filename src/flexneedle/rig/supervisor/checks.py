@@ -81,10 +81,14 @@ def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
     return not state.moving and moved <= max(_CREEP * tolerance, min(count, tolerance))
 
 
+def at_switch(drive: Drive, state: MotorState) -> bool:
+    """Whether an axis is at the limit switch of its home, where the motor controller stops it."""
+    return state.reverse_limit if drive.axis.home == "reverse-limit" else state.forward_limit
+
+
 def at_home(drive: Drive, state: MotorState) -> bool:
     """Whether an axis is at the limit switch of its home, and rests there."""
-    at = state.reverse_limit if drive.axis.home == "reverse-limit" else state.forward_limit
-    return at and not state.moving
+    return at_switch(drive, state) and not state.moving
 
 
 def switch_problem(drive: Drive, state: MotorState) -> str:

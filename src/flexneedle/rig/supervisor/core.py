@@ -321,6 +321,8 @@ class Supervisor:
             self._next_leg(now)
         elif leg.overdue(axes.states, now):
             self._fault(f"the motors have not arrived: {leg.missing(axes.states)} from the goal")
+        elif motion.home is not None and axes.at_switch(motion.home):
+            pass  # the motor controller slows it down, and takes no target meanwhile
         else:
             waited = leg.waited
             try:
@@ -333,7 +335,7 @@ class Supervisor:
         """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
         if motion.home is not None:
             self._check_motors()
-            if self._axes.at_home(motion.home):
+            if self._axes.at_switch(motion.home):
                 return
         self._fault(why)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from flexneedle.rig.supervisor.axes import Reading
 from flexneedle.rig.supervisor.checks import (
-    at_home,
+    at_switch,
     motor_problem,
     position_problem,
     rest_problem,
@@ -37,7 +37,7 @@ class Inspection:
         state, last = self.newest.states[channel], self.before.states[channel]
         seconds = self.newest.time - self.before.time
         unlimited = motion is not None and motion.unlimited
-        problem = "" if self._is_at_home(drive) else motor_problem(drive, state, last)
+        problem = "" if self._is_stopped_at_home(drive) else motor_problem(drive, state, last)
         problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
         if problem or self.stopping:
             return problem
@@ -47,8 +47,8 @@ class Inspection:
         problem = reversal_problem(drive, state, last, leg.way(channel))
         return problem or target_problem(drive, state, leg.trajectory.start[channel], leg.sent[channel])
 
-    def _is_at_home(self, drive: Drive) -> bool:
-        """Whether the axis has reached the limit switch that is its home, where its controller stops it."""
+    def _is_stopped_at_home(self, drive: Drive) -> bool:
+        """Whether the axis has reached the limit switch that is its home, where the motor controller stops it."""
         home = None if self.motion is None else self.motion.home
         state = self.newest.states[drive.axis.channel]
-        return home is not None and home.name == drive.name and at_home(drive, state)
+        return home is not None and home.name == drive.name and at_switch(drive, state)
