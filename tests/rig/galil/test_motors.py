@@ -305,7 +305,8 @@ def test_in_motion_neither_position_nor_power_changes(mode, action):
 def test_a_motor_is_switched_off_and_on_where_it_is():
     with driven(on=False) as (motors, device):
         motors.power("A", True)
-        assert device.lines == ["SHA"]
+        assert device.lines[-1] == "SHA"
+        assert not any(line.startswith("ST") for line in device.lines)
         assert motors.read()["A"].on
         motors.follow({"A": 50.0})
         settled(motors)
@@ -403,6 +404,24 @@ def test_a_reconnection_that_fails_is_tried_again_by_the_next():
         device.damage = None
         motors.reconnect()
         assert motors.read()["A"].on
+
+
+@pytest.mark.parametrize("on_the_way", [False, True])
+@pytest.mark.parametrize("mode", ["tracking", "moves"])
+def test_a_channel_that_a_broken_connection_left_in_motion_is_stopped_before_its_power_changes(mode, on_the_way):
+    """The controller refuses SH while it counts as in motion: in position tracking also at rest."""
+    with driven(mode) as (motors, device):
+        motors.set_speed("A", 1000, 102400)
+        motors.follow({"A": 99999.0 if on_the_way else 50.0})
+        if not on_the_way:
+            settled(motors)
+        motors.reconnect()
+        device.lines.clear()
+        motors.power("A", True)
+        state = motors.read()["A"]
+    assert (state.on, state.moving) == (True, False)
+    assert ("STA" in device.lines) == (on_the_way or mode == "tracking")
+    assert device.lines.index("SHA") == len(device.lines) - 2
 
 
 def test_after_a_limit_the_axis_moves_only_when_told_again():

@@ -118,7 +118,8 @@ class GalilMotors:
     def reconnect(self) -> None:
         """Drop the connection and open a new one. It moves nothing, and changes nothing in the controller.
 
-        Axes that an earlier connection has left in position tracking may count as moving, also at rest, until `stop`.
+        Axes that an earlier connection has left in position tracking may count as moving, also at rest, until `stop`,
+        `power` or `define`.
         """
         self._connect(self._deadline())
 
@@ -278,11 +279,17 @@ class GalilMotors:
         self._do([f"{'SH' if on else 'MO'}{channel}"], deadline)
 
     def _rest(self, letter: str, deadline: float) -> None:
-        """End the position tracking of a channel at rest, in which the controller refuses other commands."""
-        if self._channels[letter].tracking:
-            self._reports(deadline)
-            if self._reports(deadline)[letter].moving:  # the second one: see `seen`
-                raise DriverError(f"{self._link.name}: {letter} is in motion")
+        """End the position tracking of a channel at rest, in which the controller refuses other commands.
+
+        One that counts as in motion, and was not sent anywhere by this connection, was left in position tracking by one
+        that broke, or another program moves it: it is stopped.
+        """
+        self._reports(deadline)
+        moving = self._reports(deadline)[letter].moving  # the second one: see `seen`
+        channel = self._channels[letter]
+        if moving and channel.target is not None:
+            raise DriverError(f"{self._link.name}: {letter} is in motion")
+        if moving or channel.tracking:
             self._do([f"ST{letter}"], deadline)
             while self._moving(letter, deadline):
                 pass
