@@ -1,5 +1,6 @@
 """`rig check` compares each device with the file, and moves, powers and changes nothing."""
 
+import math
 from contextlib import closing
 
 import pytest
@@ -11,7 +12,7 @@ from flexneedle.rig.check import Finding, Wanted, check_rig, motors, tracker
 from flexneedle.rig.devices.galil.motors import factory
 from flexneedle.rig.emulator.galil.controller import reply
 from flexneedle.scenario.files import load_scenario
-from flexneedle.types import Frame, SensorReading
+from flexneedle.types import VISIBLE, Frame, SensorReading
 from galil_peer import peer
 
 PLANE = Wanted(load_scenario("phantom").with_values({"monitor.references": 0}))
@@ -62,6 +63,16 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
         "rotation": "90 deg (9000 counts)",
         "guide_y": "3 mm (-1500 counts)",  # its motor turns the other way
     }
+
+
+@pytest.mark.parametrize(
+    ("backlash", "counts", "fits"), [(0.0, -25.0, False), (0.05, -25.0, True), (0.05, -50.0, False)]
+)
+def test_a_position_may_seem_beyond_the_limits_by_half_the_backlash(backlash, counts, fits):
+    found = problems(
+        motors(rig(axes__insertion__backlash_mm=backlash), motors_with("A", position=counts), Clock())
+    )
+    assert (("insertion", "position") not in found) == fits
 
 
 @pytest.mark.parametrize(
@@ -220,6 +231,20 @@ def test_a_sensor_that_is_seldom_measured_is_a_problem():
 
     found = tracker(Seldom(clock), clock, 2.0)
     assert problems(found) == {("tracker", "sensor tip"): "measured in too few frames: out of volume"}
+
+
+@pytest.mark.parametrize("place", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)])
+def test_a_position_that_is_not_a_number_is_not_measured(place):
+    clock = Clock()
+
+    class Wrong(Tracker):
+        def read(self):
+            tip = SensorReading(place, status=VISIBLE)
+            return tuple(Frame(frame.time, frame.number, {"tip": tip}) for frame in super().read())
+
+    found = tracker(Wrong(clock), clock, 2.0)
+    why = "measured in too few frames: its position is not a number"
+    assert problems(found) == {("tracker", "sensor tip"): why}
 
 
 def test_the_references_that_the_monitor_needs_are_counted():

@@ -218,6 +218,16 @@ def test_an_axis_from_which_an_insertion_cannot_begin_is_a_line(positions, advan
     assert start_problems(rig(), PLANE, HERE | positions, "manipulation", advance) == lines
 
 
+def test_an_axis_may_seem_beyond_its_limits_by_half_its_backlash():
+    """As after a retraction to the end of its range: the side of the lost motion is unknown before the first motion."""
+    loose = rig(axes__insertion__backlash_mm=0.05)
+    for position, begins in ((-0.025, True), (-0.05, False)):
+        for one, may in ((loose, begins), (rig(), False)):
+            assert (
+                start_problems(one, PLANE, HERE | {"insertion": position}, "manipulation", 70.0) == []
+            ) == may
+
+
 def test_a_plan_that_steers_by_the_bevel_begins_from_any_position_of_the_guide():
     assert start_problems(rig(), PLANE, HERE | {"guide_y": 2.5}, "steering", 70.5) == []
 

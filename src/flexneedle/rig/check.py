@@ -208,7 +208,7 @@ def _beyond(axis: Axis, counts: float) -> str:
     position, (low, high) = counts / axis.scale, axis.limits
     if not isfinite(position):
         return "is not a number"
-    if low - axis.tolerance <= position <= high + axis.tolerance:
+    if low - axis.uncertainty <= position <= high + axis.uncertainty:
         return ""
     return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
 
@@ -286,11 +286,13 @@ def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
     names = dict.fromkeys(name for frame in frames for name in frame.readings)
     for name in names:
         readings = [frame.readings[name] for frame in frames if name in frame.readings]
-        measured = [reading for reading in readings if reading.position is not None]
+        numbers = [reading for reading in readings if all(map(isfinite, reading.position or ()))]
+        measured = [reading for reading in numbers if reading.position is not None]
         share, at = len(measured) / len(frames), ""
         if measured and (position := measured[-1].position) is not None:
             at = " at {:.2f}, {:.2f}, {:.2f} mm".format(*position)
         last = next((r.status for r in reversed(readings) if r.status != VISIBLE), "not in every frame")
+        last = last if len(numbers) == len(readings) else "its position is not a number"
         problem = "" if share >= _LEAST_MEASURED else f"measured in too few frames: {last}"
         yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)
 

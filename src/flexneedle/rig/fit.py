@@ -96,7 +96,7 @@ def _rooms(rig: RigFile, needed: Iterable[Need], positions: Mapping[str, float])
 
 def _outside(axis: Axis, position: float) -> str:
     low, high = axis.limits
-    if low - axis.tolerance <= position <= high + axis.tolerance:
+    if low - axis.uncertainty <= position <= high + axis.uncertainty:
         return ""
     limits = f"{axis.shown(low)} to {axis.shown(high)} {axis.unit}"
     return f"at {axis.shown(position)} {axis.unit}: beyond the soft limits, {limits}: jog it back"

@@ -408,7 +408,9 @@ def test_a_reconnection_that_fails_is_tried_again_by_the_next():
 
 @pytest.mark.parametrize("on_the_way", [False, True])
 @pytest.mark.parametrize("mode", ["tracking", "moves"])
-def test_a_channel_that_a_broken_connection_left_in_motion_is_stopped_before_its_power_changes(mode, on_the_way):
+def test_a_channel_that_a_broken_connection_left_in_motion_is_stopped_before_its_power_changes(
+    mode, on_the_way
+):
     """The controller refuses SH while it counts as in motion: in position tracking also at rest."""
     with driven(mode) as (motors, device):
         motors.set_speed("A", 1000, 102400)

@@ -96,6 +96,12 @@ class Axis(Section, ABC):
         return self._usual_tolerance if self._errors[1] is None else self.size * self._errors[1]
 
     @property
+    def uncertainty(self) -> float:
+        """How far a motor at rest may be from where it was sent, mm or rad: its tolerance, and half of the lost motion,
+        whose side is unknown before the first motion."""
+        return self.tolerance + 0.5 * self.backlash
+
+    @property
     def max_error(self) -> float:
         """Largest difference of commanded and measured position, mm or rad."""
         if self._errors[0] is not None:
