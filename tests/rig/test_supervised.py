@@ -19,6 +19,7 @@ from flexneedle.rig.supervised import Columns, SupervisedDriver, Watchers, super
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
+from flexneedle.simulator.simulator import Simulator
 from flexneedle.trace.topics import READINGS
 from flexneedle.types import Control
 from stages import RIG
@@ -105,15 +106,19 @@ def test_a_command_beyond_a_limit_of_the_scenario_is_not_sent():
     assert axes.steps == []
 
 
-def test_a_reading_is_expected_on_the_line_of_the_needle():
+@pytest.mark.parametrize("command", [Control(db_x=1.0), Control(db_x=1.0, db_y=0.4, dg_y=-0.3, flip=True)])
+def test_the_tip_is_expected_where_the_model_moves_it_from_its_estimate(command):
+    """Not on the line of the needle: base, guide and bevel move it across, most in air."""
     axes = Axes()
     driver = SupervisedDriver(axes, PHANTOM, 0.0)
-    tip = np.array([10.0, 2.0, 0.0, 0.1, 0.0])
-    driver.expect(SimpleNamespace(tip=tip, tip_sd=0.2), Control(db_x=1.0))
-    driver.apply(Control(db_x=1.0), 0.2)
+    simulator = Simulator(PHANTOM)
+    state, _ = simulator.replay(simulator.start(), np.array([Control(db_x=1.0)] * 5))
+    off = np.array([0.2, 0.3, 0.0, 0.01, 0.0])
+    driver.expect(SimpleNamespace(simulator=simulator, state=state, tip=state.tip + off, tip_sd=0.2), command)
+    driver.apply(command, 0.2)
     expected = axes.steps[0][3]
-    assert expected.begin == (10.0, 2.0, 0.0)
-    assert expected.end == pytest.approx((11.0, 2.0 + math.tan(0.1), 0.0))
+    assert expected.begin == pytest.approx((state.tip + off)[:3])
+    assert expected.end == pytest.approx((simulator.step(state, command).tip + off)[:3])
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
 
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from flexneedle.errors import DriverError, RigError
-from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.estimate import Estimate, after
 from flexneedle.rig.fit import fit_problems, start_problems
 from flexneedle.rig.pace import roll_time
 from flexneedle.rig.start import checked_start, deepest, needed
@@ -34,6 +34,7 @@ from flexneedle.types import (
     Motion,
     Plan,
     Pose,
+    Z,
 )
 
 _SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
@@ -178,12 +179,10 @@ class SupervisedDriver:
 
     def expect(self, estimate: Estimate, command: Control) -> None:
         """Take the estimated tip before a command, and where about it will be after it, for the check of readings."""
-        tip = Pose.of(estimate.tip)
-        axis = np.array(tip.axis) / tip.axis[0]
-        begin, end = tip.point, np.array(tip.point) + command.db_x * axis
+        moved = after(estimate.simulator, estimate.state, command).tip - estimate.state.tip
+        x, y, z = (estimate.tip + moved)[: Z + 1].tolist()
         limit = self._scenario.control.innovation_limit_mm + _SDS * estimate.tip_sd
-        x, y, z = map(float, end)
-        self._expected = Expectation(begin, (x, y, z), limit)
+        self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit)
 
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.
