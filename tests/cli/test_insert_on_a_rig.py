@@ -108,7 +108,7 @@ def test_with_yes_the_axes_are_shown_and_nothing_is_asked(capsys, events):
 def test_where_the_needle_is_left_in_the_command_that_withdraws_it_is_named(capsys, events, ends, outcome):
     ends["outcome"] = outcome
     _, _, err = run(capsys, *INSERT, "--yes")
-    line = "flexneedle: the needle is still in: withdraw it by flexneedle rig retract rig.toml"
+    line = "flexneedle: the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
     assert events[-1] == "inserted"
     assert err.splitlines()[-1] == line
     _, _, err = run(capsys, *INSERT[:-1], "dry", "--dry-run")
@@ -128,7 +128,7 @@ def test_an_error_after_the_first_motion_leaves_the_needle_in(capsys, events, en
     ends["stop"] = 3, broken
     status, _, err = run(capsys, *INSERT, "--yes")
     assert (status, events[-1]) == (1, "inserted")
-    assert "flexneedle: the needle is still in: withdraw it by" in err
+    assert "flexneedle: the needle stays where it is: withdraw it by" in err
 
 
 def test_a_dry_run_moves_nothing_and_asks_nothing(capsys, monkeypatch, events):

@@ -304,7 +304,7 @@ def test_a_worker_that_ends_leaves_a_fault_and_starts_nothing_again(server, clie
     text = "the worker has ended (exit status -9) and is started again"
     rig_is(client, "fault", why=text)
     client.wait(lambda: client.newest["insertion live"]["state"] == "failed")
-    line = "the needle is still in: withdraw it by flexneedle rig retract bench.toml"
+    line = "the needle stays where it is: withdraw it by flexneedle rig retract bench.toml"
     assert client.newest["insertion live"]["summary"] == f"{text}; {line}"
     assert client.refused("go") == "Bench is not armed: arm it first"
     prepared(client)

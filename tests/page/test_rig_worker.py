@@ -212,7 +212,7 @@ def test_a_needle_that_is_left_in_is_said_to_be(calls, in_tmp):
     with pytest.raises(DriverError):
         Insertions().insert(one)
     last = one.outbox.of("insertion")[-1]
-    line = "the needle is still in: withdraw it by flexneedle rig retract rig.toml"
+    line = "the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
     assert (last.state, last.summary) == ("failed", f"the motor is off; {line}")
 
 

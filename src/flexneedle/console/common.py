@@ -25,7 +25,7 @@ SWITCHED_ON = (
 """What precedes any motion of a rig."""
 ARMS = f"{SWITCHED_ON} Ctrl-C stops."
 """Printed before any motion of a rig."""
-STILL_IN = "the needle is still in: withdraw it by flexneedle rig retract {rig}"
+STILL_IN = "the needle stays where it is: withdraw it by flexneedle rig retract {rig}"
 """How a needle that was left in is withdrawn; rig: as the user gave it."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""

@@ -128,6 +128,10 @@ def _is_left_over(link: Path) -> bool:
     return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
 
 
+def _left(error: OSError) -> str:
+    return ": remove it, unless another emulator uses it" if isinstance(error, FileExistsError) else ""
+
+
 class Serial:
     """A pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
 
@@ -165,7 +169,9 @@ class Serial:
                 self.link.unlink()
             self.link.symlink_to(os.ttyname(host))
         except OSError as error:
-            raise InputError(f"{self.link}: the link cannot be created: {error.strerror}") from None
+            raise InputError(
+                f"{self.link}: the link cannot be created: {error.strerror}{_left(error)}"
+            ) from None
 
     def unplug(self) -> None:
         """Close the terminal and remove the link."""

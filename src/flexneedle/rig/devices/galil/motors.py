@@ -175,14 +175,15 @@ class GalilMotors:
 
     def _stops(self, deadline: float) -> list[str]:
         """Which channels the controller itself has stopped, and why, if it says so: it refuses their targets until they
-        rest."""
+        rest; and which are at a limit switch."""
         if not self._link.is_open:
             return []
         try:
             found = self._reports(deadline)
         except DriverError:  # the refusal counts
             return []
-        return [f"{letter}: {state.stopped}" for letter, state in found.items() if state.stopped]
+        reasons = {letter: state.stopped or _at_switch(state) for letter, state in found.items()}
+        return [f"{letter}: {why}" for letter, why in reasons.items() if why]
 
     def _target(self, letter: str, position: float) -> int:
         self._known(letter)
@@ -303,6 +304,12 @@ class GalilMotors:
             (values,) = self._dialogue.numbers([query], [count], self._deadline())
             found[letter] = facts.setup(values)
         return found
+
+
+def _at_switch(state: MotorState) -> str:
+    sides = ("reverse", state.reverse_limit), ("forward", state.forward_limit)
+    names = " and ".join(name for name, is_active in sides if is_active)
+    return f"{names} limit switch active" if names else ""
 
 
 def _assigned(name: str, values: Mapping[str, int]) -> str:
