@@ -94,10 +94,11 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
     """Open the devices, tick until the end, and return its reason."""
     signals = _signals()
     clock = WallClock(start=task.started)
-    tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
-    with closing(tracked) as tracker, closing(open_motors(task.rig)) as connected, ExitStack() as stack:
-        if not task.dry:  # before anything is sent that moves or stops a motor
+    with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
+        if not task.dry:  # before the tracker, which the program that has the rig uses, and before anything is sent
             stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
+        tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
+        tracker = stack.enter_context(closing(tracked))
         motors = DryMotors(connected, clock) if task.dry else connected
         core = Supervisor(task, motors, tracker, clock, outbox.put)
         set_realtime_priority()
