@@ -12,7 +12,9 @@ let view = null;
 
 export async function mount(element, store, link) {
   const notice = make("p.quiet", { role: "note", hidden: true });
-  const graphics = graphicsOf(document.createElement("canvas"));
+  const canvas = make("canvas", { tabindex: "0", role: "application", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
+  const context = canvas.getContext("webgl2");
+  const graphics = context && nameOf(context);
   if (graphics === null || SOFTWARE.test(graphics)) {
     notice.hidden = false;
     notice.textContent = graphics === null
@@ -22,14 +24,13 @@ export async function mount(element, store, link) {
   element.append(notice);
   if (graphics === null) return;
 
-  const canvas = make("canvas", { tabindex: "0", role: "application", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
   const legend = make("ul.legend", { "aria-label": "Legend" });
   const text = make("p.spoken", { id: "space-text" });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "View in space" });
   element.append(make("div.stage", {}, canvas), tools, legend, text);
 
   const { SpaceView } = await import("./space/view.js");
-  view = new SpaceView(canvas, legend, store, link);
+  view = new SpaceView(context, legend, store, link);
   for (const [label, name, key] of VIEWS) {
     tools.append(button(label, () => view.camera.look(name), { "aria-keyshortcuts": key, title: `Key ${key}` }));
   }
@@ -48,14 +49,10 @@ export function spaceView() {
   return view;
 }
 
-// Name of the graphics device, or null without WebGL.
-function graphicsOf(canvas) {
-  const gl = canvas.getContext("webgl2");
-  if (!gl) return null;
-  const info = gl.getExtension("WEBGL_debug_renderer_info");
-  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-  gl.getExtension("WEBGL_lose_context")?.loseContext();
-  return String(name);
+// Name of the graphics device.
+function nameOf(context) {
+  const info = context.getExtension("WEBGL_debug_renderer_info");
+  return String(context.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : context.RENDERER));
 }
 
 function inWords(store) {

@@ -22,10 +22,11 @@ export class SpaceView {
   #room = "";
   #entries = "";
 
-  // canvas: of a stage; legend: a list.
-  constructor(canvas, legend, store, link) {
+  // context: WebGL's of a canvas in a stage; legend: a list.
+  constructor(context, legend, store, link) {
+    const { canvas } = context;
     [this.#canvas, this.#legend, this.#store] = [canvas, legend, store];
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.renderer = new WebGLRenderer({ canvas, context });
     this.camera = new Camera(canvas, () => this.#schedule());
     this.labels = new Labels();
     this.room = new Room(this.labels);
