@@ -95,7 +95,7 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
     signals = _signals()
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
-        if not task.dry:  # before the tracker, which the program that has the rig uses, and before anything is sent
+        if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
             stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
         tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
         tracker = stack.enter_context(closing(tracked))
