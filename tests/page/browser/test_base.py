@@ -98,6 +98,23 @@ def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
 
+def test_work_without_a_share_has_the_time_since_it_began(visit, server):
+    page = visit()
+    server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
+    page.wait_for_selector(f"{STATUS} .job")
+    page.evaluate("() => { const now = performance.now(); performance.now = () => now + 75_000; }")
+    page.wait_for_selector(f"{STATUS} >> text=/the computation starts \\(7\\d s\\)/")
+
+
+def test_a_server_that_was_started_again_is_reported(visit, server):
+    page = visit()
+    server.send(session(5, seed=7))
+    page.wait_for_selector("text=seed 7")
+    server.drop()
+    page.wait_for_selector("text=The server was started again")
+    page.wait_for_selector("text=seed 0")
+
+
 def test_work_of_every_kind_has_a_name(visit, server):
     page = visit()
     kinds = get_args(Job.model_fields["kind"].annotation)

@@ -103,9 +103,25 @@ def test_without_a_clipboard_the_link_is_shown_to_be_copied(files, server):
     assert page.url == server.url
 
 
-def test_a_damaged_link_is_reported(files, server):
+def test_a_link_that_is_followed_while_another_is_in_control_is_opened_afterwards(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    link = page.evaluate("window.copied").partition("#")[2]
+    server.send(people(2, steering=2))
+    page.wait_for_selector("text=person 2 is in control")
+    page.evaluate("link => { location.hash = link; }", link)
+    page.wait_for_selector("text=The link is opened when you are in control")
+    assert not server.asked("load")
+    server.send(people(2))
+    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    until(page, "!location.hash")
+
+
+@pytest.mark.parametrize("damaged", ["x", "xyz", "A" * 3000])
+def test_a_damaged_link_is_reported(files, server, damaged):
     page = files()
-    page.evaluate("() => { location.hash = '#state=x'; }")
+    page.evaluate("damaged => { location.hash = `#state=${damaged}`; }", damaged)
     page.wait_for_selector("text=The link is damaged")
     assert not server.asked("load")
 
@@ -249,6 +265,7 @@ def test_an_insertion_that_has_ended_is_saved(files, server):
     server.send(insertion("done"))
     page.fill("[aria-label='Name of the run to save']", "../x")
     page.click("text=Save the insertion")
+    page.wait_for_selector("text=The name must begin with a letter or digit")
     page.fill("[aria-label='Name of the run to save']", "my run")
     page.click("text=Save the insertion")
     page.wait_for_timeout(100)

@@ -151,6 +151,24 @@ def test_options_and_doubts(form, server):
     ]
 
 
+def test_a_seed_that_cannot_be_used_is_reported_and_not_taken(form, server):
+    page = form()
+    problem = page.locator("#option-seed-problem")
+    for text in ("-1", "1.5", "99999999999999999999", ""):
+        page.fill("#option-seed", text)
+        page.press("#option-seed", "Enter")
+        page.press("#option-seed", "Tab")
+        problem.filter(has_text="must be a whole number").wait_for()
+        page.focus("#option-seed")
+    assert page.get_attribute("#option-seed", "aria-invalid") == "true"
+    assert not server.asked("options")
+    page.fill("#option-seed", "7")
+    page.press("#option-seed", "Enter")
+    assert server.wait_for("options") == [{"type": "options", "seed": 7}]
+    problem.wait_for(state="hidden")
+    assert page.get_attribute("#option-seed", "aria-invalid") == "false"
+
+
 def test_it_cannot_be_changed_while_another_steers(form):
     page = form([WELCOME, people(2, steering=2), session(), scene()])
     until(page, "document.querySelector('#field-target-depth_mm').matches(':disabled')")

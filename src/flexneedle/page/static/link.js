@@ -15,6 +15,7 @@ export class Link {
   #attempts = 0;
   #timer = 0;
   #number = 0;
+  #revision = -1; // of the newest session
   #waiting = new Map(); // by number of the request: {resolve, timer}
   #edits = {};
   #editTimer = 0;
@@ -125,6 +126,7 @@ export class Link {
       this.#filling.clear();
       this.#store.set("connection", "open");
     }
+    if (message.type === "session") this.#compare(message);
     const missing = this.#store.receive(message);
     if (message.type !== "rows") return;
     if (missing === null) this.#filling.delete(message.of);
@@ -132,6 +134,14 @@ export class Link {
       this.#filling.set(message.of, missing);
       this.#send({ type: "rows_from", index: missing });
     }
+  }
+
+  // A server that was started again counts its revisions from the beginning.
+  #compare({ revision }) {
+    if (revision < this.#revision) {
+      this.#refuse({ reason: "The server was started again, with the scenario that it starts with. A scenario that was not saved is lost." });
+    }
+    this.#revision = revision;
   }
 
   #answer(request, answer) {

@@ -18,6 +18,7 @@ const CONTROL = {
   release: "So that another page can take control. An insertion on a rig is then held.",
 };
 const SHOWN_FOR = 12_000; // ms
+const LONG = 5; // s
 const SHORT = 1_000; // ms: work that ends sooner is not shown
 
 export function mount(element, store, link) {
@@ -89,22 +90,32 @@ function followJobs(element, store, link) {
     const bar = make("progress", { max: "1", "aria-label": `Progress: ${JOBS[kind]}` });
     const text = make("span");
     const cancel = button("Cancel", () => link.ask({ type: "cancel", job }), { "aria-label": `Cancel: ${JOBS[kind]}` });
-    const entry = { job, kind, bar, text, cancel, element: make("span.job", {}, text, bar, cancel) };
+    const entry = { job, kind, bar, text, cancel, begun: performance.now(), words: "", counts: false, element: make("span.job", {}, text, bar, cancel) };
     entry.timer = setTimeout(() => element.append(entry.element), SHORT);
+    entry.clock = setInterval(() => tell(entry), 1000);
     entries.set(kind, entry);
     return entry;
   }
-  function update({ kind, text, bar, cancel }, job) {
+  function update(entry, job) {
+    const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
-    text.textContent = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
+    entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
+    entry.counts = !failed && (job.share ?? null) === null;
+    tell(entry);
     text.classList.toggle("bad", failed);
     bar.hidden = cancel.hidden = failed;
     if ((job.share ?? null) === null) bar.removeAttribute("value");
     else bar.value = job.share;
   }
+  // Without a share, the time since it began: what is slow and what hangs would look the same.
+  function tell({ words, counts, text, begun }) {
+    const seconds = Math.floor((performance.now() - begun) / 1000);
+    text.textContent = counts && seconds >= LONG ? `${words} (${seconds} s)` : words;
+  }
   function remove(kind) {
-    const { timer, element: shown } = entries.get(kind);
+    const { timer, clock, element: shown } = entries.get(kind);
     clearTimeout(timer);
+    clearInterval(clock);
     shown.remove();
     entries.delete(kind);
   }

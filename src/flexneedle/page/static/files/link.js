@@ -1,5 +1,7 @@
 // A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
 
+import { maySteer } from "../shown.js";
+
 const MARK = "#state=";
 
 // Address of this page with the present state.
@@ -12,16 +14,28 @@ export async function linkOf(store) {
 
 // Load the state of the address once connected, and of each link that is followed later.
 export function followLink(store, link, status) {
+  let waits = false; // until this page is in control
   const take = async () => {
     if (!location.hash.startsWith(MARK)) return;
-    const packed = location.hash.slice(MARK.length);
-    history.replaceState(null, "", location.pathname + location.search); // a reload keeps what was changed since
+    const text = await unsqueezed(location.hash.slice(MARK.length)).catch(() => null);
+    let state = null;
     try {
-      await begin(link, JSON.parse(await unsqueezed(packed)));
+      state = JSON.parse(text);
     } catch {
-      status.textContent = "The link is damaged: nothing was loaded";
+      // as without one
     }
+    waits = Boolean(state) && !maySteer(store);
+    if (waits) {
+      status.textContent = "The link is opened when you are in control";
+      return;
+    }
+    history.replaceState(null, "", location.pathname + location.search); // a reload keeps what was changed since
+    status.textContent = state ? "" : "The link is damaged: nothing was loaded";
+    if (state) await begin(link, state);
   };
+  store.subscribe(["people", "welcome"], () => {
+    if (waits && maySteer(store)) take();
+  });
   const end = store.subscribe(["people"], () => {
     if (!store.get("people")) return;
     end();

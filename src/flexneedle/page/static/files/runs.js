@@ -6,6 +6,7 @@ import { showStudy } from "./study.js";
 
 const DOWNLOADS = [["Figure", "figure.png"], ["CSV", "trace.csv"], ["Run folder", "run.zip"], ["Replay as HTML", "replay.html"]];
 const NAME = /^[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}$/;
+const RULE = "The name must begin with a letter or digit, and have only letters, digits, spaces, points, - and _.";
 const ENDED = ["done", "held", "failed", "interrupted"];
 const REPLAYED = ["insertion"]; // kinds of runs that can be shown
 const MOST = 100; // runs in the list
@@ -93,11 +94,13 @@ function showOpened(element, store, link) {
 // What is saved: the insertion that has ended last, or the row of a study that is shown.
 function saveForm(link, of, proposed, text) {
   const name = make("input", { type: "text", maxlength: "80", value: proposed, placeholder: "Name of the run", "aria-label": proposed ? `Name to save ${proposed} as` : "Name of the run to save" });
-  const form = make("form.tools", {}, name, make("button", { type: "submit" }, text));
+  const problem = make("p.problem.bad", { role: "alert", hidden: true }, RULE);
+  const form = make("form.tools", {}, name, make("button", { type: "submit" }, text), problem);
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const valid = NAME.test(name.value.trim());
     name.setAttribute("aria-invalid", valid ? "false" : "true");
+    problem.hidden = valid;
     if (valid && (await link.ask({ type: "save", name: name.value.trim(), of })).done) name.value = "";
   });
   return form;

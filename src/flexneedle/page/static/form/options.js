@@ -10,23 +10,37 @@ export function followOptions(element, store, link) {
     const answer = await link.ask({ type: "options", ...options });
     if (!answer.done) show();
   };
+  let known = null; // seed of the session that was shown last
   const seed = make("input", {
-    id: "option-seed", type: "number", min: "0", step: "1", inputmode: "numeric", change: () => takeSeed(Number(seed.value)),
+    id: "option-seed", type: "number", min: "0", step: "1", inputmode: "numeric", change: () => takeSeed(seed.value.trim() === "" ? NaN : Number(seed.value)),
   });
-  const takeSeed = (value) => (Number.isInteger(value) && value >= 0 && value <= MOST ? ask({ seed: value }) : show());
+  const problem = make("p.problem.bad", { id: "option-seed-problem", role: "alert", hidden: true });
+  const takeSeed = (value) => {
+    const valid = Number.isInteger(value) && value >= 0 && value <= MOST;
+    mark(valid ? "" : `must be a whole number from 0 to ${MOST}; the seed is still ${store.get("session").seed}`);
+    if (valid) ask({ seed: value });
+  };
+  function mark(text) {
+    problem.textContent = text;
+    problem.hidden = !text;
+    seed.setAttribute("aria-invalid", String(Boolean(text)));
+    seed.setAttribute("aria-describedby", problem.id);
+  }
   const next = button("Next", () => takeSeed(store.get("session").seed + 1), { "aria-label": "Next seed" });
   const strategy = make("select", { id: "option-strategy", change: () => ask({ strategy: strategy.value }) });
   const controller = make("select", { id: "option-controller", change: () => ask({ controller: controller.value }) });
   const help = make("p.help.quiet", { id: "option-help" });
   controller.setAttribute("aria-describedby", "option-help");
   element.append(
-    row("Seed", seed, next), row("Strategy", strategy), row("Controller", controller), help,
+    row("Seed", seed, next), problem, row("Strategy", strategy), row("Controller", controller), help,
   );
 
   function show() {
     const [session, welcome] = [store.get("session"), store.get("welcome")];
     if (!session || !welcome) return;
-    if (document.activeElement !== seed) seed.value = session.seed;
+    if (session.seed !== known) mark("");
+    if (session.seed !== known || (document.activeElement !== seed && problem.hidden)) seed.value = session.seed;
+    known = session.seed;
     choose(strategy, welcome.strategies, session.strategy);
     choose(controller, welcome.controllers.map(({ name }) => name), session.controller);
     help.textContent = welcome.controllers.find(({ name }) => name === session.controller)?.summary ?? "";

@@ -7,10 +7,13 @@ const STATES = {
   holding: "Holding", done: "Ended", held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
 };
 
+const COUNTED = ["paused", "holding", "done", "held", "failed", "interrupted"]; // else the player counts the periods
+
 // insertion: the news of that type.
 export function inWords(insertion) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
-  const parts = [`${STATES[insertion.state] ?? insertion.state}${where}: ${insertion.controller}, seed ${insertion.seed}, ${insertion.periods} periods.`];
+  const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
+  const parts = [`${STATES[insertion.state] ?? insertion.state}${where}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
   if (insertion.summary) parts.push(insertion.summary);
   else if ((insertion.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(insertion.error_mm, 3)} mm from the target.`);
   if (insertion.folder) parts.push(`Recorded as ${insertion.folder}.`);
