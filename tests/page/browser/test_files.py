@@ -10,7 +10,7 @@ from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
-from recorded_page import insertion, period_frames, rows
+from recorded_page import insertion, people, period_frames, rows
 
 pytestmark = pytest.mark.page
 
