@@ -9,10 +9,13 @@ from flexneedle.errors import InputError
 from flexneedle.page.frames import Kind, Source
 from flexneedle.page.messages import Disturb
 from flexneedle.page.orders import Signal
+from flexneedle.page.server.folder import RunsFolder
+from flexneedle.page.worker import saving
 from flexneedle.page.worker.insertion import Insertions
 from flexneedle.page.worker.recording import read
 from flexneedle.page.worker.rows import row_of
 from flexneedle.page.worker.signals import Cancelled
+from flexneedle.runs.saving import save
 from page_tasks import NO_WAIT, Reported, done, short, task
 
 TIMED = {"decide_ms"}
@@ -119,6 +122,23 @@ def test_one_that_is_refused_is_reported():
     reported = done(Insertions().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
     assert reported.of("insertion")[-1].state == "refused"
     assert "misses the target" in reported.of("insertion")[-1].summary
+
+
+def test_an_insertion_is_listed_once_it_is_saved_as_a_whole(inserted, tmp_path, monkeypatch):
+    runs, while_saving = RunsFolder(tmp_path), []
+
+    def watched(insertion, folder):
+        save(insertion, folder)
+        while_saving.append((runs.listed(), list(tmp_path.glob("*/run.json"))))
+
+    monkeypatch.setattr(saving, "save", watched)
+    (tmp_path / ".saved").mkdir()  # of a worker that was killed
+    inserted[0].save(task("save", folder=str(tmp_path / "saved")))
+    ((listed, (written,)),) = while_saving
+    assert listed == []
+    assert not written.exists()  # it has moved
+    assert [run["name"] for run in runs.listed()] == ["saved"]
+    assert [path.name for path in tmp_path.iterdir()] == ["saved"]
 
 
 def test_a_saved_insertion_is_read_as_it_was(inserted, tmp_path):

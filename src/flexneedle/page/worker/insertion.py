@@ -9,6 +9,7 @@ from flexneedle.page.worker.disturbances import Disturber, with_plate
 from flexneedle.page.worker.live import Live
 from flexneedle.page.worker.pace import Pacer
 from flexneedle.page.worker.rig import insert_on_rig
+from flexneedle.page.worker.saving import save_whole
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.page.worker.task import Task
 from flexneedle.planning.origin import placed
@@ -17,7 +18,6 @@ from flexneedle.rig.loop import run
 from flexneedle.rig.parts import SCENARIO_TRACKER
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.virtual import Seeds, virtual_rig
-from flexneedle.runs.saving import save
 from flexneedle.types import Insertion, Period
 
 
@@ -47,7 +47,7 @@ class Insertions:
         """Save the last insertion in the folder of the order. Raises InputError without one."""
         if self._last is None:
             raise InputError("there is no insertion to save: start one first")
-        save(self._last, task.work.folder)
+        save_whole(self._last, task.work.folder)
 
 
 def _insert_virtually(live: Live) -> Insertion:

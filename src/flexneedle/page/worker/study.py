@@ -9,8 +9,8 @@ from flexneedle.errors import InputError, one_line
 from flexneedle.page.messages import StudyRow, StudyRows
 from flexneedle.page.orders import Work
 from flexneedle.page.worker.recording import read, report
+from flexneedle.page.worker.saving import save_whole
 from flexneedle.page.worker.task import Task
-from flexneedle.runs.saving import save
 from flexneedle.study.folder import read_folder
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.recompute import WITHOUT, recompute
@@ -71,7 +71,7 @@ class Rows:
         insertion = self._shown.get(task.work.of)
         if insertion is None:
             raise InputError("there is no row to save: open a row of a study first")
-        save(insertion, task.work.folder)
+        save_whole(insertion, task.work.folder)
 
 
 def _worst(found: Mapping[int, Mapping[str, Any]]) -> list[int]:
