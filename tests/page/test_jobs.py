@@ -33,14 +33,18 @@ def running_number(client, kind):
 def test_a_newer_plan_replaces_the_one_that_runs(planned):
     older = start(planned, WORKS_ON)
     planned.do("start", work="plan")
-    planned.wait(lambda: (running_number(planned, "plan") or 0) > older)
+    newer = planned.wait(
+        lambda: (running_number(planned, "plan") or 0) > older and running_number(planned, "plan")
+    )
+    assert newer == older + 1
 
 
 def test_a_comparison_replaces_a_plan(planned):
     start(planned, WORKS_ON)
     planned.do("start", work="compare")
     planned.job("plan", "cancelled")
-    planned.job("compare", "running")
+    compared = planned.job("compare", "running")
+    assert planned.newest["job plan"]["job"] < compared["job"]
 
 
 def test_an_edit_cancels_what_is_searched_for_the_old_scenario(planned):
@@ -48,6 +52,7 @@ def test_an_edit_cancels_what_is_searched_for_the_old_scenario(planned):
     planned.do("edit", values={"target.depth_mm": 35.0})
     planned.job("plan", "cancelled")
     planned.wait(lambda: planned.newest["estimate"]["revision"] == 3)
+    assert planned.newest["session"]["values"]["target.depth_mm"] == 35.0
 
 
 def test_a_plan_sets_the_reach_back_which_is_then_done(planned):
@@ -61,7 +66,7 @@ def test_a_plan_sets_the_reach_back_which_is_then_done(planned):
 def test_a_worker_that_does_not_cancel_is_ended_and_the_next_order_carried_out(planned):
     number = start(planned, HANGS)
     planned.do("cancel", job=number)
-    planned.job("plan", "cancelled")
+    assert planned.job("plan", "cancelled")["job"] == number
     start_again(planned)
 
 
@@ -129,6 +134,7 @@ def test_a_broken_worker_fails_its_jobs_and_the_server_stays(tmp_path, script):
     with served(tmp_path, workers=(broken(script), STUB)) as server, Client(server) as client:
         client.wait(lambda: client.newest.get("job scene", {}).get("state") == "failed")
         client.steer().do("edit", values={"target.depth_mm": 35.0})
+        assert client.newest["session"]["values"]["target.depth_mm"] == 35.0
 
 
 def test_work_is_cancelled_when_nobody_is_connected_and_done_again(server):

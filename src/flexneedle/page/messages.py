@@ -244,10 +244,12 @@ class News(Message):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True, ser_json_inf_nan="null")
 
+    type: str
+
     @property
     def key(self) -> str:
         """What it is the state of."""
-        return str(self.type)  # type: ignore[attr-defined]
+        return self.type
 
 
 class Welcome(News):

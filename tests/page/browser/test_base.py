@@ -69,6 +69,8 @@ def test_a_refusal_is_shown_in_words(visit, server):
     page.wait_for_selector("[role=alert] >> text=Person 2 is in control")
     page.click("[role=alert] >> text=Close")
     page.wait_for_selector("text=Person 2 is in control", state="detached")
+    assert page.inner_text(".refusals") == ""
+    assert "you are in control" not in page.inner_text(STATUS)
 
 
 def test_taking_and_releasing_control_keeps_the_focus(visit):
@@ -85,6 +87,8 @@ def test_a_worker_that_starts_is_named(visit, server):
     page = visit()
     server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
     page.wait_for_selector(f"{STATUS} >> text=Scene: the computation starts")
+    assert page.locator(f"{STATUS} .job").count() == 1
+    assert page.get_attribute(f"{STATUS} progress", "value") is None  # nobody knows how long it takes
 
 
 def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
@@ -102,6 +106,7 @@ def test_work_without_a_share_has_the_time_since_it_began(visit, server):
     page = visit()
     server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
     page.wait_for_selector(f"{STATUS} .job")
+    assert page.inner_text(f"{STATUS} .job span") == "Scene: the computation starts"
     page.evaluate("() => { const now = performance.now(); performance.now = () => now + 75_000; }")
     page.wait_for_selector(f"{STATUS} >> text=/the computation starts \\(7\\d s\\)/")
 
@@ -113,6 +118,7 @@ def test_a_server_that_was_started_again_is_reported(visit, server):
     server.drop()
     page.wait_for_selector("text=The server was started again")
     page.wait_for_selector("text=seed 0")
+    assert page.evaluate("flexneedle.store.get('refusals').length") == 1
 
 
 def test_work_of_every_kind_has_a_name(visit, server):
@@ -145,6 +151,7 @@ def test_work_that_runs_or_has_failed_before_is_shown(visit, server):
     page.wait_for_selector("text=Reach: the worker has ended")
     server.send(Job(job=5, kind="reach", state="running"), Job(job=5, kind="reach", state="done"))
     page.wait_for_selector("text=the worker has ended", state="detached")
+    assert page.locator(f"{STATUS} .job").all_inner_texts() == ["Plan: iteration 2 of 20\nCancel"]
 
 
 def test_a_lost_connection_recovers_the_state(visit, server):
@@ -166,6 +173,7 @@ def test_the_reason_of_a_lost_connection_is_shown(visit, server):
     page.evaluate("() => { window.WebSocket = class { close() {} }; }")  # no other attempt succeeds
     server.drop("64 pages are connected, which is the limit")
     page.wait_for_selector("text=No connection; trying again… (64 pages are connected, which is the limit)")
+    assert page.get_attribute(f"{STATUS} .connection", "data-state") == "lost"
 
 
 def test_another_insertion_and_a_closed_recording_are_forgotten(visit, server):

@@ -98,6 +98,7 @@ def test_a_problem_is_left_with_another_state(form, server):
     server.send(session(2))
     problem.wait_for(state="hidden")
     until(page, "document.querySelector('#field-target-depth_mm').value === '40'")
+    assert page.locator(f"{FORM} .problem:visible").count() == 0
 
 
 def test_what_is_no_number_is_not_sent(form, server):
@@ -172,6 +173,12 @@ def test_a_seed_that_cannot_be_used_is_reported_and_not_taken(form, server):
 def test_it_cannot_be_changed_while_another_steers(form):
     page = form([WELCOME, people(2, steering=2), session(), scene()])
     until(page, "document.querySelector('#field-target-depth_mm').matches(':disabled')")
+    assert (
+        page.locator("#option-seed, #option-strategy, #option-controller").evaluate_all(
+            "all => all.map((each) => each.matches(':disabled'))"
+        )
+        == [True] * 3
+    )
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

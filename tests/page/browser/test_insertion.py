@@ -72,6 +72,7 @@ def test_the_focus_goes_from_insert_to_stop_and_back(panel, server):
     until(page, f"{FOCUSED} === 'Stop'")
     server.send(insertion("interrupted", periods=0, pace=0.0))
     until(page, f"{FOCUSED} === 'Insert'")
+    assert server.asked("stop") == []
 
 
 def in_a_field():

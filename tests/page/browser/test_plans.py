@@ -164,6 +164,7 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
 def test_nothing_is_started_while_another_steers(plans):
     page = plans([*opening(), people(2, steering=2)])
     until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
+    assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -58,6 +58,7 @@ def test_scrubbing_shows_a_period(player):
     until(page, f"{PERIOD} === 0")
     page.keyboard.press("ArrowRight")
     until(page, f"{PERIOD} === 1")
+    assert not page.evaluate(PLAYING)
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 2 of 50']")
     for key, period in ((".", 2), (",", 1), ("End", 49)):
         page.keyboard.press(key)
@@ -85,6 +86,7 @@ def test_it_is_made_slower_and_faster(player):
     for text, factor in (("Slower", "0.5×"), ("Slower", "0.25×"), ("Faster", "0.5×")):
         page.click(f"{PLAYER} >> text={text}")
         speed.locator(f"text={factor}").wait_for()
+    assert not page.evaluate(PLAYING)
 
 
 def test_playing_pauses(player):
@@ -103,6 +105,7 @@ def test_what_is_shown_is_chosen(player):
         page.click(f"{PLAYER} [role=group] button:has-text('{text}')")
         until(page, f"flexneedle.store.get('view of') === '{of}'")
         shows(page, of)
+        assert page.locator(f"{PLAYER} [data-of][aria-pressed=true]").count() == 1
 
 
 def choose(page, text, period=None):
@@ -125,6 +128,7 @@ def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
     server.send(insertion("done", periods=4))
     page.wait_for_selector("[data-panel=insertion] button:visible:text-is('Insert')")
     shows(page, "live")  # and not the run that was opened before
+    assert page.evaluate(PERIOD) is None
 
 
 @pytest.mark.parametrize("name", ["phantom3d", "other"])
@@ -135,6 +139,7 @@ def test_a_run_that_is_opened_is_shown_at_its_end_also_the_same_again(player, se
     server.send(*recorded(name=name))
     shows(page, "first")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
+    assert page.evaluate(PERIOD) is None
 
 
 def test_a_run_that_is_compared_or_closed_changes_the_period_only_where_it_is_shown(player, server):
@@ -169,6 +174,7 @@ def test_what_begins_while_the_connection_is_lost_is_shown(player, server):
     server.drop()
     shows(page, "live")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 3 of 3']")
+    assert page.evaluate(PERIOD) is None
 
 
 def plotted(page, title):
@@ -229,6 +235,7 @@ def test_times_of_a_rig_count_from_its_first_period(player):
     page.wait_for_selector(".decisions li button >> text=0.0 s")
     click_in_the_middle(page)
     until(page, f"Math.abs({PERIOD} - 25) <= 2")
+    assert not page.evaluate(PLAYING)
 
 
 def click_in_the_middle(page):
@@ -244,6 +251,7 @@ def test_a_click_on_a_plot_shows_its_period(player):
     see_plots(page)
     click_in_the_middle(page)
     until(page, f"Math.abs({PERIOD} - 25) <= 2")
+    assert not page.evaluate(PLAYING)
 
 
 def test_a_period_that_is_chosen_while_it_plays_ends_playing(player):
@@ -265,6 +273,7 @@ def test_a_new_insertion_ends_playing(player, server):
     server.send(insertion("running"), rows(0, 3))
     until(page, f"!{PLAYING} && {PERIOD} === undefined")
     shows(page, "live")
+    assert page.locator(f"{PLAYER} >> text=Play").count() == 1
 
 
 def test_two_runs_are_plotted_beside_each_other(player, server, pictures):
@@ -289,6 +298,7 @@ def test_a_second_run_begins_where_the_first_does(player, server):
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     click_in_the_middle(page)
     until(page, f"Math.abs({PERIOD} - 25) <= 2")
+    assert not page.evaluate(PLAYING)
 
 
 def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
@@ -315,6 +325,7 @@ def test_another_run_of_the_same_length_takes_the_place_of_the_last(player):
     drawn = f"document.querySelector('{PLOTS} [aria-label^=Roll] canvas').toDataURL()"
     page.wait_for_timeout(300)
     before = page.evaluate(drawn)
+    assert before.startswith("data:image/png")
     for of, roll in (("second", 45.0), ("first", 30.0)):
         run = [
             insertion("done", of=of, name="other", periods=50),

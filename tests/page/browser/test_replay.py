@@ -123,6 +123,8 @@ def test_it_plays(replay):
     page.keyboard.press(" ")
     until(page, f"flexneedle.store.get('view period') === {PERIODS - 1}")
     until(page, "!flexneedle.store.get('view playing')")
+    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period {PERIODS} of {PERIODS}']")
+    assert page.input_value(SCRUB) == str(PERIODS - 1)
 
 
 def test_nothing_can_be_moved_or_asked_for(replay):

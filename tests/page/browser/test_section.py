@@ -283,6 +283,7 @@ def test_the_target_is_moved_along_the_axis_view(views, server):
 def test_nothing_is_moved_where_another_steers_or_an_insertion_runs(views, news):
     page = views([*opening(), *news])
     until(page, "!document.querySelector('.handle')")
+    assert page.locator(f"{SECTION} .legend li").count() > 0  # it is drawn
 
 
 @pytest.mark.parametrize("state", ["planned", "inserting"])
