@@ -149,8 +149,8 @@ def insert_on_rig(order, signals):
 
 def do(order, signals):
     match order["do"]:
-        case "scene":
-            say("scene", revision=order["revision"], target=order["scenario"]["target"]["depth_mm"])
+        case "needle":
+            write(frame(0, source=1))
         case "estimate":
             say("estimate", revision=order["revision"])
         case "plan":

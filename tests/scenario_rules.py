@@ -224,7 +224,7 @@ RULES = [
         "the tip would start behind the guide: must be below setup.guide_to_skin_mm (41)",
     ),
     ("setup.stroke_mm", 137.5, "the base would reach the guide: must be below 137.5"),
-    ("target.depth_mm", 0.0, "must be above 0, the skin"),
+    ("target.depth_mm", 0.0, "must be above 0"),
     ("target.depth_mm", 81.6, "beyond the stroke: must be at most 81.5"),
     ("target.lateral_mm", 15.1, "must be at most 15 in size, the lateral travel of the guide"),
     ("target.lateral_mm", -15.1, "must be at most 15 in size, the lateral travel of the guide"),

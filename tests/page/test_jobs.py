@@ -103,14 +103,14 @@ def broken(script):
 
 
 def test_until_the_worker_is_ready_its_first_job_says_so(tmp_path):
-    """The others do not repeat it; after an edit the first is the scene again."""
+    """The others do not repeat it; after an edit the first is the needle again."""
     with served(tmp_path, workers=(broken("input()"), STUB)) as server, Client(server) as client:
-        scene, estimate, plan = (client.job(kind, "waiting") for kind in ("scene", "estimate", "plan"))
-        assert "the first time after installation this takes about a minute" in scene["text"]
+        needle, estimate, plan = (client.job(kind, "waiting") for kind in ("needle", "estimate", "plan"))
+        assert "the first time after installation this takes about a minute" in needle["text"]
         assert estimate["text"] == plan["text"] == ""
         client.steer().do("edit", values={"target.depth_mm": 35.0})
-        client.wait(lambda: client.newest["job scene"]["job"] > scene["job"])
-        assert client.newest["job scene"]["text"] == scene["text"]
+        client.wait(lambda: client.newest["job needle"]["job"] > needle["job"])
+        assert client.newest["job needle"]["text"] == needle["text"]
 
 
 def test_what_waits_for_another_job_does_not_say_that_its_worker_starts(planned):
@@ -132,7 +132,7 @@ def test_what_waits_for_another_job_does_not_say_that_its_worker_starts(planned)
 )
 def test_a_broken_worker_fails_its_jobs_and_the_server_stays(tmp_path, script):
     with served(tmp_path, workers=(broken(script), STUB)) as server, Client(server) as client:
-        client.wait(lambda: client.newest.get("job scene", {}).get("state") == "failed")
+        client.wait(lambda: client.newest.get("job needle", {}).get("state") == "failed")
         client.steer().do("edit", values={"target.depth_mm": 35.0})
         assert client.newest["session"]["values"]["target.depth_mm"] == 35.0
 
@@ -152,7 +152,7 @@ def test_work_is_cancelled_when_nobody_is_connected_and_done_again(server):
         client.job("reach", "cancelled")
         client.job("insertion", "cancelled")
         assert client.newest["insertion live"]["state"] == "interrupted"
-        client.job("scene", "done")
+        client.job("needle", "done")
 
 
 def test_a_plan_that_is_missing_is_made_when_somebody_comes_again(server):

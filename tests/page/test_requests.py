@@ -118,7 +118,7 @@ def test_an_edit_is_seen_by_all_and_computed(server, client):
         for each in (client, other):
             each.wait(lambda each=each: each.newest.get("scene", {}).get("revision") == 2)
             each.wait(lambda each=each: each.newest.get("estimate", {}).get("revision") == 2)
-            assert each.newest["scene"]["target"] == 35.0
+            assert each.newest["scene"]["target"][0] == 35.0
             assert each.newest["session"]["values"]["target.depth_mm"] == 35.0
             assert each.newest["session"]["changed"] == ["target.depth_mm"]
         assert "depth_mm = 35.0" in get(server, "/scenario.toml")[1]

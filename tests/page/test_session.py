@@ -117,6 +117,15 @@ def test_a_file_that_is_no_scenario_is_refused(session, text):
         session.with_file("mine", text)
 
 
+def test_a_file_of_another_program_is_refused_in_a_few_words(session):
+    with pytest.raises(Refusal) as refusal:
+        session.with_file("other.toml", "\n".join(f"key_{number} = 1" for number in range(40)))
+    assert refusal.value.reason.startswith("other.toml: name: missing; ")
+    assert refusal.value.reason.endswith(" more")
+    assert len(refusal.value.reason) < 100
+    assert refusal.value.problems["key_7"].startswith("unknown key")
+
+
 def test_options_that_are_not_set_stay(session):
     changed = session.with_options(Options(type="options", seed=7))
     assert (changed.seed, changed.strategy, changed.controller) == (7, "manipulation", "adaptive-mpc")

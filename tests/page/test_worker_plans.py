@@ -1,4 +1,4 @@
-"""Scene, estimate, plans and reach of the page's worker."""
+"""Needle at the start, estimate, plans and reach of the page's worker."""
 
 import math
 
@@ -8,28 +8,23 @@ import pytest
 import flexneedle
 from flexneedle.page.frames import Kind, Source, packed, unpacked
 from flexneedle.page.orders import Signal
+from flexneedle.page.scene import scene_of
 from flexneedle.page.worker import plans
 from flexneedle.page.worker.__main__ import carry_out
+from flexneedle.page.worker.needle import needle
 from flexneedle.page.worker.plans import estimate, plan, samples_of
 from flexneedle.page.worker.reach import _DEEPEST, reach
-from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.planning.horizon import Samples
 from page_tasks import Reported, done, short, task
 
 
-def test_a_scene_is_that_of_the_scenario():
+def test_the_needle_at_the_start_lies_from_its_base_to_its_tip():
     made = short("phantom3d", **{"entry.lateral_mm": 1.0, "entry.slope_z_mrad": 20.0})
-    reported = done(scene, task("scene", scenario=made))
-    (news,) = reported.of("scene")
-    assert (news.revision, news.axes, news.target) == (7, 2, made.target.position)
-    assert [layer["top_mm"] for layer in news.layers] == [0.0, 20.0]
-    assert [layer["bottom_mm"] for layer in news.layers] == [20.0, None]
-    assert news.guide == pytest.approx((-41.0, 1.0, -0.82))
-    assert news.axis == {"point": (1.0, 0.0), "slope": (0.0, 0.02)}
-    (needle,) = reported.shapes(Kind.NEEDLE, Source.SCENE)
-    assert needle.values[0, 0] == pytest.approx(news.base, abs=1e-4)
-    assert needle.values[0, -1, 0] == pytest.approx(-2.0, abs=0.05)
+    reported = done(needle, task("needle", scenario=made))
+    (shape,) = reported.shapes(Kind.NEEDLE, Source.SCENE)
+    assert shape.values[0, 0] == pytest.approx(scene_of(made, 1).base, abs=1e-4)
+    assert shape.values[0, -1, 0] == pytest.approx(-2.0, abs=0.05)
 
 
 def test_an_estimate_ends_near_the_target():

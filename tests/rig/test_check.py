@@ -233,6 +233,23 @@ def test_a_sensor_that_is_seldom_measured_is_a_problem():
     assert problems(found) == {("tracker", "sensor tip"): "measured in too few frames: out of volume"}
 
 
+@pytest.mark.parametrize("lost", [1, 2])
+def test_one_frame_without_a_position_is_no_problem_however_few_there_are(lost):
+    clock = Clock()
+
+    class Short(Tracker):
+        def read(self):
+            nothing = {"tip": SensorReading(None, status="missing")}
+            return tuple(
+                Frame(frame.time, frame.number, nothing if frame.number < lost else frame.readings)
+                for frame in super().read()
+            )
+
+    found = tracker(Short(clock), clock, 0.2)
+    assert of(found, "tracker", "frames").found.endswith(" 7 frames, 0 missed")
+    assert bool(problems(found)) == (lost > 1)
+
+
 @pytest.mark.parametrize("place", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)])
 def test_a_position_that_is_not_a_number_is_not_measured(place):
     clock = Clock()

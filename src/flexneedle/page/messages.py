@@ -16,7 +16,7 @@ Index = Annotated[int, Field(ge=0, lt=1_000_000)]
 Value = float | int | bool | str | list[Any] | dict[str, Any] | None
 Strategy = Literal["manipulation", "steering"]
 JobKind = Literal[
-    "scene",
+    "needle",
     "estimate",
     "plan",
     "compare",

@@ -12,7 +12,7 @@ from pydantic import Field
 from flexneedle.page.messages import Disturb, JobKind, Message, News, Strategy
 
 Do = Literal[
-    "scene", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save", "save_row"
+    "needle", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save", "save_row"
 ]
 Kind = JobKind
 

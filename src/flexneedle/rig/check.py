@@ -21,7 +21,9 @@ from flexneedle.types import VISIBLE, Frame, is_reference
 
 _PAUSE_S = 0.01
 _READINGS = 5  # of the motors, for the time of a reply
-_LEAST_MEASURED = 0.9  # share of the frames in which a sensor has a position
+_MOST_UNMEASURED = (
+    0.1  # share of the frames in which a sensor has no position; one such frame is allowed in any case
+)
 _RATE_TOLERANCE = 0.1
 
 
@@ -288,12 +290,13 @@ def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
         readings = [frame.readings[name] for frame in frames if name in frame.readings]
         numbers = [reading for reading in readings if all(map(isfinite, reading.position or ()))]
         measured = [reading for reading in numbers if reading.position is not None]
-        share, at = len(measured) / len(frames), ""
+        share, unmeasured, at = len(measured) / len(frames), len(frames) - len(measured), ""
         if measured and (position := measured[-1].position) is not None:
             at = " at {:.2f}, {:.2f}, {:.2f} mm".format(*position)
         last = next((r.status for r in reversed(readings) if r.status != VISIBLE), "not in every frame")
         last = last if len(numbers) == len(readings) else "its position is not a number"
-        problem = "" if share >= _LEAST_MEASURED else f"measured in too few frames: {last}"
+        enough = measured and unmeasured <= max(1.0, _MOST_UNMEASURED * len(frames))
+        problem = "" if enough else f"measured in too few frames: {last}"
         yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)
 
 

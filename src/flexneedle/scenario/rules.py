@@ -67,7 +67,7 @@ def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Prob
     """Return why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
     if not (isfinite(depth) and depth > 0):
-        yield Problem("target.depth_mm", depth, "must be above 0, the skin")
+        yield Problem("target.depth_mm", depth, "must be above 0")
     elif depth > setup.max_depth:
         rule = (
             f"beyond the stroke: must be at most {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"

@@ -73,6 +73,27 @@ def test_a_refusal_is_shown_in_words(visit, server):
     assert "you are in control" not in page.inner_text(STATUS)
 
 
+def test_a_page_among_others_says_which_person_it_is(visit, server):
+    page = visit()
+    server.send(people(2))
+    page.wait_for_selector("text=2 people connected, you are person 1, nobody is in control")
+    server.send(people(3, steering=2))
+    page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
+
+
+def test_the_refusal_of_a_value_goes_when_another_is_taken(visit, server):
+    page = visit()
+    problems = {"target.depth_mm": "must be above 0"}
+    server.answers["edit"] = Refused(
+        what="edit", reason="target.depth_mm = -1: must be above 0", problems=problems
+    )
+    page.evaluate("flexneedle.link.edit({'target.depth_mm': -1})")
+    page.wait_for_selector("[role=alert] >> text=must be above 0")
+    del server.answers["edit"]
+    page.evaluate("flexneedle.link.edit({'target.depth_mm': 30})")
+    page.wait_for_selector("[role=alert] >> text=must be above 0", state="detached")
+
+
 def test_taking_and_releasing_control_keeps_the_focus(visit):
     page = visit()
     page.click("text=Take control")
@@ -85,8 +106,8 @@ def test_taking_and_releasing_control_keeps_the_focus(visit):
 
 def test_a_worker_that_starts_is_named(visit, server):
     page = visit()
-    server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
-    page.wait_for_selector(f"{STATUS} >> text=Scene: the computation starts")
+    server.send(Job(job=1, kind="needle", state="waiting", text="the computation starts"))
+    page.wait_for_selector(f"{STATUS} >> text=Needle: the computation starts")
     assert page.locator(f"{STATUS} .job").count() == 1
     assert page.get_attribute(f"{STATUS} progress", "value") is None  # nobody knows how long it takes
 
@@ -104,9 +125,9 @@ def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
 
 def test_work_without_a_share_has_the_time_since_it_began(visit, server):
     page = visit()
-    server.send(Job(job=1, kind="scene", state="waiting", text="the computation starts"))
+    server.send(Job(job=1, kind="needle", state="waiting", text="the computation starts"))
     page.wait_for_selector(f"{STATUS} .job")
-    assert page.inner_text(f"{STATUS} .job span") == "Scene: the computation starts"
+    assert page.inner_text(f"{STATUS} .job span") == "Needle: the computation starts"
     page.evaluate("() => { const now = performance.now(); performance.now = () => now + 75_000; }")
     page.wait_for_selector(f"{STATUS} >> text=/the computation starts \\(7\\d s\\)/")
 

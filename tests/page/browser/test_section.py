@@ -1,5 +1,7 @@
 """Section and view along the axis: to scale, in step with the period; target, guide and boundaries are moved."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -131,13 +133,17 @@ DRAWN = """async (stretch) => {
   const { drawScene } = await import("/static/flat/section.js");
   const { mappingOf, planeOf } = await import("/static/flat/plane.js");
   const [scene, calls] = [flexneedle.store.get("scene"), []];
-  const pen = new Proxy({}, { get: (_, name) => (...values) => calls.push([name, ...values]), set: () => true });
+  const call = (name) => (...values) => {
+    calls.push([name, ...values]);
+    return { width: 6 * String(values[0]).length };  // of a text
+  };
+  const pen = new Proxy({}, { get: (_, name) => call(name), set: () => true });
   const map = mappingOf({ left: -50, right: 50, half: 10 }, 400, 300, stretch);
   const plane = planeOf("target", scene, scene.target);
   drawScene(pen, { width: 400, height: 300, map, plane, name: "target", scene });
   const target = calls.find(([name]) => name === "ellipse");
-  const texts = calls.filter(([name]) => name === "fillText").map(([, text]) => text);
-  return { scales: [map.sx, map.sy], radii: target.slice(3, 5), texts };
+  const words = calls.filter(([name]) => name === "fillText").map(([, text, x, y]) => ({ text, x, y }));
+  return { scales: [map.sx, map.sy], radii: target.slice(3, 5), texts: words.map(({ text }) => text), words };
 }"""
 
 
@@ -150,6 +156,23 @@ def test_a_stretched_axis_is_named_and_the_target_is_1_mm_in_it(views, stretch, 
     assert drawn["radii"] == drawn["scales"]
     assert drawn["scales"][1] / drawn["scales"][0] == pytest.approx(times, rel=0.01)
     assert f"from the axis (mm){label}" in drawn["texts"]
+
+
+def test_names_of_thin_layers_are_below_each_other(views):
+    names, top = ["skin", "fascia", "fat", "muscle wall", "organ"], 0.0
+    layers = []
+    for name, thickness in zip(names, [1.0, 2.0, 1.0, 20.0, None], strict=True):
+        bottom = None if thickness is None else top + thickness
+        layers.append({"name": name, "top_mm": top, "bottom_mm": bottom, "shear_modulus_kpa": 5.0})
+        top = bottom
+    page = views([*opening(), scene().model_copy(update={"layers": layers})])
+    words = [each for each in page.evaluate(DRAWN, 1)["words"] if each["text"] in names]
+    assert [each["text"] for each in words] == names
+    assert len({each["y"] for each in words[:3]}) == 3
+    assert words[0]["y"] == words[3]["y"]  # which is thick enough
+    for one, other in itertools.combinations(words, 2):
+        if one["y"] == other["y"]:
+            assert abs(one["x"] - other["x"]) >= 3 * (len(one["text"]) + len(other["text"]))
 
 
 def test_arrow_keys_move_the_target_in_its_plane(views, server):

@@ -1,4 +1,4 @@
-"""`adaptive-mpc`, the default: each period, one search to the target on a model that is fitted to the readings.
+"""`adaptive-mpc`, the default: each period, a plan to the target with a model that is fitted to the readings.
 
 Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
 the depths at which the bevel rolls, is first the plan's (`control.path`). Cross-entropy searches for a better one
@@ -304,7 +304,7 @@ def _forecast(
 
 METHOD = Method(
     "adaptive-mpc",
-    "one search to the target on a model that is fitted to the readings",
+    "plans to the target each period, with a model that is fitted to the readings",
     Identification(),
     begin=begin,
     decide=decide,

@@ -12,6 +12,7 @@ from typing import Any, Literal, assert_never
 from flexneedle.page import messages as m
 from flexneedle.page.frames import Source
 from flexneedle.page.orders import Do, Kind, Work
+from flexneedle.page.scene import scene_of
 from flexneedle.page.server.catalog import CONTROLLERS, STRATEGIES
 from flexneedle.page.server.folder import RunsFolder
 from flexneedle.page.server.hub import Hub, Outbox
@@ -26,7 +27,7 @@ from flexneedle.scenario.preset import PRESETS
 
 _SEARCHES: tuple[Kind, ...] = ("plan", "compare", "reach")
 _RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
-_WORK: tuple[Kind, ...] = ("scene", "estimate", *_SEARCHES, "recording", "study", "row")
+_WORK: tuple[Kind, ...] = ("needle", "estimate", *_SEARCHES, "recording", "study", "row")
 _RECORDINGS: dict[bool, tuple[Literal["first", "second"], Source]] = {
     False: ("first", Source.FIRST),
     True: ("second", Source.SECOND),
@@ -104,7 +105,7 @@ class Desk:
         self._look.set()
         if self._idle:  # what every page shows is done again; what somebody has asked for is not
             self._idle = False
-            self._order("scene", "scene")
+            self._order("needle", "needle")
             self._order("estimate", "estimate")
             self._plan_if_missing()
         self.hub.publish(self.people.news())
@@ -218,9 +219,10 @@ class Desk:
             self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
         self.session = session
         self.hub.publish(session.news())
+        self.hub.publish(scene_of(session.scenario, session.revision))
         self.rig.changed("the scenario or an option was changed")
         self._plans.cancel(*_SEARCHES)
-        self._order("scene", "scene")
+        self._order("needle", "needle")
         self._order("estimate", "estimate")
         self._start_timer("plan", self.limits.rest_s, self._at_rest)
 

@@ -13,7 +13,7 @@ from flexneedle.page.server.limits import Limits
 from flexneedle.page.server.worker import Worker
 
 _URGENCY: dict[Kind, int] = {
-    "scene": 0,
+    "needle": 0,
     "estimate": 1,
     "recording": 2,
     "study": 2,
@@ -23,7 +23,7 @@ _URGENCY: dict[Kind, int] = {
     "reach": 9,
 }
 _OTHER = 5
-_FINISHED: frozenset[Kind] = frozenset(("scene", "estimate"))
+_FINISHED: frozenset[Kind] = frozenset(("needle", "estimate"))
 """Short ones, which are not cancelled by a newer one: so a target that is dragged has estimates all along."""
 _BACKGROUND: frozenset[Kind] = frozenset(("row", "reach"))
 """Those that are set back for more urgent ones."""

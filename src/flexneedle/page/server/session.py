@@ -19,6 +19,8 @@ from flexneedle.scenario.plausible import doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import printable
 
+_MOST_PROBLEMS = 3
+"""In words; a file of another program has one with each of its keys."""
 _LINE = re.compile(r"(?P<key>[^\s=:]+)(?: = .*?)?: (?P<rule>.*)")
 
 
@@ -61,7 +63,7 @@ class Session:
             raise Refusal(f"{name}: not TOML: nested too deeply") from None
         except ValueError as error:
             raise Refusal(f"{name}: not TOML: {printable(str(error))}") from None
-        with warnings.catch_warnings(record=True) as caught, _refused():
+        with warnings.catch_warnings(record=True) as caught, _refused(name):
             warnings.simplefilter("always", ScenarioWarning)
             scenario = Scenario.from_values(values)
         return self._begun(name, scenario, tuple(str(warning.message) for warning in caught))
@@ -92,12 +94,16 @@ class Session:
 
 
 @contextmanager
-def _refused() -> Iterator[None]:
+def _refused(name: str = "") -> Iterator[None]:
+    """name: of the file that is read."""
     try:
         yield
     except ScenarioError as error:
         problems = dict(_by_key(line) for line in reversed(error.problems))
-        raise Refusal("; ".join(error.problems), problems) from None
+        reason = "; ".join(error.problems[:_MOST_PROBLEMS])
+        if (more := len(error.problems) - _MOST_PROBLEMS) > 0:
+            reason += f"; and {more} more"
+        raise Refusal(f"{name}: {reason}" if name else reason, problems) from None
 
 
 def _by_key(line: str) -> tuple[str, str]:

@@ -1,11 +1,13 @@
-// Loads the panels: each is a module with `export function mount(element, store, link)`, whose section of index.html
-// is shown once it is listed here. space.js is last: it is the largest.
+// Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place in index.html.
+// What one looks at comes first, space.js, the largest, last of it; the rest when that is drawn.
 
 import { Link } from "./link.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-const PANELS = ["status", "form", "files", "insertion", "player", "section", "axial", "plans", "plots", "tour", "space"];
+const SCENE = ["status", "section", "axial", "space"];
+const OTHERS = ["form", "insertion", "player", "plans", "plots", "files", "tour"];
+const FRAMES = 3; // until what is mounted is on the screen
 
 const store = new Store();
 const link = new Link(store);
@@ -15,15 +17,15 @@ followTheme(store, document.getElementById("theme"));
 
 async function load(name) {
   const element = document.querySelector(`[data-panel="${name}"]`);
-  const section = element.closest("[hidden]");
-  if (section) section.hidden = false;
   try {
     const panel = await import(`./${name}.js`);
     await panel.mount(element, store, link);
   } catch (error) {
     element.textContent = `This part of the page could not be loaded: ${error.message}`;
-    throw error;
+    reportError(error); // and the other parts are loaded
   }
 }
 
-for (const name of PANELS) load(name);
+await Promise.all(SCENE.map(load));
+for (let frame = 0; frame < FRAMES; frame++) await new Promise(requestAnimationFrame);
+for (const name of OTHERS) load(name);

@@ -36,7 +36,7 @@ export function mount(element, store, link) {
   store.subscribe(["session", "estimate", "plan "], () => {
     renew(words, lines(store).map(([text, stale]) => make("li", { class: stale ? "quiet" : "" }, text)));
   });
-  store.subscribe(["plan ", "iteration ", "view theme"], () => plot.update());
+  store.subscribe(["session", "plan ", "iteration ", "view theme"], () => plot.update());
   store.subscribe(["session", "scene", "plan ", ...STRATEGIES.map((strategy) => `shape sweep ${strategy}`), "view theme"], () => {
     for (const sweep of sweeps) sweep.update();
   });

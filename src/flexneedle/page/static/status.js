@@ -9,7 +9,7 @@ const CONNECTIONS = {
   lost: "No connection; trying again…",
 };
 const JOBS = {
-  scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
+  needle: "Needle", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
   insertion: "Insertion", check: "Check of the rig", recording: "Recorded run", study: "Study", row: "Computing again",
   save: "Saving",
 };
@@ -63,11 +63,17 @@ function followSteering(element, store, link) {
     element.hidden = !people || !welcome || store.get("connection") !== "open";
     if (element.hidden) return;
     mine = people.steering === welcome.client;
-    const who = people.steering === null ? "nobody is" : mine ? "you are" : `person ${people.steering} is`;
-    renew(words, [make("span", {}, `${people.clients} ${people.clients === 1 ? "person" : "people"} connected, ${who} in control`)]);
+    renew(words, [make("span", {}, inControl(people, welcome.client))]);
     [change.textContent, change.title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
     change.hidden = !mine && people.steering !== null;
   });
+}
+
+// The number of this page is said where there are others, since refusals and stops name people by their numbers.
+function inControl({ clients, steering }, own) {
+  const [alone, mine] = [clients === 1, steering === own];
+  const all = alone ? "1 person connected" : `${clients} people connected, you are person ${own}`;
+  return `${all}, ${steering === null ? "nobody is" : mine ? "you are" : `person ${steering} is`} in control`;
 }
 
 // Work that takes longer than a second has a bar; what has failed stays until the next of its kind begins.
@@ -121,9 +127,12 @@ function followJobs(element, store, link) {
   }
 }
 
-// The newest refusals, each for some seconds or until it is closed.
+// The newest refusals, each for some seconds or until it is closed; that of a value until a change is taken.
 function followRefusals(element, store) {
   let newest = 0;
+  store.subscribe(["session"], () => {
+    for (const each of element.querySelectorAll(".refusal:not([data-keys=''])")) each.remove();
+  });
   store.subscribe(["refusals"], () => {
     for (const refusal of store.get("refusals") ?? []) {
       if (refusal.number <= newest) continue;
@@ -134,9 +143,8 @@ function followRefusals(element, store) {
   function show({ reason, problems }) {
     const keys = Object.keys(problems).join();
     if (keys && element.lastChild?.dataset.keys === keys) element.lastChild.remove(); // such as while dragging
-    const lines = Object.values(problems).filter((line) => !reason.includes(line));
     const close = button("Close", () => shown.remove());
-    const shown = make("div.refusal", { "data-keys": keys }, make("div", {}, ...[reason, ...lines].map((line) => make("p", {}, line))), close);
+    const shown = make("div.refusal", { "data-keys": keys }, make("p", {}, reason), close);
     element.append(shown);
     while (element.children.length > 3) element.firstChild.remove();
     setTimeout(() => shown.remove(), SHOWN_FOR);

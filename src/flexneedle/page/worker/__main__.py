@@ -13,11 +13,11 @@ from flexneedle.page import channel
 from flexneedle.page.orders import Do, Ready
 from flexneedle.page.worker.inbox import Inbox
 from flexneedle.page.worker.insertion import Insertions
+from flexneedle.page.worker.needle import needle
 from flexneedle.page.worker.outbox import Outbox
 from flexneedle.page.worker.plans import estimate, plan
 from flexneedle.page.worker.reach import reach
 from flexneedle.page.worker.rig import check
-from flexneedle.page.worker.scene import scene
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.page.worker.study import Rows, rows
 from flexneedle.page.worker.task import Task
@@ -41,7 +41,7 @@ def main() -> int:
     _write(out, channel.packed(Ready().model_dump_json()))
     insertions, again = Insertions(), Rows()
     actions: Actions = {
-        "scene": scene,
+        "needle": needle,
         "estimate": estimate,
         "plan": plan,
         "reach": reach,

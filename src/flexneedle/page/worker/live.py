@@ -8,9 +8,9 @@ from flexneedle.control.interface import Decision
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.page import messages as m
 from flexneedle.page.frames import Source
+from flexneedle.page.scene import scene_of
 from flexneedle.page.worker.plans import samples_of, shapes_of
 from flexneedle.page.worker.rows import channel_of, frames_of, row_of
-from flexneedle.page.worker.scene import scene_of
 from flexneedle.page.worker.task import Task
 from flexneedle.types import Insertion, Outcome, Period, Plan
 

@@ -7,8 +7,8 @@ from typing import Literal
 from flexneedle.page import messages
 from flexneedle.page.frames import Kind, ShapeFrame, Source, frame_of
 from flexneedle.page.messages import News, Rows
+from flexneedle.page.scene import scene_of
 from flexneedle.page.worker.rows import frames_of, row_of
-from flexneedle.page.worker.scene import scene_of
 from flexneedle.page.worker.task import Task
 from flexneedle.runs.reading import load_insertion
 from flexneedle.types import Insertion, scenario_of

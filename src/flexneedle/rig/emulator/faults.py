@@ -45,9 +45,12 @@ class Fault:
     detail: str = ""
 
 
-def parse_fault(spec: str, kinds: Mapping[str, FaultKind]) -> Fault:
-    """Return the fault of an option value, of one of these kinds by name. Raises InputError."""
-    form, given = _FORM.fullmatch(spec), f"--fault {spec}"
+def parse_fault(spec: str, kinds: Mapping[str, FaultKind], device: str = "") -> Fault:
+    """Return the fault of an option value, of one of these kinds by name. Raises InputError.
+
+    device: what precedes it in the option, for the message.
+    """
+    form, given = _FORM.fullmatch(spec), f"--fault {device}{spec}"
     if form is None:
         raise InputError(f"{given}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {_example(kinds)}@5:2")
     kind, detail = _kind(given, form, kinds)

@@ -20,7 +20,7 @@ from flexneedle.scenario.sections.structure import Structure
 class Target(Section):
     """Section `target`: the position that the tip is to reach."""
 
-    depth_mm: float = 40.0
+    depth_mm: Positive = 40.0
     """x of the target: depth below the skin."""
     lateral_mm: float = 5.0
     """y of the target: lateral offset from the insertion axis."""

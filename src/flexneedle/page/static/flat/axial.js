@@ -3,7 +3,7 @@
 import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
 import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
-import { area, disc, grid, pointsOf, polyline } from "./pen.js";
+import { area, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 
 const READINGS = 40; // measured positions that are shown
 const BEVEL = 26; // px, length of the arrow
@@ -13,13 +13,16 @@ export function drawAxial(pen, { width, height, map, scene, target, parts, store
   const place = (_x, y, z) => [map.toX(z), map.toY(y)];
   const [of, row] = [shownOf(store), shownRow(store)];
   grid(pen, map, width, height, ["z (mm)", "y (mm)"]);
-  const reached = reach(pen, place, store, target[0]);
-  disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
-  for (const part of parts) draw(pen, part, place, map);
-  if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
-  if (scene.guide) guide(pen, place(0, ...(row?.guide ?? scene.guide.slice(1))));
-  const needle = parts.find(({ text }) => text === "needle");
-  if (needle) bevel(pen, place(...tipOf(needle.path)), rollOf(store, of));
+  let reached = false;
+  inside(pen, width, height, () => {
+    reached = reach(pen, place, store, target[0]);
+    disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
+    for (const part of parts) draw(pen, part, place, map);
+    if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
+    if (scene.guide) guide(pen, place(0, ...(row?.guide ?? scene.guide.slice(1))));
+    const needle = parts.find(({ text }) => text === "needle");
+    if (needle) bevel(pen, place(...tipOf(needle.path)), rollOf(store, of));
+  });
   return reached;
 }
 

@@ -3,6 +3,8 @@
 import { color } from "../theme.js";
 
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
+export const SIDE = 30; // px, of the labels on the left
+export const FOOT = 18; // of those below
 const CLOSEST = 44; // px between two labels
 const STEPS = [0.5, 1, 2, 5, 10, 20, 50, 100];
 
@@ -53,21 +55,37 @@ export function words(pen, text, [x, y], { tone = "--quiet", align = "center", b
   pen.fillText(text, x, y);
 }
 
+// Width of a text, px.
+export function widthOf(pen, text) {
+  pen.font = FONT;
+  return pen.measureText(text).width;
+}
+
+// Draw within the grid: what goes on to the left, such as a needle's shaft, would strike through its labels.
+export function inside(pen, width, height, draw) {
+  pen.save();
+  pen.beginPath();
+  pen.rect(SIDE, 0, width - SIDE, height - FOOT);
+  pen.clip();
+  draw();
+  pen.restore();
+}
+
 // Grid lines with labels in mm along both axes; a mapping of plane.js; names of both axes.
 export function grid(pen, map, width, height, [across, up]) {
-  const bottom = height - 18;
-  const [left, right] = [map.fromX(30), map.fromX(width)];
+  const bottom = height - FOOT;
+  const [left, right] = [map.fromX(SIDE), map.fromX(width)];
   const [low, high] = [map.fromY(bottom), map.fromY(0)];
   for (const x of ticks(left, right, map.sx)) {
     polyline(pen, [[map.toX(x), 0], [map.toX(x), bottom]], { tone: "--grid" });
     words(pen, minus(x), [map.toX(x), height - 5]);
   }
   for (const u of ticks(low, high, map.sy)) {
-    polyline(pen, [[30, map.toY(u)], [width, map.toY(u)]], { tone: "--grid" });
-    if (map.toY(u) > 16) words(pen, minus(u), [26, map.toY(u)], { align: "right", base: "middle" });
+    polyline(pen, [[SIDE, map.toY(u)], [width, map.toY(u)]], { tone: "--grid" });
+    if (map.toY(u) > 16) words(pen, minus(u), [SIDE - 4, map.toY(u)], { align: "right", base: "middle" });
   }
   words(pen, across, [width - 4, bottom - 4], { align: "right" });
-  words(pen, up, [34, 11], { align: "left" });
+  words(pen, up, [SIDE + 4, 11], { align: "left" });
 }
 
 function ticks(low, high, scale) {

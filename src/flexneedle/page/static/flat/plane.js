@@ -1,5 +1,7 @@
 // A section: the plane of the depth x and a lateral direction, and how it is mapped to pixels.
 
+import { FOOT, SIDE } from "./pen.js";
+
 const SMALL = 1e-6; // mm
 
 // Planes by name: {point, slope, e}; u of a point is its distance along e = (y, z) from point + slope · x.
@@ -40,7 +42,7 @@ export function stretchIn({ sx, sy }) {
 
 // Mapping of millimetres (right, up) to pixels: {toX, toY, fromX, fromY, sx, sy}. box: {left, right, half}; stretch:
 // of the upward axis against the other.
-export function mappingOf({ left, right, half }, width, height, stretch, [side, foot] = [30, 18]) {
+export function mappingOf({ left, right, half }, width, height, stretch, [side, foot] = [SIDE, FOOT]) {
   const room = (height - foot) / 2;
   const sx = Math.min((width - side) / (right - left), room / half);
   const sy = Math.min(sx * stretch, room / half); // perhaps less than was asked for

@@ -3,34 +3,39 @@
 import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
 import { shadeOf } from "../tissue.js";
 import { layersIn } from "./layers.js";
-import { area, disc, grid, pointsOf, polyline, words } from "./pen.js";
+import { FOOT, SIDE, area, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
 import { lateral, stretchIn } from "./plane.js";
 import { reachIn } from "./reach.js";
 
 const GUIDE = [6, 3.2]; // mm, length and width
-const FOOT = 18; // px of labels
+const NAMES = { top: 24, step: 13, rows: 4, gap: 4 }; // px, of the names of layers; thin ones are below each other
 const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" };
 
 // Returns whether the reach was drawn.
 export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, parts, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
-  tissue(pen, map, layers, width, height - FOOT);
-  grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
-  const reached = reach(pen, map, plane, store);
-  for (const part of parts) draw(pen, part, place, map);
-  if (guide !== null) drawGuide(pen, map, plane, guide, scene, shownRow(store));
   const row = shownRow(store);
-  if (isMeasured(row)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
-  drawTarget(pen, map, plane, target);
+  let reached = false;
+  drawTissue(pen, map, layers, width, height);
+  grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
+  inside(pen, width, height, () => {
+    reached = reach(pen, map, plane, store);
+    for (const part of parts) draw(pen, part, place, map);
+    if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
+    if (isMeasured(row)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
+    drawTarget(pen, map, plane, target);
+  });
   return reached;
 }
 
 // The scene alone, before an insertion.
 export function drawScene(pen, { width, height, map, plane, name, scene }) {
-  tissue(pen, map, layersIn(scene), width, height - FOOT);
+  drawTissue(pen, map, layersIn(scene), width, height);
   grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
-  if (scene.guide) drawGuide(pen, map, plane, scene.guide[0], scene, null);
-  drawTarget(pen, map, plane, scene.target);
+  inside(pen, width, height, () => {
+    if (scene.guide) drawGuide(pen, map, plane, scene.guide[0], scene, null);
+    drawTarget(pen, map, plane, scene.target);
+  });
 }
 
 const upward = (name, map) => [UP[name], stretchIn(map)].filter(Boolean).join(", ");
@@ -41,14 +46,34 @@ function drawTarget(pen, map, plane, [x, y, z]) {
   disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], radii, { tone: "--target", alpha: 0.85 });
 }
 
-function tissue(pen, map, layers, width, bottom) {
-  for (const { name, top, bottom: end, modulus } of layers) {
-    const [left, right] = [map.toX(top), end === null ? width : Math.min(map.toX(end), width)];
-    area(pen, [[left, 0], [right, 0], [right, bottom], [left, bottom]], "--tissue", 0.12 + 0.3 * shadeOf(modulus));
-    polyline(pen, [[left, 0], [left, bottom]], { tone: top === 0 ? "--skin" : "--tissue", width: top === 0 ? 2 : 1.25 });
-    if (right - left > 30) words(pen, name, [(left + right) / 2, 24], { tone: "--skin" });
+function drawTissue(pen, map, layers, width, height) {
+  const bottom = height - FOOT;
+  inside(pen, width, height, () => {
+    for (const { top, bottom: end, modulus } of layers) {
+      const [left, right] = edgesOf(map, top, end, width);
+      area(pen, [[left, 0], [right, 0], [right, bottom], [left, bottom]], "--tissue", 0.12 + 0.3 * shadeOf(modulus));
+      polyline(pen, [[left, 0], [left, bottom]], { tone: top === 0 ? "--skin" : "--tissue", width: top === 0 ? 2 : 1.25 });
+    }
+    drawNames(pen, map, layers, width);
+  });
+}
+
+// Names of the layers, each in the first row in which it does not run into the one before; what has no room has none.
+function drawNames(pen, map, layers, width) {
+  const { top: first, step, rows, gap } = NAMES;
+  const ends = Array(rows).fill(SIDE); // px, where the last name of each row ends
+  for (const { name, top, bottom } of layers) {
+    const [left, right] = edgesOf(map, top, bottom, width);
+    const half = widthOf(pen, name) / 2;
+    const at = Math.min((left + right) / 2, width - half - gap);
+    const row = ends.findIndex((end) => end + gap <= at - half);
+    if (left >= width || row < 0) continue;
+    ends[row] = at + half;
+    words(pen, name, [at, first + step * row], { tone: "--skin" });
   }
 }
+
+const edgesOf = (map, top, bottom, width) => [map.toX(top), bottom === null ? width : Math.min(map.toX(bottom), width)];
 
 function reach(pen, map, plane, store) {
   const news = shownOf(store) === "scene" ? store.get("reach") : null;

@@ -2,11 +2,12 @@
 
 import uPlot from "../vendor/uplot.js";
 import { make } from "../dom.js";
+import { isStale } from "../shown.js";
 import { color } from "../theme.js";
 
 const HEIGHT = 150; // px
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
-const CAPTION = "Cost over iterations: best so far; elite: the worst sample that the next iteration is fitted to; median of the samples";
+const CAPTION = "Cost over iterations: the best sample so far; elite, the highest cost among the samples that the next iteration is drawn from; the median of all samples";
 const positive = (value) => (value > 0 ? value : null); // the axis is logarithmic
 
 export class CostPlot {
@@ -14,6 +15,7 @@ export class CostPlot {
   #strategies;
   #place;
   #legend;
+  #caption = make("figcaption");
   #chart = null;
   #drawn = "";
 
@@ -21,7 +23,7 @@ export class CostPlot {
     [this.#store, this.#strategies] = [store, strategies];
     this.#place = make("div.plot", { role: "img", "aria-label": "Cost over iterations" });
     this.#legend = make("p.legend");
-    this.figure = make("figure", { hidden: true }, make("figcaption", {}, CAPTION), this.#place, this.#legend);
+    this.figure = make("figure", { hidden: true }, this.#caption, this.#place, this.#legend);
     parent.append(this.figure);
     new ResizeObserver(([{ contentRect }]) => this.#chart?.setSize({ width: contentRect.width, height: HEIGHT })).observe(this.#place);
   }
@@ -30,6 +32,8 @@ export class CostPlot {
     const lines = this.#strategies.flatMap((strategy) => linesOf(strategy, this.#store.get(`iteration ${strategy}`)));
     this.figure.hidden = !lines.length;
     if (!lines.length) return;
+    const stale = this.#strategies.some((strategy) => isStale(this.#store, this.#store.get(`iteration ${strategy}`)));
+    this.#caption.textContent = stale ? `${CAPTION} (for an earlier state of the scenario)` : CAPTION;
     const data = dataOf(lines);
     const drawn = `${this.#store.get("view theme")} ${lines.map(({ name }) => name)}`;
     if (drawn === this.#drawn) this.#chart.setData(data);

@@ -3,7 +3,7 @@
 import { boxOf } from "../box.js";
 import { make } from "../dom.js";
 import { drawScene } from "../flat/section.js";
-import { pointsOf, polyline } from "../flat/pen.js";
+import { inside, pointsOf, polyline } from "../flat/pen.js";
 import { lateral, mappingOf, planeOf, stretchIn } from "../flat/plane.js";
 import { Stage } from "../flat/stage.js";
 import { isStale } from "../shown.js";
@@ -52,12 +52,14 @@ export class SweepView {
     this.#caption.textContent = [this.#strategy, stretchIn(map)].filter(Boolean).join(", ");
     const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
     drawScene(pen, { width, height, map, plane, name: "target", scene });
-    for (const [order, step] of stepsOf(sweep.paths).entries()) {
-      const size = sweep.points * sweep.columns;
-      const path = { ...sweep, values: sweep.values.subarray(step * size, (step + 1) * size) };
-      const strength = (order + 1) / Math.min(NEEDLES, sweep.paths);
-      polyline(pen, pointsOf(path, place), { tone: `--${this.#strategy}`, width: 1.75, alpha: FAINT + (1 - FAINT) * strength });
-    }
+    inside(pen, width, height, () => {
+      for (const [order, step] of stepsOf(sweep.paths).entries()) {
+        const size = sweep.points * sweep.columns;
+        const path = { ...sweep, values: sweep.values.subarray(step * size, (step + 1) * size) };
+        const strength = (order + 1) / Math.min(NEEDLES, sweep.paths);
+        polyline(pen, pointsOf(path, place), { tone: `--${this.#strategy}`, width: 1.75, alpha: FAINT + (1 - FAINT) * strength });
+      }
+    });
   }
 }
 

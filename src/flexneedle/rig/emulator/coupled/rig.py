@@ -42,7 +42,7 @@ def split_fault(given: str) -> tuple[str, str]:
         raise InputError(
             f"--fault {given}: must be DEVICE:KIND[=DETAIL]@SECONDS[:DURATION], such as {example}"
         )
-    parse_fault(text, DEVICES[device])
+    parse_fault(text, DEVICES[device], f"{device}:")
     return device, text
 
 

@@ -171,7 +171,7 @@ def _refused(device: Device, line: str, code: int) -> tuple[Device, str]:
 
 
 _ONCE: dict[str, Callable[[Axis], Axis]] = {
-    "off": lambda axis: one.off(axis, one.ABORTED),
+    "off": one.off,
     "reset": lambda axis: one.defined(axis, 0.0),
 }
 """Faults of one instant."""

@@ -1,19 +1,9 @@
-"""The scene: where everything is before the insertion."""
+"""The scene: where everything is before the insertion. Of the scenario alone, without mechanics."""
 
 from itertools import pairwise
 
-from flexneedle.page.frames import Kind, Source, frame_of
 from flexneedle.page.messages import Scene
-from flexneedle.page.worker.task import Task
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.simulator import Simulator
-
-
-def scene(task: Task) -> None:
-    """Report the scene of a scenario, and its needle at the start."""
-    task.say(scene_of(task.scenario, task.work.revision))
-    nodes = Simulator(task.scenario, threads=1).start().nodes[:, :3]
-    task.show(frame_of(Kind.NEEDLE, Source.SCENE, 0, nodes))
 
 
 def scene_of(scenario: Scenario, revision: int) -> Scene:
