@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from signal import SIGKILL, Signals
-from time import monotonic
+from time import monotonic, sleep
 from typing import Protocol
 
 import psutil
@@ -22,11 +22,19 @@ _CLOCK = r"""
 #include <sys/time.h>
 #include <time.h>
 
-/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one as it is. */
+/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one as it is. Who has
+   read a shifted clock leaves a file of the same name and the ending .read. */
 static long shift(void) {
     long seconds = 0;
-    FILE *file = fopen(getenv("CLOCK_SHIFT"), "r");
+    const char *name = getenv("CLOCK_SHIFT");
+    FILE *file = fopen(name, "r");
     if (file) { if (fscanf(file, "%ld", &seconds) != 1) seconds = 0; fclose(file); }
+    if (seconds) {
+        char read[4096];
+        snprintf(read, sizeof read, "%s.read", name);
+        file = fopen(read, "w");
+        if (file) fclose(file);
+    }
     return seconds;
 }
 int clock_gettime(clockid_t id, struct timespec *now) {
@@ -51,6 +59,7 @@ time_t time(time_t *now) {
     return at.tv_sec;
 }
 """
+_READ_S, _PAUSE_S = 5.0, 0.01  # until the clock must have been read after a step
 _CHANNELS = {"insertion": "A", "rotation": "B", "guide_y": "C"}  # of the shipped rig file
 
 
@@ -186,7 +195,11 @@ class Clock:
         return Setting(folder / "run", {"LD_PRELOAD": str(library), "CLOCK_SHIFT": str(shift)})
 
     def inject(self, trial: Running) -> float:
-        """Step it."""
-        now = monotonic()
+        """Step it. Raises RuntimeError if none of the insertion's processes reads the clock after that."""
+        now, read = monotonic(), trial.folder / "shift.read"
         (trial.folder / "shift").write_text(f"{self.seconds}\n")
+        while not read.exists():
+            if monotonic() > now + _READ_S:
+                raise RuntimeError("nobody has read the clock that was stepped")
+            sleep(_PAUSE_S)
         return now

@@ -18,7 +18,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from random import Random
 from time import monotonic
@@ -215,17 +215,18 @@ def converse(connection: socket.socket, server: Server) -> None:
 
 
 def driver_inputs(random: Random) -> Iterator[str]:
-    """Call the driver with one damaged reply after another."""
-    longest = 0.0
-    with serving() as server:
-        settings = {"address": f"127.0.0.1:{server.port}", "reply_timeout_ms": TIMEOUT_MS}
-        settings["mode"] = random.choice(("tracking", "moves"))
-        with factory(settings, list(LETTERS)) as motors:
+    """Call the driver in both modes with one damaged reply after another."""
+    longest, rigs = 0.0, []
+    with ExitStack() as stack:
+        for mode in ("tracking", "moves"):
+            server = stack.enter_context(serving())
+            settings = {"address": f"127.0.0.1:{server.port}", "reply_timeout_ms": TIMEOUT_MS, "mode": mode}
+            motors = stack.enter_context(factory(settings, list(LETTERS)))
             server.device, _ = reply(server.device, "SH")
-            while True:
-                name = random.choice(CALLS)
-                longest = max(longest, called(motors, server, name, random))
-                yield f", longest call {1e3 * longest:.0f} ms of {TIMEOUT_MS:.0f}"
+            rigs.append((motors, server))
+        while True:
+            longest = max(longest, called(*random.choice(rigs), random.choice(CALLS), random))
+            yield f", longest call {1e3 * longest:.0f} ms of {TIMEOUT_MS:.0f}"
 
 
 def damages(random: Random) -> Callable[[bytes], bytes | None] | None:

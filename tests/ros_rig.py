@@ -143,8 +143,15 @@ class Started:
 
     def node(self):
         """The process of the insertion's node."""
+        return self._child("flexneedle.ros.node")
+
+    def supervisor(self):
+        """The process of the insertion's supervisor."""
+        return self._child("flexneedle.rig.supervisor.process")
+
+    def _child(self, module):
         children = psutil.Process(self.process.pid).children()
-        return next(child for child in children if "flexneedle.ros.node" in child.cmdline())
+        return next(child for child in children if module in child.cmdline())
 
     def end(self, seconds=60.0):
         """Wait for its end; return exit status, stdout and the lines of stderr."""

@@ -198,6 +198,18 @@ def test_a_client_that_has_sent_too_much_can_still_stop(tmp_path):
         assert client.newest["insertion live"]["state"] == "interrupted"
 
 
+def test_a_flood_of_stops_stops_and_ends(tmp_path):
+    limits = replace(QUICK, rate=0.001, burst=10.0, excess=20)
+    with served(tmp_path, limits=limits) as server, Client(server) as client, Client(server) as other:
+        client.steer().do("insert", paused=True)
+        client.job("insertion", "running")
+        with pytest.raises(ConnectionClosed) as closed:
+            flood(other, '{"type":"stop"}', 60)
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "too many messages")
+        client.job("insertion", "done")
+        assert client.newest["insertion live"]["state"] == "interrupted"
+
+
 @pytest.mark.parametrize(
     "text",
     ['{"type":"edit","values":{"name":"stop"}}', '{"type":"rows_from","index":0,"stop":"stop"}', '"stop"'],

@@ -11,9 +11,9 @@ from page_clients import Client, get, port_of, served
 HERE = Gate.of("127.0.0.1", 8000)
 
 
-def refusal(gate, *, socket=True, query="", **headers):
+def refusal(gate, *, socket=True, page=False, query="", **headers):
     raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
-    return gate.refusal(Headers(raw=raw), query, socket=socket)
+    return gate.refusal(Headers(raw=raw), query, socket=socket, page=page)
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,7 @@ def test_the_page_itself_may_connect(host):
             "10.0.0.1",
         ),
         *("", "[::2]", "localhost:8000:8000", "localhost/", "[", "127.0.0.1 ", "[::1"),
+        *("[abc]", "[1.2.3]", "[127.0.0.1]", "[::1]x"),
     ],
 )
 def test_another_host_is_refused(host):
@@ -41,6 +42,17 @@ def test_another_host_is_refused(host):
     assert status == 403
     assert reason.startswith("Host = ")
     assert reason.endswith("must be one of 127.0.0.1, ::1, localhost")
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "same-origin", "none"])
+def test_another_site_may_link_to_the_page_and_to_nothing_else(site):
+    asked = {"socket": False, "host": "127.0.0.1:8000", "sec_fetch_site": site}
+    assert refusal(HERE, page=True, **asked) is None
+    refused = refusal(HERE, **asked)
+    if site == "cross-site":
+        assert refused == (403, "Sec-Fetch-Site = cross-site: only the page itself may ask for this")
+    else:
+        assert refused is None
 
 
 @pytest.mark.parametrize(
@@ -125,6 +137,13 @@ def test_a_foreign_request_is_refused_with_a_reason(shared_server, headers):
     status, text, answered = get(shared_server, "/", **headers)
     assert (status, text.split(" = ")[0]) == (403, next(iter(headers)))
     assert "default-src 'none'" in answered["content-security-policy"]
+
+
+def test_another_site_may_link_to_the_page_but_not_to_its_files(shared_server):
+    assert get(shared_server, "/", Sec_Fetch_Site="cross-site")[0] == 200
+    status, text, _headers = get(shared_server, "/scenario.toml", Sec_Fetch_Site="cross-site")
+    assert (status, text.split(" = ")[0]) == (403, "Sec-Fetch-Site")
+    assert get(shared_server, "/scenario.toml", Sec_Fetch_Site="same-origin")[0] == 200
 
 
 @pytest.mark.parametrize(

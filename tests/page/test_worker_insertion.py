@@ -132,13 +132,13 @@ def test_an_insertion_is_listed_once_it_is_saved_as_a_whole(inserted, tmp_path, 
         while_saving.append((runs.listed(), list(tmp_path.glob("*/run.json"))))
 
     monkeypatch.setattr(saving, "save", watched)
-    (tmp_path / ".saved").mkdir()  # of a worker that was killed
+    (tmp_path / ".saved").mkdir()  # of somebody else
     inserted[0].save(task("save", folder=str(tmp_path / "saved")))
     ((listed, (written,)),) = while_saving
     assert listed == []
     assert not written.exists()  # it has moved
     assert [run["name"] for run in runs.listed()] == ["saved"]
-    assert [path.name for path in tmp_path.iterdir()] == ["saved"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".saved", "saved"]
 
 
 def test_a_saved_insertion_is_read_as_it_was(inserted, tmp_path):

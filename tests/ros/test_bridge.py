@@ -159,6 +159,20 @@ def test_a_node_that_is_killed_stops_a_rig_that_it_has_armed_and_no_other(tmp_pa
         assert f"flexneedle: {line}" in errors
 
 
+@pytest.mark.long
+def test_a_supervisor_that_is_killed_is_a_fault_on_the_topic_of_states(tmp_path):
+    with started(tmp_path, NEUTRAL, "--yes", ros={}) as insertion:
+        peer = insertion.peer(("state", "tip"))
+        insertion.until_state(peer, "inserting")
+        until(lambda: len(peer.received("tip")) > 1)
+        insertion.supervisor().kill()
+        insertion.until_state(peer, "fault")
+        status, _, _errors = insertion.end()
+        assert [one.data for one in peer.received("state")][-1] == "fault"
+    assert status == 1
+    assert "the supervisor has ended: it was killed" in insertion.stored["reason"]
+
+
 @pytest.mark.slow
 def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_run(tmp_path):
     one, other = tmp_path / "dry", tmp_path / "simulated"

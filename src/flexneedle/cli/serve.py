@@ -102,7 +102,7 @@ def _setup(args: argparse.Namespace) -> Setup:
     from flexneedle.page.server.session import Session
     from flexneedle.scenario.files import load_scenario
 
-    session = Session.of(args.scenario, load_scenario(args.scenario), CONTROLLERS[0]["name"])
+    session = Session.of(Path(args.scenario).name, load_scenario(args.scenario), CONTROLLERS[0]["name"])
     workers = (*_WORKER, "plans"), (*_WORKER, "insertion")
     rig = None if args.rig is None else _connected(args.rig)
     return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)

@@ -62,4 +62,4 @@ def in_memory(supervised: Rig, virtual: Rig) -> Rig:
     if not isinstance(virtual.driver, Phantom):
         raise InputError("a dry run needs a virtual phantom")
     ports = Imagined(supervised, virtual, virtual.driver)
-    return Rig(ports, ports, ports, ports.condition)
+    return Rig(ports, ports, ports, ports.condition, hold=supervised.hold)

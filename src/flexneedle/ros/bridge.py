@@ -62,7 +62,7 @@ class Bridge:
         self._stopped = self._lost = self._awaited = ""
         self._target: Point | None = None
         self._shift: float | None = None  # of the run's time 0 from this object's
-        self._state, self._published_at = ("idle", ""), -_STATE_S
+        self._state, self._published_at, self._good = ("idle", ""), -_STATE_S, True
         self._opened, epoch = monotonic(), time.time()
         self._node = open_node(profile, epoch=epoch)
         self._thread = Thread(target=self._listen, name="ROS", daemon=True)
@@ -155,8 +155,8 @@ class Bridge:
         self, state: str, reason: str, *, good: bool | None = None, values: dict[str, str] | None = None
     ) -> None:
         self._state, self._published_at = (state, reason), self._now()
-        is_good = state != "stopped" if good is None else good
-        self._node.publish(RigState(self._published_at, state, reason, is_good, values or {}))
+        self._good = state != "stopped" if good is None else good
+        self._node.publish(RigState(self._published_at, state, reason, self._good, values or {}))
 
     def _wait_for(self, key: str, what: str) -> None:
         self._note(f"waits for {what}")
@@ -183,8 +183,18 @@ class Bridge:
                 self._node.wait(POLL_S)
             for request in self._node.poll():
                 self._take(request)
-            if self._supervisor is None and self._now() - self._published_at >= _STATE_S:
-                self._announce(*self._state)
+            self._keep_stated()
+
+    def _keep_stated(self) -> None:
+        """Publish the state where no supervisor reports it: none is there yet, or it has ended."""
+        supervisor = self._supervisor
+        why = "" if supervisor is None else supervisor.ended
+        if why is None:
+            return
+        if why and self._state[0] not in (State.STOPPED, State.FAULT):
+            self._announce(State.FAULT, f"the supervisor has ended: {why}", good=False)
+        elif self._now() - self._published_at >= _STATE_S:
+            self._announce(*self._state, good=self._good)
 
     def _take(self, request: Request) -> None:
         match request:

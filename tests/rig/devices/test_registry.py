@@ -167,6 +167,29 @@ def does_not_open(settings, _about):
     return settings["nothing"]
 
 
+class Refusing(Motors):
+    """Motors of a user that call functions of this package, whose errors they do not know."""
+
+    def read(self):
+        raise RigError("a = 1: no such key", "b = 2: no such key")
+
+    def follow(self, _positions):
+        raise DriverError("no reply within 100 ms")
+
+
+def refusing(_settings, channels):
+    return Refusing(channels)
+
+
+def test_any_other_error_of_the_package_in_a_call_is_one_of_the_driver():
+    motors = open_motors(rig(driver={"kind": "parts:refusing"}))
+    line = "^driver parts:refusing: read: a = 1: no such key; b = 2: no such key$"
+    with pytest.raises(DriverError, match=line):
+        motors.read()
+    with pytest.raises(DriverError, match=r"^no reply within 100 ms$"):
+        motors.follow({})
+
+
 def test_any_error_in_a_device_of_your_own_names_it_the_call_and_the_line():
     motors = open_motors(rig(driver={"kind": "parts:faulty"}))
     with pytest.raises(

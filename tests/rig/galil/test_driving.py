@@ -147,7 +147,7 @@ def test_a_motor_that_is_switched_off_is_reported():
         motors.follow({"A": 1e6, "B": 500.0})
         until(lambda: not motors.read()["A"].on)
         state = motors.read()["A"]
-        assert "AB" in state.stopped
+        assert state.stopped == ""  # nobody has said why
         assert not state.moving
         with pytest.raises(DriverError, match="PT 1 refused: 20 Begin not valid with motor off"):
             motors.follow({"A": 0.0})

@@ -144,6 +144,30 @@ def test_a_stop_without_effect_is_a_fault_and_is_reported(bench):
     assert bench.core.why == "the motors do not stop"
 
 
+@pytest.mark.parametrize("every", [1, 2, 7])  # ticks: a ROS node repeats it until it is reported
+def test_motors_that_do_not_stop_are_a_fault_also_if_the_stop_is_repeated(bench, every):
+    bench.core.request(step(expected=AHEAD, duration=2.0))
+    bench.tick(3)
+    bench.stage.deaf = True
+    bench.stage.motors["A"].target = 90_000.0
+    for _ in range(60 // every):
+        bench.core.request(say.Stop("the test"))
+        bench.tick(every)
+    assert (bench.core.state, bench.core.why) == (State.FAULT, "the motors do not stop")
+
+
+def test_a_later_stop_has_its_own_time(bench):
+    bench.core.request(say.Stop("one"))
+    bench.tick(100)
+    bench.core.request(say.Reset())
+    bench.armed()
+    bench.core.request(step(expected=AHEAD, duration=2.0))
+    bench.tick(3)
+    bench.core.request(say.Stop("two"))
+    bench.tick(20)
+    assert (bench.core.state, bench.core.why) == (State.STOPPED, "two")
+
+
 def test_a_position_that_is_no_number_is_a_fault(bench):
     bench.stage.motors["C"].position = math.nan
     bench.tick()

@@ -4,10 +4,11 @@ import math
 
 import pytest
 
+from flexneedle.errors import DriverError
 from flexneedle.rig.moves import homings
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
-from stages import TICK_S, Bench, rig_file
+from stages import TICK_S, Bench, Stage, rig_file
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -105,3 +106,23 @@ def test_a_stall_while_homing_is_a_fault():
     assert done.state is State.FAULT
     assert done.why.startswith("the motors have not arrived: guide_y 32.8")
     assert bench.clock.now() - begun < 0.4
+
+
+@pytest.mark.parametrize("refused", ["set_speed", "follow"])
+@pytest.mark.parametrize("leg", [0, 1])
+def test_what_is_refused_in_a_search_is_a_fault(monkeypatch, refused, leg):
+    """At its beginning, before a target was sent, and when it backs off from the switch."""
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0})).armed()
+    motor = bench.stage.motors["C"]
+    motor.low = -1000.0
+
+    def called(*call):
+        Stage._called(bench.stage, *call)
+        if call[0] == refused and (leg == 0 or ("define", "C", -7500.0) in bench.stage.calls):
+            raise DriverError("SPC=100: ? 6 Number out of range")
+
+    monkeypatch.setattr(bench.stage, "_called", called)
+    bench.core.request(say.Home(1, "guide_y"))
+    done = bench.until(1)
+    assert (done.state, done.why) == (State.FAULT, "SPC=100: ? 6 Number out of range")
+    assert ("stop",) in bench.stage.calls

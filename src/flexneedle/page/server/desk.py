@@ -326,6 +326,7 @@ class Desk:
     def _alone(self) -> None:
         self._idle = True
         self._plans.cancel(*_WORK)
+        self._insertions.cancel("check")
         self.live.alone()
 
     def _start_timer(self, name: str, seconds: float, then: Callable[[], None]) -> None:

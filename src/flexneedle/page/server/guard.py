@@ -65,8 +65,13 @@ class Gate:
         names = frozenset((*_LOOPBACK, host.lower(), here, f"{here}.local"))
         return cls(names, literal=True, token=secrets.token_urlsafe(24), cookie=f"flexneedle-{port}")
 
-    def refusal(self, headers: Headers, query: str, *, socket: bool) -> tuple[int, str] | None:
-        """Status and reason of a request that is refused, None for one that may pass."""
+    def refusal(
+        self, headers: Headers, query: str, *, socket: bool, page: bool = False
+    ) -> tuple[int, str] | None:
+        """Status and reason of a request that is refused, None for one that may pass.
+
+        page: whether it is for the page itself, to which any site may have a link.
+        """
         host = headers.get("host", "")
         if len(headers.getlist("host")) != 1 or not self._calls(host):
             choices = ", ".join(sorted(self.names)) + (" or an address" if self.literal else "")
@@ -76,6 +81,8 @@ class Gate:
             return 403, "Origin is missing: only the page itself may connect"
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return 403, f"Origin = {shown(origin)}: must be http://{host}, only the page itself may connect"
+        if not page and headers.get("sec-fetch-site") == "cross-site":
+            return 403, "Sec-Fetch-Site = cross-site: only the page itself may ask for this"
         if self.token and not any(self._fits(given) for given in self._given(headers, query)):
             return 401, "the token is missing or wrong: open the address that flexneedle serve has printed"
         return None
@@ -83,7 +90,10 @@ class Gate:
     def _calls(self, host: str) -> bool:
         if not _HOST.fullmatch(host):
             return False
-        name = urlsplit(f"//{host}").hostname or ""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:  # brackets around what is no address
+            return False
         return name in self.names or (self.literal and _is_address(name))
 
     def _given(self, headers: Headers, query: str) -> Iterable[str]:
@@ -111,7 +121,8 @@ class Guard:
             await self._app(scope, receive, send)
             return
         query, is_socket = scope["query_string"].decode("latin-1"), scope["type"] == "websocket"
-        refused = self._gate.refusal(Headers(scope=scope), query, socket=is_socket)
+        page = scope["path"] == "/"
+        refused = self._gate.refusal(Headers(scope=scope), query, socket=is_socket, page=page)
         if refused is None and not is_socket and self._gate.token and "token" in parse_qs(query):
             answer: Response | None = self._signed_in(scope["path"])
         else:

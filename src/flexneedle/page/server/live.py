@@ -75,7 +75,9 @@ async def _read(socket: WebSocket, desk: Desk, client: int, outbox: Outbox) -> N
         received = await _received(socket)
         text = received.get("text")
         size = len(text or received.get("bytes") or "")
-        if not rate.allows(size, clock()) and not _is_stop(text):
+        if not rate.allows(size, clock()):
+            if _is_stop(text):
+                _answer(desk, client, outbox, text)
             if rate.exhausted:
                 raise _Closing(_AGAINST_RULES, "too many messages")
             outbox.notice(Refused(what="message", reason="too many messages: wait a moment"))

@@ -19,6 +19,9 @@ from flexneedle.scenario.plausible import doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import printable
 
+_MOST_DOTS, _MOST_KEYS = 300, 1_000
+"""Of a line of a file, and of a file, far more than any scenario has: a dotted key takes time with the square of its
+parts, and each unknown key a search for what was meant, while the server does nothing else."""
 _MOST_PROBLEMS = 3
 """In words; a file of another program has one with each of its keys."""
 _LINE = re.compile(r"(?P<key>[^\s=:]+)(?: = .*?)?: (?P<rule>.*)")
@@ -57,6 +60,7 @@ class Session:
 
     def with_file(self, name: str, text: str) -> "Session":
         """The session with the scenario of a file's text (TOML). Raises Refusal with the problems by key."""
+        _check_size(name, text)
         try:
             values = tomllib.loads(text)
         except RecursionError:
@@ -91,6 +95,16 @@ class Session:
         return replace(
             self, name=name, origin=scenario, scenario=scenario, notes=notes, revision=self.revision + 1
         )
+
+
+def _check_size(name: str, text: str) -> None:
+    """Raise Refusal for a file that would take long to be read and is no scenario."""
+    lines = [line for line in text.split("\n") if not line.lstrip().startswith("#")]
+    dots = max(line.count(".") for line in lines) if lines else 0
+    keys = sum(line.count("=") + line.lstrip().startswith("[") for line in lines)
+    for count, most, what in ((dots, _MOST_DOTS, "dots in a line"), (keys, _MOST_KEYS, "keys and tables")):
+        if count > most:
+            raise Refusal(f"{name}: {count} {what}: no scenario has more than {most}")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import { button, make } from "./dom.js";
 import { followLink, linkOf } from "./files/link.js";
+import { safe } from "./files/names.js";
 import { saveGif, savePng } from "./files/pictures.js";
 import { showRuns } from "./files/runs.js";
 import { maySteer } from "./shown.js";
@@ -69,7 +70,6 @@ async function send(file, link, status) {
 }
 
 // A name that the server takes.
-const safe = (name) => name.replace(/[^A-Za-z0-9 ._-]/g, "_").replace(/^[^A-Za-z0-9]+/, "").slice(0, 80) || "scenario";
 
 function acceptDrops(element, link, status) {
   element.addEventListener("dragover", (event) => event.preventDefault());

@@ -7,6 +7,7 @@ import { followTheme } from "./theme.js";
 
 const SCENE = ["status", "section", "axial", "space"];
 const OTHERS = ["form", "insertion", "player", "plans", "plots", "files", "tour"];
+const PATIENCE = 2000; // ms
 const FRAMES = 3; // until what is mounted is on the screen
 
 const store = new Store();
@@ -26,6 +27,7 @@ async function load(name) {
   }
 }
 
-await Promise.all(SCENE.map(load));
+const late = new Promise((resolve) => setTimeout(resolve, PATIENCE)); // such as three.js on a slow line
+await Promise.race([Promise.all(SCENE.map(load)), late]);
 for (let frame = 0; frame < FRAMES; frame++) await new Promise(requestAnimationFrame);
 for (const name of OTHERS) load(name);

@@ -17,7 +17,7 @@ const STAY = ["samples", "channel"];
 const RECORDED = ["first", "second"];
 const INSERTIONS = ["live", ...RECORDED];
 const OWN = /^(view |connection|refusals$|draft$)/;
-const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (path|samples|reach|sweep) scene)$/;
+const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (needle|path|samples|reach|sweep) scene)$/;
 
 // Key of a message of the server.
 export function keyOf(message) {

@@ -7,7 +7,7 @@ from pathlib import Path
 from traceback import extract_tb
 from typing import Any
 
-from flexneedle.errors import DriverError, FlexneedleError
+from flexneedle.errors import DriverError, FlexneedleError, one_line
 from flexneedle.rig.devices.answers import Answers, Rule, text
 from flexneedle.scenario.own import a_kind_of
 from flexneedle.scenario.problems import printable, unexpected
@@ -29,7 +29,7 @@ def errors_named(name: str) -> Iterator[None]:
 
 
 class Guarded:
-    """A device, of which all calls and attributes raise errors of this package only, and return what they should.
+    """A device, all calls of which raise DriverError only, and return what they should.
 
     name: of the device; owner: its class; answers: what it has to return. Raises DriverError for anything else.
     """
@@ -52,8 +52,13 @@ class Guarded:
         return value
 
     def _call(self, part: str, call: Any, *given: Any, **named: Any) -> Any:
-        with errors_named(f"{self._name}: {part}"):
-            value = call(*given, **named)
+        try:
+            with errors_named(f"{self._name}: {part}"):
+                value = call(*given, **named)
+        except DriverError:
+            raise
+        except FlexneedleError as error:  # such as that of a function of this package which the device calls
+            raise DriverError(printable(f"{self._name}: {part}: {one_line(error)}")) from error
         rule = self._answers.methods.get(part)
         return value if rule is None else self._checked(f"{part}()", rule, value)
 

@@ -107,6 +107,12 @@ class Supervisor:
         return self._process.pid
 
     @property
+    def ended(self) -> str | None:
+        """Why the supervisor has ended, "" at a request; None while it works."""
+        with self._changed:
+            return self._ended
+
+    @property
     def report(self) -> say.Report:
         """What the last tick found."""
         with self._changed:

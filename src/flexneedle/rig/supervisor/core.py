@@ -265,7 +265,8 @@ class Supervisor:
             self._motion.why = self._motion.why or why
         now = self._clock.now()
         self._tip.stop(now)
-        self._stop_motors(Stopping.at(now), now)
+        # A stop that is repeated does not begin anew: motors that do not stop would never be found.
+        self._stop_motors(Stopping.at(now) if self._stopping is None else self._stopping.due_at(now), now)
 
     def _stop_motors(self, stopping: Stopping, now: float) -> None:
         """Stop motors, again while they move or cannot be reached; once they rest, end the motion under way."""

@@ -45,7 +45,8 @@ class Inspection:
         if leg is None or channel not in leg.drives:
             return rest_problem(drive, state, self.goals[channel])
         problem = reversal_problem(drive, state, last, leg.way(channel))
-        return problem or target_problem(drive, state, leg.trajectory.start[channel], leg.sent[channel])
+        start = leg.trajectory.start[channel]  # where it still is, if its first target was refused
+        return problem or target_problem(drive, state, start, leg.sent.get(channel, start))
 
     def _is_stopped_at_home(self, drive: Drive) -> bool:
         """Whether the axis has reached the limit switch that is its home, where the motor controller stops it."""

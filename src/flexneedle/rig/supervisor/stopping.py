@@ -22,6 +22,10 @@ class Stopping:
         """The stop with motors that are stopped now."""
         return replace(self, due=now + _AGAIN_S)
 
+    def due_at(self, now: float) -> "Stopping":
+        """The stop with motors that are to be stopped now, again."""
+        return replace(self, due=now)
+
     def has_failed(self, now: float, slowing: float) -> bool:
         """Whether motors should rest by now; slowing: longest time (s) in which one slows down."""
         return now - self.since > _RESTING_S + slowing

@@ -1,6 +1,7 @@
 // A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
 
 import { maySteer } from "../shown.js";
+import { safe } from "./names.js";
 
 const MARK = "#state=";
 
@@ -45,7 +46,7 @@ export function followLink(store, link, status) {
 }
 
 async function begin(link, { name, text, seed, strategy, controller }) {
-  const loaded = await link.ask({ type: "load", name: name.replace(/[^A-Za-z0-9 ._-]/g, "-"), text });
+  const loaded = await link.ask({ type: "load", name: safe(name), text });
   if (loaded.done) await link.ask({ type: "options", seed, strategy, controller });
 }
 
