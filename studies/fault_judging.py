@@ -67,7 +67,7 @@ class Evidence:
             "during": self._during(),
             "rests": rests(self.truth),
             "left": self.left,
-            "errors": self.errors[-300:],
+            "errors": self.errors[-4000:],
         }
 
     def _span(self, detection: State | None, resumed: float) -> tuple[float, float] | None:

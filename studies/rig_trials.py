@@ -25,7 +25,7 @@ from flexneedle.rig.devices.priority import set_realtime_priority
 from flexneedle.rig.emulator.coupled.truth import Truth, read_truth
 from flexneedle.types import Insertion
 
-START_S, END_S = 300.0, 60.0
+START_S, END_S, _ABORT_S = 300.0, 60.0, 5.0
 _STALL_S = 0.005
 _POLL_S = 0.2
 _BAD_INPUT = 2  # exit status
@@ -139,17 +139,24 @@ def insertion(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
-        env=os.environ | dict(environment),
+        env=os.environ | {"PYTHONFAULTHANDLER": "1"} | dict(environment),
         cwd=cwd,
     )
 
 
 def ended(process: subprocess.Popen[bytes], seconds: float = END_S) -> tuple[int, str, str]:
-    """Wait for the end of an insertion; return its exit status and what it has printed on stdout and stderr."""
+    """Wait for the end of an insertion; return its exit status and what it has printed on stdout and stderr.
+
+    One that hangs is killed; stderr has where each of its threads was.
+    """
     try:
         out, errors = process.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
+        process.send_signal(signal.SIGABRT)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_ABORT_S)
+        with suppress(ProcessLookupError):  # all of its group have ended with it
+            os.killpg(process.pid, signal.SIGKILL)
         out, errors = process.communicate()
     return process.returncode, out.decode(), errors.decode()
 

@@ -1,14 +1,13 @@
-"""A file is complete at any time, and Ctrl-C is delayed until a record is complete."""
+"""A file is complete at any time."""
 
 import os
-import signal
 
 import pytest
 
 import flexneedle
 from flexneedle.errors import RecordError
 from flexneedle.figures.style import new_figure, save
-from flexneedle.files import replace_file, uninterrupted
+from flexneedle.files import replace_file
 
 
 def write_bytes(folder):
@@ -40,23 +39,3 @@ def test_a_file_is_the_old_one_until_the_new_one_is_complete(tmp_path, monkeypat
     assert {path.read_bytes() for path in written} == {b"old"}
     write(tmp_path)
     assert {path: path.stat().st_size for path in tmp_path.iterdir()} == written
-
-
-def test_an_interrupt_is_raised_after_the_block():
-    done = []
-
-    def interrupted_block():
-        with uninterrupted():
-            signal.raise_signal(signal.SIGINT)
-            done.append("block")
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted_block()
-    assert done == ["block"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_without_an_interrupt_nothing_happens():
-    with uninterrupted():
-        pass
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

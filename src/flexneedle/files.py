@@ -2,36 +2,15 @@
 
 import os
 import re
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from threading import current_thread, main_thread
-from types import FrameType
 
 from flexneedle.errors import InputError, RecordError
+from flexneedle.interrupts import uninterrupted
 
 RUNS = Path("runs")
 _LONGEST_NAME = 60
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay SIGINT until the end of the block, then handle it as before."""
-    before = signal.getsignal(signal.SIGINT)
-    if current_thread() is not main_thread() or not callable(before):
-        yield  # no KeyboardInterrupt can arise here
-        return
-    pending: list[FrameType | None] = []
-    signal.signal(signal.SIGINT, lambda _number, frame: pending.append(frame))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if pending:
-            before(signal.SIGINT, pending[0])
 
 
 def replace_file(path: Path, data: bytes) -> None:

@@ -3,6 +3,7 @@
 import json
 import signal
 from contextlib import ExitStack
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -11,8 +12,9 @@ import tomli_w
 import fake_engine
 from bench_rig import values
 from commands import run
-from flexneedle.cli.insert import _Signals
+from flexneedle.cli.insert import _interrupted_by_signals
 from flexneedle.errors import RunError
+from flexneedle.interrupts import SIGNALS
 from flexneedle.rig import insert as insertion
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -31,7 +33,8 @@ def events(monkeypatch, in_tmp, engine, ends):
 
     def inserted(*given, watchers, **options):
         found.append("opened")
-        watchers.opened(SimpleNamespace(positions=POSITIONS, rig=options["rig"]))
+        taken = partial(found.append, "signals taken")
+        watchers.opened(SimpleNamespace(positions=POSITIONS, rig=options["rig"], take_signals=taken))
         found.append("inserted")
         return fake_engine.insert(*given, **(options | ends))
 
@@ -39,18 +42,14 @@ def events(monkeypatch, in_tmp, engine, ends):
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_to_the_command_alone_reaches_the_supervisor_before_anything_else(number):
-    found, numbers = [], (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(each) for each in numbers]
-    signals = _Signals()
-    signals.supervisor = SimpleNamespace(signal=found.append)
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_to_the_command_interrupts_it(number):
+    before = [signal.getsignal(each) for each in SIGNALS]
     with ExitStack() as stack:
-        signals.handle(stack)
+        _interrupted_by_signals(stack)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
-    assert found == [number]
-    assert [signal.getsignal(each) for each in numbers] == before
+    assert [signal.getsignal(each) for each in SIGNALS] == before
 
 
 @pytest.fixture
@@ -70,7 +69,7 @@ def types(monkeypatch, answer, found):
 def test_the_axes_of_the_open_rig_are_shown_before_the_question(capsys, monkeypatch, events):
     types(monkeypatch, "y\n", events)
     status, out, err = run(capsys, *INSERT)
-    assert events == ["opened", "asked", "inserted"]
+    assert events == ["opened", "signals taken", "asked", "inserted"]
     assert err.index("Planning") < err.index("insertion: at 30 mm, moves at most at 10 mm/s")
     assert "guide_y: at -1.5 mm, moves at most at 5 mm/s" in err
     assert err.index("guide_y: at") < err.index("Insert? [y/N]")
@@ -82,7 +81,7 @@ def test_the_axes_of_the_open_rig_are_shown_before_the_question(capsys, monkeypa
 def test_an_insertion_that_is_not_confirmed_moves_nothing(capsys, monkeypatch, events, in_tmp, answer):
     types(monkeypatch, answer, events)
     status, _, err = run(capsys, *INSERT)
-    assert events == ["opened", "asked"]
+    assert events == ["opened", "signals taken", "asked"]
     assert status == 1
     assert err.endswith("flexneedle: not confirmed: nothing was moved\n")
     stored = json.loads((in_tmp / "run/run.json").read_text())
@@ -99,7 +98,7 @@ def test_without_a_terminal_it_is_refused_before_planning(capsys, monkeypatch, e
 
 def test_with_yes_the_axes_are_shown_and_nothing_is_asked(capsys, events):
     status, _, err = run(capsys, *INSERT, "--yes")
-    assert (status, events) == (0, ["opened", "inserted"])
+    assert (status, events) == (0, ["opened", "signals taken", "inserted"])
     assert "rotation: at 0 deg, moves at most at 360 deg/s" in err
     assert "[y/N]" not in err
 
@@ -134,7 +133,7 @@ def test_an_error_after_the_first_motion_leaves_the_needle_in(capsys, events, en
 def test_a_dry_run_moves_nothing_and_asks_nothing(capsys, monkeypatch, events):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
     status, _, err = run(capsys, *INSERT, "--dry-run")
-    assert (status, events) == (0, ["opened", "inserted"])
+    assert (status, events) == (0, ["opened", "signals taken", "inserted"])
     assert "[y/N]" not in err
 
 

@@ -113,6 +113,15 @@ def test_until_the_worker_is_ready_its_first_job_says_so(tmp_path):
         assert client.newest["job needle"]["text"] == needle["text"]
 
 
+def test_the_scene_is_shown_before_a_worker_is_ready_and_follows_edits(tmp_path):
+    with served(tmp_path, workers=(broken("input()"), STUB)) as server, Client(server) as client:
+        depth = client.newest["session"]["values"]["target.depth_mm"]
+        assert client.wait(lambda: client.newest.get("scene"))["target"][0] == depth != 31.0
+        client.steer().do("edit", values={"target.depth_mm": 31.0})
+        client.wait(lambda: client.newest["scene"]["target"][0] == 31.0)
+        assert client.newest["job needle"]["state"] == "waiting"
+
+
 def test_what_waits_for_another_job_does_not_say_that_its_worker_starts(planned):
     start(planned, WORKS_ON)
     planned.do("start", work="reach")

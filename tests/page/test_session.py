@@ -1,6 +1,6 @@
 """The session: edits, presets, files, options."""
 
-import time
+import tomllib
 
 import pytest
 
@@ -132,30 +132,16 @@ def test_a_file_of_another_program_is_refused_in_a_few_words(session):
     ("text", "reason"),
     [
         (".".join(["a"] * 90_000) + " = 1", "89999 dots in a line"),
-        (
-            '"\u2028".' * 20_000 + "a = 1",
-            "20000 dots in a line",
-        ),  # which str.splitlines takes for an end of line
+        ('"\u2028".' * 20_000 + "a = 1", "20000 dots in a line"),  # for str.splitlines an end of line
         ("\n".join(f"k{number}=1" for number in range(30_000)), "30000 keys and tables"),
         ("\n".join(f"[t{number}]" for number in range(20_000)), "20000 keys and tables"),
         ("a = {" + ", ".join(f"k{number}=1" for number in range(20_000)) + "}", "20001 keys and tables"),
     ],
 )
-def test_a_file_that_would_take_long_to_read_is_refused_before(session, text, reason):
-    began = time.process_time()
+def test_a_file_that_would_take_long_to_read_is_refused_before(session, monkeypatch, text, reason):
+    monkeypatch.delattr(tomllib, "loads")  # read, they take minutes and much memory
     with pytest.raises(Refusal, match=f"^mine: {reason}: no scenario has more than "):
         session.with_file("mine", text)
-    assert time.process_time() - began < 1.0  # read, they take minutes and much memory
-
-
-def test_the_largest_file_that_is_read_takes_little_time(session):
-    lines = [f"k{number}=1" for number in range(700)] + [
-        ".".join(f"p{n}_{k}" for k in range(300)) + " = 1" for n in range(60)
-    ]
-    began = time.process_time()
-    with pytest.raises(Refusal, match="unknown key"):
-        session.with_file("mine", "name = 'x'\n" + "\n".join(lines))
-    assert time.process_time() - began < 1.0
 
 
 def test_options_that_are_not_set_stay(session):

@@ -29,10 +29,9 @@ from flexneedle.console.common import (
 )
 from flexneedle.console.values import seed
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
+from flexneedle.interrupts import SIGNALS
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     from flexneedle.console.progress import Progress
     from flexneedle.rig.supervisor.client import Supervisor
     from flexneedle.ros.bridge import Bridge
@@ -129,10 +128,9 @@ def _insert(args: argparse.Namespace) -> int:
     if args.list:
         return _list()
     choices = _choices(args)
-    signals = _Signals()
     with ExitStack() as stack:
         if choices.rig is not None:
-            signals.handle(stack)
+            _interrupted_by_signals(stack)
         with _refusal_printed(args, choices):
             scenario = _scenario(args, choices)
         with _refusal_printed(args, choices, scenario):
@@ -146,7 +144,7 @@ def _insert(args: argparse.Namespace) -> int:
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
-                insertion = _execute(args, folder, scenario, choices, bridge, signals)
+                insertion = _execute(args, folder, scenario, choices, bridge)
             status = report(scenario, insertion, args.json, folder.path)
             if choices.moves and insertion.periods and insertion.outcome is not Outcome.DONE:
                 print_still_in(args.rig)
@@ -200,7 +198,6 @@ def _execute(
     scenario: Scenario,
     choices: Choices,
     bridge: Bridge | None,
-    signals: _Signals,
 ) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.rig.supervised import Watchers
@@ -214,7 +211,7 @@ def _execute(
         question = "Insert?" if _asks(args, choices) else ""
 
         def confirm(supervisor: Supervisor) -> None:
-            signals.supervisor = supervisor
+            supervisor.take_signals()
             if choices.moves:
                 _confirm(progress, scenario, supervisor, question)
 
@@ -300,22 +297,10 @@ def _asks(args: argparse.Namespace, choices: Choices) -> bool:
     return choices.moves and not (args.yes or (ros is not None and ros.arm))
 
 
-class _Signals:
-    """Signals that end an insertion on a rig, SIGINT, SIGTERM and SIGHUP: its supervisor gets them, too, since it stops
-    the motors whatever this process does; here the record is completed."""
-
-    def __init__(self) -> None:
-        self.supervisor: Supervisor | None = None
-
-    def handle(self, stack: ExitStack) -> None:
-        """Take the signals of this process until the stack closes."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            stack.callback(signal.signal, number, signal.signal(number, self._received))
-
-    def _received(self, number: int, frame: FrameType | None) -> None:
-        if self.supervisor is not None:
-            self.supervisor.signal(number)
-        signal.default_int_handler(number, frame)
+def _interrupted_by_signals(stack: ExitStack) -> None:
+    """Have SIGTERM and SIGHUP act as Ctrl-C until the stack closes: an insertion on a rig completes its record."""
+    for number in SIGNALS:
+        stack.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
 
 
 def _confirm(progress: Progress, scenario: Scenario, supervisor: Supervisor, question: str) -> None:

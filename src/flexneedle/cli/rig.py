@@ -360,7 +360,7 @@ def _arm(operator: Operator) -> None:
 @contextmanager
 def _stopped_on_error(operator: Operator) -> Iterator[None]:
     """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
-    from flexneedle.files import uninterrupted
+    from flexneedle.interrupts import uninterrupted
 
     try:
         yield

@@ -10,6 +10,7 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import RigError, RunError, StoppedError
+from flexneedle.interrupts import uninterrupted
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Report
@@ -76,7 +77,8 @@ class Bridge:
 
     def close(self) -> None:
         """End the node, after the last state."""
-        self._ended.set()
+        with uninterrupted():  # which would leave the lock of the event locked, for which the thread waits
+            self._ended.set()
         self._thread.join()
         if self._supervisor is None:
             self._announce("stopped" if self._stopped else "idle", self._stopped)
@@ -108,7 +110,7 @@ class Bridge:
         """Wait for a target x, y, z (mm) on its topic. Raises StoppedError after a stop, RunError without the node."""
         self._wait_for("target", f"a target on {self._topics['target']}")
         while self._target is None:
-            self._ended.wait(_CHECK_S)
+            time.sleep(_CHECK_S)
             self.check()
             if self._lost:
                 raise RunError(f"no target: {self._lost}")
@@ -124,7 +126,7 @@ class Bridge:
         An arm that came before does not count. Raises StoppedError after a stop.
         """
         self._shift = self._now() - supervisor.now()
-        with self._lock:
+        with uninterrupted(), self._lock:
             self._supervisor, stopped = supervisor, self._stopped
         if stopped:
             supervisor.request_stop(stopped)

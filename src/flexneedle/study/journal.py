@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from flexneedle.errors import InputError
-from flexneedle.files import uninterrupted
+from flexneedle.interrupts import uninterrupted
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.study.rows import TIMES
 from flexneedle.trace.results import RESULT_COLUMNS

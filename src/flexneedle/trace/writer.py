@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Self
 from mcap.writer import CompressionType, Writer
 
 from flexneedle.errors import RecordError
-from flexneedle.files import uninterrupted
+from flexneedle.interrupts import uninterrupted
 from flexneedle.trace.messages import STORE
 from flexneedle.trace.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
 from flexneedle.types import Period, Plan

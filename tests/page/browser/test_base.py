@@ -188,6 +188,20 @@ def test_a_lost_connection_recovers_the_state(visit, server):
     ]
 
 
+def test_of_another_scenario_no_plan_and_no_needle_is_kept(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody is in control")
+    kept = "['shape needle scene', 'plan steering', 'scene'].map((key) => Boolean(flexneedle.store.get(key)))"
+    server.send(*planned())
+    until(page, "flexneedle.store.get('shape needle scene') && flexneedle.store.get('plan steering')")
+    server.send(session(revision=9))
+    until(page, "flexneedle.store.get('session').revision === 9")
+    assert page.evaluate(kept) == [True, True, True]
+    server.send(session(revision=10, name="another"))
+    until(page, "flexneedle.store.get('session').revision === 10")
+    assert page.evaluate(kept) == [False, False, True]
+
+
 def test_the_reason_of_a_lost_connection_is_shown(visit, server):
     page = visit()
     page.wait_for_selector("text=nobody is in control")

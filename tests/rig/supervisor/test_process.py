@@ -6,15 +6,17 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
+from threading import Condition, Thread, current_thread, main_thread
 from time import monotonic
 
 import pytest
 
 from emulated import until
 from flexneedle.errors import DriverError, RefusedError, RigError, RunError, StoppedError
+from flexneedle.interrupts import SIGNALS
 from flexneedle.rig.supervised import Watchers
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.client import Supervisor
@@ -124,6 +126,52 @@ def test_a_signal_stops_the_motors(supervisor):
     os.kill(supervisor.pid, signal.SIGTERM)
     with pytest.raises(StoppedError, match="stopped: signal SIGTERM"):
         supervisor.wait(5.0)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_to_the_client_stops_the_motors_before_the_client_has_handled_it(number):
+    before = signal.set_wakeup_fd(-1)
+    with ExitStack() as stack:
+        supervisor = stack.enter_context(Supervisor(task()))
+        stack.callback(signal.signal, number, signal.signal(number, lambda *_: None))
+        supervisor.take_signals()
+        supervisor.arm()
+        os.kill(os.getpid(), number)
+        with pytest.raises(StoppedError, match=f"^stopped: signal {number.name}$"):
+            supervisor.wait(5.0)
+    assert signal.set_wakeup_fd(before) == -1
+
+
+def test_another_signal_to_the_client_stops_nothing(supervisor):
+    supervisor.take_signals()
+    supervisor.arm()
+    before = signal.signal(signal.SIGUSR1, lambda *_: None)
+    os.kill(os.getpid(), signal.SIGUSR1)
+    supervisor.wait(0.1)
+    signal.signal(signal.SIGUSR1, before)
+    assert supervisor.report.state is State.ARMED
+
+
+def test_an_interrupt_that_falls_on_the_taking_of_a_lock_leaves_it_unlocked(supervisor, monkeypatch):
+    """It could not be closed, since the thread that receives would wait for the lock."""
+    original, counts = Condition.__enter__, iter(range(100))
+
+    def entered(self):
+        found = original(self)
+        if current_thread() is main_thread() and next(counts) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return found
+
+    supervisor.arm()
+    monkeypatch.setattr(Condition, "__enter__", entered)
+    with pytest.raises(KeyboardInterrupt):
+        supervisor.wait(60.0)
+    monkeypatch.undo()
+    found = []
+    thread = Thread(target=lambda: found.append(supervisor.report))
+    thread.start()
+    thread.join(5.0)
+    assert found
 
 
 def test_a_stop_from_another_thread_ends_a_motion(supervisor):
@@ -250,7 +298,7 @@ def ended(pid):
 
 ENDING = """
 import sys
-from threading import Thread
+from threading import Condition, Thread, current_thread, main_thread
 sys.path.insert(0, {tests!r})
 from rig.supervisor.test_process import task
 from flexneedle.errors import FlexneedleError

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flexneedle.em.recording.grid import StageGrid, Stop
 from flexneedle.em.recording.steps import Visit, motion_mismatch
 from flexneedle.errors import InputError, RunError
-from flexneedle.files import uninterrupted
+from flexneedle.interrupts import uninterrupted
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading

@@ -1,10 +1,12 @@
 """The client of the supervisor, which it starts: motions with their ends, and what each tick found."""
 
+import signal
 import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from math import inf, isfinite
 from multiprocessing.connection import Connection
 from statistics import median
@@ -13,6 +15,7 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import DriverError, RefusedError, StoppedError
+from flexneedle.interrupts import uninterrupted
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.processes import end_process
 from flexneedle.rig.supervisor import messages as say
@@ -55,11 +58,14 @@ class Supervisor:
         self._number = 0
         self._sent = -1  # requests; the task, which is sent first, is none
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", f"{__package__}.process", str(theirs.fileno())]
+        self._signals = socket.socketpair()  # received, sent: both processes have both, and none gets EPIPE
+        for end in self._signals:
+            end.setblocking(False)
+        self._wakeup_before: int | None = None
+        passed = tuple(each.fileno() for each in (theirs, *self._signals))
+        command = [sys.executable, "-m", f"{__package__}.process", *map(str, passed)]
         # What a user's own device prints must not get into what a command prints, such as JSON.
-        self._process = subprocess.Popen(
-            command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=_STDERR
-        )
+        self._process = subprocess.Popen(command, pass_fds=passed, stdin=subprocess.DEVNULL, stdout=_STDERR)
         theirs.close()
         self._connection = Connection(ours.detach())
         self._thread = Thread(target=self._receive, name="supervisor", daemon=True)
@@ -85,12 +91,15 @@ class Supervisor:
 
     def close(self) -> None:
         """Stop the motors, and end the supervisor."""
-        if self._ended is None:
-            self._send(say.Close(), lost=True)
-        end_process(self._process, _END_S)
-        self._thread.join()  # it ends with the supervisor's end of the line
-        with self._sending:
-            self._connection.close()
+        try:
+            if self._ended is None:
+                self._send(say.Close(), lost=True)
+            end_process(self._process, _END_S)
+            self._thread.join()  # it ends with the supervisor's end of the line
+            with uninterrupted(), self._sending:
+                self._connection.close()
+        finally:
+            self._release_signals()
 
     @property
     def rig(self) -> RigFile:
@@ -109,13 +118,13 @@ class Supervisor:
     @property
     def ended(self) -> str | None:
         """Why the supervisor has ended, "" at a request; None while it works."""
-        with self._changed:
+        with self._locked():
             return self._ended
 
     @property
     def report(self) -> say.Report:
         """What the last tick found."""
-        with self._changed:
+        with self._locked():
             if self._latest is None:
                 raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
             return self._latest
@@ -129,7 +138,7 @@ class Supervisor:
 
     def read(self) -> tuple[Measurement, ...]:
         """The measurements since the last call, oldest first."""
-        with self._changed:
+        with self._locked():
             found = tuple(self._measurements)
             self._measurements.clear()
         return found
@@ -200,12 +209,22 @@ class Supervisor:
         """
         self._send(say.Stop(who), lost=True)
 
-    def signal(self, number: int) -> None:
-        """Send the supervisor's process a signal; it stops the motors at SIGINT, SIGTERM and SIGHUP.
+    def take_signals(self) -> None:
+        """Have each signal of this process that has a handler of Python stop the motors, until the end.
 
-        It may be called in a handler of signals.
+        The supervisor gets it from the system, whatever this process is busy with. Call it in the main thread.
         """
-        self._process.send_signal(number)
+        with uninterrupted():
+            sent = self._signals[1].fileno()
+            self._wakeup_before = signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
+
+    def _release_signals(self) -> None:
+        with uninterrupted():
+            if self._wakeup_before is not None:
+                signal.set_wakeup_fd(self._wakeup_before)
+                self._wakeup_before = None
+            for end in self._signals:
+                end.close()
 
     def step(
         self,
@@ -285,7 +304,7 @@ class Supervisor:
     def _send(self, message: Any, *, lost: bool = False) -> int:
         """Send a message; return how many requests were sent with it."""
         try:
-            with self._sending:
+            with uninterrupted(), self._sending:
                 self._connection.send(message)
                 self._sent += 1
         except OSError:
@@ -313,24 +332,33 @@ class Supervisor:
         Raises DriverError: the limit (s) is reached, or the supervisor has ended or hangs.
         """
         until = monotonic() + limit
-        with self._changed:
-            while not condition():
-                if self._ended is not None:
-                    raise self._end()
-                now = monotonic()
-                if (
-                    self._latest is not None
-                    and now - self._latest_at > _SILENT_S
-                    and not self._late_reports()
-                ):
-                    raise DriverError(f"the supervisor has not reported for {now - self._latest_at:.1f} s")
-                if now > until:
-                    raise DriverError(f"{problem}: waited for {limit:g} s")
-                if self._latest is not None and not stopped:
+        while not self._came(condition, until, stopped=stopped, every=every):
+            if monotonic() > until:
+                raise DriverError(f"{problem}: waited for {limit:g} s")
+
+    def _came(self, condition: Callable[[], bool], until: float, *, stopped: bool, every: float) -> bool:
+        """Whether a condition has come about, or after a wait for a report and a heartbeat may have."""
+        with self._locked():
+            if condition():
+                return True
+            if self._ended is not None:
+                raise self._end()
+            if self._latest is not None:
+                silent = monotonic() - self._latest_at
+                if silent > _SILENT_S and not self._late_reports():
+                    raise DriverError(f"the supervisor has not reported for {silent:.1f} s")
+                if not stopped:
                     self._check(self._latest.state, self._latest.why)
-                self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - now)))
-                if self._latest is not None:
-                    self._send(say.Heartbeat())
+            self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - monotonic())))
+            if self._latest is not None:
+                self._send(say.Heartbeat())
+        return False
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """The lock of what the thread has received, which an interrupt must not leave locked."""
+        with uninterrupted(), self._changed:
+            yield
 
     def _late_reports(self) -> bool:
         """Whether reports are there that this process has had no time to take."""

@@ -1,9 +1,9 @@
-"""The process of the supervisor: `python -m flexneedle.rig.supervisor.process DESCRIPTOR`.
+"""The process of the supervisor: `python -m flexneedle.rig.supervisor.process DESCRIPTORS`.
 
-Its socket comes from the client, which starts it. It ticks on the monotonic clock: a tick that comes too late for the
-next one is counted, and left out. It is a process because a planner that keeps Python busy would delay ticks, and so
-that either one may be killed: without the client it stops the motors and ends, and without it motors stop at the end
-of what is queued.
+Its sockets come from the client, which starts it: for requests, and for signals that the client gets. It ticks on the
+monotonic clock: a tick that comes too late for the next one is counted, and left out. It is a process because a planner
+that keeps Python busy would delay ticks, and so that either one may be killed: without the client it stops the motors
+and ends, and without it motors stop at the end of what is queued.
 """
 
 import gc
@@ -18,6 +18,7 @@ from time import monotonic
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.interrupts import SIGNALS
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.devices.lock import held
 from flexneedle.rig.devices.priority import set_realtime_priority
@@ -30,7 +31,6 @@ from flexneedle.types import Frame
 
 _MOST_WAITING = 400  # reports that a client has not taken: 10 s
 _REST_S = 2.0  # longest wait for motors to rest before the end
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Outbox:
@@ -72,14 +72,14 @@ class Untracked:
         """Do nothing."""
 
 
-def main(descriptor: int) -> None:
-    """Serve the client until it closes or ends."""
-    connection = Connection(descriptor)
+def main(requests: int, received: int, sent: int) -> None:
+    """Serve the client until it closes or ends. received, sent: the ends of the socket of signals."""
+    connection, signals = Connection(requests), _signals(received, sent)
     task = connection.recv()
     outbox = Outbox(connection)
     why = "the supervisor failed"
     try:
-        why = _serve(connection, task, outbox)
+        why = _serve(connection, task, outbox, signals)
     except FlexneedleError as error:
         why = one_line(error)
     except Exception as error:
@@ -90,9 +90,8 @@ def main(descriptor: int) -> None:
         outbox.close()
 
 
-def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
+def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: socket.socket) -> str:
     """Open the devices, tick until the end, and return its reason."""
-    signals = _signals()
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
         if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
@@ -111,15 +110,12 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
             motors.stop()
 
 
-def _signals() -> socket.socket:
-    """A socket that receives a byte with each signal that shall stop the motors."""
-    receiving, sending = socket.socketpair()
-    receiving.setblocking(False)
-    sending.setblocking(False)
-    signal.set_wakeup_fd(sending.detach(), warn_on_full_buffer=False)
-    for number in _SIGNALS:
+def _signals(received: int, sent: int) -> socket.socket:
+    """The socket that receives a byte with each signal of this process, and of the client once that wants it."""
+    signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
+    for number in SIGNALS:
         signal.signal(number, lambda *_: None)
-    return receiving
+    return socket.socket(fileno=received)
 
 
 def _tick(
@@ -130,8 +126,8 @@ def _tick(
     while ending is None or (monotonic() < ending and not core.at_rest):
         sources: list[Any] = [signals] if ending is not None else [signals, connection]
         ready = wait(sources, max(0.0, due - monotonic()))
-        if signals in ready:
-            core.stop(_named(signals.recv(64)))
+        if signals in ready and (names := _named(signals.recv(64))):
+            core.stop(f"signal {names}")
         if connection in ready:
             try:
                 closed = _requested(connection, core)
@@ -161,9 +157,9 @@ def _requested(connection: Connection, core: Supervisor) -> bool:
 
 
 def _named(received: bytes) -> str:
-    names = ", ".join(signal.Signals(number).name for number in received)
-    return f"signal {names}"
+    """Names of those that shall stop the motors: the client may get others."""
+    return ", ".join(number.name for number in SIGNALS if number in received)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(*map(int, sys.argv[1:]))
