@@ -332,9 +332,11 @@ class Supervisor:
         Raises DriverError: the limit (s) is reached, or the supervisor has ended or hangs.
         """
         until = monotonic() + limit
+        over = False
         while not self._came(condition, until, stopped=stopped, every=every):
-            if monotonic() > until:
+            if over:
                 raise DriverError(f"{problem}: waited for {limit:g} s")
+            over = monotonic() > until  # looked at once more
 
     def _came(self, condition: Callable[[], bool], until: float, *, stopped: bool, every: float) -> bool:
         """Whether a condition has come about, or after a wait for a report and a heartbeat may have."""
