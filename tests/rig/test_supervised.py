@@ -188,6 +188,15 @@ def test_the_loop_asks_its_watchers_for_holds(monkeypatch):
         assert ports.hold() == ""
 
 
+def test_the_loop_has_the_time_of_a_decision_and_tells_where_the_tip_will_be(monkeypatch):
+    rest = Resting()
+    rest.rig = rest.rig.model_copy(update={"loop": rest.rig.loop.model_copy(update={"decision_ms": 70.0})})
+    monkeypatch.setattr("flexneedle.rig.supervised.Supervisor", rest)
+    with supervised(rest.rig, PHANTOM, make_plan("manipulation", (40.0, 5.0, 0.0), 0), Watchers()) as ports:
+        assert ports.deadline == pytest.approx(0.07)
+        assert ports.expect == ports.driver.expect
+
+
 def test_the_tip_is_measured_anew_after_the_confirmation(opened):
     rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
     assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]
