@@ -2,12 +2,13 @@
 
 import os
 import subprocess
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from signal import SIGKILL, Signals
-from time import monotonic, sleep
+from time import monotonic, time
 from typing import Protocol
 
 import psutil
@@ -22,19 +23,11 @@ _CLOCK = r"""
 #include <sys/time.h>
 #include <time.h>
 
-/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one as it is. Who has
-   read a shifted clock leaves a file of the same name and the ending .read. */
+/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one as it is. */
 static long shift(void) {
     long seconds = 0;
-    const char *name = getenv("CLOCK_SHIFT");
-    FILE *file = fopen(name, "r");
+    FILE *file = fopen(getenv("CLOCK_SHIFT"), "r");
     if (file) { if (fscanf(file, "%ld", &seconds) != 1) seconds = 0; fclose(file); }
-    if (seconds) {
-        char read[4096];
-        snprintf(read, sizeof read, "%s.read", name);
-        file = fopen(read, "w");
-        if (file) fclose(file);
-    }
     return seconds;
 }
 int clock_gettime(clockid_t id, struct timespec *now) {
@@ -59,7 +52,7 @@ time_t time(time_t *now) {
     return at.tv_sec;
 }
 """
-_READ_S, _PAUSE_S = 5.0, 0.01  # until the clock must have been read after a step
+_PROBE, _MOST_OFF_S = "import time; print(time.time())", 60.0
 _CHANNELS = {"insertion": "A", "rotation": "B", "guide_y": "C"}  # of the shipped rig file
 
 
@@ -187,19 +180,24 @@ class Clock:
     seconds: int
 
     def prepare(self, folder: Path, _stack: ExitStack) -> Setting:
-        """A library with the shifted clock."""
+        """A library with the shifted clock. Raises RuntimeError if a process with it has the usual time."""
         source, library, shift = folder / "clock.c", folder / "clock.so", folder / "shift"
-        shift.write_text("0\n")
         source.write_text(_CLOCK)
         subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
-        return Setting(folder / "run", {"LD_PRELOAD": str(library), "CLOCK_SHIFT": str(shift)})
+        environment = {"LD_PRELOAD": str(library), "CLOCK_SHIFT": str(shift)}
+        shift.write_text(f"{self.seconds}\n")
+        probe = [sys.executable, "-c", _PROBE]
+        found = subprocess.run(probe, env=os.environ | environment, stdout=subprocess.PIPE, check=True)
+        if abs(float(found.stdout) - time() - self.seconds) > _MOST_OFF_S:
+            raise RuntimeError("the clock cannot be stepped")
+        shift.write_text("0\n")
+        return Setting(folder / "run", environment)
 
     def inject(self, trial: Running) -> float:
-        """Step it. Raises RuntimeError if none of the insertion's processes reads the clock after that."""
-        now, read = monotonic(), trial.folder / "shift.read"
+        """Step it. Raises RuntimeError if a process of the insertion has the usual clock."""
+        for process in (trial.controller, trial.supervisor):
+            if "clock.so" not in Path(f"/proc/{process.pid}/maps").read_text():
+                raise RuntimeError(f"process {process.pid} has the usual clock")
+        now = monotonic()
         (trial.folder / "shift").write_text(f"{self.seconds}\n")
-        while not read.exists():
-            if monotonic() > now + _READ_S:
-                raise RuntimeError("nobody has read the clock that was stepped")
-            sleep(_PAUSE_S)
         return now

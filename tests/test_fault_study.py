@@ -10,8 +10,10 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from flexneedle.scenario.rig import load_rig
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import rig_faults as study
 from fault_cases import FIRST_WORLD, MOST_PATH_MM, case
+from fault_injections import Clock
 from fault_judging import Evidence, good, problems
 from fault_list import FAULTS
 from fault_report import draw, table
@@ -350,3 +353,24 @@ def test_a_rig_waits_for_lines_only_so_long():
         waiting = pool.submit(Lines(process).wait, 0.01)
         assert waiting.result(timeout=10.0) is None
         process.kill()
+
+
+def test_a_stepped_clock_is_that_of_the_processes_that_have_it(tmp_path):
+    with ExitStack() as stack:
+        clock = Clock(3600)
+        setting = clock.prepare(tmp_path, stack)
+        printed = [sys.executable, "-c", "import time; print(flush=True); input(); print(time.time())"]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        process, usual = (
+            stack.enter_context(subprocess.Popen(printed, env=os.environ | more, **pipes))
+            for more in (setting.environment, {})
+        )
+        for each in (process, usual):
+            each.stdout.readline()  # it runs, with its libraries
+        stepped = SimpleNamespace(folder=tmp_path, controller=process, supervisor=process)
+        half = SimpleNamespace(folder=tmp_path, controller=process, supervisor=usual)
+        with pytest.raises(RuntimeError, match=f"process {usual.pid} has the usual clock"):
+            clock.inject(half)
+        clock.inject(stepped)
+        (shifted, _), (now, _) = process.communicate("\n"), usual.communicate("\n")
+        assert float(shifted) - float(now) == pytest.approx(3600.0, abs=60.0)
