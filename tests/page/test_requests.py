@@ -51,6 +51,19 @@ def test_while_it_changes_it_is_estimated_and_not_planned(client):
     assert client.newest["job plan"]["job"] == first
 
 
+def test_what_is_let_go_is_planned_at_once(client):
+    client.job("plan", "done")
+    client.do("edit", values={"target.depth_mm": 35.0})
+    client.do("rest")
+    client.wait(
+        lambda: client.newest["plan manipulation"]["revision"] == client.newest["session"]["revision"]
+    )
+    last = client.newest["job plan"]["job"]
+    client.do("rest")  # nothing has changed
+    client.do("steer", take=True)
+    assert client.newest["job plan"]["job"] == last
+
+
 def test_a_plan_that_was_asked_for_is_not_replaced_by_that_at_rest(tmp_path):
     with served(tmp_path / "runs", limits=replace(QUICK, rest_s=0.02)) as server, Client(server) as client:
         client.steer().job("plan", "done")
@@ -87,6 +100,7 @@ STEERED = {
     "prepare": {},
     "arm": {"armed": True, "job": 1},
     "go": {},
+    "rest": {},
     "pace": {"pace": 1.0},
     "advance": {},
     "disturb": {"what": "drop", "size": 1.0},

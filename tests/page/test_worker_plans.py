@@ -32,7 +32,9 @@ def test_an_estimate_ends_near_the_target():
     (news,) = reported.of("estimate")
     (path,) = reported.shapes(Kind.PATH, Source.SCENE)
     assert math.dist(path.values[0, -1], short().target.position) == pytest.approx(news.error_mm, abs=1e-4)
-    assert reported.shapes(Kind.SWEEP, Source.SCENE)[0].values.shape[0] == path.values.shape[1]
+    (needle_at_target,) = reported.shapes(Kind.SWEEP, Source.SCENE)
+    assert needle_at_target.values.shape[0] == 1
+    assert needle_at_target.values[0, -1] == pytest.approx(path.values[0, -1], abs=1e-4)
 
 
 def test_an_estimate_of_few_elites():

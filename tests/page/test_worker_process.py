@@ -40,8 +40,6 @@ def send(process, order):
 def test_it_cancels_within_a_plan_and_ends_with_its_stdin():
     with subprocess.Popen((*COMMAND, "plans"), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         until(process, lambda news: news["type"] == "ready")
-        niceness = os.getpriority(os.PRIO_PROCESS, process.pid)
-        assert niceness == min(os.nice(0) + 10, 19)  # so that it disturbs no insertion
         send(process, Work(job=1, do="plan", kind="plan", scenario=short(**_LONG).values()))
         until(process, lambda news: news["type"] == "iteration")
         begun = monotonic()
@@ -53,6 +51,14 @@ def test_it_cancels_within_a_plan_and_ends_with_its_stdin():
         process.stdin.close()
         process.stdout.read()
         assert process.wait(60.0) == 0
+
+
+@pytest.mark.parametrize(("name", "more"), [("plans", 0), ("plans-beside-a-rig", 10)])
+def test_beside_a_rig_plans_give_way(name, more):
+    with subprocess.Popen((*COMMAND, name), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        until(process, lambda news: news["type"] == "ready")
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.nice(0) + more, 19)
+        process.stdin.close()
 
 
 def test_plan_insert_save_and_read_over_a_web_socket(tmp_path):

@@ -110,6 +110,27 @@ def test_same_seed_same_bytes_whatever_the_threads(monkeypatch):
     assert one.controls.tobytes() != other.controls.tobytes()
 
 
+@pytest.mark.parametrize("strategy", planner.STRATEGIES)
+@pytest.mark.parametrize("changes", [{}, {"entry.free_radius_mm": 3.0, "entry.free_slope_mrad": 50.0}])
+def test_a_sketch_is_the_plan_of_one_search(strategy, changes):
+    given = {"plan.samples": 64, "plan.iterations": 8, "plan.max_iterations": 8, "target.lateral_mm": 1.0}
+    scenario = PHANTOM.with_values(given | changes)
+    plan = flexneedle.plan(scenario, strategy=strategy, seed=3)
+    assert plan.reached  # so that it is of one search, too
+    sketch = planner.sketch(scenario, strategy, 3)
+    np.testing.assert_allclose(sketch.tips, plan.tips, atol=1e-9)
+    np.testing.assert_allclose(sketch.needle, plan.shapes[-1], atol=1e-9)
+    assert (sketch.roll, sketch.reached) == (plan.roll, True)
+    assert sketch.error_mm == pytest.approx(plan.error_mm, abs=1e-9)
+
+
+def test_a_sketch_of_a_target_out_of_reach_is_not_reached():
+    scenario = PHANTOM.with_values({**COARSE, "target.lateral_mm": 9.0})
+    sketch = planner.sketch(scenario, "steering")
+    assert sketch.error_mm == pytest.approx(math.dist(sketch.tips[-1, :3], scenario.target.position))
+    assert not sketch.reached
+
+
 def test_manipulation_enters_at_an_angle_towards_the_target():
     """Slope at the skin, and of the side of the target; straight ahead it enters straight."""
     assert planned(LATERAL).entry_angle > 0.01

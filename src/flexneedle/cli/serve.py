@@ -103,8 +103,8 @@ def _setup(args: argparse.Namespace) -> Setup:
     from flexneedle.scenario.files import load_scenario
 
     session = Session.of(Path(args.scenario).name, load_scenario(args.scenario), CONTROLLERS[0]["name"])
-    workers = (*_WORKER, "plans"), (*_WORKER, "insertion")
     rig = None if args.rig is None else _connected(args.rig)
+    workers = (*_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (*_WORKER, "insertion")
     return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)
 
 

@@ -63,6 +63,12 @@ class Edit(Request):
     values: Annotated[dict[Key, Value], Field(min_length=1, max_length=200)]
 
 
+class Rest(Request):
+    """No edit follows for now, as when a target that was dragged is let go: its plan is made at once."""
+
+    type: Literal["rest"]
+
+
 class Preset(Request):
     """Begin with a scenario of the package: a preset or a random world such as "world:7"."""
 
@@ -217,6 +223,7 @@ AnyRequest = Annotated[
     | Load
     | Options
     | Start
+    | Rest
     | Cancel
     | Insert
     | Check

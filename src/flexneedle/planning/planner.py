@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,46 @@ def plan(
     return replace(found, seconds=time.perf_counter() - begun)
 
 
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """What one search has found, carried out in one go: poses of the tip (m + 1, 5), nodes of the needle at the end
+    (n, 5), its roll at the start (rad), and the distance from its tip to the target (mm).
+    """
+
+    tips: Floats
+    needle: Floats
+    roll: float
+    error_mm: float
+
+    @property
+    def reached(self) -> bool:
+        """As that of a plan."""
+        return self.error_mm <= 1.0
+
+
+def sketch(
+    scenario: Scenario,
+    strategy: str = "manipulation",
+    seed: int = 0,
+    progress: OnIteration | None = None,
+    *,
+    threads: int | None = None,
+) -> Sketch:
+    """Search once for an insertion to the scenario's target, as `plan` does, for who needs no plan but a quick look.
+
+    A target that is missed is not searched again, and neither the states between nor what limits the plan are found.
+    """
+    simulator, goal = Simulator(scenario, threads), scenario.target.position
+    problem = _problem(scenario, goal, strategy)
+    found = _search(simulator, problem, np.random.default_rng(seed), progress)
+    simulator, _ = _entered(simulator, problem, found, strategy)
+    rows = _end_at_depth(simulator, found.controls, found.roll, goal[0])
+    start = simulator.start(found.roll)
+    end, tips = simulator.replay(start, rows)
+    error = math.dist(end.tip[: Z + 1].tolist(), goal)
+    return Sketch(np.vstack([start.tip, tips]), end.nodes, found.roll, error)
+
+
 def _better(first: Plan, second: Plan) -> Plan:
     """The plan of less cost, the first of two of the same, with the history of both searches."""
     later = tuple({**entry, "best": min(entry["best"], first.cost)} for entry in second.history)
@@ -100,10 +140,8 @@ def _carried_out(
     simulator: Simulator, problem: PlanProblem, strategy: str, seed: int, solution: Solution
 ) -> Plan:
     """The plan that ends at the target's depth, with its entry in the scenario if that was free."""
-    scenario, goal = simulator.scenario, problem.target
-    if scenario.entry.free:
-        scenario = _entering(scenario, *solution.entry)
-        simulator, problem = Simulator(scenario, simulator.threads), _problem(scenario, goal, strategy)
+    simulator, problem = _entered(simulator, problem, solution, strategy)
+    goal = problem.target
     rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
     states = [simulator.start(solution.roll)]
     for row in rows:
@@ -124,8 +162,18 @@ def _carried_out(
         converged=solution.search_state.converged,
         history=solution.search_state.history,
         limit=_binding_limit(simulator, problem, rows, states),
-        scenario=scenario,
+        scenario=simulator.scenario,
     )
+
+
+def _entered(
+    simulator: Simulator, problem: PlanProblem, solution: Solution, strategy: str
+) -> tuple[Simulator, PlanProblem]:
+    """Simulator and problem with the entry that was found, if it was free."""
+    if not simulator.scenario.entry.free:
+        return simulator, problem
+    scenario = _entering(simulator.scenario, *solution.entry)
+    return Simulator(scenario, simulator.threads), _problem(scenario, problem.target, strategy)
 
 
 def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:

@@ -200,6 +200,12 @@ def test_the_pointer_moves_the_target(views, server):
     assert right == pytest.approx(2 * up, abs=0.03)
     assert right > 1.0
     assert values["target.lateral_z_mm"] == TARGET[2]
+    server.wait_for("rest")
+    assert [each["type"] for each in server.requests][-2:] == ["edit", "rest"]  # it was let go
+    handle(page, "target").click()  # and not moved
+    page.evaluate("flexneedle.link.edit({'target.depth_mm': 35})")
+    server.wait_for("edit", len(server.asked("edit")) + 1)
+    assert len(server.asked("rest")) == 1
 
 
 def test_the_guide_is_moved_along_the_axis_and_stays_before_the_skin(views, server):

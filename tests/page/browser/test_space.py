@@ -345,6 +345,7 @@ def test_dragging_the_target_edits_the_scenario(space, server):
     settled(page)
     assert page.evaluate("flexneedle.store.get('scene').target[0]") == edits[-1]["target.depth_mm"]
     assert on_view(page, "return view.target.ball.position.x") == edits[-1]["target.depth_mm"]
+    assert len(server.wait_for("rest")) == 1
 
 
 def test_in_the_plane_the_target_has_no_third_coordinate(space, server):

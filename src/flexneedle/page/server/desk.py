@@ -142,6 +142,9 @@ class Desk:
                 self._steer(client, request.take)
             case m.Edit():
                 self._begin(self.session.edited(request.values))
+            case m.Rest():
+                if self._stop_timer("plan"):
+                    self._at_rest()
             case m.Preset():
                 self._begin(self.session.with_preset(request.name))
             case m.Load():
@@ -333,9 +336,12 @@ class Desk:
         self._stop_timer(name)
         self._timers[name] = asyncio.get_running_loop().call_later(seconds, then)
 
-    def _stop_timer(self, name: str) -> None:
-        if name in self._timers:
-            self._timers.pop(name).cancel()
+    def _stop_timer(self, name: str) -> bool:
+        """Stop a timer; return whether there was one."""
+        timer = self._timers.pop(name, None)
+        if timer is not None:
+            timer.cancel()
+        return timer is not None
 
     async def _watch_runs(self) -> None:
         """Publish the folder of runs whenever it has changed; it is read in a thread, since a disk may be slow."""

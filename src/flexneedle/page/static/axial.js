@@ -16,7 +16,7 @@ export function mount(element, store, link) {
   const place = make("div.stage", {}, canvas);
   const legend = make("ul.legend", { "aria-label": "Legend of the view along the axis" });
   element.append(place, legend);
-  const handles = new Handles(place);
+  const handles = new Handles(place, () => link.rest());
   let half = LEAST; // mm, stays while the target is dragged
 
   const stage = new Stage(canvas, (pen, { width, height }) => {

@@ -58,6 +58,15 @@ export class Link {
     this.#editTimer ||= setTimeout(() => this.#sendEdits(), this.#lastEdit + EDIT_EVERY - performance.now());
   }
 
+  // Say that no edit follows for now, as when what was dragged is let go: the plan is made at once.
+  rest() {
+    if (this.#editTimer) {
+      clearTimeout(this.#editTimer);
+      this.#sendEdits();
+    }
+    this.ask({ type: "rest" }, { quiet: true });
+  }
+
   async #sendEdits() {
     this.#editTimer = 0;
     this.#lastEdit = performance.now();

@@ -43,7 +43,7 @@ class SectionView {
 
   constructor(canvas, stage, legend, store, link) {
     [this.#legend, this.#store, this.#link] = [legend, store, link];
-    this.#handles = new Handles(stage);
+    this.#handles = new Handles(stage, () => link.rest());
     this.#stage = new Stage(canvas, (pen, { width, height }) => this.#draw(pen, width, height));
     store.subscribe([...SHOWN, "people", "welcome"], () => this.#stage.schedule());
   }

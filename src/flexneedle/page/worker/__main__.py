@@ -1,4 +1,6 @@
-"""A worker: `python -m flexneedle.page.worker plans` or `insertion`, started by the server of the page."""
+"""A worker: `python -m flexneedle.page.worker plans`, `plans-beside-a-rig` or `insertion`, started by the server of the
+page. All do the same; the name shows in a list of processes.
+"""
 
 import os
 import sys
@@ -26,12 +28,13 @@ from flexneedle.scenario.problems import unexpected
 
 Actions = Mapping[Do, Callable[[Task], None]]
 _NICE = 10
-"""Niceness of plans, so that an insertion beside them, above all on a rig, has the processor first."""
+"""Niceness of plans beside a rig, so that its insertion has the processor first. Otherwise estimates are shown sooner
+without it, above all where the browser draws without a graphics processor."""
 
 
 def main() -> int:
     """Do the orders on stdin until it ends; report on stdout."""
-    if "plans" in sys.argv[1:]:
+    if "plans-beside-a-rig" in sys.argv[1:]:
         os.nice(_NICE)
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what anything prints is no message

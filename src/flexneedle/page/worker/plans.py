@@ -12,7 +12,7 @@ from flexneedle.page.messages import Estimate, Iteration
 from flexneedle.page.messages import Plan as PlanNews
 from flexneedle.page.worker.task import Task
 from flexneedle.planning.horizon import Samples
-from flexneedle.planning.planner import STRATEGIES
+from flexneedle.planning.planner import STRATEGIES, sketch
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Plan
@@ -40,17 +40,17 @@ def smaller(scenario: Scenario, samples: int, iterations: int, **changes: Any) -
 
 
 def estimate(task: Task) -> None:
-    """Report a first estimate of the plan, by a small search."""
+    """Report a first estimate of the plan, by one small search."""
     work = task.work
-    found = make_plan(
+    found = sketch(
         smaller(task.scenario, *_ESTIMATE),
-        strategy=work.strategy,
-        seed=work.seed,
-        progress=lambda _info: task.signals.check(),
+        work.strategy,
+        work.seed,
+        lambda _info: task.signals.check(),
         threads=1,  # so few samples are not faster on two; the browser gets the other cores
     )
-    for frame in shapes_of(found, Source.SCENE):
-        task.show(frame)
+    task.show(frame_of(Kind.PATH, Source.SCENE, 0, found.tips[:, :3]))
+    task.show(frame_of(Kind.SWEEP, Source.SCENE, 0, found.needle[:, :3]))
     task.say(
         Estimate(
             revision=work.revision,

@@ -9,12 +9,14 @@ export const KEYS = "Arrow keys move it by 0.5 mm, with Shift by 0.1 mm.";
 
 export class Handles {
   #stage;
+  #dropped;
   #made = new Map(); // by id: {element, handle}
   dragged = false;
 
-  // stage: element that the handles are placed in.
-  constructor(stage) {
+  // stage: element that the handles are placed in; dropped: called when one that was dragged is let go.
+  constructor(stage, dropped) {
     this.#stage = stage;
+    this.#dropped = dropped;
   }
 
   // Show handles: {id, name, at: [px, py], form, drag(px, py), nudge(right, up) in mm}.
@@ -38,19 +40,23 @@ export class Handles {
     const element = make(`button.handle.${form}`, { type: "button", "data-handle": id, "aria-roledescription": "handle", title: KEYS });
     const made = { element, handle: null };
     let grab = null; // where the pointer is on the handle
+    let moved = false; // since it was taken
     element.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
       const [x, y] = this.#placeOf(event);
       grab = [x - made.handle.at[0], y - made.handle.at[1]];
       this.dragged = true;
+      moved = false;
       element.setPointerCapture(event.pointerId);
     });
     element.addEventListener("pointermove", (event) => {
       if (!grab) return;
       const [x, y] = this.#placeOf(event);
+      moved = true;
       made.handle.drag(x - grab[0], y - grab[1]);
     });
     const end = () => {
+      if (grab && moved) this.#dropped();
       grab = null;
       this.dragged = false;
     };

@@ -26,7 +26,9 @@ export class Target {
     this.#gizmo.addEventListener("dragging-changed", ({ value }) => {
       this.dragged = value;
       camera.controls.enabled = !value;
-      if (!value) this.update();
+      if (value) return;
+      this.update();
+      link.rest();
     });
     this.#gizmo.addEventListener("objectChange", () => link.edit(targetEdit(store, this.ball.position.toArray())));
     this.group = new Group();
