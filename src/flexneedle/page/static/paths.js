@@ -23,7 +23,10 @@ function slice(shape, index) {
 }
 
 // Last point (x, y, z) of a path.
-export const tipOf = ({ values, points, columns }) => Array.from(values.subarray((points - 1) * columns, (points - 1) * columns + 3));
+export function tipOf({ values, points, columns }) {
+  const at = (points - 1) * columns;
+  return [values[at], values[at + 1], values[at + 2]];
+}
 
 // Path of a position of rows, such as "estimate", or null.
 export function pathOfRows(rows, key) {

@@ -8,9 +8,11 @@ export const FOOT = 18; // of those below
 const CLOSEST = 44; // px between two labels
 const STEPS = [0.5, 1, 2, 5, 10, 20, 50, 100];
 
-// Points [px, py] of a path; place: function of x, y, z.
+// Points [px, py] of a path; place: function of x, y, z. It is called for thousands of points a paint.
 export function pointsOf({ points, columns, values }, place) {
-  return Array.from({ length: points }, (_, at) => place(...values.subarray(at * columns, at * columns + 3)));
+  const placed = new Array(points);
+  for (let at = 0, k = 0; at < points; at++, k += columns) placed[at] = place(values[k], values[k + 1], values[k + 2]);
+  return placed;
 }
 
 export function polyline(pen, points, { tone, width = 1, alpha = 1, dash = false }) {
@@ -19,7 +21,7 @@ export function polyline(pen, points, { tone, width = 1, alpha = 1, dash = false
   [pen.globalAlpha, pen.lineWidth, pen.lineJoin] = [alpha, width, "round"];
   pen.setLineDash(dash ? [5, 3] : []);
   pen.beginPath();
-  for (const [x, y] of points) pen.lineTo(x, y);
+  for (const point of points) pen.lineTo(point[0], point[1]);
   pen.stroke();
   pen.restore();
 }
