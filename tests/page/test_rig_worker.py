@@ -50,6 +50,9 @@ class Supervisor:
     def request_stop(self, who):
         self.stops.append(who)
 
+    def take_signals(self):
+        """As for a command."""
+
 
 @pytest.fixture
 def in_tmp(tmp_path, monkeypatch):
@@ -128,10 +131,9 @@ def test_it_waits_with_what_will_move_until_it_may_go(calls, in_tmp):
     assert len(one.outbox.rows) == one.outbox.of("insertion")[-1].periods > 10
 
 
-def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys, monkeypatch):
+def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
     one = going(order(in_tmp / "runs", seed=3, controller="ce-mpc"), calls)
     Insertions().insert(one)
-    monkeypatch.setattr("flexneedle.cli.insert._Signals.handle", lambda _self, _stack: None)
     arguments = ("--seed", "3", "--controller", "ce-mpc", "--out", "command", "--yes")
     assert run(capsys, "insert", "phantom", "--rig", "rig.toml", *arguments)[0] == 0
     last = one.outbox.of("insertion")[-1]
