@@ -202,9 +202,10 @@ def test_the_pointer_moves_the_target(views, server):
     assert values["target.lateral_z_mm"] == TARGET[2]
     server.wait_for("rest")
     assert [each["type"] for each in server.requests][-2:] == ["edit", "rest"]  # it was let go
+    edits = len(server.asked("edit"))
     handle(page, "target").click()  # and not moved
     page.evaluate("flexneedle.link.edit({'target.depth_mm': 35})")
-    server.wait_for("edit", len(server.asked("edit")) + 1)
+    server.wait_for("edit", edits + 1)
     assert len(server.asked("rest")) == 1
 
 
