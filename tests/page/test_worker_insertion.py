@@ -174,10 +174,10 @@ def disturbed(*disturbs, scenario=None, seed=3):
 
 
 def test_a_push_moves_the_true_tip_in_its_direction(by_command):
-    aside = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}).rows[1].true[1]
+    pushed = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}).rows[1].true[1]
     back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0}).rows[1].true[1]
     free = by_command.periods[1].true_tip.y
-    assert aside > free + 0.02
+    assert pushed > free + 0.02
     assert back < free - 0.02
 
 

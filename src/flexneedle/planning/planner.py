@@ -42,7 +42,7 @@ from flexneedle.types import (
 _TARGET = "depth and lateral offsets in mm"
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
-_ASIDE = 0.1  # share of a standard deviation across the direction of the target
+_ACROSS = 0.1  # share of a standard deviation across the direction of the target
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
@@ -244,11 +244,11 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
     toward = complex(*goal[1:]) - axis
     point, slope = scenario.entry.nearest(toward, goal[0], 0.0)
     turned = toward != 0.0 and setup.moved_guide_axes == 2 and not setup.half_turns
-    aside = [1.0, _ASIDE if turned else 1.0][:axes]
-    lateral = np.outer(sizes, aside).ravel()
+    shares = [1.0, _ACROSS if turned else 1.0][:axes]
+    lateral = np.outer(sizes, shares).ravel()
     if setup.moved_guide_axes < axes:
         lateral[-1] = 0.0
-    sigma = np.array([plan.advance_sigma_mm, *lateral, *aside, _SHARE_SIGMA])
+    sigma = np.array([plan.advance_sigma_mm, *lateral, *shares, _SHARE_SIGMA])
     return PlanProblem(
         target=goal,
         travel=setup.tip_to_skin_mm + goal[0],

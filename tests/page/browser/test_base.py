@@ -79,6 +79,7 @@ def test_a_page_among_others_says_which_person_it_is(visit, server):
     page.wait_for_selector("text=2 people connected, you are person 1, nobody is in control")
     server.send(people(3, steering=2))
     page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
+    assert "nobody is in control" not in page.inner_text(STATUS)
 
 
 def test_the_refusal_of_a_value_goes_when_another_is_taken(visit, server):
@@ -92,6 +93,7 @@ def test_the_refusal_of_a_value_goes_when_another_is_taken(visit, server):
     del server.answers["edit"]
     page.evaluate("flexneedle.link.edit({'target.depth_mm': 30})")
     page.wait_for_selector("[role=alert] >> text=must be above 0", state="detached")
+    assert server.asked("edit")[-1]["values"] == {"target.depth_mm": 30}
 
 
 def test_taking_and_releasing_control_keeps_the_focus(visit):

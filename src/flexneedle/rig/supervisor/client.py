@@ -1,6 +1,5 @@
 """The client of the supervisor, which it starts: motions with their ends, and what each tick found."""
 
-import signal
 import socket
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.processes import end_process
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
+from flexneedle.rig.supervisor.signals import SignalLine
 from flexneedle.rig.tracking.registration import identity
 from flexneedle.scenario.rig import RigFile
 from flexneedle.scenario.sections.axes import Axis
@@ -58,11 +58,8 @@ class Supervisor:
         self._number = 0
         self._sent = -1  # requests; the task, which is sent first, is none
         ours, theirs = socket.socketpair()
-        self._signals = socket.socketpair()  # received, sent: both processes have both, and none gets EPIPE
-        for end in self._signals:
-            end.setblocking(False)
-        self._wakeup_before: int | None = None
-        passed = tuple(each.fileno() for each in (theirs, *self._signals))
+        self._signals = SignalLine()
+        passed = (theirs.fileno(), *self._signals.descriptors)
         command = [sys.executable, "-m", f"{__package__}.process", *map(str, passed)]
         # What a user's own device prints must not get into what a command prints, such as JSON.
         self._process = subprocess.Popen(command, pass_fds=passed, stdin=subprocess.DEVNULL, stdout=_STDERR)
@@ -99,7 +96,7 @@ class Supervisor:
             with uninterrupted(), self._sending:
                 self._connection.close()
         finally:
-            self._release_signals()
+            self._signals.close()
 
     @property
     def rig(self) -> RigFile:
@@ -214,17 +211,7 @@ class Supervisor:
 
         The supervisor gets it from the system, whatever this process is busy with. Call it in the main thread.
         """
-        with uninterrupted():
-            sent = self._signals[1].fileno()
-            self._wakeup_before = signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
-
-    def _release_signals(self) -> None:
-        with uninterrupted():
-            if self._wakeup_before is not None:
-                signal.set_wakeup_fd(self._wakeup_before)
-                self._wakeup_before = None
-            for end in self._signals:
-                end.close()
+        self._signals.take()
 
     def step(
         self,

@@ -7,7 +7,6 @@ and ends, and without it motors stop at the end of what is queued.
 """
 
 import gc
-import signal
 import socket
 import sys
 from contextlib import ExitStack, closing
@@ -18,7 +17,6 @@ from time import monotonic
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
-from flexneedle.interrupts import SIGNALS
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.devices.lock import held
 from flexneedle.rig.devices.priority import set_realtime_priority
@@ -26,6 +24,7 @@ from flexneedle.rig.devices.registry import address_of, open_motors, open_tracke
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.supervisor.dry import DryMotors
+from flexneedle.rig.supervisor.signals import listen, named
 from flexneedle.scenario.problems import unexpected
 from flexneedle.types import Frame
 
@@ -74,7 +73,7 @@ class Untracked:
 
 def main(requests: int, received: int, sent: int) -> None:
     """Serve the client until it closes or ends. received, sent: the ends of the socket of signals."""
-    connection, signals = Connection(requests), _signals(received, sent)
+    connection, signals = Connection(requests), listen(received, sent)
     task = connection.recv()
     outbox = Outbox(connection)
     why = "the supervisor failed"
@@ -110,14 +109,6 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: sock
             motors.stop()
 
 
-def _signals(received: int, sent: int) -> socket.socket:
-    """The socket that receives a byte with each signal of this process, and of the client once that wants it."""
-    signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
-    for number in SIGNALS:
-        signal.signal(number, lambda *_: None)
-    return socket.socket(fileno=received)
-
-
 def _tick(
     connection: Connection, core: Supervisor, outbox: Outbox, signals: socket.socket, period: float
 ) -> str:
@@ -126,7 +117,7 @@ def _tick(
     while ending is None or (monotonic() < ending and not core.at_rest):
         sources: list[Any] = [signals] if ending is not None else [signals, connection]
         ready = wait(sources, max(0.0, due - monotonic()))
-        if signals in ready and (names := _named(signals.recv(64))):
+        if signals in ready and (names := named(signals.recv(64))):
             core.stop(f"signal {names}")
         if connection in ready:
             try:
@@ -154,11 +145,6 @@ def _requested(connection: Connection, core: Supervisor) -> bool:
             return True
         core.request(request)
     return False
-
-
-def _named(received: bytes) -> str:
-    """Names of those that shall stop the motors: the client may get others."""
-    return ", ".join(number.name for number in SIGNALS if number in received)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,51 @@
+"""Signals of client and supervisor: the system writes them into one socket, which the supervisor reads.
+
+So a signal to the client alone stops the motors, too, whatever that process is busy with.
+"""
+
+import signal
+import socket
+
+from flexneedle.interrupts import SIGNALS, uninterrupted
+
+
+class SignalLine:
+    """The client's side: a socket whose two ends the supervisor inherits, so that no process gets EPIPE."""
+
+    def __init__(self) -> None:
+        self._received, self._sent = socket.socketpair()
+        for end in (self._received, self._sent):
+            end.setblocking(False)
+        self._before: int | None = None
+
+    @property
+    def descriptors(self) -> tuple[int, int]:
+        """Of the ends, for `listen`."""
+        return self._received.fileno(), self._sent.fileno()
+
+    def take(self) -> None:
+        """Have each signal of this process that has a handler of Python written. Call it in the main thread."""
+        with uninterrupted():
+            self._before = signal.set_wakeup_fd(self._sent.fileno(), warn_on_full_buffer=False)
+
+    def close(self) -> None:
+        """End that. Call it in the thread of `take`."""
+        with uninterrupted():
+            if self._before is not None:
+                signal.set_wakeup_fd(self._before)
+                self._before = None
+            self._received.close()
+            self._sent.close()
+
+
+def listen(received: int, sent: int) -> socket.socket:
+    """The supervisor's side: a socket with a byte for each signal of this process, and of a client that takes them."""
+    signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+    return socket.socket(fileno=received)
+
+
+def named(received: bytes) -> str:
+    """Names of those that shall stop the motors, or "": the client may get others."""
+    return ", ".join(number.name for number in SIGNALS if number in received)
