@@ -48,24 +48,25 @@ def test_in_nested_blocks_it_is_raised_after_the_last():
     assert done == ["inner", "outer"]
 
 
-def test_an_interrupt_while_handlers_are_set_again_is_not_lost(monkeypatch):
+@pytest.mark.parametrize("raised", SIGNALS)
+def test_after_an_interrupt_while_handlers_are_set_again_none_is_lost(monkeypatch, raised):
     original, calls = signal.signal, []
 
     def interrupted(number, handler):
         calls.append(number)
         found = original(number, handler)
         if len(calls) == len(SIGNALS) + 1:  # the first of those that are set again
-            signal.raise_signal(SIGNALS[-1])
+            signal.raise_signal(raised)
         return found
 
     monkeypatch.setattr(signal, "signal", interrupted)
     with pytest.raises(KeyboardInterrupt), uninterrupted():
         pass
     monkeypatch.undo()
-    for number in SIGNALS:
+    for each in SIGNALS:
         with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(number)
-        signal.signal(number, signal.default_int_handler)
+            signal.raise_signal(each)
+        signal.signal(each, signal.default_int_handler)
 
 
 def test_a_signal_without_a_handler_keeps_its_action():
