@@ -1,5 +1,7 @@
 """Figures of the page, from what benchmarks/page_probe.js has noted, and the table of them."""
 
+from bisect import bisect
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +12,9 @@ Log = Mapping[str, Any]
 GROWTH_MB = {"server": 5.0, "its workers": 20.0, "objects of a page": 1.0, "arrays of a page": 5.0}
 """Growth that counts as none. Ten minutes have forty insertions; to keep one takes a server or a page 0.1 MB for its
 rows, a page 4 MB for its shapes, and a worker 1 MB, whose size varies by some MB."""
+
+_FRAME, _IN_FRAME = "AnimationFrame::Render", "FireAnimationFrame"
+_SCRIPT = (_IN_FRAME, "FunctionCall", "TimerFire", "EventDispatch")
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,36 @@ def plan_delay(log: Log) -> float:
     """Time (ms) from the release of the target until the plan to its last place was painted."""
     revision = max(edit["revision"] for edit in log["edits"])
     return _painted(log["plans"], revision) - float(log["releases"][-1])
+
+
+def processor_times(trace: Mapping[str, Any]) -> list[float]:
+    """Processor time (ms) of the script before each paint that drew, of a browser's trace (category devtools.timeline).
+
+    Its clock stands still while other processes have the processor. The probe itself has one callback in each animation
+    frame, so one that drew has more.
+    """
+    events = trace["traceEvents"]
+    threads = Counter(_thread(event) for event in events if event["name"] == _IN_FRAME)
+    if not threads:
+        return []
+    thread = threads.most_common(1)[0][0]
+    begins = sorted(event["ts"] for event in events if (event["name"], event["ph"]) == (_FRAME, "b"))
+    known = [event for event in events if event["ph"] == "X" and _thread(event) == thread]
+    script = sorted((event for event in known if event["name"] in _SCRIPT), key=lambda event: event["ts"])
+    spent, drawn, end = defaultdict(float), Counter(), 0.0
+    for event in script:
+        if event["ts"] < end:
+            continue  # a part of the event before
+        end = event["ts"] + event["dur"]
+        in_frame = event["name"] == _IN_FRAME
+        frame = bisect(begins, event["ts"]) + (not in_frame)  # what is between frames is of the next one
+        spent[frame] += 1e-3 * event["tdur"]
+        drawn[frame] += in_frame
+    return [spent[frame] for frame, callbacks in drawn.items() if callbacks > 1]
+
+
+def _thread(event: Mapping[str, Any]) -> tuple[int, int]:
+    return event["pid"], event["tid"]
 
 
 def _painted(shown: Sequence[Log], revision: int) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from page_figures import Figure, estimate_delays, growth, plan_delay, rate, spread, table
+from page_figures import Figure, estimate_delays, growth, plan_delay, processor_times, rate, spread, table
 
 LOG = {
     "moves": [0.0, 40.0, 60.0, 300.0],
@@ -81,3 +81,27 @@ def test_the_table_has_bar_figure_and_verdict():
         ["b", "≥", "55", "50", "1/s", "EXCEEDED"],
         ["c", "1", "MB"],
     ]
+
+
+def test_the_script_of_a_paint_is_what_came_since_the_one_before_and_its_animation_frame():
+    """Times in µs; the second frame has the probe's callback alone, the third one more."""
+    events = [
+        _event("FunctionCall", 0, 900, 400),
+        {"name": "AnimationFrame::Render", "ph": "b", "ts": 1000, "pid": 1, "tid": 1},
+        _event("FireAnimationFrame", 1010, 100, 50),
+        {"name": "AnimationFrame::Render", "ph": "b", "ts": 2000, "pid": 1, "tid": 1},
+        _event("FireAnimationFrame", 2010, 10, 10),
+        _event("FunctionCall", 2500, 3000, 700),  # interrupted by others: of the next frame
+        _event("FunctionCall", 2600, 100, 100),  # a part of it
+        _event("FireAnimationFrame", 2700, 100, 100) | {"tid": 2},  # of another page
+        {"name": "AnimationFrame::Render", "ph": "b", "ts": 6000, "pid": 1, "tid": 1},
+        _event("FireAnimationFrame", 6010, 20, 20),
+        _event("FireAnimationFrame", 6040, 300, 280),
+        _event("FunctionCall", 6050, 200, 200),
+    ]
+    assert processor_times({"traceEvents": events}) == pytest.approx([0.7 + 0.02 + 0.28])
+    assert processor_times({"traceEvents": []}) == []
+
+
+def _event(name, begin, lasted, busy):
+    return {"name": name, "ph": "X", "ts": begin, "dur": lasted, "tdur": busy, "pid": 1, "tid": 1}

@@ -112,16 +112,24 @@ def test_same_seed_same_bytes_whatever_the_threads(monkeypatch):
 
 @pytest.mark.parametrize("strategy", planner.STRATEGIES)
 @pytest.mark.parametrize("changes", [{}, {"entry.free_radius_mm": 3.0, "entry.free_slope_mrad": 50.0}])
-def test_a_sketch_is_the_plan_of_one_search(strategy, changes):
+def test_a_sketch_is_the_plan_of_one_search(monkeypatch, strategy, changes):
+    """Of that of one roll, where the bevel is alone."""
     given = {"plan.samples": 64, "plan.iterations": 8, "plan.max_iterations": 8, "target.lateral_mm": 1.0}
-    scenario = PHANTOM.with_values(given | changes)
+    scenario, search = PHANTOM.with_values(given | changes), planner.steer
+    sketch = planner.sketch(scenario, strategy, 3)
+    monkeypatch.setattr(planner, "steer", lambda *args: search(*args[:5], 1))
     plan = flexneedle.plan(scenario, strategy=strategy, seed=3)
     assert plan.reached  # so that it is of one search, too
-    sketch = planner.sketch(scenario, strategy, 3)
     np.testing.assert_allclose(sketch.tips, plan.tips, atol=1e-9)
     np.testing.assert_allclose(sketch.needle, plan.shapes[-1], atol=1e-9)
     assert (sketch.roll, sketch.reached) == (plan.roll, True)
     assert sketch.error_mm == pytest.approx(plan.error_mm, abs=1e-9)
+
+
+def test_a_sketch_of_the_bevel_alone_reaches_with_one_roll_what_a_plan_does_with_several():
+    scenario = PHANTOM.with_values({**COARSE, "plan.flip_weight": 0.0, "target.lateral_mm": 0.5})
+    assert flexneedle.plan(scenario, strategy="steering").flips > 1
+    assert planner.sketch(scenario, "steering").reached
 
 
 def test_a_sketch_of_a_target_out_of_reach_is_not_reached():

@@ -13,7 +13,7 @@ from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import OnIteration, counted
 from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise, widened
-from flexneedle.planning.steering import radius, reach, steer
+from flexneedle.planning.steering import MOST_ROLLS, radius, reach, steer
 from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
@@ -47,6 +47,7 @@ _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
+_ENOUGH_ROLLS = 1  # to reach a target, though not at the least cost
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
 _REACHED_MM = 0.05  # the hull of what a bevel with a range of angles reaches is known to about this
 
@@ -116,10 +117,11 @@ def sketch(
     """Search once for an insertion to the scenario's target, as `plan` does, for who needs no plan but a quick look.
 
     A target that is missed is not searched again, and neither the states between nor what limits the plan are found.
+    The bevel alone gets one roll at most, which reaches whatever several reach.
     """
     simulator, goal = Simulator(scenario, threads), scenario.target.position
     problem = _problem(scenario, goal, strategy)
-    found = _search(simulator, problem, np.random.default_rng(seed), progress)
+    found = _search(simulator, problem, np.random.default_rng(seed), progress, _ENOUGH_ROLLS)
     simulator, _ = _entered(simulator, problem, found, strategy)
     rows = _end_at_depth(simulator, found.controls, found.roll, goal[0])
     start = simulator.start(found.roll)
@@ -189,13 +191,14 @@ def _search(
     problem: PlanProblem,
     rng: np.random.Generator,
     progress: OnIteration | None,
+    most_rolls: int = MOST_ROLLS,
 ) -> Solution:
     """The best primitives, or the best rolls where only the bevel is free."""
     plan, rollout = simulator.scenario.plan, _rollout(simulator)
     if _bevel_alone(problem):
         share = 1 if problem.entry_coordinates or problem.narrow else _SHARE_OF_A_SEARCH
         search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
-        return steer(rollout, problem, search, rng, progress)
+        return steer(rollout, problem, search, rng, progress, most_rolls)
     return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
 
 

@@ -43,8 +43,9 @@ def steer(
     search: Search,
     rng: np.random.Generator,
     progress: OnIteration | None = None,
+    most: int = MOST_ROLLS,
 ) -> Solution:
-    """Search the depths of 0 to 4 rolls with either side at the start, until one more roll does not lower the cost.
+    """Search the depths of 0 to `most` rolls with either side at the start, until one more does not lower the cost.
 
     Where the driver's range is less than a turn, the needle's angles before the first roll and after each one are
     searched as well. The best of all is searched once more with the travel that it needs to end at the target's depth:
@@ -54,7 +55,7 @@ def steer(
     found: list[tuple[float, int, Found]] = []
     charged = (*cost_terms(problem), *_margin(rollout, problem))
     size = radius(rollout, problem) if problem.narrow else 0.0
-    for rolls in range(MOST_ROLLS + 1):
+    for rolls in range(most + 1):
         before = min((one.cost for *_, one in found), default=np.inf)
         for side in (1.0, -1.0):
             alone = (
