@@ -23,7 +23,7 @@ import psutil
 from playwright.sync_api import Browser, Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from page_drive import Pointer, inserted, loaded, new_page, until, until_ended
+from page_drive import DEPTHS, SHARES, Pointer, inserted, loaded, new_page, until, until_ended
 from page_figures import (
     Figure,
     clicked,
@@ -37,6 +37,9 @@ from page_figures import (
 )
 
 from chromium import ARGUMENTS, CHROMIUM
+from flexneedle.planning.planner import plan
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
 
 PRESETS = ("phantom", "phantom3d")
 FIRST_WORLD, WORLDS_END = 100_000, 200_000  # numbers for reports (flexneedle/scenario/worlds.py)
@@ -72,11 +75,14 @@ def main() -> int:
         parser.error("no chromium on the path: apt-get install chromium")
     rng, size = np.random.default_rng(args.seed), QUICK if args.quick else FULL
     minutes = (0.0 if args.quick else 10.0) if args.minutes is None else args.minutes
+    worlds = rng.integers(FIRST_WORLD, WORLDS_END, size.worlds).tolist()
+    names = [*PRESETS, *(f"world:{number}" for number in worlds)]
     taken, begun = steal(), time.monotonic()
     with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as server, browsers() as browser:
-        figures = [*measured(browser, server, size, rng)]
+        figures = [*measured(browser, server, names, size, rng)]
         if minutes:
             figures += grown(browser, server, args.viewers, 60.0 * minutes, rng)
+    figures.append(searched(names, size.drags, rng))
     print(table(figures))
     share = (steal() - taken) / (time.monotonic() - begun)
     print(f"load {os.getloadavg()[1]:.1f} on {os.cpu_count()} cores, {share:.0%} of one taken by the host")
@@ -139,17 +145,17 @@ def browsers() -> Iterator[Browser]:
 # One viewer
 
 
-def measured(browser: Browser, server: Server, size: Size, rng: np.random.Generator) -> Iterator[Figure]:
+def measured(
+    browser: Browser, server: Server, names: Sequence[str], size: Size, rng: np.random.Generator
+) -> Iterator[Figure]:
     """Figures with one page."""
     page = new_page(browser, server.address)
     until(page, "flexneedle.store.get('plan manipulation')")  # so that both workers are ready
     yield first_picture(browser, server, size.visits)
-    worlds = rng.integers(FIRST_WORLD, WORLDS_END, size.worlds).tolist()
-    names = [*PRESETS, *(f"world:{number}" for number in worlds)]
     yield from dragged(page, server, names, size.drags, rng)
-    inserted_names = names[: len(PRESETS) + size.worlds // 2]
-    yield from inserting(page, server, inserted_names, rng)
-    yield painted(browser, page, inserted_names, rng)
+    fewer = names[: len(PRESETS) + size.worlds // 2]
+    yield from inserting(page, server, fewer, rng)
+    yield painted(browser, page, fewer, rng)
     page.context.close()
 
 
@@ -217,6 +223,27 @@ def painted(browser: Browser, page: Page, names: Sequence[str], rng: np.random.G
         Pointer(page, rng).click_until_ended()
         times += processor_times(json.loads(browser.stop_tracing()))
     return spread("script of a paint, its processor time", "ms", times, 5.0)
+
+
+# The plan by itself
+
+
+def searched(names: Sequence[str], count: int, rng: np.random.Generator) -> Figure:
+    """Times of plans to targets that are drawn as those that are dragged, when neither page nor server runs."""
+    plan(names[0])  # compiles or loads the kernels
+    times = {name: [1e3 * plan(aimed(name, rng)).seconds for _ in range(count)] for name in names}
+    return spread("such a plan by itself", "ms", times, None)
+
+
+def aimed(name: str, rng: np.random.Generator) -> Scenario:
+    """A scenario with a random target; in space it is off in a random direction."""
+    scenario = load_scenario(name)
+    depth, share = scenario.target.depth_mm * rng.uniform(*DEPTHS), rng.uniform(*SHARES)
+    angle = rng.uniform(0.0, np.pi) if scenario.setup.axes == 2 else 0.0
+    values = {"lateral_mm": depth * share * np.cos(angle), "lateral_z_mm": depth * share * np.sin(angle)}
+    return scenario.with_values(
+        {"target.depth_mm": depth, **{f"target.{key}": value for key, value in values.items()}}
+    )
 
 
 # Several viewers

@@ -14,6 +14,8 @@ STEP_S, MOVES = 0.016, 30
 """Of a drag: half a second."""
 PLANES = {1: ("x–y", "target"), 2: ("x–y", "x–z", "target")}
 """Planes of the section in which a target is dragged, by the number of axes."""
+DEPTHS, SHARES = (0.6, 1.05), (-0.125, 0.125)
+"""Of the targets: of the scenario's own depth, and lateral offsets of the depth, as in the paper."""
 MODIFIED = {"control.adaptive_mpc.samples": 64}
 """So that 64 paths are sampled in each period."""
 SECTION, STATUS = "[data-panel=section]", "[data-panel=status]"
@@ -86,15 +88,12 @@ class Pointer:
         self._deepest = float(page.evaluate("flexneedle.store.get('scene').target[0]"))
 
     def drag_target(self) -> dict[str, Any]:
-        """Drag the target to a random place in the section, and wait for the plan; what the probe has noted.
-
-        Depths are 60 to 105 % of the scenario's own, lateral offsets up to 12.5 % of the depth, as in the paper.
-        """
+        """Drag the target to a random place in the section, and wait for the plan; what the probe has noted."""
         page, rng = self._page, self._rng
         axes = page.evaluate("flexneedle.store.get('scene').axes")
         self._show(SECTION)
         page.click(f"{SECTION} [data-plane='{rng.choice(PLANES[axes])}']")
-        depth, share = self._deepest * rng.uniform(0.6, 1.05), rng.uniform(-0.125, 0.125)
+        depth, share = self._deepest * rng.uniform(*DEPTHS), rng.uniform(*SHARES)
         begin, end = page.evaluate("([depth, share]) => probe.places(depth, share)", [depth, share])
         page.evaluate("probe.reset()")
         page.mouse.move(*begin)

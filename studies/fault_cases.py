@@ -56,9 +56,9 @@ class Case:
         return self.scenario.setup.tip_to_skin_mm + self.scenario.target.depth_mm
 
     @property
-    def shortest_s(self) -> float:
-        """Duration of the insertion if it were one motion."""
-        return self.path_mm / self.scenario.setup.insertion_speed_mm_s
+    def steps(self) -> float:
+        """The path in longest steps."""
+        return self.path_mm / self.scenario.setup.max_advance_mm
 
     def roll(self, rng: np.random.Generator) -> float:
         """The roll (rad) in which a fault falls: half a turn, or any angle from 60° where the driver has them."""

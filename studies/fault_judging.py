@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import degrees, inf
 from typing import Any
 
@@ -11,6 +12,8 @@ from fault_list import RESTED, Fault
 from rig_trials import moved_between, rests
 
 from flexneedle.rig.emulator.coupled.truth import Truth
+from flexneedle.scenario.rig import load_rig
+from flexneedle.types import DB_X, DG_Y, Floats
 
 MOTION_MM = 0.5
 """The most that the base may move after detection."""
@@ -19,6 +22,8 @@ END = "end"
 _BY_CONTROLLER = "the controller"  # who stops the motors then
 _RECORDED = ("holding", "stopped", "fault")  # states with a reason of their own
 _AT_REST = 1e-3  # from where an axis is at the end (mm, rad)
+_COLUMNS = {"guide_y": DG_Y}  # of a control, by axes that move seldom
+_UNSEEN = 2.0  # tolerances of an axis: a stall in less need not be detected
 _PAUSE_S = 0.02  # of an axis between two motions; within one it is somewhere else after 4 ms
 
 
@@ -34,7 +39,8 @@ class State:
 @dataclass(frozen=True)
 class Evidence:
     """What is known of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
-    taken effect (s, monotonic), true states, `run.json`, messages, and how many processes were left.
+    taken effect (s, monotonic), true states, `run.json`, messages, how many processes were left, and for an axis that
+    moves seldom the commands (m, 9).
 
     A supervisor may detect a fault before that is reported, but not before it was ordered.
     """
@@ -47,6 +53,7 @@ class Evidence:
     run: Mapping[str, Any]
     errors: str
     left: int = 0
+    commands: Floats | None = None
 
     def row(self) -> dict[str, Any]:
         """All that the table, the picture and the judgement need, as plain values."""
@@ -64,6 +71,8 @@ class Evidence:
             "rest_s": self._rest(*span) if span and span[0] == self.injected else None,
             "motion_mm": None if span is None else self._moved("insertion", *span),
             "rolled_deg": None if span is None else degrees(self._moved("rotation", *span)),
+            "travelled_mm": self._travelled(),
+            "commanded_mm": self._commanded(),
             "during": self._during(),
             "rests": rests(self.truth),
             "left": self.left,
@@ -98,6 +107,19 @@ class Evidence:
         moved = moved[moved <= time]
         begins = moved[np.diff(moved, prepend=-np.inf) > _PAUSE_S]
         return float(time - begins[-1]) if len(begins) else None
+
+    def _commanded(self) -> float | None:
+        """The farthest (mm) that the faulty axis was to be from where the fault found it, by commands after that."""
+        if self.commands is None or not len(self.commands):
+            return None
+        before = np.cumsum(self.commands[:, DB_X]) - self.commands[:, DB_X]
+        after = np.cumsum(self.commands[before > self._travelled(), _COLUMNS[self.axis]])
+        return float(np.abs(after).max(initial=0.0))
+
+    def _travelled(self) -> float:
+        """How far (mm) the base had moved as the fault was injected."""
+        base = self.truth.positions["insertion"]
+        return float(np.interp(self.injected, self.truth.time, base) - base[0])
 
     def _during(self) -> str:
         """What the needle did as the fault was injected."""
@@ -171,5 +193,11 @@ def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
     if fault.within is None:
         return True
     if seconds is None:
-        return fault.timed == "from_motion_s" and row["detection_s"] is None
+        seldom = fault.timed == "from_motion_s" and row["detection_s"] is None
+        return seldom and (row["commanded_mm"] or 0.0) <= _unseen_mm(fault.axis)
     return seconds <= fault.within
+
+
+@cache
+def _unseen_mm(axis: str) -> float:
+    return _UNSEEN * dict(load_rig("emulated").axes.items())[axis].tolerance

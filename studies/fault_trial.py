@@ -23,14 +23,14 @@ from fault_judging import Evidence
 from fault_list import Fault
 from rig_trials import EmulatedRig, emulated_rig, ended, insertion
 
+import flexneedle
 from flexneedle.scenario.files import dump_scenario
+from flexneedle.types import Floats
 
+_LEFT = 6  # steps: some faults show only after a few
+_FIRST_STEP = 3  # in which a decision is late or rolls
+_PHASE_S = 0.3  # of a step and the rest after it
 _EARLIEST_S = 0.2  # after the first advance
-_LATEST = 0.8  # of the shortest duration of the insertion
-_FIRST_STEP, _LAST_STEP = (
-    3,
-    0.7,
-)  # in which a decision is late or rolls; steps, and of the path (a step is 1 mm)
 _ROLL_SHARES = (0.1, 0.8)  # of the time of the roll at its speed, since the decision
 _STOPPED_S = 3.0  # for which a controller is stopped by SIGSTOP
 _LONGEST_S, _END_S, _REST_S = 60.0, 5.0, 0.6
@@ -135,7 +135,8 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
             shutil.copytree(setting.record, keep / name, dirs_exist_ok=True)
         run = _recorded(setting.record, printed)
         times, left = (ordered, injected), _ended_by_force(others)
-        evidence = Evidence(fault, trial.axis, *times, rig.read_truth(), run, errors, left)
+        truth, commands = rig.read_truth(), _commands(setting.record, trial.axis)
+        evidence = Evidence(fault, trial.axis, *times, truth, run, errors, left, commands)
         row = trial.key | {"roll_deg": round(degrees(roll), 1)} | evidence.row()
     return row | {"exit_status": status, "seconds": monotonic() - begun}
 
@@ -144,7 +145,7 @@ def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generato
     """Options of the insertion for a controller of its own, where one decision is late or rolls."""
     if not (roll or trial.fault.decision_s):
         return ()
-    step = int(rng.integers(_FIRST_STEP, int(_LAST_STEP * trial.case.path_mm)))
+    step = int(rng.integers(_FIRST_STEP, int(trial.case.steps) - _LEFT))
     values = {"step": step, "seconds": trial.fault.decision_s, "roll": roll}
     (folder / "own.py").write_text(_CONTROLLER.format(**values))
     return ("--controller", "own:OWN")
@@ -166,7 +167,9 @@ def _await_moment(
         shares = rng.uniform(*_ROLL_SHARES)
         due = _marked(folder / "marker", process) + shares * trial.case.roll_s(roll)
     else:
-        due = begun + float(rng.uniform(_EARLIEST_S, _LATEST * trial.case.shortest_s))
+        step = float(rng.uniform(0.0, trial.case.steps - _LEFT))
+        _await_depth(step * trial.case.scenario.setup.max_advance_mm, rig, process)
+        due = max(monotonic(), begun + _EARLIEST_S) + float(rng.uniform(0.0, _PHASE_S))
     while monotonic() < due:
         _check_running(process)
         sleep(min(0.05, max(0.0, due - monotonic())))
@@ -183,6 +186,16 @@ def _first_advance(rig: EmulatedRig, process: subprocess.Popen[bytes]) -> float:
             return float(moving[0])
         _check_running(process)
         sleep(0.1)
+
+
+def _await_depth(travel: float, rig: EmulatedRig, process: subprocess.Popen[bytes]) -> None:
+    """Wait until the base has moved so far (mm)."""
+    while True:
+        base = rig.read_truth().positions["insertion"]
+        if base[-1] - base[0] >= travel:
+            return
+        _check_running(process)
+        sleep(0.05)
 
 
 def _marked(marker: Path, process: subprocess.Popen[bytes]) -> float:
@@ -226,6 +239,13 @@ def _ended_by_force(processes: tuple[psutil.Process, ...]) -> int:
     for one in left:
         one.kill()
     return len(left)
+
+
+def _commands(record: Path, axis: str) -> Floats | None:
+    """The commands (m, 9) of the insertion, where a fault is of an axis that moves seldom."""
+    if axis in ("insertion", "rotation"):
+        return None
+    return np.array([period.command for period in flexneedle.load(record).periods])
 
 
 def _recorded(record: Path, printed: str) -> Mapping[str, Any]:

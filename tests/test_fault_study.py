@@ -44,7 +44,7 @@ REASONS = {
 }
 
 
-def evidence(name, *states, outcome="done", reason=None, moves=(), left=0, axis="insertion"):
+def evidence(name, *states, outcome="done", reason=None, moves=(), left=0, axis="insertion", commands=None):
     """Of a fault at 10 s: states that the supervisor has entered, motions of the base (begin and end in s, mm)."""
     time = np.arange(8.0, 23.0, 0.004)
     base = sum((np.clip((time - a) / (b - a), 0.0, 1.0) * mm for a, b, mm in moves), np.zeros(len(time)))
@@ -53,7 +53,7 @@ def evidence(name, *states, outcome="done", reason=None, moves=(), left=0, axis=
     reason = REASONS.get(name, "") if reason is None else reason
     run = {"status": outcome, "reason": reason, "timing": {"ticks": {"states": recorded}}}
     truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
-    return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left)
+    return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left, commands)
 
 
 def row(name, *states, **more):
@@ -218,6 +218,21 @@ def test_the_time_of_a_guide_that_stalls_counts_from_the_last_motion_of_the_base
     assert found["from_motion_s"] == pytest.approx(0.75, abs=0.005)
     assert good(BY_NAME["guide stalls"], found)
     assert not good(BY_NAME["guide stalls"], found | {"from_motion_s": 0.95})
+
+
+def test_a_guide_that_stalls_may_be_missed_only_if_it_was_to_move_no_farther():
+    """Six steps of 1 mm are made or begin at the fault; in each later one the guide is to move by 0.002 mm."""
+    steps = [(8.5 + 0.3 * k, 8.7 + 0.3 * k, 1.0) for k in range(12)]
+    commands = np.zeros((12, 9))
+    commands[:, 0], commands[:6, 5], commands[6:, 5] = 1.0, 0.5, 0.002
+    given = {"moves": steps, "axis": "guide_y"}
+    found = row("guide stalls", END, commands=commands, **given)
+    assert found["commanded_mm"] == pytest.approx(0.012)
+    assert good(BY_NAME["guide stalls"], found)
+    commands[8, 5] = 0.1
+    found = row("guide stalls", END, commands=commands, **given)
+    assert found["commanded_mm"] == pytest.approx(0.11)
+    assert problems(BY_NAME["guide stalls"], found) == ["detection: None"]
 
 
 def test_what_the_needle_did_as_the_fault_was_injected():
