@@ -1,18 +1,23 @@
-"""Random rig files: each gives a rig whose numbers are usable, or lines that name a problem, and nothing else.
+"""Random rig files and profiles: each is read, with usable numbers, or refused by lines that name a problem.
 
-    python studies/fuzz_rig_file.py [--inputs N] [--seconds S] [--seed N]
+    python studies/fuzz_rig_file.py [--inputs N] [--seconds S] [--seed N] [--part files|profiles]
 
-Each input is a valid rig file with a few random changes: values, lines, tables, bytes, its end. It is read from the
-disk as `flexneedle rig check` does, with the settings of a Galil and an Aurora; no device is opened. Ends after N
-inputs (default: a million) or S seconds (default: 600), whichever is first. Prints the inputs; at the first failure its
-seed and input, and exit status 1.
+Each input is a valid file with a few random changes: values, lines, tables, bytes, its end. It is read from the disk as
+`flexneedle rig check` does, no device is opened:
+
+files       rig files, with the settings of a Galil and an Aurora, of joints and a tracker of ROS 2, of a replay
+profiles    profiles of ROS topics
+
+Each part ends after N inputs (default: a million) or S seconds (default: 600), whichever is first. Prints the inputs;
+at the first failure its seed and input, and exit status 1.
 """
 
 import math
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from importlib.resources import files as files_of
 from pathlib import Path
 from random import Random
 from time import process_time
@@ -20,8 +25,11 @@ from time import process_time
 from fuzzing import Failure, main
 
 from flexneedle.errors import RigError
-from flexneedle.rig.devices.galil.settings import checked
-from flexneedle.rig.devices.trackers import AuroraSettings
+from flexneedle.rig.devices.galil.settings import checked as galil_settings
+from flexneedle.rig.devices.trackers import AuroraSettings, ReplaySettings
+from flexneedle.ros.profile import load_profile
+from flexneedle.ros.settings import DriverSettings, TrackerSettings, profile_with
+from flexneedle.ros.settings import checked as ros_settings
 from flexneedle.scenario.rig import RigFile, load_rig, settings_of
 
 VALID = b"""\
@@ -82,6 +90,16 @@ profile = "neutral"
 arm = true
 target = false
 """
+GALIL = b'kind = "galil"\naddress = "192.168.1.2"'
+AURORA = b'kind = "aurora"\nport = "/dev/ttyUSB0"\nsensors = ["tip", "ref1"]'
+JOINTS = b'kind = "ros"\nprofile = "neutral"\nstale_ms = 200'
+TOPIC = b'kind = "ros"\nprofile = "smartneedle"\nsource = "tip"\nlate_ms = 250'
+REPLAY = b'kind = "replay"\nfile = "recording.csv"\nspeed = 2.0'
+RIGS = (VALID, VALID.replace(GALIL, JOINTS).replace(AURORA, TOPIC), VALID.replace(AURORA, REPLAY))
+PROFILES = tuple(
+    (files_of("flexneedle.ros") / "profiles" / f"{name}.toml").read_bytes()
+    for name in ("neutral", "smartneedle", "smartneedle-fbg")
+)
 ODD = (
     b"0", b"-1", b"1e400", b"-1e308", b"5e-324", b"inf", b"-inf", b"nan", b"1_0", b"0x7fffffffffffffffffff", b"true",
     b'""', b'"A"', b'"a\\nb"', b"[]", b"{}", b"[[]]", b"[nan, 1]", b"[1, 0]", b"[0, 1e6]", b"{kind = 1}", b"1979-05-27",
@@ -100,9 +118,9 @@ TABLES = (
 SLOWEST_S = 1.0  # of the processor: the machine may be busy with other processes
 
 
-def fuzzed(draw: Random) -> bytes:
-    """Return an input."""
-    data = VALID
+def fuzzed(valid: Sequence[bytes], draw: Random) -> bytes:
+    """Return an input, made of a valid one."""
+    data = draw.choice(valid)
     for _ in range(draw.randint(1, 3)):
         data = draw.choice(CHANGES)(data, draw)
     return data
@@ -213,39 +231,76 @@ def unusable(rig: RigFile) -> str:
 
 
 def outcome(path: Path) -> str:
-    """Read a file: "rig", "refused", or what is wrong."""
+    """Read a rig file: "read", "refused", or what is wrong."""
     start = f"{path}: "
     try:
         rig = load_rig(path)
         start = ""  # the settings are named without the file
-        if rig.driver.kind == "galil":
-            checked(rig.driver.settings, [axis.channel for _, axis in rig.axes.items()])
-        if rig.tracker.kind == "aurora":
-            settings_of(AuroraSettings, rig.tracker.settings)
+        _read_settings(rig)
     except RigError as error:
-        lines = error.problems
-        good = lines and all(line.startswith(start) and line.isprintable() for line in lines)
-        return "refused" if good else f"bad lines: {lines!r}"
+        return _refusal(error, start)
     except Exception as error:  # noqa: BLE001 - what the study searches
         return f"{type(error).__name__}: {error}"
-    return unusable(rig) or "rig"
+    return unusable(rig) or "read"
+
+
+def _read_settings(rig: RigFile) -> None:
+    driver, tracker = rig.driver, rig.tracker
+    if driver.kind == "galil":
+        galil_settings(driver.settings, [axis.channel for _, axis in rig.axes.items()])
+    elif driver.kind == "ros":
+        profile_with(ros_settings(driver.settings, DriverSettings).profile, "publish.joint_targets")
+    if tracker.kind == "aurora":
+        settings_of(AuroraSettings, tracker.settings)
+    elif tracker.kind == "replay":
+        settings_of(ReplaySettings, tracker.settings)
+    elif tracker.kind == "ros":
+        given = ros_settings(tracker.settings, TrackerSettings)
+        profile_with(given.profile, f"subscribe.{given.source}")
+
+
+def profile_outcome(path: Path) -> str:
+    """Read a profile: "read", "refused", or what is wrong."""
+    try:
+        profile = load_profile(path)
+    except RigError as error:
+        return _refusal(error, f"{path}: ")
+    except Exception as error:  # noqa: BLE001 - what the study searches
+        return f"{type(error).__name__}: {error}"
+    names = [topic.topic for _, topic in profile.topics()]
+    return "read" if len(names) == len({*names}) else "a topic twice"
+
+
+def _refusal(error: RigError, start: str) -> str:
+    lines = error.problems
+    good = lines and all(line.startswith(start) and line.isprintable() for line in lines)
+    return "refused" if good else f"bad lines: {lines!r}"
 
 
 def files(random: Random) -> Iterator[str]:
-    """Read one file after another."""
+    """Read one rig file after another."""
+    return _tried(RIGS, outcome, random)
+
+
+def profiles(random: Random) -> Iterator[str]:
+    """Read one profile after another."""
+    return _tried(PROFILES, profile_outcome, random)
+
+
+def _tried(valid: Sequence[bytes], read: Callable[[Path], str], random: Random) -> Iterator[str]:
     counts, slowest = Counter[str](), 0.0
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "rig.toml"
+        path = Path(folder) / "file.toml"
         while True:
-            data = fuzzed(random)
+            data = fuzzed(valid, random)
             path.write_bytes(data)
             begun = process_time()
-            found, took = outcome(path), process_time() - begun
-            if found not in ("rig", "refused") or took > SLOWEST_S:
+            found, took = read(path), process_time() - begun
+            if found not in ("read", "refused") or took > SLOWEST_S:
                 raise Failure(f"{data!r}: {found}, {took:.2f} s")
             counts[found], slowest = counts[found] + 1, max(slowest, took)
-            yield f": {counts['rig']} rigs, {counts['refused']} refused, slowest {1e3 * slowest:.0f} ms"
+            yield f": {counts['read']} read, {counts['refused']} refused, slowest {1e3 * slowest:.0f} ms"
 
 
 if __name__ == "__main__":
-    sys.exit(main(__doc__, {"files": files}))
+    sys.exit(main(__doc__, {"files": files, "profiles": profiles}))

@@ -140,7 +140,8 @@ def problem(key: str, data: bytes, record: Request | None) -> str:
     """Why a record must not be made of these bytes, or ""."""
     match record:
         case None:
-            return "" if key == "stop" else "no record"
+            nothing = key == "stop" and data[HEADER_BYTES : HEADER_BYTES + 1] == FALSE
+            return "" if nothing else "no record"
         case Arm():
             fine = key == "arm" and len(data) >= 5 and data[4] == 1
             return "" if fine else "armed"

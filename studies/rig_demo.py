@@ -128,6 +128,7 @@ def _exceeded(results: Sequence[Result]) -> Iterator[str]:
         ("mean true error above the simulated one, mm", growth, MOST_GROWTH_MM),
         ("99 % of the ticks of the worst insertion, ms", slowest, _MOST_TICK_MS),
         ("ticks left out, not by a stall", missed, 0.0),
+        ("late decisions", sum(one.late_periods for one in results), 0.0),
     ):
         if not value <= most:
             yield f"EXCEEDED: {name}: {value:.4g}, must be at most {most:g}"

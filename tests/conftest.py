@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 # Before numpy is loaded: OpenBLAS rounds differently on each kind of processor, and a closed loop carries the last
@@ -11,6 +12,10 @@ import pytest
 os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 from fake_engine import draw_nothing
+
+# The same examples each time, as slow as the machine may be.
+hypothesis.settings.register_profile("flexneedle", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("flexneedle")
 
 pytest_plugins = ["controllers"]
 

@@ -72,7 +72,7 @@ def test_a_target_behind_is_as_near_as_it_is_now(curvature):
     x=st.floats(-10, 60), y=st.floats(-10, 10), theta=st.floats(-0.5, 0.5),
     lateral=st.floats(-15, 15), bevel=st.sampled_from([-1, 1]), curvature=st.floats(0, 0.02),
 )  # fmt: skip
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=200)
+@hypothesis_settings(max_examples=200)
 def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, theta, lateral, bevel, curvature):
     here = wants_flip(at(x, y, theta), bevel, curvature, (40.0, lateral), 0.3, 0.01)
     mirrored = wants_flip(at(x, -y, -theta), -bevel, curvature, (40.0, -lateral), 0.3, 0.01)

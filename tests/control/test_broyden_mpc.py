@@ -31,13 +31,11 @@ MOVE = VECTOR.filter(lambda move: np.abs(move).max() > 0.05)
 
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR)
-@hypothesis_settings(derandomize=True)
 def test_the_full_update_meets_the_secant_equation(jacobian, moved, measured):
     np.testing.assert_allclose(bm.broyden(jacobian, moved, measured, 1.0) @ moved, measured, atol=1e-9)
 
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, gain=st.floats(0, 1))
-@hypothesis_settings(derandomize=True)
 def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian, moved, measured, gain):
     updated = bm.broyden(jacobian, moved, measured, gain)
     across = np.array([-moved[1], moved[0]])
@@ -46,7 +44,6 @@ def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian,
 
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, other=MATRIX)
-@hypothesis_settings(derandomize=True)
 def test_no_other_matrix_that_meets_the_equation_is_nearer(jacobian, moved, measured, other):
     nearest = bm.broyden(jacobian, moved, measured, 1.0)
     meets = other + np.outer(measured - other @ moved, moved) / (moved @ moved)
@@ -66,7 +63,7 @@ def test_the_gain_is_the_share_of_the_update_that_is_made():
     matrix=arrays(float, (5, 4), elements=NUMBERS), right=arrays(float, 5, elements=st.floats(-5, 5)),
     lower=arrays(float, 4, elements=st.floats(-2, 0)), upper=arrays(float, 4, elements=st.floats(0, 2)),
 )  # fmt: skip
-@hypothesis_settings(derandomize=True, max_examples=300)
+@hypothesis_settings(max_examples=300)
 def test_the_bounded_solve_costs_no_more_than_scipys(matrix, right, lower, upper):
     z = bm.bounded_least_squares(matrix, right, lower, upper)
     assert (z >= lower).all()

@@ -58,7 +58,7 @@ def test_they_are_there_under_their_names():
     step=st.floats(0.01, 0.5), reach=st.floats(0.02, 15.0), advance=st.floats(0.3, 2.0),
     readings=st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12), gain=st.floats(0.0, 20.0),
 )  # fmt: skip
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_limits_are_kept_whatever_the_target_and_the_readings(
     quick_plan, estimated, name, base, stretch, step, reach, advance, readings, gain
 ):

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from flexneedle.control import outlook as ol
@@ -87,7 +86,6 @@ def test_past_the_last_correction_nothing_is_learned():
     miss=st.floats(-30.0, 30.0), now=st.floats(-25.0, 39.0), variance=st.floats(1e-6, 1.0),
     sds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)), guided=st.booleans(),
 )  # fmt: skip
-@hypothesis_settings(deadline=None, derandomize=True)
 def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(
     miss, now, variance, sds, guided
 ):

@@ -144,7 +144,7 @@ def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along)
     guide=st.floats(-1.0, 1.0),
     offset=st.floats(-9.0, 9.0),
 )
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, guide, offset):
     """Wherever the current path has the guide, in or out of reach."""
     state = started(x, guide * REACH)
@@ -198,7 +198,7 @@ def test_two_rolls_at_one_place_cancel(quick_plan):
 
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+@hypothesis_settings(max_examples=100)
 def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
     """Where they are, in order, but for those within a twentieth of a control step of each other."""
     rolls = sorted(rolls)

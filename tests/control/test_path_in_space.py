@@ -57,7 +57,7 @@ def angles_of(ahead, rows):
 
 @pytest.mark.parametrize("rig", RIGS)
 @given(seed=SAMPLES)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_every_sample_is_within_the_limits_of_the_rig(rig, seed):
     """Guide, on its axes alone, and rotation; the depths grow to the target."""
     ahead, scenario = ahead_of(rig)
@@ -124,7 +124,7 @@ def test_two_half_turns_that_are_due_cancel():
 
 
 @given(seed=SAMPLES)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
     """Random rolls at depths that differ: at every place beyond a step's length of a roll."""
     ahead, _ = ahead_of("two axes")
@@ -143,7 +143,7 @@ def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
 
 @given(seed=SAMPLES)
 @example(seed=115)  # rolls that share the last step
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_no_roll_goes_the_long_way_round(seed):
     """Whatever angles a sample has, if the driver turns without limit; also of several rolls that are due at once."""
     ahead, _ = ahead_of("two axes", roll=2.0)

@@ -65,7 +65,6 @@ def damped_inverse(jacobian, damping):
 
 
 @given(jacobian=st.floats(-2, 2), damping=st.floats(1e-3, 1))
-@hypothesis_settings(derandomize=True)
 def test_damped_inverse_is_the_least_squares_solution(jacobian, damping):
     """Of J u = 1 and λ u = 0 together: J / (J² + λ²)."""
     expected = jacobian / (jacobian**2 + damping**2)
@@ -76,7 +75,6 @@ def test_damped_inverse_is_the_least_squares_solution(jacobian, damping):
     jacobian=arrays(float, (2, 2), elements=st.floats(-2, 2)), off=arrays(float, 2, elements=st.floats(-1, 1)),
     damping=st.floats(0.05, 1),
 )  # fmt: skip
-@hypothesis_settings(derandomize=True)
 def test_with_two_axes_too(jacobian, off, damping):
     """It solves (JᵀJ + λ²) u = Jᵀ off."""
     step = resolved_rate.damped_solution(jacobian, off, damping)
@@ -140,7 +138,7 @@ def test_without_gain_the_plan_is_all_there_is(quick_plan, along, estimated):
     steps=st.integers(0, 70), way=st.floats(0.01, 40), limit=st.floats(0.02, 0.5), reach=st.floats(0.02, 15),
     roll=st.sampled_from([0.0, np.pi]), advance=st.floats(0.2, 2.0),
 )  # fmt: skip
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_nominal_controls_insert_by_the_way_and_leave_room_for_the_disturbance(
     quick_plan, along, steps, way, limit, reach, roll, advance
 ):

@@ -70,7 +70,7 @@ def test_cells_are_not_so_short_that_a_fit_would_never_end():
     offset=st.floats(1e-3, 50.0), heights=st.lists(st.floats(0.5, 80.0), min_size=1, max_size=4),
     sd=st.floats(0.0, 50.0),
 )  # fmt: skip
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
     """The offset is at most 0.7 of the shortest compression length, whatever the prior of the factor."""
     offset = min(offset, 0.69 * min(heights))

@@ -81,7 +81,7 @@ def test_force_is_the_nominal_stress_times_the_area(stretch, stress_kpa):
     assert contact(ALPHA, HEIGHT * e)[1] == pytest.approx(1e-3 * stress_kpa * WIDTH, rel=2e-3)
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(law=layers)
 def test_every_law_has_the_stiffness_1_at_no_compression(law):
     """Energy e²/2, force e: the modulus of a layer is that of its law."""
@@ -92,7 +92,7 @@ def test_every_law_has_the_stiffness_1_at_no_compression(law):
     assert law.modulus == 3 * law.shear_modulus
 
 
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 @given(law=layers, e=st.floats(1e-3, LIMIT - 1e-4))
 def test_force_and_stiffness_are_derivatives_of_the_energy(law, e):
     """Central differences, which lose the 1e-16 of each value over 2h."""
@@ -102,7 +102,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(law, e):
     assert stiffness == pytest.approx((f2 - f1) / (2 * h), rel=1e-6, abs=1e-15 * force / h)
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(max_examples=200)
 @given(law=layers, e=compressions)
 def test_a_law_is_convex_and_finite(law, e):
     """Stiffness positive wherever a point may be; force and energy positive, finite."""
@@ -121,7 +121,7 @@ def test_the_energy_of_a_steep_law_is_equation_1(alpha):
 # ---- their tables
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(max_examples=200)
 @given(law=layers, e=compressions)
 def test_a_table_is_its_law(law, e):
     """Force and energy to 1e-9. The stiffness, by which a solve only finds its way, to 1e-8, and 1e-7 for α < −18."""
@@ -157,7 +157,7 @@ def test_a_table_of_the_linear_law_is_exact():
         assert sharpness == pytest.approx(0.0, abs=1e-9) or e >= LIMIT
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(law=layers, cell=st.integers(1, CELLS))
 def test_a_table_is_continuous_from_cell_to_cell_and_at_its_limit(law, cell):
     """Energy and force to rounding, the stiffness to what it may be off."""
@@ -167,7 +167,7 @@ def test_a_table_is_continuous_from_cell_to_cell_and_at_its_limit(law, cell):
     np.testing.assert_allclose(below[2], above[2], rtol=2e-7)
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(law=layers, e=st.floats(1e-6, 1.5))
 def test_force_and_stiffness_of_a_table_are_derivatives_of_its_energy(law, e):
     """Exactly its own, beyond the limit too, so that a line search and Newton's method agree."""
@@ -179,7 +179,7 @@ def test_force_and_stiffness_of_a_table_are_derivatives_of_its_energy(law, e):
     assert table.shape == (CELLS + 1, 8)
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(law=layers, beyond=st.floats(0.0, 3.0))
 def test_beyond_its_limit_a_table_continues_linearly(law, beyond):
     """Stiffness of the limit, force on its tangent, energy the integral of that; no Newton step is trusted there."""
@@ -192,7 +192,7 @@ def test_beyond_its_limit_a_table_continues_linearly(law, beyond):
     assert response(tables([law])[0], law.limit + beyond).sharpness == math.inf
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(law=layers, e=st.floats(1e-3, LIMIT - 1e-3))
 def test_the_sharpness_bounds_the_change_of_the_stiffness(law, e):
     """|w‴|/w″ by central differences; the mean of a cell stands for it, which is a hundredth less at a minimum."""
@@ -202,7 +202,7 @@ def test_the_sharpness_bounds_the_change_of_the_stiffness(law, e):
     assert third / of(law, e)[2] <= 1.02 * bound + 1e-5
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 @given(alpha=alphas, u=st.floats(-40.0, 40.0))
 def test_a_contact_is_that_of_the_reference(alpha, u):
     """Within and beyond the limit of 0.7, written out there as in equations 1 to 3; odd in u."""

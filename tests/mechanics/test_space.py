@@ -104,7 +104,7 @@ def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
 # ---- one plane, and any other
 
 
-@settings(deadline=None, derandomize=True, max_examples=12)
+@settings(max_examples=12)
 @given(seed=seeds)
 def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
     """Random insertions, to 1e-9 mm, and out of that plane exactly nothing."""
@@ -122,7 +122,7 @@ def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
     assert space.converged
 
 
-@settings(deadline=None, derandomize=True, max_examples=12)
+@settings(max_examples=12)
 @given(seed=seeds, angle=angles)
 def test_turning_all_inputs_turns_the_needle(seed, angle):
     """Base, guide, bevel, load and every command, in random insertions with rolls and spins."""
@@ -139,7 +139,7 @@ def test_turning_all_inputs_turns_the_needle(seed, angle):
     assert other.energy == pytest.approx(one.energy, rel=1e-7)
 
 
-@settings(deadline=None, derandomize=True, max_examples=8)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_mirrored_inputs_mirror_the_needle(seed):
     """z → −z with rolls and spins the other way: to the last bit."""
@@ -151,7 +151,7 @@ def test_mirrored_inputs_mirror_the_needle(seed):
     np.testing.assert_allclose(there * [1, 1, -1, 1, -1], tips, atol=1e-10)
 
 
-@settings(deadline=None, derandomize=True, max_examples=6)
+@settings(max_examples=6)
 @given(angle=angles, bend=st.floats(-1.0, 1.0))
 def test_a_bent_needle_with_clearance_turns_as_well(angle, bend):
     """Natural bend and the circle of the guide."""
@@ -269,7 +269,7 @@ def test_a_steady_spin_is_a_helix(rate):
 # ---- the guide's clearance
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(max_examples=10)
 @given(seed=seeds, clearance=st.floats(1e-2, 0.4))
 def test_the_circle_of_a_guide_pushes_towards_its_middle(seed, clearance):
     """No needle is beyond it, and none that does not touch it is pushed; a push has no part along the circle."""

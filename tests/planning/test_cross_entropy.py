@@ -155,7 +155,7 @@ def test_a_coordinate_without_sigma_stays_at_its_mean():
 
 
 @given(seed=st.integers(0, 2**32), failing=st.floats(0.0, 1.0))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_best_so_far_is_never_worse_than_any_sample_seen(seed, failing):
     """With a share of samples that fail, too."""
     rng = np.random.default_rng(seed)

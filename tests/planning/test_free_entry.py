@@ -50,7 +50,7 @@ def test_the_entry_of_a_plan_is_legal(scenario, entry, off, strategy):
 
 
 @given(which=st.integers(0, len(CASES) - 1), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_sample_of_the_entry_is_legal(which, seed):
     """And one that is legal by itself, as most are, is not changed by the limits."""
     free = aimed(*CASES[which])
@@ -88,7 +88,7 @@ def test_a_target_that_no_free_entry_brings_into_reach_is_refused():
     off=st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), radius=st.floats(0.0, 10.0),
     slope=st.floats(0.0, 200.0), now=st.tuples(st.floats(-200.0, 200.0), st.floats(-200.0, 200.0)),
 )  # fmt: skip
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_the_nearest_entry_is_as_near_as_any(off, radius, slope, now):
     """Compared with a few hundred others that are free."""
     entry = Entry(slope_mrad=now[0], slope_z_mrad=now[1], free_radius_mm=radius, free_slope_mrad=slope)

@@ -87,7 +87,7 @@ def test_a_correlation_is_that_of_the_first_samples():
 
 
 @given(seed=st.integers(0, 2**32), z=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
+@hypothesis_settings(max_examples=40)
 def test_it_is_never_worse_than_the_incumbent(seed, z):
     incumbent = np.array([z])
     before = terms.cost(TERMS, rigid(controls(incumbent)))[0]

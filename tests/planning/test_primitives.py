@@ -101,7 +101,7 @@ def test_short_samples_are_padded_with_steps_that_do_nothing():
 
 
 @given(z=sampled())
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+@hypothesis_settings(max_examples=100)
 def test_any_sample_keeps_travel_limits_and_turns(z):
     controls, wanted = schedule(PROBLEM, z)
     np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), PROBLEM.travel, rtol=1e-12)

@@ -58,7 +58,7 @@ def test_rolls_are_where_they_are_asked_for(z, side):
 
 
 @given(z=arrays(float, (3, 4), elements=st.floats(0.0, 1.0)), side=st.sampled_from([-1.0, 1.0]))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+@hypothesis_settings(max_examples=100)
 def test_any_sample_keeps_travel_and_steps_and_has_its_rolls(z, side):
     controls = steering.rolled(problem(0.0), z, side)
     np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), 28.0, rtol=1e-12)
@@ -85,7 +85,7 @@ def test_a_roll_leaves_the_other_steps_where_they_are():
 
 
 @given(share=st.floats(-0.95, 0.95), seed=st.integers(0, 2**32))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=20)
+@hypothesis_settings(max_examples=20)
 def test_every_target_within_reach_is_reached(share, seed):
     found = steering.steer(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
     tip = kinematic(found.controls[None], math.cos(found.roll)).tips[0, -1]

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench_rig import VALUES, rig
@@ -232,7 +232,6 @@ def test_a_plan_that_steers_by_the_bevel_begins_from_any_position_of_the_guide()
     assert start_problems(rig(), PLANE, HERE | {"guide_y": 2.5}, "steering", 70.5) == []
 
 
-@settings(deadline=None)
 @given(st.floats(2.0, 500.0), st.floats(1.0, 60.0))
 def test_the_target_fits_if_and_only_if_the_range_is_as_wide_as_the_advance_to_it(width, depth):
     found = fit_problems(rig(axes__insertion__range_mm=[0.0, width]), scenario(target__depth_mm=depth))

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench_rig import rig
@@ -76,7 +76,6 @@ def test_a_jog_faster_than_the_axis_is_refused(speed):
         jog(RIG, "insertion", "5", 0.0, speed)
 
 
-@settings(deadline=None)
 @given(st.floats(-200, 200), st.floats(-300, 300))
 def test_no_jog_goes_further_beyond_the_limits_than_it_is(position, distance):
     try:
@@ -117,7 +116,6 @@ def test_a_retraction_ends_off_the_switch_behind_the_base_or_at_its_lowest_posit
     assert retraction(found, 30.0).goal == pytest.approx(goal)
 
 
-@settings(deadline=None)
 @given(home=st.floats(-20.0, 0.0), most=st.none() | st.floats(0.1, 5.0), to=st.none() | st.floats(-1.0, 30.0))
 def test_no_retraction_ends_where_the_base_may_be_at_the_switch(home, most, to):
     most = {} if most is None else {"axes__insertion__max_error_mm": most}
@@ -190,7 +188,6 @@ def test_a_start_that_is_uncertain_by_backlash_is_said_so():
     ]
 
 
-@settings(deadline=None)
 @given(st.floats(-1e5, 1e5), st.sampled_from(["", "mm", " mm"]))
 def test_a_distance_is_the_number_that_is_written(value, unit):
     assert distance_of(f"{value!r}{unit}", "insertion", RIG.axes.insertion) == value

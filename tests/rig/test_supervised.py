@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tomli_w
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import flexneedle
@@ -31,7 +31,6 @@ SPACE = flexneedle.load_scenario("phantom3d")
 STEPS = st.floats(-1.0, 1.0)
 
 
-@settings(deadline=None)
 @given(st.lists(STEPS, min_size=5, max_size=5), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), STEPS)
 def test_travelled_axes_give_the_control_that_has_moved_them(steps, slope_y, slope_z, spin):
     columns = Columns(complex(slope_y, slope_z))

@@ -36,6 +36,7 @@ def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
         ("tip", Arm(0.0, "/t"), "armed"),
         ("tip", Stop(0.0, "/t"), "stop from tip"),
         ("tip", None, "no record"),
+        ("stop", None, "no record"),
         ("target", Target(0.0, (float("nan"), 0.0, 0.0)), "position"),
         ("target", Target(0.0, (2e4, 0.0, 0.0)), "position"),
         ("tip", TipReading(0.0, 1, None, None), "position None"),

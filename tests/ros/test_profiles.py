@@ -128,6 +128,11 @@ def test_the_fibre_optic_needle_publishes_its_own_shape():
             'frames.skin = ["x", "-y", "z"]: must be three different axes',
         ),
         ({"frames__skin": {"id": ""}}, "frames.skin.id"),
+        ({"frames__skin": {"id": "skin", "idd": 1}}, "frames.skin.idd = 1: unknown key; did you mean id?"),
+        (
+            {"frames__x": {"id": "x", "deep": [[]]}},
+            "frames.x.deep = [[]]: unknown key; valid keys: x, y, z, id",
+        ),
     ],
 )
 def test_what_is_refused(tmp_path, changes, line):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -240,7 +240,6 @@ FULL = {
 PATHS = sorted(paths(FULL), key=str)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3), st.booleans())
 @example([(("axes", "insertion", "channel"), [[{"": "A"}]])], False)
 def test_any_change_gives_a_rig_or_lines(changes, removes):
@@ -271,20 +270,33 @@ def assert_rig_or_lines(changed):
     assert fuzz_rig_file.unusable(found) == ""
 
 
-@settings(deadline=None)
 @given(st.integers(0, len(TEXT) - 1), st.integers(0, 30), st.text(max_size=6))
 def test_any_edit_of_the_text_gives_a_rig_or_lines(tmp_path_factory, start, length, new):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(TEXT[:start] + new + TEXT[start + length :], encoding="utf-8")
-    assert fuzz_rig_file.outcome(path) in ("rig", "refused")
+    assert fuzz_rig_file.outcome(path) in ("read", "refused")
 
 
+@pytest.mark.parametrize("part", [fuzz_rig_file.files, fuzz_rig_file.profiles])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_random_files_give_a_rig_or_lines(seed):
+def test_random_files_are_read_or_refused_by_lines(part, seed):
     """The study of a million inputs in small: both are frequent, nothing else occurs."""
-    done, note = fuzzing.run(fuzz_rig_file.files, 300, 60.0, seed)
+    done, note = fuzzing.run(part, 300, 60.0, seed)
     assert done == 300
-    assert min(int(count) for count in re.findall(r"(\d+) (?:rigs|refused)", note)) > 15
+    assert min(int(count) for count in re.findall(r"(\d+) (?:read|refused)", note)) > 15
+
+
+def test_unchanged_files_are_read(tmp_path):
+    """Also with the settings of each kind of device."""
+    assert len({*fuzz_rig_file.RIGS}) == 3
+    path = tmp_path / "file.toml"
+    for read, valid in (
+        (fuzz_rig_file.outcome, fuzz_rig_file.RIGS),
+        (fuzz_rig_file.profile_outcome, fuzz_rig_file.PROFILES),
+    ):
+        for data in valid:
+            path.write_bytes(data)
+            assert read(path) == "read"
 
 
 def test_an_unusable_rig_is_noticed():

@@ -16,7 +16,7 @@ from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, struct
 PRESET = load_scenario("phantom").values()
 NUMBERS = st.integers(0, LARGEST_WORLD)
 DRAWN = ("name", "needle", "setup", "tissue", "target")
-many_worlds = hypothesis_settings(deadline=None, derandomize=True, max_examples=150)
+many_worlds = hypothesis_settings(max_examples=150)
 
 
 def digest(number):

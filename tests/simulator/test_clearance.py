@@ -91,7 +91,7 @@ def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     assert rolled.reactions.guide_force[0] == pytest.approx(-state.reactions.guide_force[0], rel=1e-9)
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(max_examples=40)
 @given(
     clearance=st.floats(1e-3, 0.5), guide=st.floats(-0.5, 0.5),
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
@@ -112,7 +112,7 @@ def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
 # ---- in tissue
 
 
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 @given(
     clearance=st.floats(1e-3, 0.5), guide=st.floats(-3.0, 3.0), depth=st.integers(-20, 30),
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),

@@ -61,7 +61,7 @@ def test_step_may_end_any_distance_past_a_contact_point(past):
     assert_same_curve(end, direct, 2e-3)
 
 
-@settings(deadline=None, derandomize=True, max_examples=15)
+@settings(max_examples=15)
 @given(st.lists(st.floats(-0.3, 1.0), min_size=20, max_size=60))
 def test_path_depends_little_on_how_it_is_divided_into_steps(lengths):
     """Random pushes and short pulls end where one-millimetre steps end."""
@@ -158,7 +158,7 @@ def test_points_grow_in_over_the_second_half_of_their_interval(past):
     assert held.strain_energy == pytest.approx(ramp @ whole, rel=1e-6)
 
 
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(max_examples=20)
 @given(
     rows=st.lists(
         st.tuples(

@@ -1,7 +1,8 @@
 """Node `flexneedle_operator`: services `~/stop` and `~/arm` (std_srvs/srv/Trigger) of a flexneedle rig.
 
 The rig itself has topics, which are the same for every DDS vendor. A service call publishes on its topic and answers
-once the rig reports a state that shows that it has been carried out, or that it has not within `answer_s`.
+once the rig has reported after that, as it does at least once a second, a state that shows that it has been carried
+out, or that it has not within `answer_s`.
 """
 
 import sys
@@ -17,21 +18,23 @@ DEFAULTS = {
     "stop_topic": "/flexneedle/stop",
     "arm_topic": "/flexneedle/arm",
     "state_topic": "/flexneedle/state",
-    "answer_s": 1.0,
+    "answer_s": 2.0,
 }
 
 
 class States:
-    """The last reported state of the rig, for threads that wait for one."""
+    """The last reported state of the rig, and the number of reports, for threads that wait for one."""
 
     def __init__(self):
         self._changed = threading.Condition()
         self._state = ""
+        self._count = 0
 
     def report(self, state):
         """Note a state that the rig reports."""
         with self._changed:
             self._state = state
+            self._count += 1
             self._changed.notify_all()
 
     @property
@@ -39,17 +42,24 @@ class States:
         """The last state, "" before the first."""
         return self._state
 
-    def wait(self, wanted, seconds):
-        """Whether the state is among `wanted` within some seconds."""
+    @property
+    def count(self):
+        """The number of reports."""
+        return self._count
+
+    def wait(self, wanted, since, seconds):
+        """Whether the state is among `wanted` within some seconds, in a report after the first `since`."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._state in wanted, seconds)
+            return self._changed.wait_for(lambda: self._count > since and self._state in wanted, seconds)
 
 
 def ask(publish, states, wanted, seconds, *, repeat):
-    """Publish, again and again if `repeat`, until the state is among `wanted`; return whether it is in time."""
-    deadline = time.monotonic() + seconds
+    """Publish, again and again if `repeat`, until the state is reported to be among `wanted`; return whether it is in
+    time. A report from before may be of a rig that has ended.
+    """
+    deadline, since = time.monotonic() + seconds, states.count
     publish()
-    while not states.wait(wanted, min(REPEAT_S, max(0.0, deadline - time.monotonic()))):
+    while not states.wait(wanted, since, min(REPEAT_S, max(0.0, deadline - time.monotonic()))):
         if time.monotonic() >= deadline:
             return False
         if repeat:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
@@ -162,9 +162,13 @@ def _unknown(loc: tuple[int | str, ...], model: type[BaseModel]) -> str:
 def _section_at(loc: Sequence[str | int], model: type[BaseModel]) -> type[BaseModel] | None:
     """Return the model that describes the table at a path."""
     section: type[BaseModel] | None = model
+    named = False  # whether the next part is a name that the user has given to a section
     for part in loc:
-        if section and isinstance(part, str):
-            section = _model_in(section.model_fields[part].annotation)
+        if section and isinstance(part, str) and not named:
+            annotation = section.model_fields[part].annotation
+            section, named = _model_in(annotation), get_origin(annotation) is dict
+        else:
+            named = False
     return section
 
 

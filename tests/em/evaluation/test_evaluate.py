@@ -17,7 +17,7 @@ from flexneedle.em.evaluation.evaluate import Options, evaluate
 from flexneedle.em.table.columns import column_map
 from flexneedle.errors import InputError
 
-LAWS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LAWS = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
 # first, ±2 along y at the second.
 BY_HAND = rows_of(

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.errors import RigError
@@ -42,7 +42,6 @@ def followed(carriage, path):
     return np.array(list(places))
 
 
-@settings(deadline=None)
 @given(travels, st.sampled_from([2000.0, -2000.0, 37.5]), st.floats(-5.0, 5.0))
 def test_without_backlash_a_position_is_that_of_the_motor(path, scale, start):
     places = followed(Carriage(scale, start, FAR, FAR), path)
@@ -60,7 +59,6 @@ def with_slack(start, backlash, motor):
     return np.array(places)
 
 
-@settings(deadline=None)
 @given(travels, st.sampled_from([2000.0, -2000.0]), st.floats(0.0, 3.0))
 def test_with_backlash_the_axis_lags_by_the_lost_motion_on_reversal(path, scale, backlash):
     places = followed(Carriage(scale, 1.0, FAR, FAR, backlash), path)[1:]
@@ -128,7 +126,6 @@ def test_each_axis_follows_the_motor_of_its_channel():
 places = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6).map(np.array)
 
 
-@settings(deadline=None)
 @given(st.lists(places, min_size=2, max_size=10))
 def test_increments_add_up_to_the_whole_way(path):
     rows = np.array([increments(before, after) for before, after in itertools.pairwise(path)])

@@ -32,7 +32,7 @@ COMMAND = st.one_of(
 LINE = st.lists(COMMAND, min_size=1, max_size=3).map(";".join)
 
 
-@settings(deadline=None, derandomize=True, max_examples=150)
+@settings(max_examples=150)
 @given(st.lists(st.tuples(LINE, st.integers(0, 20)), max_size=30))
 def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
     device, _ = reply(Device(), "SHAB")
@@ -72,8 +72,6 @@ REPLY = st.one_of(
 
 
 @settings(
-    deadline=None,
-    derandomize=True,
     max_examples=150,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

@@ -465,7 +465,7 @@ def test_the_setup_has_limits_errors_and_disabled_switches_of_the_controller():
     assert found["B"] == MotorSetup(-math.inf, 1000.0, 200.0, off_on_error=True, disabled="forward")
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(max_examples=200)
 @given(st.dictionaries(st.sampled_from("ABCDEFGH"), st.integers(-(2**31) + 1, 2**31 - 1), min_size=1))
 def test_every_position_is_sent_to_its_axis_in_lines_that_fit(positions):
     from flexneedle.rig.devices.galil.motors import _in_lines

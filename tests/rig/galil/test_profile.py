@@ -37,7 +37,7 @@ def test_a_move_takes_the_time_of_its_trapezoid(distance, speed):
     assert len(after) * SAMPLE_S == pytest.approx(expected, abs=0.05 * expected + 2.0 * SAMPLE_S)
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 @given(
     goals=st.lists(st.floats(-3_000.0, 3_000.0), min_size=1, max_size=4),
     waits=st.lists(st.integers(1, 200), min_size=4, max_size=4),

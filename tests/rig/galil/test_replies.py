@@ -99,7 +99,7 @@ def test_commands_are_distributed_over_lines_in_their_order():
         lines(("X" * 81,))
 
 
-@settings(deadline=None, derandomize=True, max_examples=500)
+@settings(max_examples=500)
 @given(st.binary(max_size=40), st.integers(1, 5))
 def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
     try:
@@ -111,7 +111,7 @@ def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
         assert "".join(each.data + "?:"[each.accepted] for each in found).encode() == received
 
 
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 @given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=8), st.data())
 def test_a_reply_arrives_in_any_pieces(values, data):
     whole = f" {', '.join(map(str, values))}\r\n:".encode()

@@ -48,7 +48,7 @@ def test_a_roll_takes_its_angle_over_the_speed_of_the_rotation(angle):
     assert roll_time(PHANTOM.setup, angle) == pytest.approx(abs(angle) / (2.0 * math.pi))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.floats(0.5, 2.0),
     st.floats(0.1, 3.0),

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.rig.monitor import rules as monitor_rules
@@ -180,7 +180,6 @@ def test_the_largest_median_is_reported():
     )
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(0.0, 0.05), min_size=10, max_size=40), st.lists(st.floats(0.06, 9.9), max_size=9))
 def test_fewer_than_half_of_the_readings_above_the_limit_are_accepted(low, high):
     assert rules.distortion({"ref1": low + high}, 0.0547, 1.0) == OK

@@ -101,7 +101,7 @@ def many():
 
 
 @given(seed=st.integers(0, 2**63))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=50)
+@hypothesis_settings(max_examples=50)
 def test_a_draw_is_within_its_ranges_and_leaves_other_values_unchanged(seed):
     truth = drawn(seed)
     found = entries(truth)

@@ -29,7 +29,7 @@ def rough(grid, scenario=IDEAL):
         max_size=12,
     ),
 )
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=20)
+@hypothesis_settings(max_examples=20)
 def test_motors_are_on_whole_steps_and_rounding_does_not_accumulate(grid, rows):
     """After any commands each sum is within half a step of the requested one; the applied command is returned."""
     phantom = rough(grid)

@@ -57,7 +57,7 @@ def test_a_structural_change_does_not_change_other_draws(structure, expected):
     factor=st.floats(0.1, 10.0),
     seed=st.integers(0, 50),
 )
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_a_hidden_layer_multiplies_the_modulus_inside_and_nowhere_else(top, thickness, factor, seed):
     hidden = {"top_mm": top, "thickness_mm": thickness, "modulus_factor": factor}
     plain = truth_of(PHANTOM, seed).scenario

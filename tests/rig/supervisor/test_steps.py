@@ -41,7 +41,7 @@ def test_its_begin_and_end_are_those_of_the_motion_and_not_of_ticks(bench):
     assert done.ended == pytest.approx(0.2 - 0.5 * ramp, abs=0.01)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.floats(-1.0, 1.0), st.floats(-0.5, 0.5), st.floats(0.0, 0.02)), min_size=1, max_size=8
@@ -66,7 +66,7 @@ def test_positions_do_not_drift_and_motors_never_have_more_than_the_queue(steps)
         )  # half the lost motion, before it is known
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     motors=st.sampled_from([Stage, Moves]),
     speed=st.floats(1.0, 10.0),

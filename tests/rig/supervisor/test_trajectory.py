@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.rig.supervisor.drives import Drive
@@ -23,7 +23,6 @@ def travelling(ways, duration):
     return between({channel: DRIVES[channel] for channel in ways}, start, goal, duration)
 
 
-@settings(deadline=None)
 @given(WAYS, st.floats(0.0, 30.0))
 def test_no_axis_exceeds_its_speed_or_acceleration_and_the_motion_takes_its_time(ways, duration):
     made = travelling(ways, duration)
@@ -34,7 +33,6 @@ def test_no_axis_exceeds_its_speed_or_acceleration_and_the_motion_takes_its_time
         assert speed / made.ramp <= axis.acceleration * (1 + 1e-6)
 
 
-@settings(deadline=None)
 @given(WAYS, st.floats(0.0, 5.0))
 def test_speed_and_acceleration_are_those_of_the_positions(ways, duration):
     made = travelling(ways, duration)
@@ -63,7 +61,6 @@ def test_the_goal_is_exact():
     assert made.at(made.share(-1.0)) == {"A": 7.0, "C": 7.0}
 
 
-@settings(deadline=None)
 @given(st.floats(0.15, 2.0), st.floats(0.1, 3.0), st.floats(0.0, 0.02))
 def test_the_measured_begin_and_end_are_those_of_the_constant_speed_inside_the_ramps(duration, way, late):
     """A trapezoid with ramps h covers its middle like a motion at constant speed from h/2 to T − h/2."""

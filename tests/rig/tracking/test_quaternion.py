@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +16,6 @@ def matrix(quaternion):
 
 
 @given(vector=VECTORS)
-@hypothesis_settings(deadline=None, derandomize=True)
 def test_a_rotation_vector_gives_its_matrix(vector):
     quaternion = from_vector(vector[None])[0]
     np.testing.assert_allclose(matrix(quaternion), Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
@@ -25,7 +23,6 @@ def test_a_rotation_vector_gives_its_matrix(vector):
 
 
 @given(first=VECTORS, second=VECTORS)
-@hypothesis_settings(deadline=None, derandomize=True)
 def test_a_product_rotates_by_the_second_first(first, second):
     rotations = from_vector(np.stack([first, second]))
     both = product(rotations[0], rotations[1])
@@ -34,7 +31,6 @@ def test_a_product_rotates_by_the_second_first(first, second):
 
 
 @given(vector=VECTORS)
-@hypothesis_settings(deadline=None, derandomize=True)
 def test_a_matrix_gives_its_quaternion(vector):
     rotation = Rotation.from_rotvec(vector).as_matrix()
     quaternion = from_matrix(rotation)
@@ -43,7 +39,6 @@ def test_a_matrix_gives_its_quaternion(vector):
 
 
 @given(vector=VECTORS)
-@hypothesis_settings(deadline=None, derandomize=True)
 def test_the_shortest_rotation_to_a_direction_has_no_roll(vector):
     direction = from_vector(vector[None])[0, 1:] + [0.0, 0.0, 1e-3]
     direction = direction / np.linalg.norm(direction)

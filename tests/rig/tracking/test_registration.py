@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.errors import InputError
@@ -36,7 +36,6 @@ def rotation_of(vector):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-@settings(deadline=None)
 @given(seeds, st.integers(3, 20))
 def test_exact_pairs_give_the_exact_map(seed, count):
     rng = np.random.default_rng(seed)

@@ -138,7 +138,7 @@ def test_a_delay_that_is_not_a_multiple_of_the_period_is_exact():
 
 
 @given(waits=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=30), delay=st.floats(0.0, 0.5))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+@hypothesis_settings(max_examples=100)
 def test_each_reading_is_returned_once_and_in_order(waits, delay):
     clock = ManualClock()
     device = tracker(clock, delay=delay)

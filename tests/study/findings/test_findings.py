@@ -192,7 +192,7 @@ def test_the_worst_are_the_largest_errors_finished_or_not(read):
     assert worst(read(rows).rows, 4) == [1, 4, 2, 5]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.data())
 def test_no_insertion_is_dropped_for_any_outcomes(tmp_path_factory, data):
     """Every insertion is in one group, and each that did not finish is in one ending."""

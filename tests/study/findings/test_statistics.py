@@ -41,7 +41,7 @@ def test_rows_are_weighted_by_their_multiplicity():
     assert_allclose(quantile(VALUES, 0.9)(counts), [np.quantile([3, 3, 2, 6], 0.9)])
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30),
     st.floats(0, 1),

@@ -41,7 +41,7 @@ def test_a_line_that_damages_replies_gives_no_frame_that_was_not_sent():
     assert int(re.search(r"(\d+) replies", note)[1]) > 100, note
 
 
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 @given(
     kind=st.integers(0, 255),
     bits=st.integers(0, 0xFFFF),
@@ -54,7 +54,7 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
     assert all(abs(part) < fuzz_aurora.FARTHEST_MM for part in found.position or ())
 
 
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 @given(
     st.lists(
         st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5
@@ -68,7 +68,7 @@ def test_any_line_that_is_no_message_is_refused_and_counted(lines):
     assert feeding.incoming.read() == ()
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(st.binary(max_size=40), max_size=10))
 def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
     device = aurora.fresh()

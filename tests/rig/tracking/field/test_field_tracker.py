@@ -50,7 +50,7 @@ def test_without_errors_a_reading_is_the_true_pose():
 
 
 @given(waits=st.lists(st.floats(0.0, 0.3), min_size=1, max_size=15), delay=st.floats(0.0, 0.3))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
+@hypothesis_settings(max_examples=40)
 def test_each_frame_is_returned_once_and_in_order(waits, delay):
     clock = ManualClock()
     device = tracker(clock, delay=delay)

@@ -31,7 +31,7 @@ def test_the_grid_is_that_of_the_paper():
     shared=st.floats(0.0, 1.0),
     power=st.floats(0.0, 4.0),
 )
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
+@hypothesis_settings(max_examples=40)
 def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, power):
     """RMS over the paper's grid, for each sensor, with and without a plate."""
     plate = ABOVE | {"tip_mm": 2 * size, "reference_mm": 3 * size, "decay_mm": length}
@@ -115,7 +115,7 @@ def test_behind_the_plate_the_distortion_is_that_at_the_plate():
 
 
 @given(nearer=st.floats(1.0, 60.0), distance=st.floats(70.0, 300.0), seed=st.integers(0, 1000))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
+@hypothesis_settings(max_examples=40)
 def test_the_nearer_the_plate_the_larger_the_distortion_everywhere(nearer, distance, seed):
     room = Room(environment(plate=ABOVE | {"reference_mm": 1.0}), seed)
     far = np.linalg.norm(room.distortion("ref1", GRID, distance + nearer), axis=-1)
@@ -133,7 +133,7 @@ LENGTHS = st.sampled_from([1e-6, 1.0, 1e6])
 
 
 @given(length=LENGTHS, edge=LENGTHS, decay=LENGTHS, away=LENGTHS, power=st.sampled_from([0.0, 10.0]))
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+@hypothesis_settings(max_examples=60)
 def test_errors_are_finite_for_extreme_environments(length, edge, decay, away, power):
     plate = {"tip_mm": 1e6, "reference_mm": 1e-6, "coils_mm": 1.0, "decay_mm": decay, "coils_decay_mm": decay}
     tracker = environment(

@@ -30,7 +30,7 @@ def read(tracker, sensor, count, seed=2):
 
 
 @given(direction=DIRECTIONS)
-@hypothesis_settings(deadline=None, derandomize=True, max_examples=30)
+@hypothesis_settings(max_examples=30)
 def test_a_sensor_without_errors_reads_the_true_pose(direction):
     orientation = along(np.array(direction) / np.linalg.norm(direction))
     orientations = np.tile(orientation, (125, 1))
