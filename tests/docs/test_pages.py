@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -79,6 +80,25 @@ def test_every_command_is_one():
             failures += [f"{name}: {line}"] if error.code else []
     assert len(commands()) > 60
     assert failures == []
+
+
+def test_options_of_studies_and_benchmarks_are_theirs():
+    """As the scripts themselves explain them."""
+    shown = {
+        match
+        for text in TEXTS.values()
+        for match in re.findall(r"python ((?:studies|benchmarks)/\w+\.py)((?: --?[\w-]+(?: [\w.]+)*)*)", text)
+    }
+    assert len(shown) > 15
+    for script, options in shown:
+        assert (ROOT / script).is_file(), script
+        if options:
+            printed = subprocess.run(
+                [sys.executable, ROOT / script, "--help"], capture_output=True, text=True
+            ).stdout
+            assert [one for one in options.split() if one.startswith("-") and one not in printed] == [], (
+                script
+            )
 
 
 def test_every_make_target_is_one():
