@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Reach, Rows
@@ -29,10 +28,6 @@ pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
 REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
-COLORS = """canvas => {
-  const pen = canvas.getContext("2d");
-  return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
-}"""
 
 
 @pytest.fixture
@@ -314,17 +309,3 @@ def test_nothing_is_moved_where_another_steers_or_an_insertion_runs(views, news)
     page = views([*opening(), *news])
     until(page, "!document.querySelector('.handle')")
     assert page.locator(f"{SECTION} .legend li").count() > 0  # it is drawn
-
-
-@pytest.mark.parametrize("state", ["planned", "inserting"])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
-def test_it_is_drawn_at_each_size(views, pictures, size, scheme, state):
-    news = inserting() if state == "inserting" else [*planned(), REACH]
-    page = views(news, width=size[0], height=size[1], scheme=scheme)
-    page.evaluate("document.querySelector('.panel.section').scrollIntoView()")
-    page.wait_for_timeout(200)
-    for panel in (SECTION, AXIAL):
-        assert page.eval_on_selector(f"{panel} canvas", COLORS) > 30
-    assert too_wide(page) == []
-    pictures(page, f"section-{state}-{size[0]}-{scheme}")

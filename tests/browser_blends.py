@@ -1,0 +1,58 @@
+"""What a part adds to the drawings of a page: pixels that have come closer to its tone."""
+
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+FLAT = ("[data-panel=section] canvas", "[data-panel=axial] canvas")
+
+# Antialiased and translucent parts have few pixels of their very tone; all of theirs are between what was there and it.
+BLENDS = """
+const { color } = await import("/static/theme.js");
+const toneOf = (name) => color(name).match(/[0-9]+/g).slice(0, 3).map(Number);
+function composed(canvas) {
+  const copy = new OffscreenCanvas(canvas.width, canvas.height);
+  const pen = copy.getContext("2d");
+  pen.fillStyle = color("--stage");
+  pen.fillRect(0, 0, copy.width, copy.height);
+  pen.drawImage(canvas, 0, 0);
+  return pen.getImageData(0, 0, copy.width, copy.height).data;
+}
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+// Share from 0 to 1 by which a pixel has come closer to a tone, or 0 where it has changed to something else.
+function shareOf(before, after, at, tone) {
+  const change = [0, 1, 2].map((part) => after[at + part] - before[at + part]);
+  const whole = [0, 1, 2].map((part) => tone[part] - before[at + part]);
+  const size = dot(change, change);
+  const along = dot(change, whole);
+  if (size < 100 || along < 0.97 * Math.sqrt(size * dot(whole, whole))) return 0;
+  const share = along / dot(whole, whole);
+  return share > 1.1 ? 0 : share;
+}
+function blended(before, after, tone) {
+  let count = 0;
+  for (let at = 0; at < after.length; at += 4) if (shareOf(before, after, at, tone)) count++;
+  return count;
+}
+"""
+
+_KEEP = f"""async (selectors) => {{
+  {BLENDS}
+  window.kept = selectors.map((selector) => composed(document.querySelector(selector)));
+}}"""
+_ADDED = f"""async ([selectors, tone]) => {{
+  {BLENDS}
+  const now = selectors.map((selector) => composed(document.querySelector(selector)));
+  return now.map((after, at) => blended(window.kept[at], after, toneOf(tone)));
+}}"""
+
+
+def arrived(page):
+    """Wait until what the server has sent so far is there and painted: an answer comes after it."""
+    page.evaluate("flexneedle.link.ask({ type: 'rows_from', index: 0 })")
+    page.evaluate(PAINTED)
+
+
+def added(page, server, tone, *news, canvases=FLAT):
+    """Number of pixels in each canvas that news from the server blend with a tone."""
+    page.evaluate(_KEEP, list(canvases))
+    server.send(*news)
+    arrived(page)
+    return page.evaluate(_ADDED, [list(canvases), tone])
