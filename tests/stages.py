@@ -1,5 +1,6 @@
 """Motors and a tracker in memory, on a clock that a test sets: what a supervisor moves and reads."""
 
+import gc
 import math
 import os
 from dataclasses import dataclass, field, replace
@@ -370,3 +371,20 @@ def noting_motors(settings, channels):
     made = Noting(settings["file"], channels)
     made.address = settings.get("address", Stage.address)
     return made
+
+
+class Reporting(Stage):
+    """Motors that note in a file how their process runs: whether garbage is collected, and its scheduling."""
+
+    def __init__(self, clock, channels, notes):
+        super().__init__(clock, channels)
+        self._notes = Path(notes)
+
+    def read(self):
+        self._notes.write_text(f"{gc.isenabled()} {os.sched_getscheduler(0)}")
+        return super().read()
+
+
+def reporting_motors(settings, channels):
+    """A driver of a rig file, `stages:reporting_motors`: those; notes: the file."""
+    return Reporting(WallClock(), channels, settings["notes"])

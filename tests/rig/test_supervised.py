@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -280,6 +282,14 @@ def assert_trace_of_a_simulated_run(done, folder, without):
 @pytest.mark.long
 @pytest.mark.parametrize("dry", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
+    """Also if the rig is checked meanwhile, which the tracker's port refuses."""
+    checks = []
+
+    def check(period):
+        if period.index == 3:
+            command = [sys.executable, "-m", "flexneedle", "rig", "check", path]
+            checks.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+
     scenario = PHANTOM.with_values({"target.depth_mm": 12.0, "target.lateral_mm": 1.0})
     plan = flexneedle.plan(scenario, seed=0)
     path, truth = rig_file(tmp_path), tmp_path / "truth.csv"
@@ -287,8 +297,11 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     with emulated_rig(path, "phantom", "--seed", str(seed), "--truth", truth) as rig:
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
-        done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry)
+        done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry, on_period=check)
+        printed = checks[0].communicate()[0]
         counts = float(rig.ask("TPA").strip(" \r\n:"))
+    assert "ok       driver     reply" in printed
+    assert "PROBLEM  tracker    connection" in printed
     found = read_truth(truth)
     advanced = sum(period.applied.db_x for period in done.periods)
     scale = load_rig(path).axes.insertion.scale
