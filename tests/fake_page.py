@@ -170,7 +170,8 @@ class FakePage:
             for axis, key in enumerate(_KEYS):
                 self._target[axis] = request["values"].get(key, self._target[axis])
             target = tuple(self._target)
-            return [session(self._revision, target), scene(self._revision, target), *scene_frames(target)]
+            moved = session(self._revision, target, reach_since=1)
+            return [moved, scene(self._revision, target), *scene_frames(target)]
         return []
 
     async def _send_all(self, news):

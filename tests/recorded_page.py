@@ -42,7 +42,7 @@ def people(clients=1, steering=None):
     return People(clients=clients, steering=steering)
 
 
-def session(revision=1, target=TARGET, **changes):
+def session(revision=1, target=TARGET, reach_since=None, **changes):
     values = {
         "name": "Two-layer tissue phantom in space",
         "needle.outer_diameter_mm": 0.819,
@@ -61,7 +61,8 @@ def session(revision=1, target=TARGET, **changes):
         "controller": "adaptive-mpc",
         **changes,
     }
-    return Session(revision=revision, values=values, changed=[], doubts=[], **given)
+    since = revision if reach_since is None else reach_since
+    return Session(revision=revision, reach_since=since, values=values, changed=[], doubts=[], **given)
 
 
 def scene(revision=1, target=TARGET, axes=2):

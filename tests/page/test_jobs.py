@@ -55,6 +55,16 @@ def test_an_edit_cancels_what_is_searched_for_the_old_scenario(planned):
     assert planned.newest["session"]["values"]["target.depth_mm"] == 35.0
 
 
+def test_a_reach_goes_on_while_the_target_is_moved_and_is_cancelled_by_another_edit(planned):
+    planned.do("start", work="reach")
+    reach = planned.job("reach", "running")["job"]
+    planned.do("edit", values={"target.depth_mm": 35.0})
+    planned.wait(lambda: planned.newest["estimate"]["revision"] == 2)
+    assert planned.job("reach", "running")["job"] == reach
+    planned.do("edit", values={"tissue.0.alpha": 9.0})
+    assert planned.job("reach", "cancelled")["job"] == reach
+
+
 def test_a_plan_sets_the_reach_back_which_is_then_done(planned):
     planned.do("start", work="reach")
     reach = planned.job("reach", "running")["job"]

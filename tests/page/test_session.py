@@ -24,6 +24,34 @@ def test_an_edit_changes_values_by_key(session):
     assert news.values["tissue.0.alpha"] == 9.0
 
 
+@pytest.mark.parametrize(
+    ("values", "stays"),
+    [
+        ({"target.depth_mm": 35.0, "target.lateral_mm": -3.0}, True),
+        ({"tissue.0.alpha": 9.0}, False),
+        ({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0}, False),
+    ],
+)
+def test_a_reach_stays_while_only_the_target_has_changed(session, values, stays):
+    before = session.edited({"needle.outer_diameter_mm": 0.9})
+    assert before.reach_since == before.revision
+    after = before.edited(values)
+    assert after.news().reach_since == (before.revision if stays else after.revision)
+
+
+@pytest.mark.parametrize(
+    ("option", "stays"),
+    [({"controller": "ce-mpc"}, True), ({"seed": 3}, False), ({"strategy": "steering"}, False)],
+)
+def test_a_reach_is_of_a_seed_and_a_strategy(session, option, stays):
+    after = session.with_options(Options(type="options", **option))
+    assert after.reach_since == (session.revision if stays else after.revision)
+
+
+def test_no_reach_stays_when_a_preset_begins_anew(session):
+    assert session.with_preset("phantom").reach_since == session.revision + 1
+
+
 def test_none_returns_a_value_to_its_default(session):
     edited = session.edited({"target.lateral_mm": 3.0})
     assert edited.edited({"target.lateral_mm": None}).scenario.target.lateral_mm == 5.0

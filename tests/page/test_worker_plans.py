@@ -177,6 +177,25 @@ def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "one", "other"),
+    [
+        ("phantom", {}, {"target.depth_mm": 6.0, "target.lateral_mm": -1.0}),
+        # The angle of the target about the axis is that of the outlines' points.
+        (
+            "phantom3d",
+            {"target.depth_mm": 8.0, "target.lateral_mm": 0.5, "target.lateral_z_mm": 0.5},
+            {"target.depth_mm": 5.0, "target.lateral_mm": 0.2, "target.lateral_z_mm": 0.2},
+        ),
+    ],
+)
+def test_the_reach_does_not_depend_on_the_target(name, one, other):
+    first, second = (reached(short(name, **{"setup.stroke_mm": 12.0}, **target)) for target in (one, other))
+    assert first[1] == second[1]
+    shapes = [reported.shapes(Kind.REACH, Source.SCENE)[-1].values for reported, _ in (first, second)]
+    np.testing.assert_array_equal(*shapes)
+
+
 def test_a_reach_is_cancelled():
     one = task("reach")
     one.signals.take(Signal(job=1, cancel=True))

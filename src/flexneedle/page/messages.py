@@ -281,6 +281,8 @@ class People(News):
 class Session(News):
     """The scenario by key, and the options. revision counts changes; a scene, plan or estimate repeats its revision.
 
+    reach_since: the first revision whose reach is still that of the scenario. Since then only the target and the
+    controller have changed, on which a reach does not depend.
     A session with another name comes before its scene and frames: the browser then forgets plans and paths.
 
     changed: keys that differ from the preset or file it began with. doubts: values that are valid and implausible.
@@ -288,6 +290,7 @@ class Session(News):
 
     type: Literal["session"] = "session"
     revision: int
+    reach_since: int
     name: str
     values: dict[str, Any]
     changed: list[str]
@@ -392,8 +395,8 @@ class Plan(News):
 class Reach(News):
     """Targets that can be hit, in the plane of y or, in space, of the target: outlines are the frame REACH.
 
-    low, high: depth and lateral offset of points on its edges, at angle_deg. They are where needles have ended: those
-    that bend much less deep than was sought, where the stroke ends.
+    low, high: depth and lateral offset of points on its edges, at angle_deg, that of the target of its revision. They
+    are where needles have ended: those that bend much less deep than was sought, where the stroke ends.
     """
 
     type: Literal["reach"] = "reach"

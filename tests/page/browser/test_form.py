@@ -15,7 +15,7 @@ FORM = "[data-panel=form]"
 
 def session(revision=1, changed=(), doubts=(), seed=0, preset="phantom3d", **values):
     flat = load_scenario(preset).flat() | values
-    given = {"seed": seed, "strategy": "manipulation", "controller": "adaptive-mpc"}
+    given = {"reach_since": revision, "seed": seed, "strategy": "manipulation", "controller": "adaptive-mpc"}
     return Session(
         revision=revision, name=preset, values=flat, changed=list(changed), doubts=list(doubts), **given
     )

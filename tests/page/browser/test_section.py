@@ -204,6 +204,20 @@ def test_the_pointer_moves_the_target(views, server):
     assert len(server.asked("rest")) == 1
 
 
+def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(views, server):
+    page = views([*planned(), REACH])
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
+    for panel in (SECTION, AXIAL):
+        drag(page, handle(page, "target", panel), 20, 10)
+        edited(page, server)
+    assert page.evaluate("flexneedle.store.get('session').revision") > REACH.revision
+    assert all("reach" in names for names in legends(page))
+    server.send(session(90), scene(90))
+    until(page, "flexneedle.store.get('session').revision === 90")
+    until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
+    assert not any("reach" in names for names in legends(page))
+
+
 def test_the_guide_is_moved_along_the_axis_and_stays_before_the_skin(views, server):
     page = views()
     handle(page, "guide").focus()

@@ -348,6 +348,19 @@ def test_dragging_the_target_edits_the_scenario(space, server):
     assert len(server.wait_for("rest")) == 1
 
 
+@pytest.mark.parametrize(
+    ("target", "strip"), [((32.0, 5.0, 3.0), True), ((40.0, -2.5, -1.5), True), ((40.0, 5.0, -3.0), False)]
+)
+def test_the_strip_of_the_reach_is_shown_while_the_target_is_in_its_plane(space, target, strip):
+    """Its outlines are those of targets in all directions."""
+    page = space([*planned(), REACH, session(2, target, reach_since=1), scene(2, target)])
+    settled(page)
+    shown = "return view.shapes.group.children.at(-1).children.map((each) => each.visible)"
+    assert on_view(page, shown) == [strip, True]
+    assert "reach" in legend(page)
+    assert page.locator(f"{SPACE} .legend li", has_text="reach").locator(".swatch.area").count() == strip
+
+
 def test_in_the_plane_the_target_has_no_third_coordinate(space, server):
     page = space([*opening(), scene(axes=1)])
     until(page, "flexneedle.store.get('scene').axes === 1")

@@ -215,16 +215,17 @@ class Desk:
         """Go on with a changed session: what is computed for the old one is cancelled.
 
         Its plan is made when no other change has followed: so each place of a dragged target has an estimate, and the
-        place where it rests a plan.
+        place where it rests a plan. A reach that is still that of the scenario stays, and one that runs goes on.
         """
         if session.origin is not self.session.origin:  # nothing of another scenario may come after this
             self.hub.forget_all_of(*_RESULTS)
             self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
+        outdated: tuple[Kind, ...] = ("reach",) if session.reach_since == session.revision else ()
         self.session = session
         self.hub.publish(session.news())
         self.hub.publish(scene_of(session.scenario, session.revision))
         self.rig.changed("the scenario or an option was changed")
-        self._plans.cancel(*_SEARCHES)
+        self._plans.cancel("plan", "compare", *outdated)
         self._order("needle", "needle")
         self._order("estimate", "estimate")
         self._start_timer("plan", self.limits.rest_s, self._at_rest)

@@ -18,6 +18,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import printable
+from flexneedle.scenario.sections.settings import Target
 
 _MOST_DOTS, _MOST_KEYS = 300, 1_000
 """Of a line of a file, and of a file, far more than any scenario has: a dotted key takes time with the square of its
@@ -29,7 +30,10 @@ _LINE = re.compile(r"(?P<key>[^\s=:]+)(?: = .*?)?: (?P<rule>.*)")
 
 @dataclass(frozen=True)
 class Session:
-    """A scenario with options. origin: that it began with; notes: warnings of its file; revision: number of changes."""
+    """A scenario with options. origin: that it began with; notes: warnings of its file; revision: number of changes.
+
+    reach_since: as in its news.
+    """
 
     name: str
     origin: Scenario
@@ -38,6 +42,7 @@ class Session:
     seed: int = 0
     strategy: Strategy = "manipulation"
     revision: int = 1
+    reach_since: int = 1
     notes: tuple[str, ...] = field(default=())
 
     @classmethod
@@ -48,7 +53,7 @@ class Session:
     def edited(self, values: Mapping[str, Any]) -> "Session":
         """The session with values of the scenario changed by key. Raises Refusal with the problems by key."""
         with _refused():
-            return replace(self, scenario=self.scenario.with_values(values), revision=self.revision + 1)
+            return self._changed(scenario=self.scenario.with_values(values))
 
     def with_preset(self, name: str) -> "Session":
         """The session with a scenario of the package. Raises Refusal."""
@@ -75,13 +80,14 @@ class Session:
     def with_options(self, options: Options) -> "Session":
         """The session with the options that are set."""
         chosen = options.model_dump(include={"seed", "strategy", "controller"}, exclude_none=True)
-        return replace(self, revision=self.revision + 1, **chosen)
+        return self._changed(**chosen)
 
     def news(self) -> SessionNews:
         """The session as clients get it."""
         values, before = self.scenario.flat(), self.origin.flat()
         return SessionNews(
             revision=self.revision,
+            reach_since=self.reach_since,
             name=self.name,
             values=values,
             changed=[key for key in before | values if before.get(key) != values.get(key)],
@@ -91,10 +97,20 @@ class Session:
             controller=self.controller,
         )
 
+    def _changed(self, **changes: Any) -> "Session":
+        after = replace(self, revision=self.revision + 1, **changes)
+        same = _of_the_reach(after) == _of_the_reach(self)
+        return after if same else replace(after, reach_since=after.revision)
+
     def _begun(self, name: str, scenario: Scenario, notes: tuple[str, ...]) -> "Session":
-        return replace(
-            self, name=name, origin=scenario, scenario=scenario, notes=notes, revision=self.revision + 1
-        )
+        revision = self.revision + 1
+        begun = replace(self, name=name, origin=scenario, scenario=scenario, notes=notes)
+        return replace(begun, revision=revision, reach_since=revision)
+
+
+def _of_the_reach(session: Session) -> tuple[Scenario, int, Strategy]:
+    """What a reach depends on, and some settings besides: its targets are its own (`page/worker/reach.py`)."""
+    return session.scenario.model_copy(update={"target": Target()}), session.seed, session.strategy
 
 
 def _check_size(name: str, text: str) -> None:

@@ -97,7 +97,13 @@ export function maySteer(store) {
 // Whether what is shown can be moved by hand: the scene before an insertion.
 export const mayMove = (store) => maySteer(store) && shownOf(store) === "scene";
 
-// Whether a plan, estimate or reach is of an earlier state of the scenario than the present.
+// The reach, if it is that of the present scenario, or null; it stays while only the target is moved (messages.py).
+export function shownReach(store) {
+  const reach = shownOf(store) === "scene" ? store.get("reach") : null;
+  return reach && reach.revision >= store.get("session")?.reach_since ? reach : null;
+}
+
+// Whether a plan or estimate is of an earlier state of the scenario than the present.
 export function isStale(store, result) {
   return Boolean(result) && result.revision !== store.get("session")?.revision;
 }

@@ -2,7 +2,7 @@
 
 import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
-import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
+import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
 import { area, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 
 const READINGS = 40; // measured positions that are shown
@@ -39,8 +39,8 @@ function draw(pen, { path, tone, width = 1, alpha = 1, dash, thick, sampled, pre
 }
 
 function reach(pen, place, store, depth) {
-  const [news, outlines] = [store.get("reach"), store.get("shape reach scene")];
-  if (shownOf(store) !== "scene" || !news || isStale(store, news) || !outlines?.paths) return false;
+  const outlines = store.get("shape reach scene");
+  if (!shownReach(store) || !outlines?.paths) return false;
   const { paths, points, columns, values } = outlines;
   const far = (path) => Math.abs(values[path * points * columns] - depth);
   const nearest = Array.from({ length: paths }, (_, path) => path).reduce((best, path) => (far(path) < far(best) ? path : best), 0);

@@ -2,7 +2,7 @@
 
 import { across, lateral } from "./plane.js";
 
-const NEAR = 0.02; // rad between the strip's plane and the section
+const NEAR = 0.02; // rad between the strip's plane and a section of the same
 
 // Points [x, u] of a closed outline in the plane, or null where there is none.
 export function reachIn(plane, reach, outlines) {
@@ -31,9 +31,17 @@ function cutOf(plane, a, b) {
   return [[a[0] + share * (b[0] - a[0]), u + share * (v - u)]];
 }
 
-function stripOf({ e }, { low, high, angle_deg: angle }) {
-  const cosine = e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
-  if (1 - Math.abs(cosine) > NEAR ** 2) return [];
-  const turned = ([x, u]) => [x, Math.sign(cosine) * u];
+// Whether the strip of a reach is in a section's plane.
+export const isIn = (plane, reach) => 1 - Math.abs(cosineOf(plane, reach)) <= NEAR ** 2;
+
+function cosineOf({ e }, { angle_deg: angle }) {
+  return e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
+}
+
+function stripOf(plane, reach) {
+  if (!isIn(plane, reach)) return [];
+  const side = Math.sign(cosineOf(plane, reach));
+  const turned = ([x, u]) => [x, side * u];
+  const { low, high } = reach;
   return low.map((end, at) => ({ low: turned(end), high: turned(high[at]) }));
 }

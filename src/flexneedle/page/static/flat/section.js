@@ -1,6 +1,6 @@
 // Draws a section: tissue, grid, reach, guide, target, and what moves.
 
-import { isMeasured, isStale, shownOf, shownRow } from "../shown.js";
+import { isMeasured, shownReach, shownRow } from "../shown.js";
 import { shadeOf } from "../tissue.js";
 import { layersIn } from "./layers.js";
 import { FOOT, SIDE, area, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
@@ -76,8 +76,8 @@ function drawNames(pen, map, layers, width) {
 const edgesOf = (map, top, bottom, width) => [map.toX(top), bottom === null ? width : Math.min(map.toX(bottom), width)];
 
 function reach(pen, map, plane, store) {
-  const news = shownOf(store) === "scene" ? store.get("reach") : null;
-  if (!news || isStale(store, news)) return false;
+  const news = shownReach(store);
+  if (!news) return false;
   const outline = reachIn(plane, news, store.get("shape reach scene"));
   if (!outline) return false;
   const points = outline.map(([x, u]) => [map.toX(x), map.toY(u)]);

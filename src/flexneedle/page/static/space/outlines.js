@@ -15,9 +15,11 @@ export class Outlines {
     this.group.add(this.strip, this.#lines.object);
   }
 
-  // reach: low, high, [depth, lateral] (mm), and angle_deg of their plane about the axis, or null; shape: outlines, or null.
-  update(reach, shape, color) {
+  // reach: low, high, [depth, lateral] (mm), and angle_deg of their plane about the axis, or null; strip: whether it is
+  // shown; shape: outlines, or null.
+  update(reach, strip, shape, color) {
     this.group.visible = Boolean(reach);
+    this.strip.visible = strip;
     if (!reach) return;
     this.strip.material.color = color;
     this.strip.geometry.dispose();

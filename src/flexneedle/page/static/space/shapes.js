@@ -4,9 +4,11 @@ import {
   ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, SphereGeometry,
   Vector3,
 } from "../vendor/three.js";
+import { planeOf } from "../flat/plane.js";
+import { isIn } from "../flat/reach.js";
 import { first, fresh, pathOfRows, ranksOf, tipOf } from "../paths.js";
 import { foreseen, plannedPaths, rollOf } from "../planned.js";
-import { isMeasured, isStale, shownRow, shownSecond, shownShape } from "../shown.js";
+import { isMeasured, shownReach, shownRow, shownSecond, shownShape, shownTarget } from "../shown.js";
 import { Lines } from "./lines.js";
 import { Outlines } from "./outlines.js";
 import { paint } from "./room.js";
@@ -61,7 +63,7 @@ export class Shapes {
       ...this.#tips(store, of, row),
       this.#measured(row),
       this.#second(store, scene),
-      this.#reach(store, of),
+      this.#reach(store, scene),
     ];
     this.#place(scene, row, shape("needle"), rollOf(store, of));
     return entries.filter(Boolean);
@@ -191,12 +193,13 @@ export class Shapes {
     return second && { text: "second run", tone: "--second" };
   }
 
-  #reach(store, of) {
-    const reach = of === "scene" ? store.get("reach") : null;
-    const current = reach && !isStale(store, reach) ? reach : null;
-    const outlines = current && store.get("shape reach scene");
-    if (this.#differs("reach", [current, outlines])) this.#outlines.update(current, outlines ?? null, paint("--reach"));
-    return current && { text: "reach", tone: "--reach", form: "area" };
+  // Its strip is in the plane of the target for which it was computed: one that was moved out of that is not in it.
+  #reach(store, scene) {
+    const reach = shownReach(store);
+    const outlines = reach && store.get("shape reach scene");
+    const strip = Boolean(reach) && isIn(planeOf("target", scene, shownTarget(store)), reach);
+    if (this.#differs("reach", [reach, strip, outlines])) this.#outlines.update(reach, strip, outlines ?? null, paint("--reach"));
+    return reach && { text: "reach", tone: "--reach", form: strip ? "area" : "line" };
   }
 
   #place(scene, row, needle, roll) {
