@@ -10,7 +10,7 @@ import numpy as np
 
 Log = Mapping[str, Any]
 GROWTH_MB = {"server": 5.0, "its workers": 20.0, "objects of a page": 1.0, "arrays of a page": 5.0}
-"""Growth that counts as none. Ten minutes have forty insertions; to keep one takes a server or a page 0.1 MB for its
+"""Growth that counts as none. Ten minutes have 20 to 40 insertions; to keep one takes a server or a page 0.1 MB for its
 rows, a page 4 MB for its shapes, and a worker 1 MB, whose size varies by some MB."""
 
 _FRAME, _IN_FRAME = "AnimationFrame::Render", "FireAnimationFrame"

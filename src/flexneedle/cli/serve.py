@@ -32,7 +32,7 @@ def add_parser(commands: Commands) -> None:
         "flexneedle serve",
         "flexneedle serve mine.toml --rig rig.toml",
         about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
-        "access. Prints its address; Ctrl-C ends it. One page steers at a time; any may watch, and stop.",
+        "access. Prints its address; Ctrl-C ends it. One page at a time is in control; any may watch, and stop.",
     )
     parser.add_argument(
         "scenario",

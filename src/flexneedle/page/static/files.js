@@ -69,8 +69,6 @@ async function send(file, link, status) {
   await link.ask({ type: "load", name: safe(file.name), text });
 }
 
-// A name that the server takes.
-
 function acceptDrops(element, link, status) {
   element.addEventListener("dragover", (event) => event.preventDefault());
   element.addEventListener("drop", (event) => {
