@@ -32,6 +32,7 @@ from page_figures import (
     plan_delay,
     processor_times,
     rate,
+    refusals,
     spread,
     table,
 )
@@ -173,7 +174,7 @@ def dragged(
     page: Page, server: Server, names: Sequence[str], count: int, rng: np.random.Generator
 ) -> Iterator[Figure]:
     """Times of estimates and plans while targets are dragged, and what the server itself takes."""
-    estimates, plans, shares = {}, {}, []
+    estimates, plans, shares, all_logs = {}, {}, [], []
     for name in names:
         loaded(page, name)
         before, begun = server.busy(), time.monotonic()
@@ -181,6 +182,8 @@ def dragged(
         shares.append(100.0 * (server.busy()[0] - before[0]) / (time.monotonic() - begun))
         estimates[name] = [delay for log in logs for delay in estimate_delays(log)]
         plans[name] = [plan_delay(log) for log in logs]
+        all_logs += logs
+    yield refusals("refused while targets are dragged", all_logs)
     yield spread("dragged target to the estimate of its plan", "ms", estimates, 200.0)
     yield spread("release to the plan", "ms", plans, 1000.0)
     yield spread("server while targets are dragged", "% of a core", shares, 15.0)
@@ -201,6 +204,7 @@ def inserting(page: Page, server: Server, names: Sequence[str], rng: np.random.G
         shares.append(100.0 * (after[0] - before[0]) / lasted)
         workers.append(100.0 * (after[1] - before[1]) / lasted)
         logs.append(page.evaluate("probe"))
+    yield refusals("refused while insertions play", logs)
     yield rate([log["frames"] for log in logs], 55.0)
     yield spread("script of a paint, by the clock", "ms", [ms for log in logs for ms in log["paints"]], 5.0)
     yield clicked("click to its painting", logs, "clicks", 50.0)

@@ -14,6 +14,7 @@ GROWTH_MB = {"server": 5.0, "its workers": 20.0, "objects of a page": 1.0, "arra
 rows, a page 4 MB for its shapes, and a worker 1 MB, whose size varies by some MB."""
 
 _FRAME, _IN_FRAME = "AnimationFrame::Render", "FireAnimationFrame"
+_REFUSED = -1  # the revision of an edit that was refused; None: not answered
 _SCRIPT = (_IN_FRAME, "FunctionCall", "TimerFire", "EventDispatch")
 
 
@@ -81,19 +82,30 @@ def growth(memory: Sequence[Sequence[float]], warm: int, viewers: int) -> list[F
 
 
 def estimate_delays(log: Log) -> list[float]:
-    """Time (ms) from each move of the target until an estimate of that place, or of a later one, was painted."""
+    """Time (ms) from each move of the target until an estimate of that place, or of a later one, was painted.
+
+    Infinite where no edit has followed, or the edit was not answered. A refused one has no estimate (see `refusals`).
+    """
     delays = []
     for moved in log["moves"]:
         revision = next((edit["revision"] for edit in log["edits"] if edit["time"] >= moved), None)
-        if revision is not None and revision > 0:
+        if revision != _REFUSED:
             delays.append(_painted(log["estimates"], revision) - moved)
     return delays
 
 
 def plan_delay(log: Log) -> float:
     """Time (ms) from the release of the target until the plan to its last place was painted."""
-    revision = max(edit["revision"] for edit in log["edits"])
-    return _painted(log["plans"], revision) - float(log["releases"][-1])
+    revisions = [edit["revision"] for edit in log["edits"] if edit["revision"] != _REFUSED]
+    last = revisions[-1] if revisions else None
+    return _painted(log["plans"], last) - float(log["releases"][-1])
+
+
+def refusals(name: str, logs: Sequence[Log]) -> Figure:
+    """Requests that were refused in all logs: none may be, as nobody else is in control and no target out of bounds."""
+    reasons = Counter(reason for log in logs for reason in log["refused"])
+    detail = "; ".join(f"{count} × {reason}" for reason, count in reasons.most_common())
+    return Figure(name, "", float(reasons.total()), 0.0, detail)
 
 
 def processor_times(trace: Mapping[str, Any]) -> list[float]:
@@ -126,9 +138,10 @@ def _thread(event: Mapping[str, Any]) -> tuple[int, int]:
     return event["pid"], event["tid"]
 
 
-def _painted(shown: Sequence[Log], revision: int) -> float:
-    """When (ms) a revision was first painted; infinite if it never was."""
-    return min((one["time"] for one in shown if one["revision"] >= revision), default=float("inf"))
+def _painted(shown: Sequence[Log], revision: int | None) -> float:
+    """When (ms) a revision was first painted; infinite if it never was, or is unknown."""
+    known = [] if revision is None else [one["time"] for one in shown if one["revision"] >= revision]
+    return min(known, default=float("inf"))
 
 
 def _most(values: Sequence[float]) -> float:

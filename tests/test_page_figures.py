@@ -7,7 +7,17 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-from page_figures import Figure, estimate_delays, growth, plan_delay, processor_times, rate, spread, table
+from page_figures import (
+    Figure,
+    estimate_delays,
+    growth,
+    plan_delay,
+    processor_times,
+    rate,
+    refusals,
+    spread,
+    table,
+)
 
 LOG = {
     "moves": [0.0, 40.0, 60.0, 300.0],
@@ -28,6 +38,18 @@ def test_an_estimate_is_that_of_the_edit_with_the_move_or_of_a_later_one():
 
 def test_an_estimate_that_has_not_come_is_late_without_end():
     assert estimate_delays(LOG | {"estimates": []}) == [math.inf] * 3
+
+
+def test_an_edit_that_was_not_answered_or_not_sent_is_late_without_end():
+    unanswered = [*LOG["edits"][:1], LOG["edits"][1] | {"revision": None}]
+    assert estimate_delays(LOG | {"edits": unanswered}) == [100.0, math.inf, math.inf, math.inf]
+    assert plan_delay(LOG | {"edits": unanswered}) == math.inf
+
+
+def test_what_was_refused_is_counted_with_its_reasons():
+    figure = refusals("refused", [{"refused": ["late", "busy"]}, {"refused": ["busy"]}])
+    assert (figure.value, figure.kept, figure.detail) == (3.0, False, "2 × busy; 1 × late")
+    assert refusals("refused", [{"refused": []}]).kept
 
 
 def test_a_plan_is_that_of_the_last_edit():
