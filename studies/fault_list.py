@@ -70,7 +70,7 @@ _motors = partial(Fault, "motors")
 _computer = partial(Fault, "computer")
 _SOME = "some"
 _NO_READING = "^(missing: no reading|stale)"
-_NOT_CONNECTED = "closed the connection|not connected|not sent"
+_NOT_CONNECTED = "closed the connection|not connected|not sent|reset by peer"
 # Another character than that of a reply, or another digit: a position that is elsewhere, or a bit of a state.
 _GARBLED = (
     "not a reply|must be .* numbers|more than the replies|before a refusal|no (position|byte)|refused"
