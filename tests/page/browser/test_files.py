@@ -7,6 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from browser_layout import too_wide
+from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
@@ -14,7 +15,7 @@ from recorded_page import insertion, people, period_frames, rows
 
 pytestmark = pytest.mark.page
 
-FILES = "[data-panel=files]"
+FILES, SECTION = "[data-panel=files]", "[data-panel=section] canvas"
 TEXT = 'name = "mine"\n[target]\ndepth_mm = 33.0\n'
 
 
@@ -310,6 +311,10 @@ def test_a_picture_of_the_scene_is_saved(files, tmp_path):
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
 
 
+PAINTED = """async () => {
+  for (let frame = 0; frame < 4; frame++) await new Promise(requestAnimationFrame);
+}"""
+
 # Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.
 CODED = """
 const coded = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
@@ -368,6 +373,31 @@ def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
     assert len(frames) == 4
     assert frames[0] != frames[-1]
     assert page.evaluate("flexneedle.store.get('view period')") is None
+
+
+def test_pictures_without_webgl_are_of_the_section_though_it_is_off_the_screen(files, server, tmp_path):
+    page = files(width=390, before=NO_WEBGL)
+
+    def saved(button):
+        with page.expect_download() as download:
+            page.click(f"text={button}")
+        download.value.save_as(tmp_path / "made")
+        return (tmp_path / "made").read_bytes()
+
+    page.locator("text=Picture").scroll_into_view_if_needed()
+    page.evaluate(PAINTED)
+    box = page.locator(SECTION).bounding_box()
+    assert box["y"] + box["height"] < -100.0
+    before = saved("Picture")
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
+    frames = page.evaluate(DECODED, b64encode(saved("GIF")).decode())
+    assert len(set(frames)) == 4
+    picture = saved("Picture")
+    assert picture != before
+    page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn by itself
+    page.evaluate(PAINTED)
+    assert saved("Picture") == picture
 
 
 def frames_of(count):

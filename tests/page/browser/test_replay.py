@@ -3,6 +3,7 @@
 import pytest
 
 from browser_layout import too_wide
+from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.page.frames import Source, unpacked
 from flexneedle.page.replay.document import document
@@ -14,12 +15,6 @@ SPACE, SECTION, AXIAL = (f"[data-panel={name}] canvas" for name in ("space", "se
 SCRUB, PLOTS = "[data-panel=player] input[type=range]", "[data-panel=plots]"
 WORDS, DRAWN = "[data-panel=insertion]", "[data-panel=space] .legend li"
 HOSTILE = "</script><script>window.hit = 1</script><!-- <script><img src=x onerror='window.hit = 1'>"
-NO_WEBGL = """
-  const context = HTMLCanvasElement.prototype.getContext;
-  HTMLCanvasElement.prototype.getContext = function (name, ...more) {
-    return name === "webgl2" ? null : context.call(this, name, ...more);
-  };
-"""
 NO_STORAGE = "Object.defineProperty(window, 'localStorage', { get() { throw new Error('refused'); } });"
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from browser_layout import too_wide
+from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.page.messages import Reach
 from recorded_page import (
@@ -36,12 +37,6 @@ CANVAS = f"{SPACE} canvas"
 SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
 REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 STATES = {"opening": opening, "planned": lambda: [*planned(), REACH], "inserting": inserting}
-NO_WEBGL = """{
-  const context = HTMLCanvasElement.prototype.getContext;
-  HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
-    return kind.startsWith("webgl") ? null : context.call(this, kind, ...more);
-  };
-}"""
 
 VIEW = "const { spaceView } = await import('/static/space.js'); const view = spaceView();"
 

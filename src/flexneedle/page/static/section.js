@@ -14,11 +14,13 @@ import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js"
 const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Axis and target", "target"]];
 const STRETCHES = [1, 2, 5];
 
+let view = null;
+
 export function mount(element, store, link) {
   const canvas = make("canvas", { role: "img", "aria-label": "Section of the scene" });
   const stage = make("div.stage", {}, canvas);
   const legend = make("ul.legend", { "aria-label": "Legend of the section" });
-  const view = new SectionView(canvas, stage, legend, store, link);
+  view = new SectionView(canvas, stage, legend, store, link);
   const planes = PLANES.map(([text, name]) => button(text, () => view.choose(name), { "data-plane": name }));
   const stretch = make("select", { "aria-label": "Stretch of the lateral axis", change: () => view.stretchBy(Number(stretch.value)) });
   stretch.append(...STRETCHES.map((each) => make("option", { value: String(each) }, each === 1 ? "to scale" : `lateral ×${each}`)));
@@ -27,6 +29,11 @@ export function mount(element, store, link) {
     for (const each of planes) each.setAttribute("aria-pressed", String(each.dataset.plane === view.plane));
   };
   view.changed();
+}
+
+// The section of this page, or null before it is loaded. For pictures: `sectionView().drawn()`.
+export function sectionView() {
+  return view;
 }
 
 class SectionView {
@@ -57,6 +64,11 @@ class SectionView {
   stretchBy(factor) {
     this.#stretch = factor;
     this.#stage.schedule();
+  }
+
+  // The canvas with the section drawn into it just now.
+  drawn() {
+    return this.#stage.drawn();
   }
 
   #draw(pen, width, height) {

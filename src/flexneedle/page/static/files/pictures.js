@@ -36,8 +36,8 @@ export async function saveGif(store, progress) {
 }
 
 async function drawing() {
-  const { spaceView } = await import("../space.js");
-  return spaceView()?.drawn() ?? document.querySelector("[data-panel=section] canvas");
+  const [{ spaceView }, { sectionView }] = await Promise.all([import("../space.js"), import("../section.js")]);
+  return (spaceView() ?? sectionView()).drawn(); // by hand: what is off the screen is not drawn by itself
 }
 
 // A copy at most `widest` wide, on the ground of its stage.

@@ -1,4 +1,5 @@
-// A drawing in two dimensions that fills its place, is sharp, and is drawn only when it has changed and is on the screen.
+// A drawing in two dimensions that fills its place, is sharp, and is drawn only when it has changed and is on the screen,
+// or for a picture.
 
 const SHARPEST = 2; // device pixels to a pixel of the page
 
@@ -35,6 +36,12 @@ export class Stage {
     this.pen.setTransform(this.sharpness, 0, 0, this.sharpness, 0, 0);
     this.pen.clearRect(0, 0, this.width, this.height);
     this.#draw(this.pen, this);
+  }
+
+  // The canvas as it is to be now, also off the screen.
+  drawn() {
+    this.draw();
+    return this.canvas;
   }
 
   #resize({ width, height }) {
