@@ -157,8 +157,7 @@ def test_an_insertion_is_stopped_from_the_bar_in_every_state(visit, server, stat
     page = visit()
     server.send(insertion(state, rig="Bench"))
     page.click(f"{STATUS} >> text=Stop the insertion")
-    page.wait_for_timeout(100)
-    assert server.asked("stop") == [{"type": "stop"}]
+    assert server.wait_for("stop") == [{"type": "stop"}]
     server.send(insertion("interrupted", rig="Bench"))
     page.wait_for_selector(f"{STATUS} >> text=Stop the insertion", state="hidden")
 

@@ -37,8 +37,7 @@ def test_a_preset_and_a_random_world_are_begun(files, server):
     page.click("[aria-label='Begin with the preset']")
     page.fill("[aria-label='Number of a random world']", "7")
     page.click("text=Random world")
-    page.wait_for_timeout(100)
-    assert [each["name"] for each in server.asked("preset")] == ["phantom", "world:7"]
+    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "world:7"]
 
 
 def test_a_file_is_loaded(files, server):
@@ -46,8 +45,7 @@ def test_a_file_is_loaded(files, server):
     payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
     page.set_input_files(f"{FILES} input[type=file]", payload)
     page.wait_for_selector("text=you are in control")
-    page.wait_for_timeout(100)
-    assert server.asked("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
+    assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
 
 
 def test_a_file_that_is_too_large_is_not_sent(files, server):
@@ -75,8 +73,7 @@ def test_a_link_reproduces_scenario_and_options(files, server):
     page.goto(address)
     page.wait_for_selector("text=you are in control")
     until(page, "!location.hash")
-    page.wait_for_timeout(200)
-    assert server.asked("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
     assert server.asked("options") == [
         {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
     ]
@@ -136,8 +133,7 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
     assert links == [f"/runs/first/{file}" for file in ("figure.png", "trace.csv", "run.zip", "replay.html")]
     server.send(insertion("done", of="first"), rows(0, 3, "first"), *period_frames(2, Source.FIRST))
     page.click("[aria-label='Close phantom3d']")
-    page.wait_for_timeout(100)
-    assert server.asked("open") == [
+    assert server.wait_for("open", 3) == [
         {"type": "open", "name": "first", "second": False},
         {"type": "open", "name": "first", "second": True},
         {"type": "open", "name": None, "second": False},
@@ -256,8 +252,7 @@ def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
     server.send(Job(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
     page.wait_for_selector("text=Computing again: many, row 17")
     page.click("[aria-label='Cancel: Computing again']")
-    page.wait_for_timeout(100)
-    assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
+    assert server.wait_for("cancel") == [{"type": "cancel", "job": 7}]
 
 
 def test_an_insertion_that_has_ended_is_saved(files, server):
@@ -269,8 +264,7 @@ def test_an_insertion_that_has_ended_is_saved(files, server):
     page.wait_for_selector("text=The name must begin with a letter or digit")
     page.fill("[aria-label='Name of the run to save']", "my run")
     page.click("text=Save the insertion")
-    page.wait_for_timeout(100)
-    assert server.asked("save") == [{"type": "save", "name": "my run", "of": "live"}]
+    assert server.wait_for("save") == [{"type": "save", "name": "my run", "of": "live"}]
 
 
 def test_a_row_that_is_shown_is_saved_as_a_run(files, server):

@@ -39,7 +39,7 @@ def test_it_is_started_paced_and_stopped(panel, server):
     page.select_option("[aria-label=Pace]", "5")
     click(page, "Continue")
     click(page, "Stop")
-    page.wait_for_timeout(100)
+    server.wait_for("stop")
     kinds = ("insert", "pace", "advance", "stop")
     asked = [each for each in server.requests if each["type"] in kinds]
     assert [(each["type"], each.get("pace")) for each in asked] == [
@@ -98,8 +98,7 @@ def test_one_that_waits_for_its_worker_can_be_stopped_and_nothing_else(panel, se
     assert buttons == ["Stop"]
     assert page.is_disabled("[aria-label=Pace]")
     click(page, "Stop")
-    page.wait_for_timeout(100)
-    assert server.asked("stop") == [{"type": "stop"}]
+    assert server.wait_for("stop") == [{"type": "stop"}]
 
 
 def test_disturbances_are_sent_and_listed(panel, server):
@@ -219,8 +218,7 @@ def test_who_does_not_steer_can_only_stop_a_rig(rig_panel, server):
     page.check("#rig-free")
     assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
     click(page, "Stop")
-    page.wait_for_timeout(100)
-    assert server.asked("stop") == [{"type": "stop"}]
+    assert server.wait_for("stop") == [{"type": "stop"}]
     assert server.asked("arm") == []
 
 
@@ -275,8 +273,7 @@ def test_anybody_can_stop_and_only_who_steers_can_do_more(panel, server):
     page = panel([*opening(), people(2, steering=2), insertion("running")])
     assert page.locator(PANEL).get_by_role("button", name="Pause", exact=True).is_disabled()
     click(page, "Stop")
-    page.wait_for_timeout(100)
-    assert server.asked("stop") == [{"type": "stop"}]
+    assert server.wait_for("stop") == [{"type": "stop"}]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -51,8 +51,7 @@ def test_work_is_started_and_cancelled(plans, server):
     page = plans()
     for work in ("plan", "compare", "reach"):
         page.click(f"{PLANS} [data-work={work}]")
-    page.wait_for_timeout(100)
-    assert [each["work"] for each in server.asked("start")] == ["plan", "compare", "reach"]
+    assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
     server.send(Job(job=4, kind="compare", state="running", share=0.25))
     page.click(f"{PLANS} button:has-text('Cancel')")
     assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
