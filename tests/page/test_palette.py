@@ -1,4 +1,4 @@
-"""Lines of the page that are compared are distinguished by people without red or green cones as well."""
+"""Lines of the page that are compared are distinguished by people without one kind of cones as well."""
 
 import re
 from itertools import combinations
@@ -29,13 +29,20 @@ VISIONS = {
             [-0.011820, 0.042940, 0.968881],
         ]
     ),
+    "tritanopia": np.array(
+        [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ]
+    ),
 }
 RGB_TO_XYZ = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
 LEAST = 10.0
 """CIE76 distance of two lines; 2.3 is just noticed where two areas touch."""
-IN_VIEWS = ("plan", "estimate", "true", "needle", "second")
+IN_VIEWS = ("plan", "estimate", "true", "needle", "second", "measured")
 IN_PLOTS = ("estimate", "true", "guide", "needle", "measured")
 COMPARED = {
     ("manipulation", "steering"),

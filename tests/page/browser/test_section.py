@@ -308,6 +308,38 @@ def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
     assert page.evaluate(OF_TONE, "--measured") == [0, 0]
 
 
+PAINTS = """{
+  const pen = CanvasRenderingContext2D.prototype;
+  window.painted = { fill: new Set(), stroke: new Set() };
+  for (const [how, style] of [["fill", "fillStyle"], ["stroke", "strokeStyle"]]) {
+    const paint = pen[how];
+    pen[how] = function (...values) {
+      painted[how].add(`${this[style]} ${this.canvas.closest("[data-panel]").dataset.panel}`);
+      return paint.apply(this, values);
+    };
+  }
+}"""
+"""Keeps in which tones each panel has filled and drawn lines."""
+PAINTED = """async ([tone, panel]) => {
+  const { color } = await import("/static/theme.js");
+  const pen = document.createElement("canvas").getContext("2d");
+  pen.fillStyle = color(tone);
+  return Object.values(painted).map((tones) => tones.has(`${pen.fillStyle} ${panel}`));
+}"""
+
+
+def test_a_measured_tip_is_a_cross_in_all_views_and_their_legends(views):
+    """Along the axis the tips and ends of needles are discs."""
+    page = views(inserting(), before=PAINTS)
+    assert page.evaluate(PAINTED, ["--measured", "section"]) == [False, True]
+    assert page.evaluate(PAINTED, ["--measured", "axial"]) == [False, True]
+    assert page.evaluate(PAINTED, ["--needle", "axial"]) == [True, False]
+    until(page, "document.querySelector('[data-panel=space] .legend .cross')")
+    for panel in (SECTION, AXIAL, "[data-panel=space]"):
+        named = page.locator(f"{panel} .legend li", has_text="measured tip")
+        assert named.locator(".swatch.cross").count() == 1
+
+
 def test_the_target_is_moved_along_the_axis_view(views, server):
     page = views()
     handle(page, "target", AXIAL).focus()

@@ -3,9 +3,9 @@
 import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
 import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
-import { area, disc, grid, inside, pointsOf, polyline } from "./pen.js";
+import { area, cross, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 
-const READINGS = 40; // measured positions that are shown
+const READINGS = 40; // measured positions that are shown, as crosses: what else there is a point for is a disc
 const BEVEL = 26; // px, length of the arrow
 
 // Returns whether the reach was drawn.
@@ -53,7 +53,7 @@ function reach(pen, place, store, depth) {
 
 function readings(pen, place, rows) {
   for (const each of rows) {
-    if (isMeasured(each)) disc(pen, place(...each.measured), 1.5, { tone: "--measured", alpha: 0.7 });
+    if (isMeasured(each)) cross(pen, place(...each.measured), { tone: "--measured" });
   }
 }
 

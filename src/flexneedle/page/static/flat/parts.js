@@ -59,7 +59,7 @@ function tips(store, of) {
 export function measuredTip(store) {
   const row = shownRow(store);
   const some = row && store.get(`rows ${shownOf(store)}`).slice(0, row.index + 1).some(isMeasured);
-  return some ? [{ text: "measured tip", tone: "--measured", disc: true }] : [];
+  return some ? [{ text: "measured tip", tone: "--measured", cross: true }] : [];
 }
 
 function secondRun(store, radius) {

@@ -6,6 +6,7 @@ const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
 export const SIDE = 30; // px, of the labels on the left
 export const FOOT = 18; // of those below
 const CLOSEST = 44; // px between two labels
+const CROSS = 3.5; // from its middle along each axis, px
 const STEPS = [0.5, 1, 2, 5, 10, 20, 50, 100];
 
 // Points [px, py] of a path; place: function of x, y, z. It is called for thousands of points a paint.
@@ -48,6 +49,11 @@ export function disc(pen, [x, y], radius, { tone, alpha = 1, open = false, width
   if (open) pen.stroke();
   else pen.fill();
   pen.restore();
+}
+
+export function cross(pen, [x, y], { tone }) {
+  const ends = (side) => [-CROSS, CROSS].map((far) => [x + far, y + side * far]);
+  for (const side of [-1, 1]) polyline(pen, ends(side), { tone, width: 1.25 });
 }
 
 export function words(pen, text, [x, y], { tone = "--quiet", align = "center", base = "alphabetic" } = {}) {

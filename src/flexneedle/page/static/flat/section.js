@@ -3,7 +3,7 @@
 import { isMeasured, shownReach, shownRow } from "../shown.js";
 import { shadeOf } from "../tissue.js";
 import { layersIn } from "./layers.js";
-import { FOOT, SIDE, area, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
+import { FOOT, SIDE, area, cross, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
 import { lateral, stretchIn } from "./plane.js";
 import { reachIn } from "./reach.js";
 
@@ -22,7 +22,7 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
     reached = reach(pen, map, plane, store);
     for (const part of parts) draw(pen, part, place, map);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
-    if (isMeasured(row)) disc(pen, place(...row.measured), 2.5, { tone: "--measured" });
+    if (isMeasured(row)) cross(pen, place(...row.measured), { tone: "--measured" });
     drawTarget(pen, map, plane, target);
   });
   return reached;

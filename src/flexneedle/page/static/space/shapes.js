@@ -1,8 +1,7 @@
 // What moves: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
 
 import {
-  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, SphereGeometry,
-  Vector3,
+  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
 } from "../vendor/three.js";
 import { planeOf } from "../flat/plane.js";
 import { isIn } from "../flat/reach.js";
@@ -17,7 +16,7 @@ import { Tube } from "./tube.js";
 const PATH = 0.14; // mm, radius of a path
 const CHANNEL = 1.7; // radius of the channel by the needle's
 const STALE = 0.35; // opacity of a path that was planned for an earlier state of the scenario
-const [BEVEL, GUIDE] = [6, 6]; // mm, lengths
+const [BEVEL, GUIDE, READING] = [6, 6, 2]; // mm, lengths
 // Stretch of the tissue from low to high, distinguishable by lightness alone.
 const STRETCH = [[0.99, 0.88, 0.68], [0.90, 0.62, 0.0], [0.84, 0.37, 0.0], [0.45, 0.11, 0.0]];
 
@@ -25,6 +24,7 @@ export class Shapes {
   #tubes = {};
   #paths = new Lines(); // sampled ones
   #outlines = new Outlines();
+  #reading;
   #theme = "";
   #seen = new Map(); // by part: what it was drawn from
 
@@ -39,9 +39,7 @@ export class Shapes {
     this.#addTube("predicted", translucent({ opacity: 0.24 }), "--predicted", 5);
     this.#addGuide();
     this.#addBevel();
-    this.measured = new Mesh(new SphereGeometry(0.35), new MeshBasicMaterial({ depthTest: false, transparent: true }));
-    this.measured.renderOrder = 7;
-    this.group.add(this.measured);
+    this.#addMeasured();
     this.#paths.object.renderOrder = 2;
     this.group.add(this.#paths.object, this.#outlines.group);
   }
@@ -95,6 +93,20 @@ export class Shapes {
     this.bevel = new Group();
     this.bevel.add(shaft, head);
     this.group.add(this.bevel);
+  }
+
+  // Bars along the diagonals of a cube: a cross from all sides, as in the flat views.
+  #addMeasured() {
+    this.#reading = new MeshBasicMaterial({ depthTest: false, transparent: true });
+    const bar = new CylinderGeometry(0.09, 0.09, READING, 6);
+    this.measured = new Group();
+    for (const [y, z] of [[1, 1], [1, -1], [-1, 1], [-1, -1]]) {
+      const mesh = new Mesh(bar, this.#reading);
+      mesh.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), new Vector3(1, y, z).normalize());
+      mesh.renderOrder = 7;
+      this.measured.add(mesh);
+    }
+    this.group.add(this.measured);
   }
 
   // Whether a part is drawn from something else than before.
@@ -179,8 +191,8 @@ export class Shapes {
     this.measured.visible = isMeasured(row);
     if (!this.measured.visible) return null;
     this.measured.position.set(...row.measured);
-    this.measured.material.color = paint("--measured");
-    return { text: "measured tip", tone: "--measured", form: "disc" };
+    this.#reading.color = paint("--measured");
+    return { text: "measured tip", tone: "--measured", form: "cross" };
   }
 
   #second(store, scene) {
