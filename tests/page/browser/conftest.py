@@ -66,7 +66,7 @@ def tab(browser, kept_tabs):
     """A function that opens an empty tab. Errors on its pages, in `errors`, fail the test at its end.
 
     before: a script that runs before those of a page; tour: whether the tour is shown, as on a first visit; draws:
-    whether WebGL draws.
+    whether WebGL draws; touch: whether it is touched.
     """
     kept, fresh, errors = [], [], []
 
@@ -77,17 +77,19 @@ def tab(browser, kept_tabs):
         if message.type == "error":
             errors.append(message.text)
 
-    def made(before, tour, draws):
-        page = browser.new_context().new_page()
+    def made(before, tour, draws, touch=False):
+        page = browser.new_context(has_touch=touch).new_page()
         page.set_default_timeout(20_000)
         for script in ("" if tour else TOUR_SEEN, "" if draws else DRAWS_NOTHING, before):
             if script:
                 page.add_init_script(script)
         return page
 
-    def opened(width, height, scheme, before=None, tour=False, draws="SCREENSHOTS" in os.environ):
-        if before or tour or any(draws == as_kept for as_kept, _ in kept):
-            page = made(before, tour, draws)
+    def opened(
+        width, height, scheme, before=None, tour=False, draws="SCREENSHOTS" in os.environ, touch=False
+    ):
+        if before or tour or touch or any(draws == as_kept for as_kept, _ in kept):
+            page = made(before, tour, draws, touch)
             fresh.append(page)
         else:
             page = kept_tabs.pop(draws, None) or made(None, tour, draws)

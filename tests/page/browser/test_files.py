@@ -56,6 +56,33 @@ def test_a_file_that_is_too_large_is_not_sent(files, server):
     assert not server.asked("load")
 
 
+DROPPED = """(element, text) => {
+  const dataTransfer = new DataTransfer();
+  dataTransfer.items.add(new File([text], "dropped.toml"));
+  const drop = (type) => element.dispatchEvent(new DragEvent(type, { bubbles: true, cancelable: true, dataTransfer }));
+  return ["dragover", "drop"].map((type) => !drop(type));
+}"""
+"""Drop a file on an element; whether the page takes it, as otherwise the browser opens it in the place of the page."""
+
+
+def test_a_file_that_is_dropped_on_the_panel_is_loaded(files, server):
+    page = files()
+    assert page.eval_on_selector(f"{FILES} .runs", DROPPED, TEXT) == [True, True]
+    assert server.wait_for("load") == [{"type": "load", "name": "dropped.toml", "text": TEXT}]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_it_fits_its_width(files, server, pictures, size, scheme):
+    page = files(width=size[0], height=size[1], scheme=scheme, before=NO_CLIPBOARD)
+    server.send(insertion("done", of="first", name="mine"), rows(0, 3, "first"))
+    page.click("summary:has-text('Download')")
+    page.click("text=Copy a link")
+    page.wait_for_selector("[aria-label='Link to copy']")
+    assert too_wide(page) == []
+    pictures(page.locator(FILES), f"files-{size[0]}-{scheme}")
+
+
 CLIPBOARD = """
   const writeText = async (text) => { window.copied = text; };
   Object.defineProperty(navigator, "clipboard", { value: { writeText } });
@@ -204,11 +231,13 @@ def listing(request):
     return [StudyRows(name=request["name"], index=index, rows=found, **about)]
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width):
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
+)
+def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width, scheme):
     server.news[-1] = Runs(runs=[MANY])
     server.answers["study"] = listing
-    page = files(width=width)
+    page = files(width=width, scheme=scheme)
     assert not page.is_visible("text=Worst first")
     page.click("[aria-label='Rows of many']")
     page.wait_for_selector("text=many: Many targets, 149 of 150 rows")
@@ -218,7 +247,7 @@ def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures,
     assert entries[2].split("\n") == refused
     assert entries[3] == "3 of 149 finished rows: choose the first row for others"
     assert page.locator("[aria-label='Open row 9']").count() == 0
-    pictures(page.locator(FILES), f"study-{width}")
+    pictures(page.locator(FILES), f"study-{width}-{scheme}")
     page.click("[aria-label='Open row 17']")
     page.click("[aria-label='Compare with row 3']")
     page.fill("[aria-label='First row']", "120")

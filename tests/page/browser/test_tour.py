@@ -9,11 +9,12 @@ FOCUS = "document.activeElement.innerText"
 NO_STORAGE = "Object.defineProperty(window, 'localStorage', { get() { throw new Error('refused'); } });"
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_it_is_shown_once(visit, pictures, width):
-    page = visit(tour=True, width=width, ready=f"{CARD}:visible")
-    page.wait_for_selector(".space.toured")
-    pictures(page, f"tour-{width}")
+def test_it_is_shown_once(visit, pictures, width, scheme):
+    page = visit(tour=True, width=width, scheme=scheme, ready=f"{CARD}:visible")
+    page.wait_for_selector(".space.toured .legend li")
+    pictures(page, f"tour-{width}-{scheme}")
     page.click(f"{CARD} >> text=Skip")
     assert not page.is_visible(CARD)
     assert not page.locator(".toured").count()

@@ -1,0 +1,119 @@
+"""What stays in space while a needle moves: layers with their names, skin, guide, grid with its labels."""
+
+import numpy as np
+import pytest
+
+from browser_blends import PAINTED, arrived
+from recorded_page import opening, scene
+
+pytestmark = pytest.mark.page
+
+SPACE = "[data-panel=space]"
+BOX = (-50.0, 50.0, 10.0)
+"""Of the scene: from left to right, half as wide as it is high (mm)."""
+VIEW = "const view = (await import('/static/space.js')).spaceView();"
+OBJECTS = f"""async () => {{
+  {VIEW}
+  const {{ paint }} = await import("/static/space/room.js");
+  const tones = ["--tissue", "--skin", "--grid"].map((name) => [name, paint(name).getHex()]);
+  return view.room.group.children.map(({{ type, geometry, material, position }}) => ({{
+    type: `${{type}} ${{geometry.type}}`,
+    tone: tones.find(([, hex]) => hex === material.color.getHex())?.[0],
+    opacity: material.opacity,
+    at: position.x,
+    size: geometry.parameters,
+    corners: [...geometry.attributes.position.array],
+  }}));
+}}"""
+LISTEN = f"""async () => {{
+  {VIEW}
+  const {{ add }} = view.labels;
+  window.labels = [];
+  view.labels.add = (...given) => {{
+    window.labels.push(given.slice(0, 3));
+    add.apply(view.labels, given);
+  }};
+}}"""
+"""Note the labels that are made from now on: text, place, colour."""
+SPRITES = (
+    f"async () => {{ {VIEW} return view.labels.group.children.map(({{ position }}) => position.toArray()); }}"
+)
+
+
+@pytest.fixture
+def space(visit, server):
+    def opened(news):
+        server.news = news
+        return visit(ready=f"{SPACE} .legend li")
+
+    return opened
+
+
+def labels(page):
+    """Places of the labels by their texts."""
+    page.evaluate(LISTEN)
+    page.click("#theme")  # all are made anew
+    page.evaluate(PAINTED)
+    made = page.evaluate("window.labels")
+    np.testing.assert_allclose(page.evaluate(SPRITES), [place for _, place, _ in made])
+    places = {}
+    for text, place, _ in made:
+        places.setdefault(text, []).append(tuple(place))
+    return places
+
+
+def test_layers_are_boxes_to_scale_the_stiffer_the_denser_and_the_first_begins_with_the_skin(space):
+    objects = space(opening()).evaluate(OBJECTS)
+    layers = [each for each in objects if each["type"] == "Mesh BoxGeometry"]
+    _, right, half = BOX
+    for layer, (top, bottom) in zip(layers, [(0.0, 20.0), (20.0, right)], strict=True):
+        size = layer["size"]
+        assert (layer["at"], size["width"]) == ((top + bottom) / 2.0, bottom - top)
+        assert (size["height"], size["depth"], layer["tone"]) == (2 * half, 2 * half, "--tissue")
+    assert layers[0]["opacity"] < layers[1]["opacity"] < 0.5
+    surfaces = [each for each in objects if "Plane" in each["type"] or "Edges" in each["type"]]
+    assert [(each["at"], each["tone"]) for each in surfaces] == [(0.0, "--skin")] * 2 + [
+        (20.0, "--tissue")
+    ] * 2
+
+
+def test_the_grid_has_lines_each_5_mm_on_floor_and_back(space):
+    grids = [each for each in space(opening()).evaluate(OBJECTS) if each["tone"] == "--grid"]
+    assert len(grids) == 1
+    lines = np.reshape(grids[0]["corners"], (-1, 2, 3))
+    left, right, half = BOX
+    floor, back = lines[..., 1] == -half, lines[..., 2] == -half
+    assert np.all(floor.all(axis=1) | back.all(axis=1))
+    length = np.abs(np.diff(lines, axis=1)[:, 0])
+    assert np.all(np.count_nonzero(length, axis=1) == 1)
+    along = length[:, 0] > 0.0
+    np.testing.assert_array_equal(length[along, 0], right - left)
+    depths = np.unique(lines[~along, 0, 0])
+    np.testing.assert_array_equal(depths, np.arange(left, right + 5.0, 5.0))
+    assert np.count_nonzero(~along) == 2 * len(depths)
+    assert np.count_nonzero(along) == 2 * len(np.arange(-half, half + 5.0, 5.0))
+
+
+def test_labels_name_layers_skin_guide_and_lengths(space):
+    places = labels(space(opening()))
+    half = BOX[2]
+    assert places.pop("skin") == [(0.0, half, half)]
+    assert places.pop("superficial") == [(10.0, half, -half)]
+    assert places.pop("deep") == [(35.0, half, -half)]
+    assert places.pop("guide") == [(-41.0, 2.5, 0.0)]
+    assert {text.partition(" ")[0] for text in places if "mm" in text} == {"x", "y", "z"}
+    depths = {float(text.replace("−", "-")): at for text, at in places.items() if "mm" not in text}
+    for depth in (-40.0, -20.0, 20.0, 40.0):
+        assert depths[depth] == [(depth, -half, 1.15 * half)]
+    assert {place[1:] for place in depths[half]} == {(half, -half), (-half, half)}
+    assert set(depths) == {-40.0, -20.0, 0.0, 20.0, 40.0, -half, half}
+
+
+def test_without_a_guide_none_is_named_or_drawn(space, server):
+    page = space(opening())
+    guide = f"async () => {{ {VIEW} return view.shapes.guide.visible; }}"
+    assert page.evaluate(guide)
+    server.send(scene().model_copy(update={"guide": None}))
+    arrived(page)
+    assert not page.evaluate(guide)
+    assert "guide" not in labels(page)
