@@ -101,6 +101,20 @@ def test_during_an_insertion_all_views_name_the_true_and_the_measured_tip(views,
     assert [both & names for names in legends(page)] == [set()] * 3
 
 
+@pytest.mark.parametrize(
+    ("state", "text", "form"),
+    [(planned, "needle at the target, planned", "line"), (inserting, "predicted needle ± 2 sd", "area")],
+)
+def test_all_legends_show_the_needle_at_the_target_alike(views, state, text, form):
+    """As a line; as an area where it has a band."""
+    page = views(state())
+    until(page, "document.querySelector('[data-panel=space] .legend li')")
+    for panel in (SECTION, AXIAL, "[data-panel=space]"):
+        swatch = page.locator(f"{panel} .legend li", has_text=text).locator(".swatch")
+        assert swatch.get_attribute("class") == f"swatch {form}"
+        assert swatch.get_attribute("style") == "color: var(--predicted);"
+
+
 def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
     """Also where there is one of an earlier state of the scenario."""
     page = views(

@@ -199,6 +199,21 @@ def test_the_predicted_needle_is_as_wide_as_it_is_uncertain(space):
     np.testing.assert_allclose(middle[:, 0], needle(TARGET[0], sway=0.1), atol=1e-3)
 
 
+IN_ITS_TONE = """
+const { paint } = await import("/static/space/room.js");
+const tone = paint("--predicted").getHex();
+return view.shapes.group.children.filter((each) => each.visible && each.material?.color.getHex() === tone).length;
+"""
+
+
+@pytest.mark.parametrize(("state", "tubes"), [(planned, 1), (inserting, 2)])
+def test_the_needle_at_the_target_is_drawn_in_the_tone_of_its_legend(space, state, tubes):
+    """During an insertion with its band."""
+    page = space(state())
+    settled(page)
+    assert on_view(page, IN_ITS_TONE) == tubes
+
+
 def test_the_cut_channel_is_the_darker_the_more_it_is_stretched(space):
     page = space(inserting(60))
     settled(page)

@@ -3,8 +3,8 @@
 import { make } from "../dom.js";
 
 export function legendOf(element, parts, reached) {
-  const entries = parts.filter(({ text }) => text).map(({ text, tone, dash, thick, sampled, predicted, cross }) => [
-    text, tone, cross ? "cross" : dash ? "dashed" : thick ? "thick" : sampled ? "thin" : predicted ? "area" : "line",
+  const entries = parts.filter(({ text }) => text).map(({ text, tone, dash, thick, sampled, spread, cross }) => [
+    text, tone, cross ? "cross" : dash ? "dashed" : thick ? "thick" : sampled ? "thin" : spread ? "area" : "line",
   ]);
   if (reached) entries.unshift(["reach", "--reach", "area"]);
   entries.push(["target, 1 mm", "--target", "disc"]);

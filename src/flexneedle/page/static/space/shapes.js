@@ -138,9 +138,9 @@ export class Shapes {
 
   #predicted(scene, { path, text, spread }) {
     const radius = scene.needle_radius_mm;
-    this.#draw("foreseen", path, 0.5 * radius, { tone: "--estimate", opacity: 0.6 });
+    this.#draw("foreseen", path, 0.5 * radius, { tone: "--predicted", opacity: 0.6 });
     this.#draw("predicted", spread ? path : null, (point) => radius + spread * path.values[point * path.columns + 3]);
-    return path && { text, tone: "--predicted", form: "area" };
+    return path && { text, tone: "--predicted", form: spread ? "area" : "line" };
   }
 
   #channel(scene, path) {
