@@ -2,11 +2,10 @@
 
 import json
 import shutil
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import pytest
 
+import small_study
 from flexneedle.errors import InputError
 from flexneedle.page.frames import Kind, Source
 from flexneedle.page.messages import StudyRow
@@ -15,43 +14,16 @@ from flexneedle.page.worker import study as worker
 from flexneedle.page.worker.__main__ import carry_out
 from flexneedle.page.worker.recording import recorded
 from flexneedle.page.worker.study import Rows, rows
-from flexneedle.study import pools
 from flexneedle.study.recompute import recompute
-from flexneedle.study.runner import run_study
 from page_tasks import Reported, task
 
-STUDY = """\
-name = "mine"
-title = "Mine"
-repeats = 2
-[values]
-plan = { samples = 16, iterations = 2 }
-setup.tip_to_skin_mm = 4.0
-phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
-[[cases]]
-name = "base"
-targets = [[8, 0.5], [7, 0]]
-[[axes]]
-key = "phantom.tracker_bias_mm"
-values = [0.0, 0.3]
-"""
 SIZE = 8
-
-
-@contextmanager
-def _local(_workers=None):
-    with ThreadPoolExecutor(1) as pool:
-        yield pool
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The folder of a study of 8 rows."""
-    folder = tmp_path_factory.mktemp("made")
-    (folder / "mine.toml").write_text(STUDY)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pools, "local", _local)
-        return run_study(folder / "mine.toml", folder / "study")
+    return small_study.run(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
