@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from browser_blends import BLENDS, arrived
 from browser_layout import too_wide
 from fake_page import until
+from flexneedle.page.frames import Kind, Source
 from flexneedle.page.messages import Estimate, Job
 from recorded_page import (
     insertion,
@@ -17,17 +19,15 @@ from recorded_page import (
     planned,
     rows,
     samples,
+    scene,
     session,
+    shape,
 )
 
 pytestmark = pytest.mark.page
 
 PLANS = "[data-panel=plans]"
 PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-INKED = """canvas => {
-  const pen = canvas.getContext("2d");
-  return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
-}"""
 
 
 @pytest.fixture
@@ -123,8 +123,47 @@ def test_strategies_are_side_by_side_with_their_terms(plans):
         "manipulation, lateral",
         "steering, lateral",
     ]
-    for canvas in page.locator(f"{PLANS} .sweeps canvas").all():
-        assert canvas.evaluate(INKED) > 30
+
+
+BANDS = f"""async ([selector, tone, x]) => {{
+  {BLENDS}
+  const {{ boxOf }} = await import("/static/box.js");
+  const {{ mappingOf }} = await import("/static/flat/plane.js");
+  const canvas = document.querySelector(selector);
+  const [{{ width, height }}, scene] = [canvas, flexneedle.store.get("scene")];
+  const across = Math.round(mappingOf(boxOf(scene, scene.target), width, height, 3).toX(x));
+  const picture = composed(canvas);
+  const at = (y) => 4 * (y * width + across);
+  const ground = [0, 1, 2].map((part) => picture[at(1) + part]);
+  const bands = [];
+  let before = 0;
+  for (let y = 0; y < height; y++) {{
+    const pixel = picture.slice(at(y), at(y) + 4);
+    const share = shareOf(ground, pixel, 0, toneOf(tone));
+    if (share && !before) bands.push(0);
+    if (share) bands[bands.length - 1] = Math.max(bands.at(-1), share);
+    before = share;
+  }}
+  return bands;
+}}"""
+"""Share of a tone in each of the lines that cross a column of a canvas at x (mm), from above."""
+
+
+@pytest.mark.parametrize("strategy", ["manipulation", "steering"])
+def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans, strategy):
+    """At the first step, the last, and evenly between them."""
+    x = np.linspace(-60.0, 45.0, 12)
+    needles = [np.column_stack([x, np.full(12, 8.0 - 0.5 * step), np.zeros(12)]) for step in range(33)]
+    flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0))]
+    sweep = shape(Kind.SWEEP, Source[strategy.upper()], 0, *needles)
+    page = plans([*opening(), *flat, plan(strategy), sweep])
+    canvas = f"{PLANS} .sweeps figure:not([hidden]) canvas"
+    page.locator(canvas).scroll_into_view_if_needed()
+    arrived(page)
+    shares = page.evaluate(BANDS, [canvas, f"--{strategy}", -11.0])
+    assert len(shares) == 9
+    assert np.all(np.diff(shares) > 0.04)
+    assert shares[-1] > 0.8
 
 
 def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
