@@ -235,6 +235,9 @@ def test_joint_targets():
 def test_only_what_the_profile_lists_is_made():
     assert set(composed(PLAN, PERIOD, profile="smartneedle-fbg")) == {
         "predicted_shape",
+        "tip",
         "plan",
+        "markers",
+        "joint_states",
         "diagnostics",
     }
