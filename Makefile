@@ -41,7 +41,7 @@ test-all: kernels  ## run all tests but the slow ones and the page's: statistics
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not page" $(PYTEST_ARGS)
 
 test-page: kernels  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
-	$(BIN)/python -m pytest -n auto --dist worksteal -m page tests/page $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "page and not slow" tests/page $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py
@@ -135,7 +135,7 @@ tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedl
 	done
 
 slow: kernels  ## the longest tests: a thousand insertions against the reference, every fault of a device, examples of the docs
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "slow and not page" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(PYTEST_ARGS)
 
 docs: setup  ## build the documentation site into site/; warnings are errors
 	$(BIN)/python tools/docs/scenario_reference.py

@@ -61,6 +61,7 @@ def test_beside_a_rig_plans_give_way(name, more):
         process.stdin.close()
 
 
+@pytest.mark.slow
 def test_plan_insert_save_and_read_over_a_web_socket(tmp_path):
     workers = ((*COMMAND, "plans"), (*COMMAND, "insertion"))
     with served(tmp_path / "runs", limits=Limits(), workers=workers) as server, Client(server) as client:

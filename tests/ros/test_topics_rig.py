@@ -25,7 +25,7 @@ def topics_rig():
     assert process.returncode == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_rig_of_the_page_inserts_a_needle(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(rig_of_page())

@@ -95,8 +95,7 @@ STATES = {
 
 
 @pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+@pytest.mark.parametrize(("size", "scheme"), [((1280, 900), "light"), ((390, 844), "dark")])
 def test_each_part_is_drawn_in_its_tone(views, server, pictures, size, scheme, state):
     before, parts = STATES[state]
     page = views(before, width=size[0], height=size[1], scheme=scheme)

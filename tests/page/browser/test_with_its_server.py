@@ -98,6 +98,7 @@ LOST = "((rows) => rows.some((_, at) => at > 2 && rows.slice(at - 3, at + 1).eve
 """Whether the tip was not measured in four periods one after the other."""
 
 
+@pytest.mark.slow
 def test_searches_a_stopped_insertion_a_link_and_a_row_of_a_study(address, tab, tmp_path):
     page = tab(1280, 800, "light", before=CLIPBOARD)
     page.goto(address)
