@@ -230,18 +230,26 @@ def unusable(rig: RigFile) -> str:
     return ""
 
 
-def outcome(path: Path) -> str:
-    """Read a rig file: "read", "refused", or what is wrong."""
-    start = f"{path}: "
+def outcome(path: Path, read: Callable[[Path], str]) -> str:
+    """Read a file: "read", "refused", or what is wrong. read: returns what is, or ""."""
     try:
-        rig = load_rig(path)
-        start = ""  # the settings are named without the file
-        _read_settings(rig)
+        return read(path) or "read"
     except RigError as error:
-        return _refusal(error, start)
+        lines = error.problems
+        good = lines and all(line.startswith(f"{path}: ") and line.isprintable() for line in lines)
+        return "refused" if good else f"bad lines: {lines!r}"
     except Exception as error:  # noqa: BLE001 - what the study searches
         return f"{type(error).__name__}: {error}"
-    return unusable(rig) or "read"
+
+
+def read_rig(path: Path) -> str:
+    """Read a rig file and the settings of its devices; return what is wrong with the rig, or ""."""
+    rig = load_rig(path)
+    try:
+        _read_settings(rig)
+    except RigError as error:  # whose lines do not name the file
+        raise RigError(*(f"{path}: {line}" for line in error.problems)) from error
+    return unusable(rig)
 
 
 def _read_settings(rig: RigFile) -> None:
@@ -259,32 +267,20 @@ def _read_settings(rig: RigFile) -> None:
         profile_with(given.profile, f"subscribe.{given.source}")
 
 
-def profile_outcome(path: Path) -> str:
-    """Read a profile: "read", "refused", or what is wrong."""
-    try:
-        profile = load_profile(path)
-    except RigError as error:
-        return _refusal(error, f"{path}: ")
-    except Exception as error:  # noqa: BLE001 - what the study searches
-        return f"{type(error).__name__}: {error}"
-    names = [topic.topic for _, topic in profile.topics()]
-    return "read" if len(names) == len({*names}) else "a topic twice"
-
-
-def _refusal(error: RigError, start: str) -> str:
-    lines = error.problems
-    good = lines and all(line.startswith(start) and line.isprintable() for line in lines)
-    return "refused" if good else f"bad lines: {lines!r}"
+def read_profile(path: Path) -> str:
+    """Read a profile; return what is wrong with it, or ""."""
+    names = [topic.topic for _, topic in load_profile(path).topics()]
+    return "" if len(names) == len({*names}) else "a topic twice"
 
 
 def files(random: Random) -> Iterator[str]:
     """Read one rig file after another."""
-    return _tried(RIGS, outcome, random)
+    return _tried(RIGS, read_rig, random)
 
 
 def profiles(random: Random) -> Iterator[str]:
     """Read one profile after another."""
-    return _tried(PROFILES, profile_outcome, random)
+    return _tried(PROFILES, read_profile, random)
 
 
 def _tried(valid: Sequence[bytes], read: Callable[[Path], str], random: Random) -> Iterator[str]:
@@ -295,7 +291,7 @@ def _tried(valid: Sequence[bytes], read: Callable[[Path], str], random: Random) 
             data = fuzzed(valid, random)
             path.write_bytes(data)
             begun = process_time()
-            found, took = read(path), process_time() - begun
+            found, took = outcome(path, read), process_time() - begun
             if found not in ("read", "refused") or took > SLOWEST_S:
                 raise Failure(f"{data!r}: {found}, {took:.2f} s")
             counts[found], slowest = counts[found] + 1, max(slowest, took)

@@ -14,6 +14,7 @@ from flexneedle.page.messages import (
     Job,
     People,
     Plan,
+    Reach,
     Row,
     Rows,
     Runs,
@@ -65,7 +66,7 @@ def session(revision=1, target=TARGET, reach_since=None, **changes):
     return Session(revision=revision, reach_since=since, values=values, changed=[], doubts=[], **given)
 
 
-def scene(revision=1, target=TARGET, axes=2):
+def scene(revision=1, target=TARGET, axes=2, point=(0.0, 0.0)):
     return Scene(
         revision=revision,
         axes=axes,
@@ -77,9 +78,20 @@ def scene(revision=1, target=TARGET, axes=2):
         base=(START - LENGTH, 0.0, 0.0),
         needle_length_mm=LENGTH,
         needle_radius_mm=0.41,
-        axis={"point": (0.0, 0.0), "slope": (0.0, 0.0)},
+        axis={"point": point, "slope": (0.0, 0.0)},
         target=target,
     )
+
+
+def _reach():
+    """In the plane of the target."""
+    y, z = np.array(TARGET[1:]) / np.hypot(*TARGET[1:])
+    ends = {"low": ((5.0, -1.0), (45.0, -12.0)), "high": ((5.0, 1.0), (44.0, 12.0))}
+    edges = {edge: [(x, u * y, u * z) for x, u in points] for edge, points in ends.items()}
+    return Reach(revision=1, angle_deg=np.degrees(np.arctan2(z, y)), **edges)
+
+
+REACH = _reach()
 
 
 def curve(x, target=TARGET, sway=0.0):

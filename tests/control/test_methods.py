@@ -89,12 +89,12 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
 
 
 @pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
-def test_towards_a_path_far_aside_the_guide_goes_to_the_end_of_its_reach_and_no_further(
+def test_towards_a_path_beyond_its_reach_the_guide_moves_to_the_end_of_that_and_no_further(
     quick_plan, estimated, name
 ):
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.8, "target.lateral_mm": 0.0})
-    aside = np.array([0.0, 6.0, 0.0, 0.0, 0.0])
-    away = replace(quick_plan, tips=quick_plan.tips + aside, target=(40.0, 11.0, 0.0))
+    offset = np.array([0.0, 6.0, 0.0, 0.0, 0.0])
+    away = replace(quick_plan, tips=quick_plan.tips + offset, target=(40.0, 11.0, 0.0))
     commands, _ = drive(name, away, scenario, estimated, [0.0] * 8, steps=8)
     assert np.cumsum(commands[:, DG_Y]).max() == pytest.approx(0.8, abs=1e-9)
     assert np.abs(commands[:, DG_Y]).max() == pytest.approx(0.5)

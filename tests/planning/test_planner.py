@@ -132,6 +132,20 @@ def test_a_sketch_of_the_bevel_alone_reaches_with_one_roll_what_a_plan_does_with
     assert planner.sketch(scenario, "steering").reached
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(160_000, 160_040))
+def test_in_random_worlds_a_sketch_of_the_bevel_alone_reaches_what_a_plan_does(number):
+    """Near targets that one roll reaches, and those of the worlds, which are mostly out of reach; searched as little as on
+    the page.
+    """
+    base = world(number)
+    for share in (0.15, 1.0):
+        scenario = base.with_values({"target.lateral_mm": share * base.target.lateral_mm})
+        few = {"plan.samples": 24, "plan.iterations": 4, "plan.max_iterations": 4, "plan.elite_fraction": 0.1}
+        sketch = planner.sketch(scenario.with_values(few), "steering")
+        assert sketch.reached == flexneedle.plan(scenario, strategy="steering").reached
+
+
 def test_a_sketch_of_a_target_out_of_reach_is_not_reached():
     scenario = PHANTOM.with_values({**COARSE, "target.lateral_mm": 9.0})
     sketch = planner.sketch(scenario, "steering")

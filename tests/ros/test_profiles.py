@@ -169,6 +169,7 @@ def test_every_key_has_a_type():
 
 
 def test_files_are_listed_with_the_package():
-    folder = Path(profiles.__file__).parent / "profiles"
-    for path in folder.glob("*.toml"):
-        Profile.model_validate(tomllib.loads(path.read_text()))
+    paths = sorted((Path(profiles.__file__).parent / "profiles").glob("*.toml"))
+    assert {path.stem for path in paths} == {"neutral", "smartneedle", "smartneedle-fbg"}
+    for path in paths:
+        assert Profile.model_validate(tomllib.loads(path.read_text())).name

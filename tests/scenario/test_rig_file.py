@@ -274,7 +274,7 @@ def assert_rig_or_lines(changed):
 def test_any_edit_of_the_text_gives_a_rig_or_lines(tmp_path_factory, start, length, new):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(TEXT[:start] + new + TEXT[start + length :], encoding="utf-8")
-    assert fuzz_rig_file.outcome(path) in ("read", "refused")
+    assert fuzz_rig_file.outcome(path, fuzz_rig_file.read_rig) in ("read", "refused")
 
 
 @pytest.mark.parametrize("part", [fuzz_rig_file.files, fuzz_rig_file.profiles])
@@ -291,12 +291,12 @@ def test_unchanged_files_are_read(tmp_path):
     assert len({*fuzz_rig_file.RIGS}) == 3
     path = tmp_path / "file.toml"
     for read, valid in (
-        (fuzz_rig_file.outcome, fuzz_rig_file.RIGS),
-        (fuzz_rig_file.profile_outcome, fuzz_rig_file.PROFILES),
+        (fuzz_rig_file.read_rig, fuzz_rig_file.RIGS),
+        (fuzz_rig_file.read_profile, fuzz_rig_file.PROFILES),
     ):
         for data in valid:
             path.write_bytes(data)
-            assert read(path) == "read"
+            assert fuzz_rig_file.outcome(path, read) == "read"
 
 
 def test_an_unusable_rig_is_noticed():

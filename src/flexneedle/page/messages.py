@@ -395,14 +395,14 @@ class Plan(News):
 class Reach(News):
     """Targets that can be hit, in the plane of y or, in space, of the target: outlines are the frame REACH.
 
-    low, high: depth and lateral offset of points on its edges, at angle_deg, that of the target of its revision. They
-    are where needles have ended: those that bend much less deep than was sought, where the stroke ends.
+    low, high: points (mm) on its edges in that plane, at angle_deg about the axis, that of the target of its revision.
+    They are where needles have ended: those that bend much less deep than was sought, where the stroke ends.
     """
 
     type: Literal["reach"] = "reach"
     revision: int
-    low: list[tuple[float, float]]
-    high: list[tuple[float, float]]
+    low: list[Vector]
+    high: list[Vector]
     angle_deg: float
 
 

@@ -9,6 +9,7 @@ from flexneedle.page.frames import Kind, Source
 from flexneedle.page.messages import Reach, Rows
 from recorded_page import (
     ITERATIONS,
+    REACH,
     TARGET,
     insertion,
     iteration,
@@ -29,7 +30,6 @@ from recorded_page import (
 pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
-REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 PERIOD = 50
 LEAST = (20, 15)
 """Pixels of a part in the section, and along the axis, where a path may be seen from its end."""
@@ -185,17 +185,25 @@ def test_in_space_the_reach_in_section_is_where_the_plane_cuts_its_outlines(view
     assert behind is None
 
 
-def test_in_the_plane_the_reach_in_section_is_a_strip(views, server):
-    """Its outlines have no width."""
-    flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0), axes=1)]
+@pytest.mark.parametrize(("plane", "entry"), [("target", 0.0), ("target", 2.0), ("x–y", 2.0)])
+def test_in_the_plane_the_reach_in_section_is_a_strip(views, server, plane, entry):
+    """Its outlines have no width. The section through the axis measures from where that is."""
+    flat = [
+        session(target=(40.0, 5.0, 0.0)),
+        scene(target=(40.0, 5.0, 0.0), axes=1, point=(entry, 0.0)),
+    ]
     page = views([*opening(), *flat])
+    page.click(f"{SECTION} [data-plane='{plane}']")
+    arrived(page)
     ends = [np.array([[x, -0.2 * x, 0.0], [x, 0.1 * x, 0.0], [x, -0.2 * x, 0.0]]) for x in (15.0, 40.0)]
-    strip = Reach(revision=1, low=[(15, -3), (40, -8)], high=[(15, 1.5), (40, 4)], angle_deg=0.0)
+    edges = {"low": [tuple(end[0]) for end in ends], "high": [tuple(end[1]) for end in ends]}
+    strip = Reach(revision=1, angle_deg=0.0, **edges)
     before, inside = reach_at(
         page, server, FLAT[0], BOX, (12.0, 30.0), strip, shape(Kind.REACH, Source.SCENE, 0, *ends)
     )
     assert before is None
-    np.testing.assert_allclose(inside, (-6.0, 3.0), atol=TWO_PIXELS)
+    off = entry if plane == "target" else 0.0
+    np.testing.assert_allclose(inside, (-6.0 - off, 3.0 - off), atol=TWO_PIXELS)
 
 
 def test_along_the_axis_the_reach_is_that_at_the_depth_of_the_target(views, server):

@@ -7,8 +7,9 @@ import pytest
 
 from fake_page import until
 from flexneedle.page.frames import Source
-from flexneedle.page.messages import Reach, Rows
+from flexneedle.page.messages import Rows
 from recorded_page import (
+    REACH,
     TARGET,
     estimate,
     inserting,
@@ -27,7 +28,6 @@ from recorded_page import (
 pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
-REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 
 
 @pytest.fixture

@@ -9,10 +9,10 @@ from browser_blends import BLENDS
 from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
-from flexneedle.page.messages import Reach
 from recorded_page import (
     NODES,
     PERIODS,
+    REACH,
     TARGET,
     estimate,
     inserting,
@@ -35,7 +35,6 @@ pytestmark = pytest.mark.page
 SPACE = "[data-panel=space]"
 CANVAS = f"{SPACE} canvas"
 SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
-REACH = Reach(revision=1, low=[(5.0, -1.0), (45.0, -12.0)], high=[(5.0, 1.0), (44.0, 12.0)], angle_deg=31.0)
 STATES = {"opening": opening, "planned": lambda: [*planned(), REACH], "inserting": inserting}
 
 VIEW = "const { spaceView } = await import('/static/space.js'); const view = spaceView();"

@@ -94,17 +94,12 @@ def _show(task: Task, known: dict[float, Outline], angle: float) -> None:
         sorted(ends) for ends in zip(*known.values(), strict=True)
     )  # of each direction, by the depth found
     outlines = list(zip(*ends, strict=True))
-    back = cmath.rect(1.0, -angle)
-
-    def along(end: Point) -> tuple[float, float]:
-        return end[0], (complex(*end[1:]) * back).real
-
     task.show(frame_of(Kind.REACH, Source.SCENE, 0, *([*outline, outline[0]] for outline in outlines)))
     task.say(
         Reach(
             revision=task.work.revision,
-            low=[along(outline[len(outline) // 2]) for outline in outlines],
-            high=[along(outline[0]) for outline in outlines],
+            low=[outline[len(outline) // 2] for outline in outlines],
+            high=[outline[0] for outline in outlines],
             angle_deg=math.degrees(angle),
         )
     )

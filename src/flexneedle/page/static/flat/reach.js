@@ -32,16 +32,14 @@ function cutOf(plane, a, b) {
 }
 
 // Whether the strip of a reach is in a section's plane.
-export const isIn = (plane, reach) => 1 - Math.abs(cosineOf(plane, reach)) <= NEAR ** 2;
-
-function cosineOf({ e }, { angle_deg: angle }) {
-  return e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
+export function isIn({ e }, { angle_deg: angle }) {
+  const cosine = e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
+  return 1 - Math.abs(cosine) <= NEAR ** 2;
 }
 
 function stripOf(plane, reach) {
   if (!isIn(plane, reach)) return [];
-  const side = Math.sign(cosineOf(plane, reach));
-  const turned = ([x, u]) => [x, side * u];
   const { low, high } = reach;
-  return low.map((end, at) => ({ low: turned(end), high: turned(high[at]) }));
+  const placed = (point) => [point[0], lateral(plane, ...point)];
+  return low.map((end, at) => ({ low: placed(end), high: placed(high[at]) }));
 }

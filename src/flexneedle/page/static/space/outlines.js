@@ -15,8 +15,7 @@ export class Outlines {
     this.group.add(this.strip, this.#lines.object);
   }
 
-  // reach: low, high, [depth, lateral] (mm), and angle_deg of their plane about the axis, or null; strip: whether it is
-  // shown; shape: outlines, or null.
+  // reach: its news (messages.py), or null; strip: whether it is shown; shape: outlines, or null.
   update(reach, strip, shape, color) {
     this.group.visible = Boolean(reach);
     this.strip.visible = strip;
@@ -28,10 +27,8 @@ export class Outlines {
   }
 }
 
-function stripOf({ low, high, angle_deg: angle }) {
-  const [c, s] = [Math.cos((angle * Math.PI) / 180), Math.sin((angle * Math.PI) / 180)];
-  const corner = ([x, u]) => [x, c * u, s * u];
-  const corners = low.flatMap((end, at) => [...corner(end), ...corner(high[at])]);
+function stripOf({ low, high }) {
+  const corners = low.flatMap((end, at) => [...end, ...high[at]]);
   const faces = low.slice(1).flatMap((_, at) => [2 * at, 2 * at + 1, 2 * at + 2, 2 * at + 1, 2 * at + 3, 2 * at + 2]);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
