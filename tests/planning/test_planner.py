@@ -135,9 +135,7 @@ def test_a_sketch_of_the_bevel_alone_reaches_with_one_roll_what_a_plan_does_with
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(160_000, 160_040))
 def test_in_random_worlds_a_sketch_of_the_bevel_alone_reaches_what_a_plan_does(number):
-    """Near targets that one roll reaches, and those of the worlds, which are mostly out of reach; searched as little as on
-    the page.
-    """
+    """Near targets, and those of the worlds, which are mostly out of reach; searched as little as on the page."""
     base = world(number)
     for share in (0.15, 1.0):
         scenario = base.with_values({"target.lateral_mm": share * base.target.lateral_mm})
