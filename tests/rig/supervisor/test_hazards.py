@@ -328,10 +328,11 @@ def test_after_homing_the_rig_is_not_armed(bench):
 
 def at_switch(**keys):
     """A bench whose guide rests at the reverse limit switch of its home."""
-    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0, **keys})).armed()
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0, **keys}))
     motor = bench.stage.motors["C"]
     motor.low = motor.position
-    return bench, motor
+    bench.tick()
+    return bench.armed(), motor
 
 
 def test_an_axis_at_its_switch_is_at_home():

@@ -125,6 +125,31 @@ def test_an_axis_that_moves_without_a_command_is_a_fault(bench):
     assert bench.core.why == "guide_y: moved by 0.050 mm without a command"
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "names"),
+    [(0.0, math.inf, "reverse"), (-math.inf, 0.0, "forward"), (0.0, 0.0, "reverse and forward")],
+)
+def test_a_limit_switch_that_becomes_active_while_its_motor_rests_is_a_fault(bench, low, high, names):
+    bench.core.request(step())
+    bench.tick(3)
+    motor = bench.stage.motors["C"]
+    motor.low, motor.high = low, high
+    bench.tick()
+    assert bench.core.why == f"guide_y: at rest, {names} limit switch active"
+    assert bench.until(1).state is State.FAULT
+    assert bench.position("insertion") < 1.0
+    assert_rests(bench)
+
+
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_a_limit_switch_that_was_active_before_is_none(side):
+    bench = Bench()
+    setattr(bench.stage.motors["C"], side, 0.0)
+    bench.tick()
+    bench.armed().tick(20)
+    assert bench.core.state is State.ARMED
+
+
 @pytest.mark.parametrize("state", ["armed", "inserting"])
 def test_after_a_stop_nothing_moves_until_the_rig_is_reset_and_armed(bench, state):
     if state == "inserting":

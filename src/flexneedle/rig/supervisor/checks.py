@@ -108,6 +108,16 @@ def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     return ""
 
 
+def new_switch_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
+    """A limit switch that became active while its motor rests, where its controller has nothing to stop."""
+    became = {
+        "reverse": state.reverse_limit and not before.reverse_limit,
+        "forward": state.forward_limit and not before.forward_limit,
+    }
+    names = " and ".join(name for name, is_new in became.items() if is_new)
+    return f"{drive.name}: at rest, {names} limit switch active" if names else ""
+
+
 def misplaced(drive: Drive, state: MotorState) -> bool:
     """Whether a motor at rest is further from where its controller has it than the checks at rest allow."""
     return abs(drive.error(state)) > min(drive.axis.max_error, _STILL * drive.axis.tolerance)

@@ -7,6 +7,7 @@ from flexneedle.rig.supervisor.axes import Reading
 from flexneedle.rig.supervisor.checks import (
     at_switch,
     motor_problem,
+    new_switch_problem,
     position_problem,
     rest_problem,
     reversal_problem,
@@ -43,7 +44,8 @@ class Inspection:
             return problem
         leg = None if motion is None else motion.leg
         if leg is None or channel not in leg.drives:
-            return rest_problem(drive, state, self.goals[channel])
+            problem = rest_problem(drive, state, self.goals[channel])
+            return problem or new_switch_problem(drive, state, last)
         problem = reversal_problem(drive, state, last, leg.way(channel))
         start = leg.trajectory.start[channel]  # where it still is, if its first target was refused
         return problem or target_problem(drive, state, start, leg.sent.get(channel, start))
