@@ -42,7 +42,7 @@ RGB_TO_XYZ = np.array(
 )
 LEAST = 10.0
 """CIE76 distance of two lines; 2.3 is just noticed where two areas touch."""
-IN_VIEWS = ("plan", "estimate", "true", "needle", "second", "measured")
+IN_VIEWS = ("plan", "estimate", "predicted", "true", "needle", "second", "measured")
 IN_PLOTS = ("estimate", "true", "guide", "needle", "measured")
 COMPARED = {
     ("manipulation", "steering"),

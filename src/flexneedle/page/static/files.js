@@ -21,7 +21,7 @@ export function mount(element, store, link) {
   const status = make("span.quiet", { role: "status" });
   const address = make("input", { type: "text", readonly: true, "aria-label": "Link to copy", hidden: true });
   const copy = button("Copy a link", () => copyLink(store, status, address), { title: "A link to this scenario with seed, strategy and controller" });
-  const picture = button("Picture", savePng, { title: "The scene in space as PNG" });
+  const picture = button("Picture", savePng, { title: "The scene as PNG: in space, or in section where WebGL is missing" });
   const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
