@@ -3,10 +3,8 @@
 import shutil
 
 CHROMIUM = shutil.which("chromium")
-ARGUMENTS = [
-    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-accelerated-2d-canvas", "--disable-gpu-rasterization",
-]  # fmt: skip
+# WebGL in software, the rest of the page without a GPU that is emulated: that would take most of a core.
+ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
 NO_WEBGL = """{
   const context = HTMLCanvasElement.prototype.getContext;
   HTMLCanvasElement.prototype.getContext = function (kind, ...more) {

@@ -18,7 +18,7 @@ from typing import Literal
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
-_ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+_ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
 _WAIT_MS, _POLL_MS = 120_000, 100
 _PAINTED_MS = 3000  # in space, by software
 _ENDED = "['done', 'held', 'failed'].includes(flexneedle.store.get('insertion live')?.state)"
