@@ -201,7 +201,7 @@ class Consumers:
         )
         vars(self.motors).update(
             _profile=load_profile("neutral"), _channels=("a", "b"), _speeds={"a": 1.0, "b": 1.0},
-            _offsets={"a": 0.0, "b": 0.0}, _points={}, _link=link, _opening=None,
+            _offsets={"a": 0.0, "b": 0.0}, _points={}, _link=link, _newest=None, _opening=None,
         )  # fmt: skip
 
     def take(self, record: Request) -> str:

@@ -19,12 +19,12 @@ from flexneedle.errors import CommandError, DriverError, RigError
 from flexneedle.rig.emulator.coupled.truth import read_truth
 from flexneedle.rig.supervised import Columns, SupervisedDriver, Watchers, supervised
 from flexneedle.rig.supervisor.machine import State
-from flexneedle.rig.supervisor.messages import Done
+from flexneedle.rig.supervisor.messages import Done, Step
 from flexneedle.scenario.rig import load_rig
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.trace.topics import READINGS
 from flexneedle.types import Control
-from stages import RIG
+from stages import RIG, Bench
 from synthetic import make_plan
 from traces import contents
 
@@ -45,6 +45,15 @@ def test_along_a_tilted_entry_only_the_insertion_axis_moves():
     columns = Columns(0.1 - 0.05j)
     travel = columns.travel(Control(db_x=1.0, db_y=0.1, db_z=-0.05))
     assert travel == {"insertion": pytest.approx(math.sqrt(1.0 + 0.1**2 + 0.05**2))}
+
+
+def test_a_turn_of_the_base_is_an_axis_that_no_rig_has():
+    travel = Columns(0j).travel(Control(db_x=1.0, db_theta=0.003, db_psi=-0.002))
+    assert travel == {"insertion": 1.0, "base_theta": 0.003, "base_psi": -0.002}
+    for axis in ("base_theta", "base_psi"):
+        bench = Bench().armed()
+        bench.core.request(Step(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
+        assert bench.sent[-1].why.startswith(f"the rig has no axis {axis}; axes: insertion, ")
 
 
 class Axes:

@@ -69,6 +69,14 @@ def test_the_states_are_those_of_the_joints(motors):
     assert not states["insertion"].moving
 
 
+def test_states_without_newer_ones_are_repeated(motors, joints):
+    until(lambda: not motors.read()["roll"].repeated)
+    joints.silent.set()
+    until(lambda: all(state.repeated for state in motors.read().values()))
+    joints.silent.clear()
+    until(lambda: not motors.read()["roll"].repeated)
+
+
 def test_nothing_is_sent_before_a_motion_is_asked_for(motors, joints):
     for _ in range(5):
         motors.read()

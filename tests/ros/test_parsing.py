@@ -173,6 +173,28 @@ def test_the_clock_of_the_sender_may_drift(rate):
     assert time == pytest.approx(true, abs=1.1e-3)  # 10 s at 100 ppm
 
 
+def test_a_sender_whose_clock_is_set_back_has_no_earlier_times_afterwards():
+    stamps, refused = Stamps(), 0
+    for number in range(100):
+        true = 10.0 + 0.025 * number
+        try:
+            time = stamps.measured(true + (1000.0 if number < 50 else 999.8), true + 0.003)
+        except InputError:
+            refused += 1
+        else:
+            assert time == pytest.approx(true + 0.003)
+    assert refused == 8
+
+
+def test_a_single_old_message_changes_no_times():
+    stamps = Stamps()
+    stamps.measured(5.0, 10.0)
+    stamps.measured(5.1, 10.1)
+    with pytest.raises(InputError, match="old data"):
+        stamps.measured(5.05, 10.15)
+    assert stamps.measured(5.2, 10.3) == pytest.approx(10.2)
+
+
 @pytest.mark.parametrize("stamp", [5.0, 4.9, -1.0])
 def test_a_stamp_that_is_not_newer_is_old_data(stamp):
     stamps = Stamps()

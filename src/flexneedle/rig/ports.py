@@ -73,7 +73,8 @@ class MotorState:
 
     position: measured by the encoder; commanded: where the controller's own profile is now; moving: whether the profile
     is under way; on: whether the motor is powered; reverse_limit, forward_limit: whether the limit switch is active;
-    stopped: why the controller itself ended the motion or switched the motor off, "" while it did neither.
+    stopped: why the controller itself ended the motion or switched the motor off, "" while it did neither; repeated:
+    whether nothing newer is known than at the call before.
     """
 
     position: float
@@ -83,6 +84,7 @@ class MotorState:
     reverse_limit: bool = False
     forward_limit: bool = False
     stopped: str = ""
+    repeated: bool = False
 
 
 @dataclass(frozen=True)

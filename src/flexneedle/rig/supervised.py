@@ -62,6 +62,8 @@ class Columns:
             "base_y": base_y,
             "base_z": base_z,
             "rotation": row.spin,
+            "base_theta": row.db_theta,  # turns of the base: no rig has them, and the supervisor refuses them
+            "base_psi": row.db_psi,
             **{name: row[column] for name, column in _GUIDE.items()},
         }
         return {name: way for name, way in travel.items() if abs(way) > 1e-12}

@@ -55,6 +55,7 @@ class RosMotors:
         self._points: dict[str, SetPoint] = {}
         self._connect = partial(JointLink, profile, self._channels, stale_s)
         self._link: JointLink | None = self._connect()
+        self._newest: JointReading | None = None  # of the last call of `read`
         self._opening: Future[JointLink] | None = None
 
     def __enter__(self) -> Self:
@@ -74,7 +75,9 @@ class RosMotors:
         reading = self._connected.fresh()
         if any(point.moving for point in self._points.values()):
             self._advance()
-        return {channel: self._state(channel, reading) for channel in self._channels}
+        repeated, self._newest = reading is self._newest, reading
+        states = {channel: self._state(channel, reading) for channel in self._channels}
+        return {channel: replace(state, repeated=repeated) for channel, state in states.items()}
 
     def set_speed(self, channel: str, speed: float, _acceleration: float) -> None:
         """Limit the speed of the motions to come, and of those under way. The acceleration is that of the joint."""

@@ -387,6 +387,18 @@ def test_a_tip_missing_in_a_few_frames_is_accepted():
     assert lost(last.time + 0.025, off) is None
 
 
+def test_a_tip_missing_after_a_jump_does_not_take_that_back():
+    monitor, _ = observed(Monitor(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    last = monitor.good
+    time = last.time + 0.025
+    off = Measurement(time, last.x, last.y + 9.0, last.z, frame(time))
+    monitor, verdict = monitor.check(off, at_rest, time, 0.3, 2.0)
+    assert not verdict.ok
+    gone = Measurement(time + 0.025, None, None, None, frame(time + 0.025, tip=None))
+    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
+    assert monitor.last_good_before_dropout(gone, verdict) is None
+
+
 def test_a_disabled_monitor_still_rejects_missing_and_improbable_readings():
     off = Monitor(SETTINGS.model_copy(update={"enabled": False}))
     assert one(Measurement(1.0, 30.0, 1.0, 60.0), off) == OK

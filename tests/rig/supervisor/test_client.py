@@ -11,6 +11,8 @@ from flexneedle.rig.supervisor import client
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.machine import State
+from flexneedle.rig.tracking.registration import identity
+from flexneedle.scenario.sections.monitor import MonitorSettings
 from stages import rig_file
 
 
@@ -64,11 +66,34 @@ class Scripted:
 
 
 @pytest.fixture
-def supervisor(monkeypatch):
+def scripted(monkeypatch):
     monkeypatch.setattr(client.subprocess, "Popen", Scripted)
     monkeypatch.setattr(client, "_SILENT_S", 60.0)  # it reports only when it is asked
+
+
+@pytest.fixture
+def supervisor(scripted):  # noqa: ARG001  it has to be there first
     with Supervisor.of_operator(rig_file()) as made:
         yield made
+
+
+@pytest.mark.usefixtures("scripted")
+@pytest.mark.parametrize("error", [OSError("no space left"), ValueError("a bug")])
+def test_what_a_follower_raises_is_raised_where_the_client_waits_and_the_rig_can_still_be_stopped(error):
+    seen = []
+
+    def fails(report):
+        seen.append(report)
+        raise error
+
+    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
+    with Supervisor(task, fails) as made:
+        with pytest.raises(type(error), match=str(error)):
+            made.wait(5.0)
+        assert made.ended is None
+        made.stop()
+    assert len(seen) == 1
+    assert made.ended == ""
 
 
 def test_after_a_stop_a_reset_is_accepted(supervisor):

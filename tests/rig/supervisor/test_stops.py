@@ -1,6 +1,7 @@
 """What stops the motors: motors, tracker, client and operator; and that nothing starts by itself."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -139,6 +140,39 @@ def test_a_limit_switch_that_becomes_active_while_its_motor_rests_is_a_fault(ben
     assert bench.until(1).state is State.FAULT
     assert bench.position("insertion") < 1.0
     assert_rests(bench)
+
+
+def test_a_limit_switch_that_becomes_active_as_its_motion_ends_is_a_fault(bench):
+    """The controller still counts the axis as in motion, but has nothing to stop; later it rests."""
+    bench.core.request(step())
+    read, motor = bench.stage.read, bench.stage.motors["A"]
+    late = []
+
+    def at_the_end():
+        found = read()
+        if motor.position < 999.0:
+            return found
+        late.append(not late)
+        return found | {"A": replace(found["A"], moving=late[-1], forward_limit=True)}
+
+    bench.stage.read = at_the_end
+    bench.until(1)
+    bench.tick()
+    assert bench.core.why == "insertion: at rest, forward limit switch active"
+
+
+def test_a_limit_switch_that_becomes_active_during_a_hold_is_a_fault(bench):
+    bench.camera.tip = lambda time: (time, 0.0, 0.01 * time)
+    bench.stage.motors["A"].lag = 0.02
+    bench.core.request(step(expected=FAR))
+    bench.tick(2)
+    bench.camera.tip = lambda _: (9.0, 9.0, 9.0)
+    bench.tick()
+    assert bench.core.state is State.HOLDING
+    assert not bench.reports[-1].at_rest
+    bench.stage.motors["C"].low = 0.0
+    bench.tick()
+    assert bench.core.why == "guide_y: at rest, reverse limit switch active"
 
 
 @pytest.mark.parametrize("side", ["low", "high"])
@@ -282,3 +316,28 @@ def test_jogging_homing_and_retracting(bench):
     ):
         bench.core.request(bad)
         assert isinstance(bench.sent[-1], say.Refused)
+
+
+def test_a_state_that_is_repeated_does_not_show_that_a_motor_rests(bench):
+    """As of joints that report at half the rate of the ticks, and go on after the motion of their set points."""
+    bench.camera.tip = lambda time: (time, 0.0, 0.01 * time)
+    bench.stage.motors["A"].lag = 0.03
+    bench.core.request(step(expected=FAR))
+    read, kept = bench.stage.read, []
+
+    def at_half_the_rate():
+        found = read()
+        kept.append(
+            found if len(kept) % 2 == 0 else {k: replace(one, repeated=True) for k, one in kept[-1].items()}
+        )
+        return kept[-1]
+
+    bench.stage.read = at_half_the_rate
+    bench.tick(4)
+    bench.camera.tip = lambda _: (9.0, 9.0, 9.0)
+    done = bench.until(1)
+    assert done.state is State.HOLDING
+    assert done.travelled["insertion"] == pytest.approx(1e-3 * bench.stage.motors["A"].position, abs=2e-3)
+    bench.tick(40)
+    assert bench.core.state is State.HOLDING
+    assert bench.reports[-1].at_rest

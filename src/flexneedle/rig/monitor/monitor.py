@@ -191,14 +191,17 @@ class Monitor:
         return good if now - good.time <= max_age + 1e-9 else None
 
     def last_good_before_dropout(self, newest: Measurement, verdict: Verdict) -> Measurement | None:
-        """Return the last good reading if only the tip is missing in the newest frame, for at most `lost_after_s`.
+        """Return the last good reading if only the tip is missing since then, for at most `lost_after_s`.
 
         verdict: on the newest frame; a stale one, or one with an invalid time, gives no information on the tip. None
-        for a tracker without frames, since it may have stopped.
+        for a tracker without frames, since it may have stopped, and if a tip was rejected since the last good reading.
         """
         if newest.frame is None or verdict.kind is not VerdictKind.MISSING:
             return None
-        return self.last_good(newest.time, self.settings.lost_after_s)
+        good = self.last_good(newest.time, self.settings.lost_after_s)
+        if good is None or any(one.time > good.time and one.x is not None for one in self.recent):
+            return None
+        return good
 
     def _frames(self) -> list[Frame]:
         return [one.frame for one in self.recent if one.frame is not None]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.ports import Clock, MotorPaces, Motors, MotorState
-from flexneedle.rig.supervisor.checks import at_home, at_switch, misplaced, rests
+from flexneedle.rig.supervisor.checks import at_home, at_switch, misplaced, rests, switches
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import AxisState
 from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
@@ -24,8 +24,8 @@ class Reading:
 
 
 class RigAxes:
-    """Drives by axis, their motors, the last reading and the one before it, and where motors were last sent (counts by
-    channel).
+    """Drives by axis, their motors, the last reading and the one before it, where motors were last sent (counts by
+    channel), and limit switches by channel that were active as positions were taken, and still are.
 
     lost: whether the motors could not be reached, so that they are not known to
     rest, until they are stopped. Calls of motors raise DriverError.
@@ -102,6 +102,7 @@ class RigAxes:
         """Take where the motors are as where they were sent, and as reported."""
         self.settle()
         self._reported = self.positions
+        self.switches = {channel: switches(state) for channel, state in self.states.items()}
 
     def take_travel(self) -> dict[str, float]:
         """The travel (mm or rad) by axis from where the motion before was reported to have ended, so that what motors
@@ -116,6 +117,9 @@ class RigAxes:
         """Read the states of all motors."""
         with self._reached():
             self.before, self.newest = self.newest, self._read()
+        self.switches = {
+            channel: self.switches[channel] & switches(state) for channel, state in self.states.items()
+        }
 
     def power_on(self) -> str:
         """Switch all motors on, and read them; return what else was changed, or "".

@@ -75,7 +75,12 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
 
 
 def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
-    """Whether a motor rests, its servo included, which may follow on when the controller's profile has ended."""
+    """Whether a motor rests, its servo included, which may follow on when the controller's profile has ended.
+
+    A state that is repeated does not show it.
+    """
+    if state.repeated:
+        return False
     tolerance, count = drive.axis.tolerance, 1.0 / abs(drive.axis.scale)
     moved = abs(state.position - before.position) * count
     return not state.moving and moved <= max(_CREEP * tolerance, min(count, tolerance))
@@ -108,14 +113,21 @@ def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     return ""
 
 
-def new_switch_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
-    """A limit switch that became active while its motor rests, where its controller has nothing to stop."""
-    became = {
-        "reverse": state.reverse_limit and not before.reverse_limit,
-        "forward": state.forward_limit and not before.forward_limit,
-    }
-    names = " and ".join(name for name, is_new in became.items() if is_new)
-    return f"{drive.name}: at rest, {names} limit switch active" if names else ""
+def switches(state: MotorState) -> frozenset[str]:
+    """Which limit switches of an axis are active: "reverse", "forward"."""
+    sides = {"reverse": state.reverse_limit, "forward": state.forward_limit}
+    return frozenset(side for side, is_active in sides.items() if is_active)
+
+
+def new_switch_problem(drive: Drive, state: MotorState, known: frozenset[str]) -> str:
+    """A limit switch that became active at a motor that rests, where its controller has nothing to stop.
+
+    known: those that were active as the rig was armed, and still are.
+    """
+    new = switches(state) - known
+    if state.moving or not new:
+        return ""
+    return f"{drive.name}: at rest, {' and '.join(sorted(new, reverse=True))} limit switch active"
 
 
 def misplaced(drive: Drive, state: MotorState) -> bool:

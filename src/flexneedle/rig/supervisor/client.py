@@ -41,7 +41,7 @@ _ENOUGH = 9  # measurements for a median
 class Supervisor:
     """A supervisor in a process of its own. Use it as a context manager.
 
-    on_report: called with what each tick found, in a thread.
+    on_report: called with what each tick found, in a thread; what it raises is raised where the client waits next.
     Raises DriverError or StoppedError if the rig has a fault or is stopped, InputError if it refuses a request.
     """
 
@@ -53,6 +53,7 @@ class Supervisor:
         self._latest_at = monotonic()
         self._ended: str | None = None
         self._unopened = ""
+        self._failed: Exception | None = None  # of on_report, which is then not called again
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
@@ -332,6 +333,9 @@ class Supervisor:
                 return True
             if self._ended is not None:
                 raise self._end()
+            if self._failed is not None:
+                failed, self._failed = self._failed, None
+                raise failed
             if self._latest is not None:
                 silent = monotonic() - self._latest_at
                 if silent > _SILENT_S and not self._late_reports():
@@ -371,16 +375,16 @@ class Supervisor:
 
     def _receive(self) -> None:
         why = "it was killed"
-        try:
-            while True:
+        while True:
+            try:
                 message = self._connection.recv()
-                if isinstance(message, say.Ended):
-                    why = message.why
-                    self._unopened = why if self._latest is None else ""
-                    break
-                self._take(message)
-        except (EOFError, OSError):
-            pass
+            except (EOFError, OSError):
+                break
+            if isinstance(message, say.Ended):
+                why = message.why
+                self._unopened = why if self._latest is None else ""
+                break
+            self._take(message)
         with self._changed:
             self._ended = why
             self._changed.notify_all()
@@ -395,7 +399,12 @@ class Supervisor:
                     self._answers[message.number] = message
             self._changed.notify_all()
         if self._on_report is not None and isinstance(message, say.Report):
-            self._on_report(message)
+            try:
+                self._on_report(message)
+            except Exception as error:  # noqa: BLE001  raised where the client waits: this thread must go on
+                with self._changed:
+                    self._failed, self._on_report = error, None
+                    self._changed.notify_all()
 
 
 def _position(measurement: Measurement) -> Point | None:

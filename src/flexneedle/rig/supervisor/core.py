@@ -229,7 +229,7 @@ class Supervisor:
             self._check_rest()
             return
         stopping = self._stopping is not None
-        inspection = Inspection(self._motion, axes.goals, stopping, axes.newest, axes.before)
+        inspection = Inspection(self._motion, axes.goals, stopping, axes.newest, axes.before, axes.switches)
         if problem := inspection.first_problem(axes.drives):
             self._fault(problem)
 

@@ -20,7 +20,7 @@ from flexneedle.rig.supervisor.motion import Motion
 @dataclass(frozen=True)
 class Inspection:
     """The motion under way, or None; where motors were last sent (counts by channel); whether they are being stopped;
-    this reading of their states and the one before.
+    this reading of their states and the one before; limit switches by channel that were active before.
     """
 
     motion: Motion | None
@@ -28,6 +28,7 @@ class Inspection:
     stopping: bool
     newest: Reading
     before: Reading
+    switches: Mapping[str, frozenset[str]]
 
     def first_problem(self, drives: Mapping[str, Drive]) -> str:
         """The problem of the first drive (by axis) that has one, or ""."""
@@ -40,15 +41,22 @@ class Inspection:
         unlimited = motion is not None and motion.unlimited
         problem = "" if self._is_stopped_at_home(drive) else motor_problem(drive, state, last)
         problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
+        if not self._is_at_its_home(drive):
+            problem = problem or new_switch_problem(drive, state, self.switches[channel])
         if problem or self.stopping:
             return problem
         leg = None if motion is None else motion.leg
         if leg is None or channel not in leg.drives:
-            problem = rest_problem(drive, state, self.goals[channel])
-            return problem or new_switch_problem(drive, state, last)
+            return rest_problem(drive, state, self.goals[channel])
         problem = reversal_problem(drive, state, last, leg.way(channel))
         start = leg.trajectory.start[channel]  # where it still is, if its first target was refused
         return problem or target_problem(drive, state, start, leg.sent.get(channel, start))
+
+    def _is_at_its_home(self, drive: Drive) -> bool:
+        """Whether the axis searches or leaves its home, whose switch may then change several times."""
+        motion = self.motion
+        homes = () if motion is None else (motion.home, motion.released)
+        return any(home is not None and home.name == drive.name for home in homes)
 
     def _is_stopped_at_home(self, drive: Drive) -> bool:
         """Whether the axis has reached the limit switch that is its home, where the motor controller stops it."""
