@@ -50,7 +50,7 @@ class FakePage:
     """
 
     def __init__(self, schema=b"{}"):
-        self._schema, self._sockets = schema, []
+        self._schema, self._sockets, self._cut = schema, [], []
         self._heard = threading.Condition()
         self._begin()
         routes = [
@@ -96,6 +96,10 @@ class FakePage:
     def drop(self, reason=""):
         """Close all connections."""
         asyncio.run_coroutine_threadsafe(self._drop(reason), self._loop).result(20.0)
+
+    def cut(self):
+        """Send nothing more over the present connections, and leave them open, as a line that is dead."""
+        self._cut = list(self._sockets)
 
     def asked(self, kind):
         """Requests of a type, without their numbers."""
@@ -178,9 +182,8 @@ class FakePage:
         for socket in list(self._sockets):
             await self._send_to(socket, news)
 
-    @staticmethod
-    async def _send_to(socket, news):
-        for each in news:
+    async def _send_to(self, socket, news):
+        for each in () if socket in self._cut else news:
             if isinstance(each, News):
                 await socket.send_text(each.model_dump_json())
             else:

@@ -170,7 +170,7 @@ def test_the_token_is_in_the_printed_address_and_then_in_a_cookie(tmp_path, monk
         status, _text, headers = get(server, path)
         assert (status, headers["location"]) == (303, "/")
         assert "HttpOnly" in headers["set-cookie"]
-        assert "SameSite=strict" in headers["set-cookie"]
+        assert "SameSite=lax" in headers["set-cookie"]
         cookie = headers["set-cookie"].partition(";")[0]
         assert get(server, "/", Cookie=cookie)[0] == 200
         with Client(server, additional_headers={"Cookie": cookie}) as client:

@@ -120,9 +120,9 @@ def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
         other.do("steer", take=False)
 
 
-def test_all_requests_but_three_need_the_steering():
+def test_all_requests_but_four_need_the_steering():
     free = {request for request in m.Request.__subclasses__() if not request.steering}
-    assert free == {m.Steer, m.Stop, m.RowsFrom}
+    assert free == {m.Steer, m.Stop, m.Ping, m.RowsFrom}
     assert len(STEERED) + len(free) == len(m.Request.__subclasses__())
 
 

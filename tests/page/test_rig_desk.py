@@ -150,14 +150,24 @@ def test_nobody_steers_just_after_the_insertion_has_gone_on(on_loop):
     on_loop(test)
 
 
-def test_a_rig_that_has_a_fault_is_not_armed_any_more(on_loop):
+@pytest.mark.parametrize("state", ["stopped", "fault", "ended"])
+@pytest.mark.parametrize("waits", [0, 1, 2])
+def test_a_rig_that_was_stopped_is_not_armed_any_more(on_loop, waits, state):
+    """Also one that reports on, for what it waited."""
+
     def test(bench):
         bench.reports("idle", waits=1)
+        if waits == 2:
+            bench.arm(JOB)
+            bench.go()
+            bench.reports("holding", waits=2)
         bench.arm(JOB)
-        bench.reports("fault", why="no reply")
+        bench.reports(state, why="no reply", waits=waits)
+        assert bench.shown == state
         with pytest.raises(Refusal, match="Bench is not armed"):
             bench.go()
-        assert bench.shown == "fault"
+        with pytest.raises(Refusal, match="Bench is not ready"):
+            bench.arm(JOB)
 
     on_loop(test)
 

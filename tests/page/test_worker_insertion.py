@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 import flexneedle
@@ -11,10 +12,12 @@ from flexneedle.page.messages import Disturb
 from flexneedle.page.orders import Signal
 from flexneedle.page.server.folder import RunsFolder
 from flexneedle.page.worker import saving
+from flexneedle.page.worker.disturbances import DisturbedPlant, Disturber
 from flexneedle.page.worker.insertion import Insertions
 from flexneedle.page.worker.recording import read
 from flexneedle.page.worker.rows import row_of
 from flexneedle.page.worker.signals import Cancelled
+from flexneedle.rig.phantom.draw import draw
 from flexneedle.runs.saving import save
 from page_tasks import NO_WAIT, Reported, done, short, task
 
@@ -192,6 +195,28 @@ def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(by_command):
     assert rows[-1].true_energy_mj > 1.3 * by_command.periods[-1].true_strain_energy
     deep = disturbed({"what": "stiffen", "size": 3.0, "layer": 1}).rows  # which the needle does not reach
     assert deep[-1].true_energy_mj == by_command.periods[-1].true_strain_energy
+
+
+def test_a_layer_is_stiffer_where_it_truly_is(monkeypatch):
+    """Its boundaries are displaced, and a hidden layer splits those of the scenario."""
+    hidden = {"top_mm": 24.0, "thickness_mm": 3.0, "modulus_factor": 4.0}
+    scenario = short().with_values(
+        {"phantom.layer_shift_sd_mm": 1.5, "phantom.structure.hidden_layer": hidden}
+    )
+    truth = draw(scenario, np.random.default_rng(3))
+    tops = np.cumsum([layer.thickness_mm for layer in truth.scenario.tissue[:-1]])
+    assert len(tops) > 1
+    assert truth.layer_tops[1] in (0.0, *tops.tolist())
+    assert abs(truth.layer_tops[1] - scenario.layer_tops[1]) > 0.1
+    given = []
+    monkeypatch.setattr(DisturbedPlant, "stiffen", lambda _plant, *how: given.append(how))
+    disturber = Disturber(scenario, lambda: 0.0, lambda _news: None)
+    disturber.plant(truth, 0.0)
+    disturber.watch(None)
+    for layer in (0, 1):
+        disturber.take(Disturb(type="disturb", what="stiffen", size=3.0, layer=layer))
+    boundary = truth.layer_tops[1]
+    assert given == [(0.0, boundary, 3.0), (boundary, math.inf, 3.0)]
 
 
 def test_a_lost_tip_holds_the_needle_and_comes_back():

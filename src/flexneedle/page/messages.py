@@ -176,7 +176,7 @@ class Disturb(Request):
     what: Literal["push", "stiffen", "drop", "plate"]
     size: Annotated[float, Field(ge=0.0, le=1e4)]
     angle_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
-    layer: Annotated[int, Field(ge=0, le=20)] = 0
+    layer: Annotated[int, Field(ge=0, le=999)] = 0
 
 
 class Open(Request):
@@ -205,6 +205,14 @@ class Save(Request):
     type: Literal["save"]
     name: Name
     of: Literal["live", "first", "second"] = "live"
+
+
+class Ping(Request):
+    """Nothing: the answer shows that the server is there. A page asks where it has heard nothing for a second."""
+
+    steering = False
+
+    type: Literal["ping"]
 
 
 class RowsFrom(Request):
@@ -237,6 +245,7 @@ AnyRequest = Annotated[
     | Open
     | Study
     | Save
+    | Ping
     | RowsFrom,
     Field(discriminator="type"),
 ]

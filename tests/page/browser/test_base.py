@@ -189,6 +189,21 @@ def test_a_lost_connection_recovers_the_state(visit, server):
     ]
 
 
+FASTER = "const every = setInterval; window.setInterval = (call, ms) => every(call, ms / 10);"
+
+
+def test_a_dead_line_is_noticed_and_the_page_connects_again(visit, server):
+    page = visit(before=FASTER)
+    page.wait_for_selector("text=nobody is in control")
+    server.wait_for("ping", 3)  # while all is quiet
+    assert page.evaluate("flexneedle.store.get('connection')") == "open"
+    server.news = [*planned()[:1], people(clients=3), session(revision=9, seed=4)]
+    server.cut()
+    page.wait_for_selector("text=3 people connected")
+    known = page.evaluate("['connection', 'connection reason'].map((key) => flexneedle.store.get(key))")
+    assert known == ["open", "the server is silent"]
+
+
 def test_of_another_scenario_no_plan_and_no_needle_is_kept(visit, server):
     page = visit()
     page.wait_for_selector("text=nobody is in control")

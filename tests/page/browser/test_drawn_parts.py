@@ -206,10 +206,18 @@ def test_in_the_plane_the_reach_in_section_is_a_strip(views, server, plane, entr
     np.testing.assert_allclose(inside, (-6.0 - off, 3.0 - off), atol=TWO_PIXELS)
 
 
-def test_along_the_axis_the_reach_is_that_at_the_depth_of_the_target(views, server):
+@pytest.mark.parametrize("depths", [(15.0, 35.0, 60.0), (5.0, 20.0, 44.0)])
+def test_along_the_axis_the_reach_is_that_at_the_depth_of_the_target(views, server, depths):
     page = views(opening())
-    outlines = ellipses(15.0, 35.0, 60.0)
-    up, side = reach_at(page, server, FLAT[1], AXIAL_BOX, (0.0, 3.0), REACH, outlines)
-    np.testing.assert_allclose(up, (-7.0, 7.0), atol=TWO_PIXELS)
-    rest = 7.0 * np.sqrt(1.0 - (3.0 / 3.5) ** 2)
+    up, side = reach_at(page, server, FLAT[1], AXIAL_BOX, (0.0, 3.0), REACH, ellipses(*depths))
+    half = SLOPES[0] * TARGET[0]
+    np.testing.assert_allclose(up, (-half, half), atol=TWO_PIXELS)
+    rest = half * np.sqrt(1.0 - (3.0 / (SLOPES[1] * TARGET[0])) ** 2)
     assert side[0] == pytest.approx(-rest, abs=TWO_PIXELS)
+
+
+def test_along_the_axis_there_is_no_reach_beyond_its_deepest_outline(views, server):
+    page = views(opening())
+    assert added(page, server, "--reach", REACH, ellipses(15.0, 38.0), canvases=[FLAT[1]])[0] == 0
+    legend = page.locator(f"{AXIAL} .legend li").all_inner_texts()
+    assert "reach" not in legend

@@ -228,6 +228,7 @@ def test_a_check_lists_its_problems(rig_panel, server):
     page.wait_for_selector("text=you are in control")
     server.send(Job(job=9, kind="check", state="running", text="each device is read, nothing moves"))
     page.wait_for_selector("text=Checking: each device is read, nothing moves …")
+    assert page.is_disabled(f"{PANEL} button:text-is('Check')")
     findings = [
         {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
         {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},

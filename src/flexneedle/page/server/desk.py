@@ -156,6 +156,8 @@ class Desk:
                 self._order("reach" if request.work == "reach" else "plan", request.work)
             case m.Cancel():
                 self._cancel(request.job)
+            case m.Ping():
+                pass
             case m.RowsFrom():
                 outbox.rows_from("rows live", request.index)
             case m.Open():

@@ -137,7 +137,8 @@ class Guard:
     def _signed_in(self, path: str) -> Response:
         """The same page without the token in its address, where a history or a log would keep it."""
         answer = RedirectResponse(path if path.startswith("/") and path[1:2] not in ("/", "\\") else "/", 303)
-        answer.set_cookie(self._gate.cookie, self._gate.token, httponly=True, samesite="strict")
+        # Not "strict": who follows a link to the page from elsewhere is signed in, too. Sockets are judged by Origin.
+        answer.set_cookie(self._gate.cookie, self._gate.token, httponly=True, samesite="lax")
         return answer
 
 

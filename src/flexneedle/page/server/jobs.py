@@ -27,6 +27,8 @@ _FINISHED: frozenset[Kind] = frozenset(("needle", "estimate"))
 """Short ones, which are not cancelled by a newer one: so a target that is dragged has estimates all along."""
 _BACKGROUND: frozenset[Kind] = frozenset(("row", "reach"))
 """Those that are set back for more urgent ones."""
+_CLOSING: frozenset[Kind] = frozenset(("check", "recording", "study"))
+"""Those that read devices or files, and close them before they end."""
 _SLOTS: dict[Kind, Kind] = {"compare": "plan", "row": "recording"}
 """Kinds that replace another one, and are replaced by it."""
 _FOR_THE_SERVER = ("rig_report",)
@@ -148,7 +150,8 @@ class Jobs:
         if self._running is not None and not self._running.cancelled:
             self._running.cancelled = True
             self.signal(self._running.work.job, cancel=True)
-            self.expect_end(self._limits.cancel_s)
+            closes = self._running.work.kind in _CLOSING
+            self.expect_end(self._limits.close_s if closes else self._limits.cancel_s)
 
     def _next(self) -> None:
         if self._running is None and self._waiting and self.worker.ready:

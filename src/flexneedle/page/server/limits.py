@@ -34,6 +34,8 @@ class Limits:
     """A rig that was armed and not started for this time is disarmed."""
     cancel_s: float = 1.0
     """A worker that has not cancelled by then is ended."""
+    close_s: float = 20.0
+    """The same where it reads devices or files, which it has to close."""
     stop_s: float = 5.0
     """A worker that has not stopped an insertion by then is ended; the supervisor has stopped its rig before."""
     record_s: float = 30.0

@@ -155,8 +155,10 @@ class Rig:
 
     @property
     def _waits(self) -> bool:
-        """Whether the insertion rests until it may go."""
-        return self._report is not None and self._report.waits > self._gone
+        """Whether the insertion rests until it may go. One that was stopped goes no more, whatever it waited for."""
+        if self._report is None or self._state in _OVER:
+            return False
+        return self._report.waits > self._gone
 
     def _set_armed(self, expire: Callable[[], None] | None) -> None:
         if self._armed is not None:

@@ -6,7 +6,9 @@ const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
 const EDIT_EVERY = 50; // ms
 const MOST_REFUSALS = 20;
 const ANSWER_WITHIN = 10_000; // ms
-const FREE = ["steer", "stop", "rows_from"]; // what a client that does not steer may ask for
+const LOOK_EVERY = 1000; // ms, whether the server is there
+const MOST_SILENT = 4; // looks without a word of it: more, and the line is dead, which a browser notices after minutes
+const FREE = ["steer", "stop", "rows_from", "ping"]; // what a client that does not steer may ask for
 
 export class Link {
   #store;
@@ -16,6 +18,7 @@ export class Link {
   #timer = 0;
   #number = 0;
   #revision = -1; // of the newest session
+  #silent = 0; // looks since the server's last word; not a time, as a page that stood still has its words to take yet
   #waiting = new Map(); // by number of the request: {resolve, timer}
   #edits = {};
   #editTimer = 0;
@@ -26,18 +29,21 @@ export class Link {
   constructor(store, address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`) {
     this.#store = store;
     this.#address = address;
+    setInterval(() => this.#look(), LOOK_EVERY);
   }
 
   // Connect, now and whenever the connection is lost. Store key "connection": connecting, open, lost; "connection
   // reason": the server's words when it was lost, which may be empty.
   connect() {
     clearTimeout(this.#timer);
+    this.#timer = 0;
     this.#store.set("connection", this.#attempts ? "lost" : "connecting");
     const socket = new WebSocket(this.#address);
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => this.#receive(data);
     socket.onclose = ({ reason }) => this.#lost(socket, reason);
     this.#socket = socket;
+    this.#silent = 0;
   }
 
   // Send a request. Resolves to {done: true} or {done: false, reason, problems}; never rejects. What needs steering
@@ -113,7 +119,18 @@ export class Link {
     this.#store.set("refusals", [...refusals, newest].slice(-MOST_REFUSALS));
   }
 
+  #look() {
+    const socket = this.#socket;
+    if (!socket || this.#timer) return;
+    this.#silent += 1;
+    if (this.#silent > MOST_SILENT) {
+      this.#lost(socket, "the server is silent");
+      socket.close(); // which may take as long
+    } else if (this.#silent > 1) this.#send({ type: "ping" });
+  }
+
   #receive(data) {
+    this.#silent = 0;
     if (data instanceof ArrayBuffer) {
       this.#store.receiveFrame(unpacked(data));
       return;
@@ -162,6 +179,7 @@ export class Link {
 
   #lost(socket, reason) {
     if (socket !== this.#socket) return;
+    socket.onmessage = this.#socket = null;
     for (const request of [...this.#waiting.keys()]) {
       this.#answer(request, { done: false, reason: "The connection to the server was lost.", problems: {} });
     }

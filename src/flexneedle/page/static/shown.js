@@ -94,6 +94,12 @@ export function maySteer(store) {
   return Boolean(people) && (people.steering === null || people.steering === welcome?.client);
 }
 
+// Whether this client is in control.
+export function steers(store) {
+  const people = store.get("people");
+  return Boolean(people) && people.steering !== null && people.steering === store.get("welcome")?.client;
+}
+
 // Whether what is shown can be moved by hand: the scene before an insertion.
 export const mayMove = (store) => maySteer(store) && shownOf(store) === "scene";
 

@@ -91,6 +91,7 @@ class Disturber:
         """now: the time (s) of the run; say: is called when something else disturbs it than before."""
         self._scenario, self._now, self._say = scenario, now, say
         self._plant: DisturbedPlant | None = None
+        self._layers: tuple[float, ...] = ()
         self._tracker: DisturbedTracker | None = None
         environment = scenario.tracker.environment
         self._plate = None if environment is None or environment.plate is not None else _FAR_MM
@@ -99,7 +100,7 @@ class Disturber:
 
     def plant(self, truth: Truth, roll: float) -> DisturbedPlant:
         """The factory of the plant."""
-        self._plant = DisturbedPlant(truth, roll)
+        self._plant, self._layers = DisturbedPlant(truth, roll), (*truth.layer_tops, math.inf)
         return self._plant
 
     def plate_distance_at(self, _time: float) -> float | None:
@@ -142,8 +143,8 @@ class Disturber:
                 angle = math.radians(disturb.angle_deg)
                 self._plant.push(disturb.size * complex(math.cos(angle), math.sin(angle)))
             case "stiffen":
-                ends = (*self._scenario.layer_tops, math.inf)
-                self._plant.stiffen(ends[disturb.layer], ends[disturb.layer + 1], disturb.size)
+                top, bottom = self._layers[disturb.layer : disturb.layer + 2]
+                self._plant.stiffen(top, bottom, disturb.size)
             case "drop":
                 self._dropped_until = self._now() + disturb.size
                 self._tracker.drop(self._now(), self._dropped_until)

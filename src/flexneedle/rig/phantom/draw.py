@@ -19,7 +19,8 @@ class Truth:
 
     bend: tip deflection of the free needle, towards the bevel and turned from it by bend_angle (rad); run_out: offset
     of the tip from the needle's axis, in the same way; both roll with the needle. load: constant force y, z on the tip
-    (N). bias x, y, z of the tracker (mm); variation: factor on μ in cells of `cell_mm` from the skin down.
+    (N). bias x, y, z of the tracker (mm); variation: factor on μ in cells of `cell_mm` from the skin down. split: true
+    tops of layers (mm) where a hidden layer splits them, else empty.
     """
 
     scenario: Scenario
@@ -35,6 +36,12 @@ class Truth:
     bend_angle: float = 0.0
     run_out_angle: float = 0.0
     load: tuple[float, float] = (0.0, 0.0)
+    split: tuple[float, ...] = ()
+
+    @property
+    def layer_tops(self) -> tuple[float, ...]:
+        """True depths (mm) at which the layers of the scenario begin from which it was drawn."""
+        return self.split or self.scenario.layer_tops
 
     def __repr__(self) -> str:
         base = f"base {self.base_y:.3f} mm, {1e3 * self.base_turn:.2f} mrad"
@@ -66,8 +73,10 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     variation = _variation(scenario, cell, rng)
     values |= _start(scenario, rng) | _modulus(scenario, rng)
     base_z, base_psi, bend_angle, run_out_angle = _out_of_plane(scenario, rng)
+    layered = scenario.with_values(values)
+    truth = with_hidden_layer(layered, scenario)
     return Truth(
-        with_hidden_layer(scenario.with_values(values), scenario),
+        truth,
         base_y,
         base_turn,
         bend_side * settings.initial_bend_mm,
@@ -79,6 +88,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         base_psi,
         bend_angle,
         run_out_angle,
+        split=() if truth is layered else layered.layer_tops,
     )
 
 

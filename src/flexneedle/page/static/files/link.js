@@ -1,6 +1,6 @@
 // A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
 
-import { maySteer } from "../shown.js";
+import { maySteer, steers } from "../shown.js";
 import { safe } from "./names.js";
 
 const MARK = "#state=";
@@ -35,7 +35,7 @@ export function followLink(store, link, status) {
     if (state) await begin(link, state);
   };
   store.subscribe(["people", "welcome"], () => {
-    if (waits && maySteer(store)) take();
+    if (waits && steers(store)) take(); // not as soon as nobody is: that may be between two connections of one who was
   });
   const end = store.subscribe(["people"], () => {
     if (!store.get("people")) return;

@@ -4,6 +4,7 @@ import { tipOf } from "../paths.js";
 import { rollOf } from "../planned.js";
 import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
 import { area, cross, disc, grid, inside, pointsOf, polyline } from "./pen.js";
+import { reachAt } from "./reach.js";
 
 const READINGS = 40; // measured positions that are shown, as crosses: what else there is a point for is a disc
 const BEVEL = 26; // px, length of the arrow
@@ -40,12 +41,9 @@ function draw(pen, { path, tone, width = 1, alpha = 1, dash, thick, sampled, pre
 
 function reach(pen, place, store, depth) {
   const outlines = store.get("shape reach scene");
-  if (!shownReach(store) || !outlines?.paths) return false;
-  const { paths, points, columns, values } = outlines;
-  const far = (path) => Math.abs(values[path * points * columns] - depth);
-  const nearest = Array.from({ length: paths }, (_, path) => path).reduce((best, path) => (far(path) < far(best) ? path : best), 0);
-  const outline = { points, columns, values: values.subarray(nearest * points * columns, (nearest + 1) * points * columns) };
-  const corners = pointsOf(outline, place);
+  const ends = shownReach(store) && outlines ? reachAt(depth, outlines) : [];
+  if (ends.length < 2) return false;
+  const corners = ends.map((end) => place(...end));
   area(pen, corners, "--reach", 0.2);
   polyline(pen, [...corners, corners[0]], { tone: "--reach" });
   return true;

@@ -31,6 +31,21 @@ function cutOf(plane, a, b) {
   return [[a[0] + share * (b[0] - a[0]), u + share * (v - u)]];
 }
 
+// Points [x, y, z] of the outline at a depth x (mm): in each direction between the ends found next above and below; none
+// beyond the deepest one.
+export function reachAt(depth, { paths, points, columns, values }) {
+  const end = (path, at) => values.subarray((path * points + at) * columns, (path * points + at) * columns + 3);
+  const found = [];
+  for (let at = 0; at < points; at++) {
+    const below = Array.from({ length: paths }, (_, path) => path).findIndex((path) => path > 0 && end(path - 1, at)[0] <= depth && depth <= end(path, at)[0]);
+    if (below < 0) continue;
+    const [a, b] = [end(below - 1, at), end(below, at)];
+    const share = b[0] > a[0] ? (depth - a[0]) / (b[0] - a[0]) : 1;
+    found.push([0, 1, 2].map((axis) => a[axis] + share * (b[axis] - a[axis])));
+  }
+  return found;
+}
+
 // Whether the strip of a reach is in a section's plane.
 export function isIn({ e }, { angle_deg: angle }) {
   const cosine = e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);

@@ -33,7 +33,7 @@ export function rigForm(store, link) {
     name.textContent = `Rig: ${rig.name}`;
     state.textContent = `It ${STATES[rig.state] ?? rig.state}${rig.why ? `: ${rig.why}` : ""}.`;
     check.hidden = prepare.hidden = rig.job !== null;
-    check.disabled = prepare.disabled = !steers || busy;
+    check.disabled = prepare.disabled = !steers || busy || isChecking(store);
     for (const each of [moves, seen, arm, go]) each.hidden = !waits;
     if (rig.moves.join() !== shownMoves) { // what was confirmed is not what is shown now
       shownMoves = rig.moves.join();
@@ -48,17 +48,18 @@ export function rigForm(store, link) {
     go.disabled = !steers || !isArmed(store);
   };
   free.addEventListener("change", show);
-  store.subscribe(["rig", "welcome", "people", "insertion live"], show);
+  store.subscribe(["rig", "welcome", "people", "insertion live", "job check"], show);
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
   return form;
 }
 
 const isArmed = (store) => store.get("rig")?.state === "armed";
+const isChecking = (store) => ["waiting", "running"].includes(store.get("job check")?.state);
 
 // Progress of a check, then its problems, and all findings below.
 function inLines(store) {
   const [job, found] = [store.get("job check"), store.get("check")];
-  if (job && ["waiting", "running"].includes(job.state)) return [make("p", { role: "status" }, `Checking: ${job.text || "waits"} …`)];
+  if (isChecking(store)) return [make("p", { role: "status" }, `Checking: ${job.text || "waits"} …`)];
   if (job?.state === "failed") return [make("p.bad", { role: "alert" }, `The check has failed: ${job.text}`)];
   if (!found) return [];
   const problems = found.findings.filter(({ problem }) => problem);
