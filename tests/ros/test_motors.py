@@ -73,6 +73,7 @@ def test_states_without_newer_ones_are_repeated(motors, joints):
     until(lambda: not motors.read()["roll"].repeated)
     joints.silent.set()
     until(lambda: all(state.repeated for state in motors.read().values()))
+    assert motors.read()["roll"].position == joints.positions["roll"]
     joints.silent.clear()
     until(lambda: not motors.read()["roll"].repeated)
 
