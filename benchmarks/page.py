@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,10 @@ import psutil
 from playwright.sync_api import Browser, Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from page_drive import DEPTHS, SHARES, Pointer, inserted, loaded, new_page, until, until_ended
+from page_drive import DEPTHS, SHARES, VIEWS, Pointer, inserted, loaded, new_page, until, until_ended
 from page_figures import (
     Figure,
+    Log,
     clicked,
     estimate_delays,
     growth,
@@ -190,23 +192,28 @@ def dragged(
 
 
 def inserting(page: Page, server: Server, names: Sequence[str], rng: np.random.Generator) -> Iterator[Figure]:
-    """Figures while insertions play in real time with 64 sampled paths."""
-    logs, shares, workers = [], [], []
-    for name in names:
+    """Figures while insertions play in real time with 64 sampled paths, with the section in view, and the plots."""
+    shares, workers = [], []
+    logs_of: dict[str, list[Log]] = {view: [] for view in VIEWS}
+    for name, view in product(names, VIEWS):
         loaded(page, name)
         pointer = Pointer(page, rng)
         pointer.drag_target()
         inserted(page)
         page.evaluate("probe.reset()")
         before, begun = server.busy(), time.monotonic()
-        pointer.click_until_ended()
+        pointer.click_until_ended(view)
         lasted, after = time.monotonic() - begun, server.busy()
         shares.append(100.0 * (after[0] - before[0]) / lasted)
         workers.append(100.0 * (after[1] - before[1]) / lasted)
-        logs.append(page.evaluate("probe"))
+        logs_of[view].append(page.evaluate("probe"))
+    logs = [log for some in logs_of.values() for log in some]
     yield refusals("refused while insertions play", logs)
-    yield rate([log["frames"] for log in logs], 55.0)
-    yield spread("script of a paint, by the clock", "ms", [ms for log in logs for ms in log["paints"]], 5.0)
+    for view, some in logs_of.items():
+        yield rate(f"animation frames, {view} in view", [log["frames"] for log in some], 55.0)
+    for view, some in logs_of.items():
+        times = [ms for log in some for ms in log["paints"]]
+        yield spread(f"script of a paint, by the clock, {view} in view", "ms", times, 5.0)
     yield clicked("click to its painting", logs, "clicks", 50.0)
     yield clicked("click to the painting of the server's answer", logs, "answered", 50.0)
     yield spread("server while insertions play", "% of a core", shares, 15.0)
@@ -219,13 +226,13 @@ def painted(browser: Browser, page: Page, names: Sequence[str], rng: np.random.G
     The time by the clock has what other processes took of the page's core, too: on two cores the insertion, the
     server and the browser's own drawing.
     """
-    times: list[float] = []
-    for name in names:
+    times: dict[str, list[float]] = {view: [] for view in VIEWS}
+    for name, view in product(names, VIEWS):
         loaded(page, name)
         inserted(page)
         browser.start_tracing(page=page, categories=["devtools.timeline"])
-        Pointer(page, rng).click_until_ended()
-        times += processor_times(json.loads(browser.stop_tracing()))
+        Pointer(page, rng).click_until_ended(view)
+        times[view] += processor_times(json.loads(browser.stop_tracing()))
     return spread("script of a paint, its processor time", "ms", times, 5.0)
 
 

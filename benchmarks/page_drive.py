@@ -19,6 +19,8 @@ DEPTHS, SHARES = (0.6, 1.05), (-0.125, 0.125)
 MODIFIED = {"control.adaptive_mpc.samples": 64}
 """So that 64 paths are sampled in each period."""
 SECTION, STATUS = "[data-panel=section]", "[data-panel=status]"
+VIEWS = {"section": SECTION, "plots": "[data-panel=plots]"}
+"""What is in view while an insertion plays; the scene in space is drawn beside it."""
 
 
 def new_page(browser: Browser, address: str) -> Page:
@@ -106,12 +108,13 @@ class Pointer:
         page.evaluate("new Promise((resolve) => setTimeout(resolve, 100))")  # so that it is painted
         return dict(page.evaluate("probe"))
 
-    def click_until_ended(self) -> None:
-        """Click on a plane of the section, or on the steering, at random times until the insertion has ended."""
+    def click_until_ended(self, view: str) -> None:
+        """Click on a plane of the section if that is in view, or on the steering, at random times until the insertion
+        has ended."""
         page, rng = self._page, self._rng
-        self._show(SECTION)
+        self._show(VIEWS[view])
         while page.evaluate("flexneedle.store.get('insertion live').state") == "running":
-            if rng.random() < 0.5:
+            if view == "section" and rng.random() < 0.5:
                 self._click(f"{SECTION} [data-plane='{rng.choice(PLANES[2])}']")
             else:
                 self._click(f"{STATUS} .steering button")

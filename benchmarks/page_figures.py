@@ -43,7 +43,7 @@ def spread(
     """The figure that 95 % of the values do not exceed; with the 95 % of each group, if there are groups."""
     groups = values if isinstance(values, Mapping) else {}
     all_values = [value for group in groups.values() for value in group] if groups else list(values)
-    of_groups = "".join(f"; {key} {_most(group):.0f}" for key, group in groups.items())
+    of_groups = "".join(f"; {key} {_most(group):.3g}" for key, group in groups.items())
     detail = f"95 % of {len(all_values)}; median {np.median(all_values or [np.nan]):.3g}, largest "
     return Figure(
         name, unit, _most(all_values), bar, f"{detail}{max(all_values, default=np.nan):.3g}{of_groups}"
@@ -55,14 +55,14 @@ def clicked(name: str, logs: Sequence[Log], key: str, bar: float) -> Figure:
     return spread(name, "ms", [ms for log in logs for ms in log[key]], bar)
 
 
-def rate(frames: Sequence[Sequence[float]], bar: float) -> Figure:
+def rate(name: str, frames: Sequence[Sequence[float]], bar: float) -> Figure:
     """Animation frames a second, of their times (ms) in several insertions: the least of them."""
     rates = [1e3 * (len(times) - 1) / (times[-1] - times[0]) for times in frames]
     longest = max(float(np.diff(times).max()) for times in frames)
     detail = (
         f"least of {len(rates)} insertions; median {np.median(rates):.1f}, longest pause {longest:.0f} ms"
     )
-    return Figure("animation frames", "1/s", min(rates), bar, detail, least=True)
+    return Figure(name, "1/s", min(rates), bar, detail, least=True)
 
 
 def growth(memory: Sequence[Sequence[float]], warm: int, viewers: int) -> list[Figure]:

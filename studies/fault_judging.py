@@ -24,7 +24,11 @@ _RECORDED = ("holding", "stopped", "fault")  # states with a reason of their own
 _AT_REST = 1e-3  # from where an axis is at the end (mm, rad)
 _COLUMNS = {"guide_y": DG_Y}  # of a control, by axes that move seldom
 _UNSEEN = 2.0  # tolerances of an axis: a stall in less need not be detected
-_PAUSE_S = 0.02  # of an axis between two motions; within one it is somewhere else after 4 ms
+_PAUSE_S = 0.02  # of the base between two motions; within one it is somewhere else after 4 ms
+_REST_S = (
+    0.06  # of base and guides between two steps; within one a guide that moves by a few counts pauses less
+)
+_TOGETHER = {"insertion", "guide_y", "guide_z"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class State:
 class Evidence:
     """What is known of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
     taken effect (s, monotonic), true states, `run.json`, messages, how many processes were left, and for an axis that
-    moves seldom the commands (m, 9).
+    moves seldom the commands (m, 9). step: of the base (mm).
 
     A supervisor may detect a fault before that is reported, but not before it was ordered.
     """
@@ -54,6 +58,7 @@ class Evidence:
     errors: str
     left: int = 0
     commands: Floats | None = None
+    step: float = 1.0
 
     def row(self) -> dict[str, Any]:
         """All that the table, the picture and the judgement need, as plain values."""
@@ -102,11 +107,27 @@ class Evidence:
         return moved_between(self.truth, since, until, axis)
 
     def _from_motion(self, time: float) -> float | None:
-        """Time since the base last began to move, and with it the guide, or should have; None if it has not."""
-        moved = self.truth.time[:-1][np.diff(self.truth.positions["insertion"]) != 0.0]
-        moved = moved[moved <= time]
-        begins = moved[np.diff(moved, prepend=-np.inf) > _PAUSE_S]
-        return float(time - begins[-1]) if len(begins) else None
+        """Time since the fault, or since the axis was to begin to move if that is later; None if it never was.
+
+        Base and guide move together, so that those which are not faulty show when the other was to begin. For a guide,
+        which moves seldom, the last time before detection counts; for a base the first one after the fault, and that
+        only if the fault found it at rest, or next to the end of a step.
+        """
+        others = [
+            self.truth.positions[axis] for axis in _TOGETHER - {self.axis} if axis in self.truth.positions
+        ]
+        moving = np.any([np.diff(place) != 0.0 for place in others], axis=0)
+        moved = self.truth.time[:-1][moving & (self.truth.time[:-1] <= time)]
+        begins = moved[np.diff(moved, prepend=-np.inf) > _REST_S]
+        if self.axis not in _COLUMNS:
+            later = begins[begins >= self.injected] if self._rested() else begins[:0]
+            begins = np.append(later, self.injected)[:1]
+        return float(time - max(begins[-1], self.injected)) if len(begins) else None
+
+    def _rested(self) -> bool:
+        """Whether the base was at rest as the fault was injected, or nearer to the end of a step than must be seen."""
+        short = -self._travelled() % self.step
+        return self._during() != "advance" or min(short, self.step - short) <= _unseen_mm(self.axis)
 
     def _commanded(self) -> float | None:
         """The farthest (mm) that the faulty axis was to be from where the fault found it, by commands after that."""
@@ -193,7 +214,7 @@ def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
     if fault.within is None:
         return True
     if seconds is None:
-        seldom = fault.timed == "from_motion_s" and row["detection_s"] is None
+        seldom = fault.axis in _COLUMNS and row["detection_s"] is None
         return seldom and (row["commanded_mm"] or 0.0) <= _unseen_mm(fault.axis)
     return seconds <= fault.within
 

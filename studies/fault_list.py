@@ -46,7 +46,8 @@ class Fault:
     because: what the reason contains, in a pattern, with {axis} for the axis that is faulty; axis: its name, outside of
     rolls; rolls: whether it falls in a roll in no case, in some ("some") or in all ("all"). decision_s: how long a
     decision takes, where that is the fault. timed: the time that counts, by its key in a row: from the fault to
-    detection; to that from the beginning of the motion in which the fault shows; or from the fault until all axes rest.
+    detection; to that from the beginning of the motion in which it shows, if that is later than the fault; or from the
+    fault until all axes rest.
     """
 
     group: str
@@ -108,7 +109,8 @@ FAULTS: Sequence[Fault] = (
     _tracker("unplugged", Device("aurora:unplug"), HELD, 0.45, _NO_READING),
     _tracker("indicator high", Device("aurora:indicator=0.2"), HELD, 0.9, "^field distorted:"),
     _tracker("0.5 s late", Device("aurora:delay=0.5"), HELD, 0.6, _NO_READING),
-    _motors("stall", Device("galil:stall={channel}"), FAULT, 0.4, "{axis}"),
+    # A motor that stalls at rest, or has next to nothing left, shows it only in its next step.
+    _motors("stall", Device("galil:stall={channel}"), FAULT, 0.4, "{axis}", timed="from_motion_s"),
     _motors("roll stalls", Device("galil:stall={channel}"), FAULT, 0.4, "{axis}", "all"),
     # It shows in motions faster than max_error / lag = 1.3 mm/s: at worst after a rest and a slow step.
     _motors("lag of 0.15 s", Device("galil:lag={channel}"), FAULT, 1.0, "{axis}", _SOME),

@@ -1,7 +1,8 @@
 """A worker of the page without physics: it answers every order at once with made-up news, and reports every signal.
 
 Seeds of a plan choose what goes wrong: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled.
-Row 15 of a study does that, too.
+Row 15 of a study does that, too; with 14 an insertion neither cancels nor stops.
+A save waits for a pipe called GATE in the folder of runs, if there is one.
 An insertion that is cancelled still sends a row, and a run called SLOW is read only when it is cancelled.
 An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a fault then, 17 does
 not stop, 18 takes some beats of the server for its record.
@@ -17,7 +18,7 @@ from queue import SimpleQueue
 from flexneedle.page.channel import packed, read
 
 CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
-ROWS, SLOW = 600, "slow"
+ROWS, SLOW, GATE = 600, "slow", ".gate"
 FRAME = struct.pack("<BBBBIII", 4, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
 """A sampled path of the live insertion, 24 kB."""
 
@@ -102,7 +103,7 @@ def insert(order, signals):
         if signal.get("advance"):
             rows("live", count, 1)
             count += 1
-        ends = signal.get("stop") or signal.get("cancel")
+        ends = order["seed"] != HANGS and (signal.get("stop") or signal.get("cancel"))
         if signal.get("cancel"):
             rows("live", count, 1)
             write(frame(count))
@@ -178,6 +179,8 @@ def do(order, signals):
             findings = [{"part": "driver", "item": "connection", "found": order["rig"], "problem": ""}]
             say("check", revision=order["revision"], findings=findings)
         case "save" | "save_row":
+            if (gate := Path(order["folder"]).parent / GATE).exists():
+                gate.read_bytes()  # of a pipe: until somebody has written to it
             Path(order["folder"]).mkdir()
             (Path(order["folder"]) / "run.json").write_text(json.dumps(order))
     return "done"

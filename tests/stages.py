@@ -10,6 +10,7 @@ from flexneedle.errors import DriverError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.ports import MotorState
 from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor import suspension
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.tracking.registration import identity
 from flexneedle.scenario.rig import RigFile
@@ -306,6 +307,13 @@ def real_motors(settings, channels):
     for motor in stage.motors.values():
         motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
         motor.position += float(settings.get("off", 0.0))
+    return stage
+
+
+def suspended_motors(settings, channels):
+    """A driver of a rig file, `stages:suspended_motors`: the computer seems to be suspended for an hour on the way."""
+    stage = real_motors(settings, channels)
+    suspension.asleep = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
     return stage
 
 

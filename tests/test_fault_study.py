@@ -29,7 +29,7 @@ from fault_injections import Clock
 from fault_judging import Evidence, good, problems
 from fault_list import FAULTS
 from fault_report import draw, table
-from fault_trial import Trial
+from fault_trial import Trial, run_trial
 from rig_trials import Lines
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -220,6 +220,44 @@ def test_the_time_of_a_guide_that_stalls_counts_from_the_last_motion_of_the_base
     assert not good(BY_NAME["guide stalls"], found | {"from_motion_s": 0.95})
 
 
+@pytest.mark.parametrize(("fault_to_step", "seconds"), [(0.7, 0.1), (0.0, 0.1), (-0.1, 0.0)])
+def test_the_time_of_a_base_that_stalls_counts_from_its_next_step_which_the_guide_shows(
+    fault_to_step, seconds
+):
+    step = INJECTED + fault_to_step
+    found = evidence(
+        "stall", (9.0, "inserting", ""), (step + 0.1, "fault", "insertion: off"), outcome="failed"
+    )
+    time = found.truth.time
+    place = 0.01 * np.clip((time - step) / 0.2, 0.0, 1.0) + 0.01 * (time > step - 1.0)
+    found.truth.positions["guide_y"] = place
+    shown = found.row() | {"axis": "insertion"}
+    assert shown["detection_s"] == pytest.approx(max(0.0, fault_to_step + 0.1))
+    assert shown["from_motion_s"] == pytest.approx(seconds, abs=0.005)
+    assert good(BY_NAME["stall"], shown)
+    assert not good(BY_NAME["stall"], shown | {"from_motion_s": 0.41})
+    assert not good(BY_NAME["stall"], shown | {"from_motion_s": None, "detection_s": None})
+
+
+@pytest.mark.parametrize(
+    ("moves", "seconds"),
+    [
+        ([], 0.6),  # at rest, and missed in a step
+        ([(9.9, 10.0, 0.97)], 0.6),  # next to the end of a step
+        ([(9.9, 10.0, 0.6)], 1.0),  # in a step, and missed there
+    ],
+)
+def test_a_base_that_stalls_may_be_missed_in_no_step(moves, seconds):
+    found = evidence(
+        "stall", (9.0, "inserting", ""), (11.0, "fault", "insertion: off"), outcome="failed", moves=moves
+    )
+    time = found.truth.time
+    found.truth.positions["guide_y"] = sum(np.clip((time - at) / 0.2, 0.0, 1.0) for at in (9.9, 10.4, 10.8))
+    shown = found.row() | {"axis": "insertion"}
+    assert shown["from_motion_s"] == pytest.approx(seconds, abs=0.005)
+    assert not good(BY_NAME["stall"], shown)
+
+
 def test_a_guide_that_stalls_may_be_missed_only_if_it_was_to_move_no_farther():
     """Six steps of 1 mm are made or begin at the fault; in each later one the guide is to move by 0.002 mm."""
     steps = [(8.5 + 0.3 * k, 8.7 + 0.3 * k, 1.0) for k in range(12)]
@@ -286,6 +324,25 @@ def test_in_rolls_the_rotation_is_faulty_and_some_faults_never_fall_in_one():
     assert Trial(BY_NAME["stall"], case(2)).axis == "insertion"
     assert Trial(BY_NAME["roll stalls"], case(3)).axis == "rotation"
     assert Trial(BY_NAME["guide stalls"], case(2)).axis == "guide_y"
+
+
+def test_a_fault_that_came_too_late_for_its_roll_is_tried_again(monkeypatch):
+    tried = []
+
+    def attempted(trial, rng, keep):
+        tried.append((trial, rng.random(), keep))
+        return {"during": "rest" if len(tried) < 3 else "roll"}
+
+    monkeypatch.setattr("fault_trial._attempted", attempted)
+    monkeypatch.setattr("fault_trial.good", lambda _, row: row["during"] != "bad")
+    in_roll, elsewhere = Trial(BY_NAME["roll stalls"], case(3)), Trial(BY_NAME["motor off"], case(3))
+    assert run_trial(in_roll) == {"during": "roll", "attempts": 3}
+    assert len({time for _, time, _ in tried}) == 3
+    assert tried[0][1] == in_roll.rng().random()
+    tried.clear()
+    assert run_trial(elsewhere) == {"during": "rest", "attempts": 1}
+    monkeypatch.setattr("fault_trial._attempted", lambda *_: {"during": "bad"})
+    assert run_trial(in_roll) == {"during": "bad", "attempts": 1}  # whatever it was, it is no good
 
 
 def test_table_and_picture(tmp_path):

@@ -66,7 +66,7 @@ def test_a_spread_is_what_95_percent_do_not_exceed():
 
 
 def test_a_rate_is_the_least_of_all():
-    figure = rate([[0.0, 10.0, 20.0], [0.0, 10.0, 40.0]], 55.0)
+    figure = rate("animation frames", [[0.0, 10.0, 20.0], [0.0, 10.0, 40.0]], 55.0)
     assert figure.value == pytest.approx(50.0)
     assert not figure.kept
     assert figure.detail.endswith("longest pause 30 ms")

@@ -473,6 +473,9 @@ class Insertion:
     rig: str = ""  # name of the rig, "" on a virtual one
     ticks: Mapping[str, Any] = field(default_factory=dict, compare=False)  # of the rig: number, times, states
     dry_run: bool = False  # the rig did not move: the needle was the virtual phantom's
+    disturbed: str = (
+        ""  # what a person disturbed and when; with it the seed does not give this insertion again
+    )
 
     @property
     def target(self) -> Point:
@@ -535,8 +538,9 @@ class Insertion:
 
     @property
     def summary(self) -> str:
-        """Outcome of the insertion in one line, which begins with "dry run" for one."""
-        return f"dry run: {self._ending}" if self.dry_run else self._ending
+        """Outcome of the insertion in one line, which begins with "dry run" for one and ends with disturbances."""
+        disturbed = f"; disturbed: {self.disturbed}" if self.disturbed else ""
+        return f"{'dry run: ' if self.dry_run else ''}{self._ending}{disturbed}"
 
     @property
     def _ending(self) -> str:

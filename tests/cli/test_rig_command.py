@@ -24,6 +24,7 @@ class Supervisor:
 
     def __init__(self):
         self.calls, self.failure = [], None
+        self.positions = {"insertion": 30.0, "rotation": 0.0, "guide_y": 0.0}
 
     def __call__(self, rig):
         self.calls.append(("rig", rig.name))
@@ -46,8 +47,8 @@ class Supervisor:
     def off(self):
         self._move("off")
 
-    def jog(self, axis, distance, speed):
-        self._move("jog", axis, round(distance, 9), round(speed, 9))
+    def move_to(self, axis, position, speed):
+        self._move("move_to", axis, round(position, 9), round(speed, 9))
 
     def home(self, axis):
         self._move("home", axis)
@@ -143,7 +144,7 @@ def test_a_problem_is_a_line_and_the_exit_status_1(capsys, file, device):
     status, out, _ = run(capsys, "rig", "check", file())
     (line,) = [line for line in out.splitlines() if line.startswith("PROBLEM")]
     assert " ".join(line.split()) == (
-        "PROBLEM insertion limit switches forward; the forward switch is active"
+        "PROBLEM insertion limit switches forward; the forward limit switch is active at 30.000 mm"
     )
     assert status == 1
     assert out.splitlines()[-1].endswith("rig.toml: 1 problem")
@@ -228,17 +229,17 @@ def test_a_port_that_does_not_exist_is_a_problem_of_the_tracker(capsys, file):
 MOTIONS = [
     (
         ("jog", "insertion", "-5mm"),
-        ("jog", "insertion", -5.0, 2.0),
+        ("move_to", "insertion", 25.0, 2.0),
         "insertion: from 30 to 25 mm (-5 mm), at most at 2 mm/s",
     ),
     (
         ("jog", "insertion", "5", "--speed", "1"),
-        ("jog", "insertion", 5.0, 1.0),
+        ("move_to", "insertion", 35.0, 1.0),
         "insertion: from 30 to 35 mm",
     ),
     (
         ("jog", "rotation", "-9deg"),
-        ("jog", "rotation", round(-math.pi / 20, 9), round(math.radians(72), 9)),
+        ("move_to", "rotation", round(-math.pi / 20, 9), round(math.radians(72), 9)),
         "rotation: from 0 to -9 deg (-9 deg), at most at 72 deg/s",
     ),
     (
@@ -268,6 +269,32 @@ def test_a_confirmed_motion_is_carried_out(capsys, file, supervisor, terminal, w
     assert supervisor.calls == [("rig", "Bench"), ("arm",), call, ("closed",)]
     assert status == 0
     assert err.endswith("done\n")
+
+
+@pytest.mark.usefixtures("device")
+def test_a_jog_never_goes_the_other_way(capsys, file, supervisor):
+    supervisor.positions["insertion"] = 30.015
+    status, _, err = run(capsys, "rig", "jog", file(), "insertion", "0.01", "--yes")
+    assert status == 2
+    assert "insertion: is at 30.015 mm now" in err
+    assert ("arm",) not in supervisor.calls
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("words", [("jog", "insertion", "5"), ("retract",)])
+@pytest.mark.parametrize(("at", "moves"), [(30.039, True), (29.961, True), (30.041, False), (29.5, False)])
+def test_an_axis_that_was_moved_while_the_question_waited_is_not_moved(
+    capsys, file, supervisor, words, at, moves
+):
+    """Two tolerances, of 0.02 mm, are no motion."""
+    supervisor.positions["insertion"] = at
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:], "--yes")
+    assert status == (0 if moves else 2)
+    assert (("arm",) in supervisor.calls) is moves
+    if not moves:
+        why = f"insertion: is at {at} mm now, not at 30 mm any more: nothing was moved; try again"
+        assert err.splitlines()[-1] == f"flexneedle: {why}"
+        assert supervisor.calls[1:] == [("stop",), ("closed",)]
 
 
 @pytest.mark.usefixtures("device")

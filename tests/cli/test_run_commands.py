@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 OWN = ", or module:NAME of your own"
 INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
 INSERT_KEYS = [
-    *("controller", "phantom", "rig", "dry_run"),
+    *("controller", "phantom", "rig", "dry_run", "disturbed"),
     *("target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "planned_error_mm"),
     *(
         "reached",

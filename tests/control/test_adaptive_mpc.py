@@ -103,12 +103,16 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
 
 
 def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, along):
-    """Four standard deviations off, to either side; in air, and where the needle has just rested, it moves."""
+    """Four standard deviations off, to either side; in air, and where the needle has just rested, it moves.
 
-    def rest(state, sd, command=FORWARD):
+    A needle that was measured at rest for as long already, since the decision came late, does not rest any more.
+    """
+
+    def rest(state, sd, command=FORWARD, measured=0.9):
         estimate = estimate_of(state)
         off = sd * np.sqrt(estimate.reading_variance)
-        estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(Move(0.0, 1.0, command),))
+        move = Move(0.0, 1.0, command, (Measurement(measured, *state.tip[:2].tolist()),))
+        estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(move,))
         return decide(quick_plan, estimate).rest
 
     inside = along(quick_plan, 40)
@@ -117,6 +121,9 @@ def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, al
     assert rest(inside, 3.9) == 0.0
     assert rest(inside, 4.1, STILL) == 0.0
     assert rest(along(quick_plan, 3), 4.1) == 0.0
+    assert rest(inside, 4.1) == pytest.approx(0.3)
+    assert rest(inside, 4.1, measured=1.1) == pytest.approx(0.1)
+    assert rest(inside, 4.1, measured=1.3) == 0.0
 
 
 def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along):

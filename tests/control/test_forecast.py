@@ -59,7 +59,7 @@ def test_the_needle_is_held_from_the_confidence_on(side, sd):
     assert held.startswith(f"no path to the target found: predicted miss {side * bound:+.2f} ± {sd:.2f} mm")
     assert "control.miss_limit_mm = 2 " in held
     assert "(limit 0.95)" in held
-    assert held.endswith("use --force to insert anyway")
+    assert held.endswith("to insert anyway: flexneedle insert --force")
 
 
 def test_limit_and_confidence_are_the_scenarios():

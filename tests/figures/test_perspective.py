@@ -99,7 +99,7 @@ def held():
     """With the longest reason that the default controller gives."""
     reason = (
         "no path to the target found: predicted miss -12.96 ± 10.59 mm is beyond control.miss_limit_mm = 2 with a "
-        "probability of 0.958 (limit 0.95); use --force to insert anyway"
+        "probability of 0.958 (limit 0.95); to insert anyway: flexneedle insert --force"
     )
     made = in_space(make_insertion(make_plan(target=(45.0, 3.0)), outcome="held"), -2.0)
     return replace(made, reason=reason)

@@ -86,10 +86,13 @@ def test_a_slow_client_gets_the_newest_frame_and_all_rows(server):
 def test_a_client_that_reads_nothing_is_disconnected_and_the_others_are_served(
     tmp_path, monkeypatch, by_system
 ):
-    """By the system, where it can, and by the server."""
+    """By the system, where it can, and by the server.
+
+    The time is long enough for the other client, on a busy machine: the system ends a connection without a word to it.
+    """
     if not by_system:
         monkeypatch.delattr(socket, "TCP_USER_TIMEOUT", raising=False)
-    with served(tmp_path, limits=replace(QUICK, send_s=0.2)) as server, Client(server) as client:
+    with served(tmp_path, limits=replace(QUICK, send_s=2.0)) as server, Client(server) as client:
         stuck = SlowClient(server)
         client.wait(lambda: client.newest["people"]["clients"] == 2)
         client.steer().do("insert")
@@ -113,6 +116,7 @@ MALFORMED = {
     '{"type": "pace", "pace": NaN}': "pace.pace: Input should be a finite number",
     '{"type": "pace", "pace": 1e999}': "pace.pace: Input should be a finite number",
     '{"type": "pace", "pace": -1}': "pace.pace: Input should be greater than or equal to 0",
+    '{"type": "pace", "pace": 1e-11}': "pace.pace: Value error, must be 0 (paused) or at least 0.01",
     '{"type": "pace", "pace": 51}': "pace.pace: Input should be less than or equal to 50",
     '{"type": "stop", "more": 1}': "stop.more: Extra inputs are not permitted",
     '{"type": "steer", "take": 1}': "steer.take: Input should be a valid boolean",
@@ -140,6 +144,17 @@ def test_a_malformed_message_is_refused_with_its_reason(shared_server, text):
         assert refused["reason"].startswith(MALFORMED[text])
         assert "\n" not in refused["reason"]
         client.do("rows_from", index=0)
+
+
+def test_a_refused_message_is_answered_by_its_number(shared_server):
+    """Also one that is no request at all: its page waits for an answer."""
+    with Client(shared_server) as client:
+        for number, text in enumerate(
+            ['{"type": "pace", "pace": -1', '{"type": "nonsense"', '{"more": [1]'], 7
+        ):
+            client.socket.send(f'{text}, "request": {number}}}')
+            refused = client.wait(lambda number=number: client.answer_to(number))
+            assert (refused["type"], refused["what"]) == ("refused", "message")
 
 
 def test_bytes_are_refused(shared_server):

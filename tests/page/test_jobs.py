@@ -1,5 +1,6 @@
 """Jobs over a real worker's process: what replaces what, and what happens when the worker does not do as it should."""
 
+import json
 import sys
 from dataclasses import replace
 from threading import Event
@@ -162,15 +163,17 @@ def test_work_is_cancelled_when_nobody_is_connected_and_done_again(server):
         client.steer().do("start", work="reach")
         client.job("reach", "running")
         client.do("insert", paused=True)
-        client.wait(lambda: "insertion live" in client.newest)
+        client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "paused")
         client.do("edit", values={"target.depth_mm": 35.0})
         client.do("start", work="reach")
         client.job("reach", "running")
     wait_until_alone(server)
     with Client(server) as client:
         client.job("reach", "cancelled")
-        client.job("insertion", "cancelled")
-        assert client.newest["insertion live"]["state"] == "interrupted"
+        client.job("insertion", "done")  # it was stopped, with the reason
+        ended = client.newest["insertion live"]
+        assert ended["state"] == "interrupted"
+        assert json.loads(ended["summary"])["stop"] == "nobody was connected"
         client.job("needle", "done")
 
 
@@ -210,7 +213,7 @@ def test_a_run_that_is_closed_before_it_is_read_is_not_shown(server, client, tmp
 def wait_until_alone(server):
     """Wait for the timer that cancels; the server's thread has no other event to wait for."""
     end = monotonic() + PATIENCE_S
-    while (server.desk._plans.numbers or server.desk._insertions.numbers) and monotonic() < end:
+    while (server.desk._plans.works or server.desk._insertions.works) and monotonic() < end:
         Event().wait(0.01)
 
 
@@ -261,6 +264,7 @@ def test_a_recording_replaces_a_row_in_its_place(with_study):
     with_study.do("open", name="one")
     with_study.job("row", "cancelled")
     with_study.job("recording", "done")
+    assert with_study.newest["insertion first"]["row"] is None
 
 
 def test_a_row_that_waits_is_replaced_too(with_study):
@@ -269,6 +273,7 @@ def test_a_row_that_waits_is_replaced_too(with_study):
     with_study.job("row", "waiting")
     with_study.do("open", name="one")
     with_study.job("row", "cancelled")
+    assert "insertion first" not in with_study.newest  # it had not begun
 
 
 def test_closing_a_recording_cancels_the_row_that_would_replace_it(with_study):

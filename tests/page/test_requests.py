@@ -10,7 +10,7 @@ from flexneedle.page import messages as m
 from flexneedle.page.server.rig import ConnectedRig
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from page_clients import QUICK, STUB, Client, get, served
-from page_worker import ROWS, WORKS_ON
+from page_worker import HANGS, ROWS, WORKS_ON
 
 
 def test_a_client_is_welcomed_with_what_can_be_chosen(server):
@@ -84,8 +84,13 @@ def test_steering_is_taken_and_released(server):
     with Client(server) as client:
         client.do("steer", take=True)
         client.wait(lambda: client.newest["people"]["steering"] == client.number)
+        assert client.newest["people"]["clients"] == 1
         client.do("steer", take=False)
         client.wait(lambda: client.newest["people"]["steering"] is None)
+        assert (
+            client.refused("edit", values={"target.depth_mm": 35.0})
+            == "nobody is in control: take control first"
+        )
 
 
 STEERED = {
@@ -268,9 +273,25 @@ def test_an_insertion_that_waits_for_its_worker_is_shown_and_stopped_by_anybody(
             assert shown["target"] == [40.0, 5.0, 0.0]
             other.do("stop")
             other.wait(lambda: other.newest["insertion live"]["state"] == "interrupted")
+            if not rig:
+                assert other.newest["insertion live"]["summary"].startswith("stopped: person")
         client.job("insertion", "cancelled")
         assert client.refused("stop") == "no insertion runs: start one first"
         assert client.refused("save", name="mine") == "there is no insertion to save: start one first"
+
+
+def test_an_insertion_that_hangs_ends_as_stopped_with_its_worker(tmp_path):
+    with served(tmp_path, limits=replace(QUICK, stop_s=0.1)) as server, Client(server) as client:
+        client.steer().do("options", seed=HANGS)
+        client.do("insert", paused=True)
+        client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "paused")
+        client.do("stop")
+        client.job("insertion", "failed")
+        ended = client.wait(
+            lambda: client.newest["insertion live"]["state"] != "running" and client.newest["insertion live"]
+        )
+        assert ended["state"] == "interrupted"
+        assert ended["summary"].startswith("stopped: person")
 
 
 def test_a_newer_virtual_insertion_replaces_the_older(client):
@@ -279,6 +300,8 @@ def test_a_newer_virtual_insertion_replaces_the_older(client):
     client.do("insert", paused=True)
     client.wait(lambda: client.newest["job insertion"]["job"] > first)
     client.job("insertion", "running")
+    client.wait(lambda: client.newest["insertion live"]["state"] == "paused")
+    assert client.newest["job insertion"]["job"] > first
 
 
 def test_what_comes_late_of_an_insertion_that_was_replaced_is_not_handed_on(server, client):
@@ -329,3 +352,9 @@ def test_without_a_rig_nothing_is_done_to_it(client):
     reason = "no rig is connected: start flexneedle serve with --rig FILE"
     for request, values in {"check": {}, "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}}.items():
         assert client.refused(request, **values) == reason
+
+
+def test_an_insertion_begins_without_disturbances_of_the_last(client):
+    client.do("insert", paused=True)
+    client.wait(lambda: "disturbances" in client.newest)
+    assert client.newest["disturbances"]["active"] == []

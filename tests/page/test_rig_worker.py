@@ -205,6 +205,9 @@ def test_one_that_is_stopped_while_the_rig_opens_is_not_armed(calls, in_tmp):
     assert calls.supervisor.waits == 0
 
 
+LEFT_IN = "the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
+
+
 def test_a_needle_that_is_left_in_is_said_to_be(calls, in_tmp):
     def then(news):
         if news.type == "rows" and news.first == 4:
@@ -214,8 +217,14 @@ def test_a_needle_that_is_left_in_is_said_to_be(calls, in_tmp):
     with pytest.raises(DriverError):
         Insertions().insert(one)
     last = one.outbox.of("insertion")[-1]
-    line = "the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
-    assert (last.state, last.summary) == ("failed", f"the motor is off; {line}")
+    assert (last.state, last.summary) == ("failed", f"the motor is off; {LEFT_IN}")
+
+
+def test_a_needle_at_its_target_is_left_in_too(calls, in_tmp):
+    one = going(order(in_tmp), calls)
+    Insertions().insert(one)
+    last = one.outbox.of("insertion")[-1]
+    assert (last.state, last.summary[-len(LEFT_IN) :]) == ("done", LEFT_IN)
 
 
 def follower(**more):

@@ -17,7 +17,7 @@ from flexneedle.page.server import app
 from flexneedle.page.server.folder import RunsFolder, zipped
 from flexneedle.page.server.refusal import Refusal
 from page_clients import PATIENCE_S, Client, get, port_of, served
-from page_worker import ROWS
+from page_worker import GATE, ROWS
 from replays import insertion
 
 RUN = {
@@ -373,3 +373,23 @@ def requested(server, method, path):
     connection.request(method, path)
     yield connection.getresponse()
     connection.close()
+
+
+def test_a_run_that_is_being_saved_is_neither_cancelled_nor_replaced(runs, client):
+    """It takes seconds, and what is lost is nowhere else."""
+    client.do("insert", paused=True)
+    client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "paused")
+    client.do("stop")
+    client.job("insertion", "done")
+    os.mkfifo(runs / GATE)
+    client.do("save", name="mine")
+    number = client.job("save", "running")["job"]
+    assert client.refused("save", name="yours") == "another run is being saved: wait for its end"
+    assert client.refused("cancel", job=number).startswith("a run that is being saved is not cancelled")
+    client.do("insert", paused=True)  # which waits for it
+    assert client.newest["job save"]["state"] == "running"
+    (runs / GATE).write_bytes(b"")
+    client.job("save", "done")
+    assert (runs / "mine" / "run.json").exists()
+    client.wait(lambda: client.newest["insertion live"]["state"] == "paused")
+    (runs / GATE).unlink()

@@ -8,6 +8,7 @@ from flexneedle.page.messages import Options
 from flexneedle.page.server.refusal import Refusal
 from flexneedle.page.server.session import Session
 from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.sections.needle import GAUGES
 
 
 @pytest.fixture
@@ -50,6 +51,28 @@ def test_a_reach_is_of_a_seed_and_a_strategy(session, option, stays):
 
 def test_no_reach_stays_when_a_preset_begins_anew(session):
     assert session.with_preset("phantom").reach_since == session.revision + 1
+
+
+@pytest.mark.parametrize("gauge", ["18G", "25G"])
+def test_gauge_and_diameters_of_a_needle_take_each_others_place(session, gauge):
+    """An edit of one is refused beside the other: each would have to be cleared before."""
+    by_gauge = session.edited({"needle.gauge": gauge})
+    needle = by_gauge.scenario.needle
+    assert (needle.gauge, needle.outer_diameter_mm, needle.inner_diameter_mm) == (gauge, None, None)
+    assert by_gauge.edited({"needle.gauge": "21G"}).scenario.needle.gauge == "21G"
+    for values in (
+        {"needle.gauge": None},
+        {"needle.outer_diameter_mm": 1.5},
+        {"needle.inner_diameter_mm": 0.1},
+    ):
+        needle = by_gauge.edited(values).scenario.needle
+        outer, inner = GAUGES[gauge]
+        expected = {"outer_diameter_mm": outer, "inner_diameter_mm": inner}
+        expected |= {key.split(".")[1]: value for key, value in values.items() if value is not None}
+        assert needle.gauge is None
+        assert {key: getattr(needle, key) for key in expected} == expected
+    assert by_gauge.edited({"needle.stylet": True}).scenario.needle.gauge == gauge
+    assert by_gauge.edited({"needle.inner_diameter_mm": None}).scenario.needle.gauge == gauge
 
 
 def test_none_returns_a_value_to_its_default(session):

@@ -1,6 +1,7 @@
 """Insertions of the page's worker: the same as those of `flexneedle.insert`, at any pace."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,9 +20,11 @@ from flexneedle.page.worker.rows import row_of
 from flexneedle.page.worker.signals import Cancelled
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.runs.saving import save
+from flexneedle.trace.export import marks
 from page_tasks import NO_WAIT, Reported, done, short, task
 
 TIMED = {"decide_ms"}
+REFERENCES = ("ref1", "ref2", "ref3")
 
 
 def plain(rows):
@@ -53,6 +56,39 @@ def test_rows_are_those_of_the_command(inserted, by_command):
     rows = inserted[1].rows
     assert plain(rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
     assert len(rows) == len(by_command.periods) > 12
+
+
+def test_the_indicator_is_the_largest_of_the_references(by_command):
+    assert {row_of(period, by_command.plan).indicator for period in by_command.periods} == {None}
+    scenario = short(**{"tracker.environment": "ideal", "monitor.enabled": False})
+    plan = flexneedle.plan(scenario, seed=3)
+    for period in flexneedle.insert(scenario, plan, 3).periods:
+        frames = [checked.measurement.frame for checked in period.readings]
+        by_name = {name: [frame.readings[name].indicator for frame in frames] for name in REFERENCES}
+        medians = [np.median([one for one in values if one is not None]) for values in by_name.values()]
+        assert row_of(period, plan).indicator == pytest.approx(max(medians), rel=1e-12)
+
+
+def test_the_indicator_of_the_tip_counts_only_without_references():
+    """The monitor judges the field by the references, too."""
+    plan = flexneedle.plan(scenario := short(**{"tracker.environment": "ideal"}), seed=3)
+    period = flexneedle.insert(scenario, plan, 3).periods[3]
+
+    def seen(*names):
+        """The period's indicator with these sensors alone, the tip with an indicator of 9."""
+        readings = []
+        for checked in period.readings:
+            frame = checked.measurement.frame
+            sensors = {name: frame.readings[name] for name in names}
+            if "tip" in sensors:
+                sensors["tip"] = replace(sensors["tip"], indicator=9.0)
+            measured = replace(checked.measurement, frame=replace(frame, readings=sensors))
+            readings.append(replace(checked, measurement=measured))
+        return row_of(replace(period, readings=tuple(readings)), plan).indicator
+
+    assert seen("tip", *REFERENCES) == seen(*REFERENCES) == row_of(period, plan).indicator < 1.0
+    assert seen("tip") == 9.0
+    assert seen() is None
 
 
 def test_rows_are_the_same_period_by_period(by_command):
@@ -188,6 +224,37 @@ def test_no_push_is_no_disturbance(by_command):
     reported = disturbed({"what": "push", "size": 0.0}, {"what": "stiffen", "size": 1.0})
     assert plain(reported.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
     assert reported.of("disturbances")[-1].active == []
+    assert reported.of("insertion")[-1].summary == by_command.summary
+
+
+def test_the_record_of_a_disturbed_insertion_says_so(tmp_path, inserted):
+    """Its seed alone does not give it again."""
+    one, worker = task("insert", "insertion", seed=3, pace=NO_WAIT), Insertions()
+    for size in (0.05, 0.0):
+        one.signals.take(
+            Signal(job=1, disturb=Disturb(type="disturb", what="push", size=size, angle_deg=90.0))
+        )
+    worker.insert(one)
+    disturbed_by = "push of 0.05 N at 90° at 0.0 s, push ended at 0.0 s"
+    assert one.outbox.of("insertion")[-1].summary.endswith(f"; disturbed: {disturbed_by}")
+    for folder, ended in (("pushed", worker), ("plain", inserted[0])):
+        ended.save(task("save", folder=str(tmp_path / folder)))
+    pushed, plain_one = flexneedle.load(tmp_path / "pushed"), flexneedle.load(tmp_path / "plain")
+    assert (pushed.disturbed, plain_one.disturbed) == (disturbed_by, "")
+    assert pushed.summary == one.outbox.of("insertion")[-1].summary
+    assert marks(pushed) == {"disturbed": True}
+    assert marks(plain_one) == {}
+
+
+def test_a_record_names_the_first_disturbances_and_counts_the_others():
+    times = iter(range(100))
+    disturber = Disturber(short(), lambda: next(times), lambda _news: None)
+    disturber.plant(draw(short(), np.random.default_rng(3)), 0.0)
+    disturber.watch(None)
+    for size in range(1, 14):
+        disturber.take(Disturb(type="disturb", what="push", size=0.01 * size))
+    assert disturber.summary.startswith("push of 0.01 N at 0° at 0.0 s, push of 0.02 N at 0° at 1.0 s, ")
+    assert disturber.summary.endswith("push of 0.1 N at 0° at 9.0 s, 3 more")
 
 
 def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(by_command):
@@ -234,6 +301,7 @@ def test_a_plate_distorts_the_readings_until_it_is_taken_away(environment):
     by_command = flexneedle.insert(scenario, plan, 3)
     assert plain(disturbed(scenario=scenario).rows) == plain(row_of(one, plan) for one in by_command.periods)
     near = disturbed({"what": "plate", "size": 60.0}, scenario=scenario).rows
+    assert near[3].indicator > 1.2 * row_of(by_command.periods[3], plan).indicator
     assert abs(near[3].measured[1] - by_command.periods[3].measurement.y) > 0.1
     away = disturbed({"what": "plate", "size": 60.0}, {"what": "plate", "size": 0.0}, scenario=scenario)
     same = [row.measured for row in away.rows] == [row.measured for row in disturbed(scenario=scenario).rows]

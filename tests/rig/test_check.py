@@ -83,11 +83,11 @@ def test_a_position_may_seem_beyond_the_limits_by_half_the_backlash(backlash, co
         ({"position": float("nan")}, "position", "is not a number"),
         ({"moving": True}, "motor", "moves, though this command does not move it"),
         ({"stopped": "the motor is off: position error"}, "motor", "the motor is off: position error"),
-        ({"forward_limit": True}, "limit switches", "the forward switch is active"),
+        ({"forward_limit": True}, "limit switches", "the forward limit switch is active at 0.000 mm"),
         (
             {"forward_limit": True, "reverse_limit": True},
             "limit switches",
-            "both are active: check their wiring and polarity",
+            "both limit switches are active: check their wiring and polarity",
         ),
         ({"commanded": 201.0}, "commanded - measured", FAR_OFF),
         ({"commanded": float("nan")}, "commanded - measured", FAR_OFF),
@@ -352,7 +352,10 @@ def test_a_controller_that_leaves_the_axes_their_range_has_no_problem():
     shown = {
         item: of(findings, "insertion", item).found for item in ("controller's limits", "motor off on error")
     }
-    assert shown == {"controller's limits": "-1 to 121 mm", "motor off on error": "beyond 0.4 mm"}
+    assert shown == {
+        "controller's limits": "-1 to 121 mm, also while its home is searched",
+        "motor off on error": "beyond 0.4 mm",
+    }
     assert of(findings, "guide_y", "controller's limits").found == "none"
     assert of(findings, "guide_y", "motor off on error").found == "no"
 

@@ -152,14 +152,16 @@ def test_a_needle_without_a_guide_needs_none():
         (
             {"guide_y": -1.0},
             [
-                "at -1 mm, 14 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to either side"
+                "at -1 mm, 14 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to either side; "
+                "jog it to 0 mm"
             ],
         ),
         ({"guide_y": 0.019}, []),  # within the tolerance of a motion that has ended
         (
             {"guide_y": 17.0},
             [
-                "at 17 mm, 0 mm to the high end of range_mm (15): setup.max_guide_travel_mm is 15, to either side"
+                "at 17 mm, 0 mm to the high end of range_mm (15): setup.max_guide_travel_mm is 15, to either side; "
+                "jog it to 0 mm"
             ],
         ),
     ],
@@ -167,6 +169,38 @@ def test_a_needle_without_a_guide_needs_none():
 )
 def test_an_axis_too_near_to_its_end_is_a_line(positions, lines):
     assert [line for _, line in room_problems(rig(), PLANE, positions)] == lines
+
+
+def test_an_axis_with_too_little_range_cannot_be_jogged_to_a_better_place():
+    narrow = rig(axes__guide_y__range_mm=[-10.0, 15.0])
+    assert [line[-14:] for _, line in room_problems(narrow, PLANE, {"guide_y": 2.0})] == [
+        "to either side"
+    ] * 2
+
+
+@pytest.mark.parametrize(
+    ("low", "backlash", "remedy"),
+    [
+        (-16.0, 0.0, "jog it between -1 and 0 mm"),
+        (-16.0, 0.1, "jog it between -1 and 0 mm"),
+        (-15.0, 0.04, "jog it to 0 mm"),  # found within 0.02 mm of it, the tolerance
+        (
+            -15.0,
+            0.1,
+            "range_mm must be 30.06 mm wide: with its backlash the position is uncertain by 0.05 mm",
+        ),
+        (-15.06, 0.1, "jog it between -0.06 and 0 mm"),
+    ],
+)
+def test_it_is_said_where_to_jog_an_axis_or_why_no_jog_helps(low, backlash, remedy):
+    """At the place that is named an insertion may begin, also where the position is off by half of the backlash."""
+    given = rig(axes__guide_y__range_mm=[low, 15.0], axes__guide_y__backlash_mm=backlash)
+    (line,) = [line for _, line in room_problems(given, PLANE, {"guide_y": 2.0})]
+    assert line.endswith(f"; {remedy}")
+    if remedy.startswith("jog"):
+        middle = 0.5 * (low + 15.0)
+        for off in (-0.5, 0.0, 0.5):
+            assert room_problems(given, PLANE, {"guide_y": middle + off * backlash}) == []
 
 
 def test_what_is_queued_is_the_largest_speed_times_the_queue_within_its_distance():
@@ -208,7 +242,7 @@ HERE = {"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}
             70.5,
             [
                 "guide_y: at 2.5 mm, 12.5 mm to the high end of range_mm (15): setup.max_guide_travel_mm is 15, "
-                "to either side"
+                "to either side; jog it to 0 mm"
             ],
         ),
     ],

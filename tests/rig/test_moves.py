@@ -164,11 +164,11 @@ def test_what_would_move_is_a_line():
     assert lines == [
         "insertion: in its negative direction to the reverse limit switch, by at most 132 mm at 1 mm/s; "
         "the position there is called 0 mm; then in its positive direction by 2.4 mm at 1 mm/s, off the switch to "
-        "2.4 mm",
+        "2.4 mm. If the switch is active now, first in its positive direction by 2.4 mm at 1 mm/s",
         "rotation: stays where it is, and its position is called 0 deg",
-        "insertion: in its positive direction to the reverse limit switch, by at most 132 mm at 1 mm/s; "
+        "insertion: in its positive direction to the reverse limit switch, by at most 133.5 mm at 1 mm/s; "
         "the position there is called 121.5 mm; then in its negative direction by 3.9 mm at 1 mm/s, off the switch to "
-        "117.6 mm",
+        "117.6 mm. If the switch is active now, first in its negative direction by 3.9 mm at 1 mm/s",
     ]
     assert str(jog(RIG, "rotation", "90", 0.0)) == "rotation: from 0 to 90 deg (90 deg), at most at 72 deg/s"
     assert retraction(RIG, 2.4) is retraction(RIG, 0.0) is retraction(RIG, -0.5) is None, "it is there"

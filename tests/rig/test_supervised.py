@@ -15,15 +15,20 @@ from hypothesis import strategies as st
 
 import flexneedle
 from emulated_rig import emulated_rig, rig_file
-from flexneedle.errors import CommandError, DriverError, RigError
+from flexneedle.control.interface import Decision
+from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.rig.emulator.coupled.truth import read_truth
+from flexneedle.rig.loop import _carry_out
+from flexneedle.rig.pace import travel_time
+from flexneedle.rig.step import Step as LoopStep
 from flexneedle.rig.supervised import Columns, SupervisedDriver, Watchers, supervised
+from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.machine import State
-from flexneedle.rig.supervisor.messages import Done, Step
+from flexneedle.rig.supervisor.messages import Done, Report, Step
 from flexneedle.scenario.rig import load_rig
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.trace.topics import READINGS
-from flexneedle.types import Control
+from flexneedle.types import Action, Control
 from stages import RIG, Bench
 from synthetic import make_plan
 from traces import contents
@@ -114,6 +119,29 @@ def test_a_command_beyond_a_limit_of_the_scenario_is_not_sent():
     with pytest.raises(CommandError, match=r"db_x = 1\.1: must be at most 1 mm"):
         SupervisedDriver(axes, PHANTOM, 0.0).apply(Control(db_x=1.1), 0.2)
     assert axes.steps == []
+
+
+@pytest.mark.parametrize("command", [Control(db_x=1.0), Control(db_y=0.01), Control(dg_y=0.5, flip=True)])
+def test_a_travel_faster_than_the_speeds_of_the_scenario_is_not_sent(command):
+    axes, shortest = Axes(), travel_time(PHANTOM.setup, command)
+    driver = SupervisedDriver(axes, PHANTOM, 0.0)
+    for duration in (0.999 * shortest, 0.0, math.nan):
+        with pytest.raises(RefusedError, match=rf"must take at least {shortest:g} s, at the speeds"):
+            driver.apply(command, duration)
+    assert axes.steps == []
+    driver.apply(command, shortest)
+    assert axes.steps[0][2] == shortest
+
+
+@given(st.integers(1, 8), st.floats(0.0, 1e-5))
+def test_the_loop_gives_a_travel_as_long_as_its_driver_wants(readings, more):
+    """Also one that takes whole readings but for a rounding error."""
+    axes = Axes()
+    advance = PHANTOM.setup.insertion_speed_mm_s * PHANTOM.tracker.period * (readings + more)
+    command = Control(db_x=min(advance, PHANTOM.setup.max_advance_mm))
+    moved = LoopStep(Action.MOVE, Decision(command, "as planned"))
+    _carry_out(PHANTOM, SimpleNamespace(driver=SupervisedDriver(axes, PHANTOM, 0.0)), moved, 0.0)
+    assert len(axes.steps) == 1
 
 
 @pytest.mark.parametrize("command", [Control(db_x=1.0), Control(db_x=1.0, db_y=0.4, dg_y=-0.3, flip=True)])
@@ -237,7 +265,7 @@ def test_the_needle_rolls_at_the_scenarios_speed(opened):
         (
             Resting(guide_y=-0.5),
             "guide_y: at -0.5 mm, 14.5 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to "
-            "either side",
+            "either side; jog it to 0 mm",
         ),
         (
             Resting(rotation=math.radians(1090)),
@@ -286,6 +314,29 @@ def assert_trace_of_a_simulated_run(done, folder, without):
     assert recorded[READINGS][1] >= expected[READINGS][1]  # a tracker may report more sensors
     expected[READINGS] = recorded[READINGS]
     assert recorded == {topic: found for topic, found in expected.items() if topic not in without}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["tracking", "moves"])
+def test_a_home_is_found_at_the_switch_of_the_emulated_rig_again_and_again(tmp_path, mode):
+    """Each time at the same place; with moves the last target still waits as the axis reaches its switch."""
+    home = 'channel = "C"\nhome = "reverse-limit"\nhome_mm = -15.0'
+    replaced = {'channel = "C"': home, "speed_mm_s = 10.0": "speed_mm_s = 40.0"}
+    path, truth = rig_file(tmp_path, **replaced, **{'kind = "galil"': f'kind = "galil"\nmode = "{mode}"'}), []
+    with emulated_rig(path, "phantom", "--truth", tmp_path / "truth.csv") as rig:
+        path.write_text(path.read_text().replace("127.0.0.1:0", rig.ready["ready"]["galil"]))
+        with Supervisor.of_operator(load_rig(path)) as supervisor:
+            for further in (0.37, 1.1, 0.0):
+                supervisor.arm()
+                supervisor.home("guide_y")
+                assert supervisor.positions["guide_y"] == pytest.approx(-14.4, abs=0.02)
+                truth.append(read_truth(tmp_path / "truth.csv").positions["guide_y"][-1])
+                supervisor.arm()
+                supervisor.move_to("guide_y", -14.4 + further)
+    assert truth == pytest.approx(
+        [-14.6] * 3, abs=0.3
+    )  # the switch is 15 mm off; there the axis slows down first
+    assert max(truth) - min(truth) < 0.04  # the way on which it slows down, at 4 mm/s
 
 
 @pytest.mark.long
@@ -340,3 +391,20 @@ def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monk
     with pytest.raises(RigError, match=r"tip = -28\.\d.* must be within"):
         flexneedle.insert(scenario, plan, 0, rig=path)
     assert {json.loads(line)[0] for line in notes.read_text().splitlines()} <= {"stop", "close"}
+
+
+def test_a_follower_that_fails_keeps_no_report_from_the_others():
+    class Follower:
+        def __init__(self, error=None):
+            self.error, self.seen = error, []
+
+        def report(self, report):
+            self.seen.append(report)
+            if self.error is not None:
+                raise self.error
+
+    first, second, report = Follower(OSError("no space left")), Follower(), Report(0.0, State.IDLE)
+    watchers = Watchers(followers=(first, second))
+    with pytest.raises(OSError, match="no space left"):
+        watchers.report(report)
+    assert first.seen == second.seen == [report]

@@ -3,6 +3,7 @@
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ import pytest
 import flexneedle
 from emulated import until
 from emulated_rig import emulated_rig, rig_file
-from flexneedle.errors import RigError
+from flexneedle.errors import RigError, StoppedError
 from flexneedle.rig.emulator.coupled.truth import read_truth
+from flexneedle.ros import bridge
 from flexneedle.ros.bridge import profile_of
 from flexneedle.ros.profile import load_profile
+from flexneedle.ros.records import Arm, Refused, Stop, Target
 from flexneedle.scenario.rig import RigFile, RosSettings
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import READINGS
@@ -258,6 +261,68 @@ def test_from_python_a_rig_with_a_section_that_nothing_follows_is_refused():
     rig = RigFile.model_validate(RIG | {"ros": {"arm": True}})
     with pytest.raises(RigError, match="ros: nothing listens to the stop of this section"):
         flexneedle.insert(scenario, plan, rig=rig)
+
+
+class Node:
+    """Stands in for the node's process: brings requests, and then fails."""
+
+    def __init__(self, requests, error=None):
+        self.requests, self.error, self.published = [tuple(requests)], error, []
+
+    def wait(self, seconds):
+        time.sleep(min(seconds, 1e-3))
+
+    def poll(self):
+        if not self.requests and self.error is not None:
+            raise self.error
+        return self.requests.pop() if self.requests else ()
+
+    def publish(self, record):
+        self.published.append(record)
+
+    def close(self):
+        pass
+
+
+def followed(monkeypatch, node):
+    monkeypatch.setattr(bridge, "open_node", lambda *_args, **_options: node)
+    return bridge.Bridge(RosSettings())
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("rig", [True, False])
+def test_a_connection_that_fails_is_a_stop(monkeypatch, rig):
+    """Nobody would hear one any more."""
+    stops = []
+    node = Node((), None if rig else ValueError("a bug"))
+    with followed(monkeypatch, node) as bridge_:
+        if rig:
+            supervisor = SimpleNamespace(now=lambda: 0.0, request_stop=stops.append, ended=None)
+            bridge_.opened(supervisor)
+            node.error = ValueError("a bug")
+        until(lambda: bridge_.record["events"])
+        why = "the connection to ROS has failed: ValueError: a bug"
+        with pytest.raises(StoppedError, match=f"stopped: {why}"):
+            bridge_.check()
+        until(lambda: stops == [why] if rig else node.published)
+    assert [one["event"] for one in bridge_.record["events"]] == [f"stop: {why}"]
+
+
+def test_a_stop_is_listed_however_much_was_refused_before(monkeypatch):
+    refused = [Refused(0.0, "/sensor/tip", "old data", count) for count in range(1, 1501)]
+    ignored = [Arm(0.0, "/flexneedle/arm"), Target(0.0, (35.0, 2.0, 0.0))] * 100
+    with followed(monkeypatch, Node([*ignored, *refused, Stop(0.0, "/flexneedle/stop")])) as bridge_:
+        until(lambda: bridge_._stopped)
+    listed = [one["event"] for one in bridge_.record["events"]]
+    assert len(listed) == 1001
+    assert listed[:2] == [
+        "arm on /flexneedle/arm: ignored, not awaited",
+        "target 35, 2, 0 mm: ignored, not awaited",
+    ]
+    assert listed[-2:] == [
+        "message 800 refused on /sensor/tip: old data; more of what is refused or ignored is not listed",
+        "stop: ROS topic /flexneedle/stop",
+    ]
 
 
 def test_options_that_contradict_each_other_are_refused(tmp_path, capsys):

@@ -183,7 +183,54 @@ def test_a_sender_whose_clock_is_set_back_has_no_earlier_times_afterwards():
             refused += 1
         else:
             assert time == pytest.approx(true + 0.003)
-    assert refused == 8
+    assert refused == 21  # from the first one on; the second shows it, and then for half a second
+
+
+@pytest.mark.parametrize("seconds", [1.0, 2.2, 2.9])
+def test_a_clock_that_is_set_back_twice_has_no_earlier_times_afterwards(seconds):
+    """Again before it is seen to be as late as before, while it is observed, and after that."""
+    stamps, accepted = Stamps(), 0
+    for number in range(400):
+        true = 10.0 + 0.025 * number
+        back = (2.0 if number >= 40 else 0.0) + (0.1 if true >= 11.0 + seconds else 0.0)
+        try:
+            time = stamps.measured(true + 1000.0 - back, true + 0.003)
+        except InputError:
+            continue
+        accepted += number >= 40
+        assert time == pytest.approx(true + 0.003)
+    assert accepted > 230
+
+
+@pytest.mark.parametrize("every", [3, 10, 40])
+def test_a_topic_whose_messages_change_places_recovers_after_a_set_back(every):
+    stamps, accepted = Stamps(), 0
+    for number in range(400):
+        swapped = {1: number - 1, 0: number + 1}.get(number % every, number)  # two in each `every`
+        arrival = 10.0 + 0.025 * number
+        try:
+            stamps.measured(10.0 + 0.025 * swapped - (0.1 if number > 100 else 0.0), arrival)
+        except InputError:
+            continue
+        accepted += number > 130
+    assert accepted > 150
+
+
+def test_messages_after_held_up_ones_that_came_in_order_are_not_taken_for_new():
+    """Nothing but a message without delay shows what the clock of the sender is."""
+    stamps = Stamps()
+    stamps.measured(5.0, 10.0)
+    for stamp, arrival in ((3.0, 10.1), (3.1, 10.1)):
+        with pytest.raises(InputError, match="old data"):
+            stamps.measured(stamp, arrival)
+    with pytest.raises(
+        InputError, match=r"its clock was set back: refused until that was observed for 0\.5 s"
+    ):
+        stamps.measured(5.1, 10.5)  # 0.4 s after it was measured
+    with pytest.raises(InputError, match="set back"):
+        stamps.measured(5.5, 10.5)
+    assert stamps.measured(5.6, 10.7) == pytest.approx(10.6)
+    assert stamps.measured(5.7, 10.8) == pytest.approx(10.7)
 
 
 def test_a_single_old_message_changes_no_times():

@@ -238,6 +238,27 @@ def test_an_arm_is_asked_for_once_and_may_fail(running):
     assert answered.message == "not done within 2 s: the rig reports 'idle'"
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "done"),
+    [
+        ("idle", ("armed", "inserting"), True),
+        ("idle", ("inserting",), True),  # the topic keeps one state, so that "armed" may never come
+        ("inserting", ("inserting",), False),
+        ("inserting", ("armed", "inserting"), True),
+    ],
+)
+def test_an_arm_is_done_also_where_the_rig_has_gone_on(running, before, after, done):
+    running.state[1](SimpleNamespace(data=before))
+    answers = []
+    caller = Thread(target=lambda: answers.append(running.call("~/arm")))
+    caller.start()
+    until(lambda: running.sent)
+    for state in after:
+        running.state[1](SimpleNamespace(data=state))
+    caller.join()
+    assert answers[0].success is done
+
+
 def test_without_a_rig_a_service_fails_and_a_stop_is_sent_all_the_same(running):
     running.publishers = 0
     running.state[1](SimpleNamespace(data="stopped"))  # of a rig that has ended

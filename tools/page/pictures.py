@@ -119,11 +119,13 @@ def _draw_disturbance(browser: Browser, folder: Path) -> None:
         _press(page, "insertion", "Start paused")
         _await(page, "flexneedle.store.get('insertion live')?.state === 'paused'")
         page.locator("[aria-label=Pace]").select_option("2")
+        _press(page, "insertion", "Continue")
         _await(page, "flexneedle.store.get('rows live')?.length > 40")
         _press(page, "insertion", "Pause")
         page.get_by_label("Force on the tip in N").fill("0.02")
         _press(page, "insertion", "Push")
         page.locator("[aria-label=Pace]").select_option("20")
+        _press(page, "insertion", "Continue")
         _await(page, _ENDED)
         page.locator("section.plots").scroll_into_view_if_needed()  # plots are drawn only on the screen
         page.wait_for_timeout(_PAINTED_MS)

@@ -12,6 +12,8 @@ import time
 STOPPED = ("stopped", "fault")
 """Not idle: that may have been reported before the stop, which an idle rig confirms by "stopped"."""
 ARMED = ("armed",)
+UNDER_WAY = ("inserting", "holding")
+"""Of a rig that was idle, these show too that it was armed: "armed" lasts a moment, and the topic keeps one state."""
 REPEAT_S = 0.05
 
 DEFAULTS = {
@@ -23,18 +25,20 @@ DEFAULTS = {
 
 
 class States:
-    """The last reported state of the rig, and the number of reports, for threads that wait for one."""
+    """The last reported state of the rig, and in which report each came last, for threads that wait for one."""
 
     def __init__(self):
         self._changed = threading.Condition()
         self._state = ""
         self._count = 0
+        self._newest = {}
 
     def report(self, state):
         """Note a state that the rig reports."""
         with self._changed:
             self._state = state
             self._count += 1
+            self._newest[state] = self._count
             self._changed.notify_all()
 
     @property
@@ -48,9 +52,16 @@ class States:
         return self._count
 
     def wait(self, wanted, since, seconds):
-        """Whether the state is among `wanted` within some seconds, in a report after the first `since`."""
+        """Whether a state among `wanted` is reported within some seconds, after the first `since` reports.
+
+        Also if another was reported after it.
+        """
+
+        def is_reported():
+            return any(self._newest.get(state, 0) > since for state in wanted)
+
         with self._changed:
-            return self._changed.wait_for(lambda: self._count > since and self._state in wanted, seconds)
+            return self._changed.wait_for(is_reported, seconds)
 
 
 def ask(publish, states, wanted, seconds, *, repeat):
@@ -111,8 +122,11 @@ def main(args=None):
                     publisher.publish(Bool(data=True))
                 response.success, response.message = False, f"no rig publishes {given['state_topic']}"
                 return response
+            shows = wanted
+            if wanted is ARMED and states.last == "idle":
+                shows = ARMED + UNDER_WAY
             done = ask(
-                lambda: publisher.publish(Bool(data=True)), states, wanted, given["answer_s"], repeat=repeat
+                lambda: publisher.publish(Bool(data=True)), states, shows, given["answer_s"], repeat=repeat
             )
             response.success, response.message = done, answer(done, states, given["answer_s"])
             return response

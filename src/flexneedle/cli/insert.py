@@ -123,7 +123,6 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.runs.recording import check_choices
     from flexneedle.trace.folder import Folder
-    from flexneedle.types import Outcome
 
     if args.list:
         return _list()
@@ -146,7 +145,7 @@ def _insert(args: argparse.Namespace) -> int:
             with _refusal_printed(args, choices, scenario, folder):
                 insertion = _execute(args, folder, scenario, choices, bridge)
             status = report(scenario, insertion, args.json, folder.path)
-            if choices.moves and insertion.periods and insertion.outcome is not Outcome.DONE:
+            if choices.moves and insertion.periods:
                 print_still_in(args.rig)
     return status or int(bool(folder.problems))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -34,8 +34,13 @@ class Operator(Protocol):
         """Switch the motors on; return what else that has changed, or ""."""
         ...
 
-    def jog(self, axis: str, distance: float, speed: float) -> object:
-        """Move an axis by a distance (mm or rad), at most at a speed (mm/s or rad/s)."""
+    @property
+    def positions(self) -> Mapping[str, float]:
+        """Where the axes are (mm or rad) by name."""
+        ...
+
+    def move_to(self, axis: str, position: float, speed: float) -> object:
+        """Move an axis to a position (mm or rad), at most at a speed (mm/s or rad/s)."""
         ...
 
     def home(self, axis: str) -> object:
@@ -269,7 +274,7 @@ def _jog(args: argparse.Namespace) -> int:
     axis_of(rig, args.axis)
     move = jog(rig, args.axis, args.distance, _positions(rig)[args.axis], args.speed)
     return _carried_out(
-        rig, [move], args.yes, lambda operator: operator.jog(move.name, move.distance, move.speed)
+        rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
     )
 
 
@@ -343,8 +348,13 @@ def _carried_out(
     *notes: str,
 ) -> int:
     """Print the motions, command them once they are confirmed, and return the exit status."""
+    from flexneedle.rig.moves import Move, require_start
+
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with supervised(rig) as operator, _stopped_on_error(operator):
+        for move in moves:
+            if isinstance(move, Move):
+                require_start(move, operator.positions[move.name])
         _arm(operator)
         command(operator)
     print("done", file=sys.stderr)

@@ -44,7 +44,7 @@ def hopeless(decision: Decision, control: ControlSettings) -> str:
     return (
         f"no path to the target found: predicted miss {_predicted(decision)} is beyond "
         f"control.miss_limit_mm = {limit:g} with a probability of {probability:.3f} "
-        f"(limit {control.miss_confidence:g}); use --force to insert anyway"
+        f"(limit {control.miss_confidence:g}); to insert anyway: flexneedle insert --force"
     )
 
 

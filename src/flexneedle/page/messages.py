@@ -7,7 +7,7 @@ are in mm, times in s, angles in degrees where the name says so.
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter
 
 Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
@@ -29,6 +29,7 @@ JobKind = Literal[
     "save",
 ]
 Vector = tuple[float, float, float]
+_SLOWEST = 0.01
 
 
 class Message(BaseModel):
@@ -143,11 +144,17 @@ class Go(Request):
     type: Literal["go"]
 
 
+def _paused_or_not_too_slow(pace: float) -> float:
+    if 0.0 < pace < _SLOWEST:
+        raise ValueError(f"must be 0 (paused) or at least {_SLOWEST:g}")
+    return pace
+
+
 class Pace(Request):
     """Pace of a virtual insertion: 1 is real time, 0 paused. A rig has none."""
 
     type: Literal["pace"]
-    pace: Annotated[float, Field(ge=0.0, le=50.0)]
+    pace: Annotated[float, Field(ge=0.0, le=50.0), AfterValidator(_paused_or_not_too_slow)]
 
 
 class Advance(Request):

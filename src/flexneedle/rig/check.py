@@ -13,6 +13,8 @@ from flexneedle.rig.fit import fit_problems, queued, room_problems
 from flexneedle.rig.moves import uncertain
 from flexneedle.rig.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.rig.speeds import kept, step_time
+from flexneedle.rig.supervisor.checks import resting_switch_problem
+from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
@@ -160,7 +162,9 @@ def _reply(rig: RigFile, seconds: float) -> Finding:
 def _of_axis(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
     yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _at_rest(state))
     yield Finding(name, "position", _position(axis, state.position), _beyond(axis, state.position))
-    yield Finding(name, "limit switches", _switches(state) or "none active", _switch_problem(axis, state))
+    yield Finding(
+        name, "limit switches", _switches(state) or "none active", _switch_problem(name, axis, state)
+    )
     if state.on:
         yield _following(name, axis, state)
 
@@ -171,9 +175,10 @@ def _of_setup(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
     yield Finding(name, "switches in use", "all" if not off else "not all", off)
     low, high = sorted((setup.lowest / axis.scale, setup.highest / axis.scale))
     narrow = low > axis.limits[0] + axis.tolerance or high < axis.limits[1] - axis.tolerance
+    held = ", also while its home is searched" if axis.to_home and (isfinite(low) or isfinite(high)) else ""
     limits = f"{axis.shown(axis.limits[0])} to {axis.shown(axis.limits[1])} {axis.unit}"
     rule = f"narrower than range_{axis.unit}, {limits}: motions would end there" if narrow else ""
-    yield Finding(name, "controller's limits", _limits(axis, low, high), rule)
+    yield Finding(name, "controller's limits", _limits(axis, low, high) + held, rule)
     yield _error_limit(name, axis, setup)
 
 
@@ -220,12 +225,9 @@ def _switches(state: MotorState) -> str:
     return " and ".join(name for name, is_active in active if is_active)
 
 
-def _switch_problem(axis: Axis, state: MotorState) -> str:
-    """An axis may rest at the switch of its home."""
-    if state.reverse_limit and state.forward_limit:
-        return "both are active: check their wiring and polarity"
-    name = _switches(state)
-    return f"the {name} switch is active" if name and axis.home != f"{name}-limit" else ""
+def _switch_problem(name: str, axis: Axis, state: MotorState) -> str:
+    """An axis may rest at the switch of its home, where that is."""
+    return resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
 
 
 def _following(name: str, axis: Axis, state: MotorState) -> Finding:

@@ -182,11 +182,30 @@ def _too_fast(axis: Axis, scenario: Scenario, need: Need) -> Iterator[Problem]:
 
 def _room(axis: Axis, need: Need, position: float) -> Iterator[str]:
     low, high = axis.limits
-    for end, travel, room in (("low", need.back, position - low), ("high", need.travel, high - position)):
+    for end, at, travel, room in (
+        ("low", low, need.back, position - low),
+        ("high", high, need.travel, high - position),
+    ):
         left = max(room, 0.0)
         if travel > left + axis.tolerance:
-            limit = f"{left:.6g} mm to the {end} end of range_mm ({low if end == 'low' else high:g})"
-            yield f"at {position:.6g} mm, {limit}: {need.reason}"
+            limit = f"{left:.6g} mm to the {end} end of range_mm ({at:g})"
+            yield f"at {position:.6g} mm, {limit}: {need.reason}{_remedy(axis, need)}"
+
+
+def _remedy(axis: Axis, need: Need) -> str:
+    """Where to jog an axis that has too little room, if there is such a place, at which it is also found to be.
+
+    There is none of the insertion axis: what is jogged back is to be advanced again.
+    """
+    low, high = axis.limits[0] + need.back, axis.limits[1] - need.travel
+    if not need.both or low > high + _ROUNDING:
+        return ""
+    unsure = axis.uncertainty - axis.tolerance
+    if 0.5 * (high - low) < unsure - axis.tolerance:
+        width = need.width + 2.0 * (unsure - axis.tolerance)
+        return f"; range_mm must be {width:.6g} mm wide: with its backlash the position is uncertain by {unsure:.6g} mm"
+    where = f"to {low:.6g} mm" if high - low <= _ROUNDING else f"between {low:.6g} and {high:.6g} mm"
+    return f"; jog it {where}"
 
 
 def _turning_base(scenario: Scenario, strategy: str) -> Iterator[Problem]:

@@ -23,7 +23,7 @@ from flexneedle.planning.origin import check_origin, placed
 from flexneedle.rig.guard import Guard
 from flexneedle.rig.measuring import Observation, observe, observe_before_start
 from flexneedle.rig.monitor.monitor import Monitor
-from flexneedle.rig.pace import travel_time
+from flexneedle.rig.pace import ROUNDING_S, travel_time
 from flexneedle.rig.parts import controller_of
 from flexneedle.rig.ports import Driver
 from flexneedle.rig.progress import Progress, hold_after
@@ -81,7 +81,7 @@ def run(
     if not (plan.reached or force or chosen.predicts):
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
-            "use --force (force=True) to insert anyway"
+            "to insert anyway: flexneedle insert --force (force=True)"
         )
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
@@ -215,7 +215,7 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
             rig.clock.wait(step.wait)
         return Motion(command, begun, rig.clock.now())
     reading = scenario.tracker.period
-    readings = math.ceil(travel_time(scenario.setup, command) / reading - 1e-6)
+    readings = math.ceil((travel_time(scenario.setup, command) - ROUNDING_S) / reading)
     try:
         motion = rig.driver.apply(command, max(1, readings) * reading)
     except CommandError as error:  # of a controller: refused, with a record of all before

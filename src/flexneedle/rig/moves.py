@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from math import isfinite
 
 from flexneedle.arguments import shown as text_of
-from flexneedle.errors import InputError
-from flexneedle.rig.supervisor.requested import homed_at, homing_reach, homing_speed
+from flexneedle.errors import InputError, RefusedError
+from flexneedle.rig.supervisor.checks import STILL
+from flexneedle.rig.supervisor.homes import homed_at, homing_reach, homing_speed
 from flexneedle.scenario.rig import RigFile
 from flexneedle.scenario.sections.axes import Axis
 
@@ -39,6 +40,16 @@ class Move:
         return f"{self.name}: {way}, at most at {at(self.speed)} {unit}/s{slack}"
 
 
+def require_start(move: Move, position: float) -> None:
+    """Raise RefusedError if an axis at a position (mm, rad) is not where its motion begins, or beyond its goal."""
+    axis, turns = move.axis, (move.goal - position) * move.distance <= 0.0
+    if turns or not abs(position - move.start) <= STILL * axis.tolerance:
+        now, then = (_with_unit(axis, at) for at in (position, move.start))
+        raise RefusedError(
+            f"{move.name}: is at {now} now, not at {then} any more: nothing was moved; try again"
+        )
+
+
 @dataclass(frozen=True)
 class Homing:
     """Finding the home of one axis."""
@@ -56,7 +67,8 @@ class Homing:
         search = f"in its {_direction(reach)} direction to the {_switch(axis)}"
         there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
         off = f"in its {_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
-        return f"{self.name}: {search}, {there}; then {off}, off the switch to {_with_unit(axis, homed_at(axis))}"
+        to = f"off the switch to {_with_unit(axis, homed_at(axis))}"
+        return f"{self.name}: {search}, {there}; then {off}, {to}. If the switch is active now, first {off}"
 
 
 def _direction(travel: float) -> str:

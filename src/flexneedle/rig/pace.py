@@ -3,6 +3,9 @@
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import Control
 
+ROUNDING_S = 1e-7
+"""By how much (s) a travel may be shorter than its time."""
+
 
 def roll_time(setup: Setup, roll: float) -> float:
     """Time (s) of a roll (rad), during which the needle does not advance."""

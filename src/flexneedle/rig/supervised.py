@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexneedle.errors import DriverError, RigError
+from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.estimate import Estimate, after
 from flexneedle.rig.fit import fit_problems, start_problems
-from flexneedle.rig.pace import roll_time
+from flexneedle.rig.pace import ROUNDING_S, roll_time, travel_time
 from flexneedle.rig.start import checked_start, deepest, needed
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
@@ -163,10 +163,16 @@ class Watchers:
             self.confirm(supervisor)
 
     def report(self, report: Report) -> None:
-        """Hand out what a tick found."""
+        """Hand out what a tick found, to all also where one of them fails; raises the first error."""
         self.ticks.add(report)
+        errors = []
         for follower in self.followers:
-            follower.report(report)
+            try:
+                follower.report(report)
+            except Exception as error:  # noqa: BLE001  raised below
+                errors.append(error)
+        if errors:
+            raise errors[0]
 
 
 class SupervisedDriver:
@@ -190,9 +196,14 @@ class SupervisedDriver:
         """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.
 
         A motion that the monitor ended is returned as far as it went. Raises CommandError if the command breaks a limit
-        of the scenario, RefusedError if it breaks one of the rig, DriverError after a fault, StoppedError after a stop.
+        of the scenario, RefusedError if it breaks one of the rig or is faster than the scenario's speeds, DriverError
+        after a fault, StoppedError after a stop.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
+        if not duration >= (shortest := travel_time(self._scenario.setup, command)) - 2.0 * ROUNDING_S:
+            raise RefusedError(
+                f"travel in {duration:g} s: must take at least {shortest:g} s, at the speeds of the scenario"
+            )
         roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
         travel, roll_duration = self._columns.travel(command), roll_time(self._scenario.setup, roll)
         done = self._supervisor.step(roll, travel, duration, self._expected, roll_duration)

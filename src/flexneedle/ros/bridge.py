@@ -17,7 +17,7 @@ from flexneedle.rig.supervisor.messages import Report
 from flexneedle.ros.client import open_node
 from flexneedle.ros.profile import Profile, load_profile
 from flexneedle.ros.records import Arm, Lost, Refused, Request, RigState, Stop, Target
-from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.problems import Problem, to_line, unexpected
 from flexneedle.scenario.rig import RosSettings
 from flexneedle.types import Period, Plan, Point
 
@@ -25,7 +25,7 @@ POLL_S = 0.01
 """Longest time between two checks for a stop."""
 _STATE_S = 1.0  # the state is published at least this often
 _CHECK_S = 0.05  # while an arm or a target is awaited
-_MOST_EVENTS = 1000  # in the record
+_MOST_EVENTS = 1000  # that others cause, in the record
 _BAD = frozenset({State.HOLDING, State.STOPPED, State.FAULT})
 
 
@@ -61,6 +61,7 @@ class Bridge:
         self._unprinted = SimpleQueue[str]()
         self._supervisor: Supervisor | None = None
         self._stopped = self._lost = self._awaited = ""
+        self._others = 0  # events that other nodes may cause without end
         self._target: Point | None = None
         self._shift: float | None = None  # of the run's time 0 from this object's
         self._state, self._published_at, self._good = ("idle", ""), -_STATE_S, True
@@ -167,9 +168,16 @@ class Bridge:
         self.check()
 
     def _note(self, event: str) -> None:
-        if len(self.record["events"]) < _MOST_EVENTS:
-            self.record["events"].append({"time_s": self._now(), "event": event})
-            self._unprinted.put(event)
+        self.record["events"].append({"time_s": self._now(), "event": event})
+        self._unprinted.put(event)
+
+    def _note_some(self, event: str) -> None:
+        """Note what other nodes may send without end."""
+        self._others += 1
+        if self._others < _MOST_EVENTS:
+            self._note(event)
+        elif self._others == _MOST_EVENTS:
+            self._note(f"{event}; more of what is refused or ignored is not listed")
 
     def _now(self) -> float:
         """Time (s) of the node's records: since this object was made."""
@@ -178,6 +186,15 @@ class Bridge:
     # The thread
 
     def _listen(self) -> None:
+        """Listen to the end. Where this itself fails no stop would be heard any more, so that it is one."""
+        try:
+            self._keep_listening()
+        except Exception as error:
+            self._lost = f"the connection to ROS has failed: {unexpected(error)}"
+            self._stop(self._lost)
+            raise
+
+    def _keep_listening(self) -> None:
         while not self._ended.is_set():
             if self._lost:  # a node that hung may still bring a stop
                 self._ended.wait(POLL_S)
@@ -209,17 +226,20 @@ class Bridge:
                 else:
                     self._note(f"{reason}: nothing is published, and no stop is received from there")
             case Arm(_, topic):
-                self._note(f"arm on {topic}" + ("" if self._awaited == "arm" else ": ignored, not awaited"))
-                if self._awaited == "arm":
+                if self._awaited == "arm" and not self._armed.is_set():
+                    self._note(f"arm on {topic}")
                     self._armed.set()
+                else:
+                    self._note_some(f"arm on {topic}: ignored, not awaited")
             case Target(_, point):
                 shown = ", ".join(f"{value:g}" for value in point)
-                wanted = self._awaited == "target"
-                self._note(f"target {shown} mm" + ("" if wanted else ": ignored, not awaited"))
-                if wanted:
+                if self._awaited == "target":
+                    self._note(f"target {shown} mm")
                     self._target = point
+                else:
+                    self._note_some(f"target {shown} mm: ignored, not awaited")
             case Refused(_, topic, reason, count):
-                self._note(f"message {count} refused on {topic}: {reason}")
+                self._note_some(f"message {count} refused on {topic}: {reason}")
 
     def _stop(self, who: str) -> None:
         with self._lock:
@@ -227,7 +247,7 @@ class Bridge:
             self._stopped = self._stopped or who
         if supervisor is not None:
             supervisor.request_stop(who)
-        else:
-            self._set("stopped", self._stopped)
         if first:  # a stop is repeated until the rig reports it
             self._note(f"stop: {who}")
+        if supervisor is None:
+            self._set("stopped", self._stopped)

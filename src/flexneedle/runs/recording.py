@@ -68,9 +68,9 @@ class Choices:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Names of controller, phantom, tracker and rig, and `dry_run`; on a rig phantom and tracker have no name."""
+        """What the insertion is made with, by the names of `PARTS`; on a rig phantom and tracker have no name."""
         own = (self.phantom, self.tracker, "") if self.rig is None else ("", "", self.rig.name)
-        return dict(zip(PARTS, (self.controller, *own, self.dry_run), strict=True))
+        return dict(zip(PARTS, (self.controller, *own, self.dry_run, ""), strict=True))
 
 
 def record_plans(

@@ -16,8 +16,8 @@ from flexneedle.trace.results import insertion_result, insertion_timing, plan_re
 from flexneedle.trace.writer import TraceWriter
 from flexneedle.types import Insertion, Plan, scenario_of
 
-PARTS = ("controller", "phantom", "tracker", "rig", "dry_run")
-"""What an insertion was made with, in `run.json` and `trace.mcap`: names, and whether the rig did not move."""
+PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
+"""What an insertion was made with, in `run.json` and `trace.mcap`: fields of `Insertion`."""
 
 
 def save(record: Plan | Insertion, folder: str | Path) -> Path:
@@ -63,7 +63,7 @@ def finish_plans(folder: Folder) -> None:
 def open_trace(
     folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, Any]
 ) -> TraceWriter:
-    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig, and dry_run."""
+    """Return the writer of `trace.mcap`; parts: by the names of `PARTS`."""
     named = {name: str(part) for name, part in parts.items()}
     about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **named, **versions()}
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())

@@ -13,8 +13,9 @@ _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status"
 
 
 def marks(insertion: Insertion) -> dict[str, Any]:
-    """Return the columns that mark every row of a dry run; none for an insertion that moved a needle."""
-    return {"dry_run": True} if insertion.dry_run else {}
+    """Return the columns that mark every row of a dry run or a disturbed insertion; none for another."""
+    found = {"dry_run": insertion.dry_run, "disturbed": bool(insertion.disturbed)}
+    return {name: True for name, marked in found.items() if marked}
 
 
 def write_csv(file: IO[str], insertion: Insertion) -> None:

@@ -1,9 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller, phantom, tracker, rig and dry_run. A plan that chose where the needle
-enters has its own section `entry`; the scenario of an insertion is the one with the entry of its plan. All except
-`timing`, the date and the wall-clock times, is the same for the same seed.
+plans; that of an insertion also controller, phantom, tracker, rig, dry_run and disturbed. A plan that chose where
+the needle enters has its own section `entry`; the scenario of an insertion is the one with the entry of its plan.
+All except `timing`, the date and the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -34,7 +34,8 @@ _FORMAT = 1
 class RunFile:
     """Contents of `run.json`. status: "running" (or killed), "done", "held", "failed" or "interrupted".
 
-    controller, phantom, tracker, rig: of an insertion, "" if not recorded; dry_run: whether the rig did not move.
+    controller, phantom, tracker, rig: of an insertion, "" if not recorded; dry_run: whether the rig did not move;
+    disturbed: what a person disturbed and when.
     """
 
     folder: Path
@@ -51,6 +52,7 @@ class RunFile:
     tracker: str
     rig: str = ""
     dry_run: bool = False
+    disturbed: str = ""
 
 
 @dataclass(eq=False)
@@ -162,7 +164,9 @@ def _checked(path: Path, values: Any) -> RunFile:
     try:
         read = values["plans"].items()
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
-        named |= {name: values.get(name, "") for name in ("controller", "phantom", "tracker", "rig")}
+        named |= {
+            name: values.get(name, "") for name in ("controller", "phantom", "tracker", "rig", "disturbed")
+        }
         named["dry_run"] = values.get("dry_run", False) is True
         scenario = Scenario.from_record(values["scenario"])
         plans = {name: _plan(plan, values["scenario"]) for name, plan in read}

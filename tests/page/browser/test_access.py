@@ -23,7 +23,7 @@ FOUND = {
 STATES = {
     "opening": (opening, "[data-panel=space] .legend li"),
     "planned": (planned, "[data-panel=plans] table"),
-    "inserting": (inserting, "[data-panel=status] .job button"),
+    "inserting": (inserting, "[data-panel=status] .job progress"),
 }
 """News by state, and what is shown last."""
 

@@ -125,6 +125,18 @@ def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
 
+def test_an_insertion_is_stopped_and_a_run_that_is_saved_is_not_cancelled(visit, server):
+    page = visit()
+    server.send(insertion("running"))
+    server.send(
+        *(Job(job=n, kind=kind, state="running") for n, kind in enumerate(("insertion", "save", "plan")))
+    )
+    page.wait_for_selector(f"{STATUS} >> text=Saving")
+    cancels = page.locator(f"{STATUS} .job button:visible")
+    assert cancels.evaluate_all("all => all.map((one) => one.ariaLabel)") == ["Cancel: Plan"]
+    assert page.is_visible(f"{STATUS} >> text=Stop the insertion")
+
+
 def test_work_without_a_share_has_the_time_since_it_began(visit, server):
     page = visit()
     server.send(Job(job=1, kind="needle", state="waiting", text="the computation starts"))

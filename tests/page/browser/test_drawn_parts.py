@@ -148,16 +148,16 @@ SPAN = f"""async ([selector, [left, right, half], x]) => {{
   return found.length ? [map.fromY(found.at(-1) + 1), map.fromY(found[0])] : null;
 }}"""
 """Lowest and highest place (mm) of the reach in the column of a canvas at x (mm), of a view of a box."""
-BOX, AXIAL_BOX = (-50.0, 50.0, 10.0), (-8.0, 8.0, 8.0)
+BOX, AXIAL_BOX = (-50.0, 50.0, 10.0), (-9.0, 9.0, 9.0)
 SLOPES = (0.2, 0.1)
 """Half axes of the reach by its depth."""
 TWO_PIXELS = 0.4  # mm
 
 
-def ellipses(*depths):
+def ellipses(*depths, wide=1.0):
     """Outlines of the reach at depths, around the axis."""
     angle = np.linspace(0.0, 2.0 * np.pi, 97)
-    y, z = SLOPES[0] * np.cos(angle), SLOPES[1] * np.sin(angle)
+    y, z = wide * SLOPES[0] * np.cos(angle), wide * SLOPES[1] * np.sin(angle)
     return shape(
         Kind.REACH, Source.SCENE, 0, *(np.column_stack([np.full(97, x), x * y, x * z]) for x in depths)
     )
@@ -214,6 +214,43 @@ def test_along_the_axis_the_reach_is_that_at_the_depth_of_the_target(views, serv
     np.testing.assert_allclose(up, (-half, half), atol=TWO_PIXELS)
     rest = half * np.sqrt(1.0 - (3.0 / (SLOPES[1] * TARGET[0])) ** 2)
     assert side[0] == pytest.approx(-rest, abs=TWO_PIXELS)
+
+
+@pytest.mark.parametrize("wide", [2.0, 5.0])
+def test_along_the_axis_the_whole_reach_is_in_view(views, server, wide):
+    page = views(opening())
+    half = wide * SLOPES[0] * TARGET[0]
+    seen = np.floor(half + 1.0)
+    (up,) = reach_at(
+        page,
+        server,
+        FLAT[1],
+        (-seen, seen, seen),
+        (0.0,),
+        REACH,
+        ellipses(15.0, 35.0, 60.0, wide=wide),
+    )
+    np.testing.assert_allclose(up, (-half, half), atol=wide * TWO_PIXELS)
+
+
+@pytest.mark.parametrize("wide", [2.0, 4.0])
+def test_in_section_the_whole_reach_is_in_view(views, server, wide):
+    page = views(opening())
+    page.click(f"{SECTION} [data-plane='x–y']")
+    arrived(page)
+    half, deepest = wide * SLOPES[0] * 60.0, 60.0
+    box = (BOX[0], deepest + 1.0, np.ceil(half + 1.0))
+    edge, beyond = reach_at(
+        page,
+        server,
+        FLAT[0],
+        box,
+        (0.95 * deepest, deepest + 0.5),
+        REACH,
+        ellipses(15.0, 35.0, deepest, wide=wide),
+    )
+    np.testing.assert_allclose(edge, (-0.95 * half, 0.95 * half), atol=wide * TWO_PIXELS)
+    assert beyond is None
 
 
 def test_along_the_axis_there_is_no_reach_beyond_its_deepest_outline(views, server):

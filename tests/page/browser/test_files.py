@@ -11,7 +11,7 @@ from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.page.frames import Source
 from flexneedle.page.messages import Job, Runs, StudyRow, StudyRows
-from recorded_page import insertion, people, period_frames, rows
+from recorded_page import insertion, people, period_frames, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -145,6 +145,28 @@ def test_a_link_that_is_followed_while_another_is_in_control_is_opened_afterward
     page.click("text=Take control")
     assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
     until(page, "!location.hash")
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_a_link_asks_before_changes_are_lost(files, server, opened):
+    """Any web site can send a browser to one."""
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    link = page.evaluate("window.copied").partition("#")[2]
+    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
+    until(page, "flexneedle.store.get('session').changed.length")
+    page.evaluate("link => { location.hash = link; }", link)
+    page.wait_for_selector(
+        f"{FILES} >> text=The link has the scenario phantom3d. To open it drops the changes"
+    )
+    assert not server.asked("load")
+    page.click("text=Open the link" if opened else "text=Keep this scenario")
+    page.wait_for_selector(f"{FILES} >> text=The link has the scenario", state="detached")
+    if opened:
+        assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    page.evaluate(PAINTED)
+    assert len(server.asked("load")) == opened
 
 
 @pytest.mark.parametrize("damaged", ["x", "xyz", "A" * 3000])

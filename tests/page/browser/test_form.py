@@ -1,11 +1,15 @@
 """The scenario by fields: made from the schema, searched, refused with the problem beside the field."""
 
+import json
+
 import pytest
 
 from browser_layout import too_wide
 from fake_page import until
 from flexneedle.page.messages import Refused, Session
+from flexneedle.page.server.catalog import SCHEMA
 from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.sections.environment import ENVIRONMENTS
 from recorded_page import WELCOME, opening, people, scene, scene_frames
 
 pytestmark = pytest.mark.page
@@ -41,8 +45,204 @@ def test_every_value_of_a_scenario_has_a_field(form):
     page.fill(f"{FORM} input[type=search]", ".")  # in all keys and descriptions
     shown = set(page.evaluate("[...document.querySelectorAll('[data-key]')].map((each) => each.dataset.key)"))
     values = set(load_scenario("phantom3d").flat())
-    lists = {key for key in values if key.startswith("tissue.") and key.endswith(".law")}
-    assert values - lists <= shown
+    assert values <= shown
+
+
+FIELDS = """async ([schema, values]) => {
+  const { sectionsOf } = await import("/static/form/fields.js");
+  return sectionsOf(schema, values).flatMap((section) => section.fields);
+}"""
+
+
+def test_every_table_that_may_be_set_has_a_field_with_values_to_begin_with(form):
+    """One after the other, since tables have others inside; the field shows which it is, and takes it back."""
+    page, scenario, seen = form(), load_scenario("phantom3d"), {}
+    while True:
+        fields = page.evaluate(FIELDS, [json.loads(SCHEMA), scenario.flat()])
+        starts = {
+            each["key"]: each["start"] for each in fields if "start" in each and each["key"] not in seen
+        }
+        if not starts:
+            break
+        for key, start in starts.items():
+            before, scenario = scenario, scenario.with_values({key: start})
+            assert before.with_values({key: None}) == before != scenario
+        seen |= starts
+    optional = {"registration", "environment", "environment.plate"}
+    assert set(seen) == {f"tracker.{key}" for key in optional} | {"phantom.structure.hidden_layer"}
+
+
+def test_a_table_is_set_changed_and_taken_away(form, server):
+    page = form()
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    choice = page.locator("#field-phantom-structure-hidden_layer")
+    assert (choice.input_value(), choice.locator("option").all_text_contents()) == (
+        "",
+        ["not set", "own values"],
+    )
+    choice.focus()
+    choice.select_option("own values")
+    server.wait_for("edit")
+    layer = {"top_mm": 10.0, "thickness_mm": 5.0, "modulus_factor": 2.0}
+    assert server.asked("edit")[-1]["values"] == {"phantom.structure.hidden_layer": layer}
+    new = {f"phantom.structure.hidden_layer.{name}": value for name, value in layer.items()}
+    server.send(session(2, list(new), **new))
+    page.wait_for_selector("details[data-section='phantom.structure.hidden_layer'][open]")  # it is in sight
+    assert page.evaluate("document.activeElement.id") == "field-phantom-structure-hidden_layer"
+    assert choice.input_value() == "own values"
+    changed = page.locator(f"{FORM} [data-key='phantom.structure.hidden_layer'].changed")
+    assert changed.count() == 1
+    assert page.locator("#field-phantom-structure-hidden_layer-thickness_mm").input_value() == "5"
+    choice.select_option("not set")
+    until(page, "!flexneedle.store.get('draft')")
+    assert server.asked("edit")[-1]["values"] == {"phantom.structure.hidden_layer": None}
+
+
+def test_a_layer_gets_another_law_and_keeps_what_both_have(form, server):
+    page = form()
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    page.locator("#field-tissue-1-law").select_option("linear")
+    server.wait_for("edit")
+    values = server.asked("edit")[-1]["values"]
+    before = load_scenario("phantom3d")
+    linear = before.with_values(values)
+    assert [layer.law for layer in linear.tissue] == ["ogden", "linear"]
+    assert linear.tissue[0] == before.tissue[0]
+    assert linear.tissue[1].shear_modulus_kpa == before.tissue[1].shear_modulus_kpa
+    server.send(session(2, **linear.flat()).model_copy(update={"values": linear.flat()}))
+    page.wait_for_selector("#field-tissue-1-alpha", state="detached")
+    page.locator("#field-tissue-1-law").select_option("ogden")
+    until(page, "!flexneedle.store.get('draft')")
+    again = linear.with_values(server.asked("edit")[-1]["values"])
+    assert again.tissue[1].alpha == 8.74
+    assert again.tissue[1].model_copy(update={"alpha": before.tissue[1].alpha}) == before.tissue[1]
+
+
+def test_a_named_table_keeps_its_values_as_own_ones(form, server):
+    noisy = load_scenario("phantom3d").with_values(
+        {"tracker.environment": "noisy", "tracker.environment.tilt_mrad_per_mm": 5.0}
+    )
+    page = form([WELCOME, people(), session(**noisy.flat()), scene(), *scene_frames()])
+    page.fill(f"{FORM} input[type=search]", "environment")
+    choice = page.locator("#field-tracker-environment")
+    assert choice.input_value() == "noisy"
+    choice.select_option("own values")
+    server.wait_for("edit")
+    own = noisy.with_values(server.asked("edit")[-1]["values"])
+    environment = noisy.tracker.environment.model_copy(update={"name": "own"})
+    assert own.tracker.environment == environment
+    server.send(session(2, **own.flat()))
+    until(page, "flexneedle.store.get('session').revision === 2")
+    until(page, "document.querySelector('#field-tracker-environment').value === 'own values'")
+
+
+def test_a_layer_with_a_law_of_its_own_has_fields_for_its_values(form):
+    """Its law is not changed here: it could not be set again."""
+    own = {"tissue.1.law": "mine:Law", "tissue.1.yield_kpa": 3.0, "tissue.1.hardens": True}
+    given = session(**own)
+    del given.values["tissue.1.alpha"]
+    page = form([WELCOME, people(), given, scene(), *scene_frames()])
+    page.fill(f"{FORM} input[type=search]", "tissue.1.")
+    keys = page.evaluate(
+        "[...document.querySelectorAll('[data-key^=\"tissue.1.\"]')].map((each) => each.dataset.key)"
+    )
+    assert set(keys) >= {key for key in given.values if key.startswith("tissue.1.")}
+    assert "tissue.1.alpha" not in keys
+    law = page.locator("#field-tissue-1-law")
+    assert law.locator("option").all_text_contents() == ["mine:Law"]
+    assert page.locator("#field-tissue-1-yield_kpa").input_value() == "3"
+    assert page.locator("#field-tissue-1-hardens").is_checked()
+
+
+@pytest.mark.parametrize(
+    ("key", "chosen", "part"),
+    [
+        ("phantom.structure.hidden_layer", "own values", "phantom.structure.hidden_layer.top_mm"),
+        ("tissue.1.law", "ogden", "tissue.1.alpha"),
+    ],
+)
+def test_a_choice_that_is_refused_stays_with_the_problem_of_its_part(form, server, key, chosen, part):
+    """Of a part that has no field yet."""
+    server.answers["edit"] = Refused(what="edit", reason="no", problems={part: "must be at most 5"})
+    linear = session(**{"tissue.1.law": "linear"})
+    del linear.values["tissue.1.alpha"]
+    page = form([WELCOME, people(), linear, scene(), *scene_frames()])
+    page.fill(f"{FORM} input[type=search]", key)
+    choice = field(page, key).locator("select")
+    choice.focus()
+    choice.select_option(chosen)
+    problem = field(page, key).locator(".problem")
+    problem.wait_for()
+    assert problem.inner_text() == f"{part.split('.')[-1]}: must be at most 5"
+    assert choice.input_value() == chosen
+
+
+def test_a_problem_of_a_field_is_not_shown_at_its_table_too(form, server):
+    values = {"phantom.structure.hidden_layer": {"top_mm": 10.0, "thickness_mm": 5.0, "modulus_factor": 2.0}}
+    hidden = load_scenario("phantom3d").with_values(values)
+    key = "phantom.structure.hidden_layer.thickness_mm"
+    server.answers["edit"] = Refused(what="edit", reason="no", problems={key: "must be above 0 mm"})
+    page = form([WELCOME, people(), session(**hidden.flat()), scene(), *scene_frames()])
+    page.fill(f"{FORM} input[type=search]", "hidden_layer")
+    page.fill("#field-phantom-structure-hidden_layer-thickness_mm", "-1")
+    page.press("#field-phantom-structure-hidden_layer-thickness_mm", "Enter")
+    problem = field(page, key).locator(".problem")
+    problem.wait_for()
+    assert problem.inner_text() == "must be above 0 mm"
+    assert not field(page, "phantom.structure.hidden_layer").locator(".problem").is_visible()
+
+
+def test_a_choice_that_has_the_focus_follows_the_scenario(form, server):
+    """Another person has changed it, or the edit has come to nothing: nothing is being written in it."""
+    page = form()
+    page.fill(f"{FORM} input[type=search]", "setup.rotation")
+    choice = page.locator("#field-setup-rotation")
+    before = choice.input_value()
+    other = next(each for each in choice.locator("option").all_text_contents() if each != before)
+    choice.focus()
+    server.send(session(2, **{"setup.rotation": other}))
+    until(page, "flexneedle.store.get('session').revision === 2")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert (choice.input_value(), page.evaluate("document.activeElement.id")) == (
+        other,
+        "field-setup-rotation",
+    )
+
+
+def test_a_layer_that_is_added_opens_no_other(form, server):
+    page = form()
+    page.locator("details[data-section='tissue.0'] > summary").click()
+    page.get_by_role("button", name="Add a layer above layer 1").click()
+    server.wait_for("edit")
+    added = load_scenario("phantom3d").with_values(server.asked("edit")[-1]["values"])
+    assert len(added.tissue) == 3
+    server.send(session(2, **added.flat()))
+    page.wait_for_selector("details[data-section='tissue.2']")
+    opened = page.locator(f"{FORM} .sections > details[open]")
+    assert "tissue.2" not in opened.evaluate_all("all => all.map((each) => each.dataset.section)")
+
+
+def test_points_are_written_and_read_one_after_the_other(form, server):
+    points = [[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.5]]
+    values = load_scenario("phantom3d").with_values({"tracker.registration": {"fiducials_mm": points}}).flat()
+    page = form([WELCOME, people(), session(**values), scene(), *scene_frames()])
+    page.fill(f"{FORM} input[type=search]", "fiducials_mm")
+    given = page.locator("#field-tracker-registration-fiducials_mm")
+    assert given.input_value() == "0, 0, 0; 100, 0, 0; 0, 100, 0.5"
+    given.fill("0 0 0; 50 0; 0, 80, 0")
+    given.press("Enter")
+    problem = field(page, "tracker.registration.fiducials_mm").locator(".problem")
+    assert problem.inner_text() == "must be points x, y, z, separated by semicolons"
+    for missing in ("0, 0, ; 50, 0, 1; 0, 80, 0", "0 0 0;; 50 0 0; 0 80 0"):  # an empty part is no 0
+        given.fill(missing)
+        given.press("Enter")
+        assert problem.inner_text() == "must be points x, y, z, separated by semicolons"
+    given.fill("0 0 0; 50 0 −1; 0, 80, 0;")
+    given.press("Enter")
+    until(page, "!flexneedle.store.get('draft')")
+    assert server.asked("edit")[-1]["values"] == {
+        "tracker.registration.fiducials_mm": [[0, 0, 0], [50, 0, -1], [0, 80, 0]]
+    }
 
 
 def test_a_field_has_label_unit_and_bounds(form):
@@ -189,3 +389,44 @@ def test_it_fits_its_width(form, pictures, size, scheme):
     page.locator("#field-target-depth_mm").focus()
     assert too_wide(page) == []
     pictures(page, f"form-{size[0]}-{scheme}")
+
+
+def test_no_unit_is_left_in_a_label(form):
+    noisy = load_scenario("phantom3d").with_values({"tracker.environment": "noisy"})
+    fields = form().evaluate(FIELDS, [json.loads(SCHEMA), noisy.flat()])
+    labels = {each["key"]: [each["label"], each["unit"]] for each in fields}
+    assert labels["tracker.environment.tilt_mrad_per_mm"] == ["Tilt", "mrad/mm"]
+    units = {"mm", "mrad", "rad", "deg", "kpa", "gpa", "mn", "mj", "hz", "per"}
+    left = {key for key, (label, _) in labels.items() if units & set(label.lower().split())}
+    assert left == {"tracker.jitter_per_axis"} & set(labels)
+
+
+def test_a_tracker_without_an_environment_may_be_given_a_shipped_one(form, server):
+    """In which a metal plate distorts the field; its values have fields of their own from then on."""
+    assert ENVIRONMENTS.names() == ["ideal", "noisy"]
+    page = form()
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    choice = page.locator("#field-tracker-environment")
+    assert choice.locator("option").all_text_contents() == ["not set", *ENVIRONMENTS.names(), "own values"]
+    choice.select_option("noisy")
+    server.wait_for("edit")
+    assert server.asked("edit")[-1]["values"] == {"tracker.environment": "noisy"}
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_labels_are_readable(form, width):
+    """No word of a label is broken, beside the widest value as well."""
+    page = form(width=width, height=900)
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    broken = page.evaluate(
+        """() => [...document.querySelectorAll('.field > label')].filter((label) => {
+          const range = document.createRange();
+          return label.firstChild.data.split(' ').some((word) => {
+            const begin = label.firstChild.data.indexOf(word);
+            range.setStart(label.firstChild, begin);
+            range.setEnd(label.firstChild, begin + word.length);
+            return range.getClientRects().length > 1;
+          });
+        }).map((label) => label.textContent)"""
+    )
+    assert broken == []

@@ -36,14 +36,14 @@ def test_it_is_started_paced_and_stopped(panel, server):
     click(page, "Pause")
     server.send(insertion("paused", periods=3, pace=0.0))
     click(page, "One period")
-    page.select_option("[aria-label=Pace]", "5")
+    page.select_option("[aria-label=Pace]", "5")  # which moves nothing before it goes on
     click(page, "Continue")
     click(page, "Stop")
     server.wait_for("stop")
     kinds = ("insert", "pace", "advance", "stop")
     asked = [each for each in server.requests if each["type"] in kinds]
     assert [(each["type"], each.get("pace")) for each in asked] == [
-        ("insert", None), ("pace", 0), ("advance", None), ("pace", 5), ("pace", 5), ("stop", None),
+        ("insert", None), ("pace", 0), ("advance", None), ("pace", 5), ("stop", None),
     ]  # fmt: skip
     server.send(insertion("done", periods=3, pace=0.0, error_mm=0.0161))
     page.wait_for_selector("text=The tip ended 0.016 mm from the target.")
@@ -91,9 +91,13 @@ def test_a_plate_is_offered_only_to_a_tracker_with_a_field(panel, server):
     assert bring.is_enabled()
 
 
-def test_one_that_waits_for_its_worker_can_be_stopped_and_nothing_else(panel, server):
-    page = panel([*opening(), insertion("waiting", periods=0, pace=0.0)])
-    page.wait_for_selector("text=Waiting for the computation")
+@pytest.mark.parametrize(
+    ("state", "words"), [("waiting", "Waiting for the computation"), ("planning", "Planning")]
+)
+def test_before_it_moves_it_can_be_stopped_and_nothing_else(panel, server, state, words):
+    page = panel([*opening(), insertion(state, periods=0, pace=0.0)])
+    page.wait_for_selector(f"{PANEL} >> text={words}")
+    assert page.locator(f"{PANEL} button:text-is('Pause')").count() == 1
     buttons = page.locator(f"{PANEL} button:visible:enabled").all_inner_texts()
     assert buttons == ["Stop"]
     assert page.is_disabled("[aria-label=Pace]")
@@ -121,6 +125,40 @@ def test_disturbances_are_sent_and_listed(panel, server):
     ]
     server.send(Disturbances(active=["0.25 N on the tip"]))
     page.wait_for_selector("text=Active: 0.25 N on the tip")
+
+
+def test_a_disturbance_that_cannot_be_is_not_sent(panel, server):
+    page = panel([*opening(), in_a_field(), insertion("running")])
+    page.wait_for_selector(f"{PANEL} fieldset.disturb")
+    for label, text, button in (
+        ("Force on the tip in N", "", "Push"),
+        ("Factor on its stiffness", "-1", "Stiffen"),
+        ("Seconds without the tracker", "1e9", "Drop"),
+        ("Distance of the plate from the center of the tracker's workspace in mm", "-60", "Bring"),
+    ):
+        field = page.get_by_label(label, exact=True)
+        field.fill(text)
+        click(page, button)
+        assert not field.evaluate("(input) => input.checkValidity()")
+    page.get_by_label("Force on the tip in N").fill("0.1")
+    page.get_by_label("Direction of the force in degrees").fill("1000")
+    click(page, "Push")
+    page.get_by_label("Direction of the force in degrees").fill("90")
+    click(page, "Push")
+    sent = server.wait_for("disturb")
+    assert sent == [{"type": "disturb", "what": "push", "size": 0.1, "angle_deg": 90}]
+
+
+def test_decisions_of_a_recorded_run_are_said_to_be(panel, server):
+    """Above them is how the last insertion ended, which may be another."""
+    page = panel([*opening(), insertion("done", periods=3), rows(0, 3)])
+    whose = page.locator(f"{PANEL} >> text=Decisions of")
+    page.wait_for_selector(f"{PANEL} >> text=Period 3")
+    assert not whose.is_visible()
+    recorded = insertion("done", of="first", periods=5).model_copy(update={"name": "mine"})
+    server.send(recorded, rows(0, 5, "first"))
+    whose.wait_for()
+    assert whose.inner_text() == "Decisions of mine, which is shown:"
 
 
 MOVES = [
@@ -275,6 +313,22 @@ def test_anybody_can_stop_and_only_who_steers_can_do_more(panel, server):
     assert page.locator(PANEL).get_by_role("button", name="Pause", exact=True).is_disabled()
     click(page, "Stop")
     assert server.wait_for("stop") == [{"type": "stop"}]
+
+
+def test_on_a_telephone_the_section_stays_in_view_above_what_is_done_to_it(panel, server):
+    page = panel(width=390, height=844)
+    box = """(selector) => {
+      document.querySelector(selector).scrollIntoView({ block: 'end' });
+      const { top, bottom } = document.querySelector('.section canvas').getBoundingClientRect();
+      return [top, bottom];
+    }"""
+    assert page.evaluate("getComputedStyle(document.querySelector('.panel.section')).position") == "static"
+    server.send(insertion("running", periods=3), rows(0, 3))
+    page.wait_for_selector(f"{PANEL} fieldset.disturb")
+    assert page.evaluate(box, "[data-panel=plots]")[0] >= 0.0
+    top, bottom = page.evaluate(box, "fieldset.disturb")
+    push = page.locator(PANEL).get_by_role("button", name="Push", exact=True).bounding_box()
+    assert 0 <= top < bottom < push["y"] < 844 - push["height"]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -213,3 +213,21 @@ def test_it_is_drawn_at_each_size(plans, pictures, size, scheme):
     page.wait_for_timeout(300)
     assert too_wide(page) == []
     pictures(page, f"plans-{size[0]}-{scheme}")
+
+
+SAMPLED = """async () => {
+  const { sampledPaths } = await import("/static/planned.js");
+  return sampledPaths(flexneedle.store)?.number ?? null;
+}"""
+
+
+def test_in_a_comparison_the_paths_of_the_strategy_that_is_searched_are_shown(plans, server):
+    page = plans()
+    server.send(iteration(2), samples(2))
+    server.send(Job(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
+    server.send(samples(3, source=Source.STEERING))
+    until(page, "flexneedle.store.get('shape samples steering')")
+    assert page.evaluate(SAMPLED) == 3
+    server.send(Job(job=4, kind="compare", state="done"))
+    until(page, "flexneedle.store.get('job compare').state === 'done'")
+    assert page.evaluate(SAMPLED) == 2

@@ -1,5 +1,7 @@
 """The player: which insertion and period all views show; plots follow it, and choose it."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -101,7 +103,7 @@ def test_playing_pauses(player):
 
 def test_what_is_shown_is_chosen(player):
     page = player([*inserting(10), *recorded()])
-    for text, of in (("Plan", "scene"), ("Recorded run", "first"), ("Insertion", "live")):
+    for text, of in (("Target and plan", "scene"), ("Recorded run", "first"), ("Insertion", "live")):
         page.click(f"{PLAYER} [role=group] button:has-text('{text}')")
         until(page, f"flexneedle.store.get('view of') === '{of}'")
         shows(page, of)
@@ -120,7 +122,7 @@ def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
     server.send(insertion("planning", periods=0), insertion("running"), rows(0, 3))
     shows(page, "live")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 3 of 3']")
-    choose(page, "Plan")
+    choose(page, "Target and plan")
     server.send(insertion("done", periods=3), insertion("planning", periods=0))
     shows(page, "live")
     server.send(insertion("running"), rows(0, 4))
@@ -135,7 +137,7 @@ def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
 def test_a_run_that_is_opened_is_shown_at_its_end_also_the_same_again(player, server, name):
     page = player()
     choose(page, "Recorded run", 20)
-    choose(page, "Plan")
+    choose(page, "Target and plan")
     server.send(*recorded(name=name))
     shows(page, "first")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
@@ -169,7 +171,7 @@ def test_after_a_lost_connection_the_same_is_shown(player, server):
 
 def test_what_begins_while_the_connection_is_lost_is_shown(player, server):
     page = player([*opening(), insertion("done"), rows(0, 70)])
-    choose(page, "Plan")
+    choose(page, "Target and plan")
     server.news = [*opening(), insertion("running", periods=3), rows(0, 3)]
     server.drop()
     shows(page, "live")
@@ -316,6 +318,24 @@ def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
     }"""
     for period, second in ((0, 0), (3, 6), (10, 20), (30, 49)):
         assert page.evaluate(at, period) == [second, second]
+    page.evaluate("flexneedle.store.set('view of', 'scene')")  # chosen: nothing is compared with it
+    shown = """async () => Boolean((await import("/static/shown.js")).shownSecond(flexneedle.store))"""
+    assert not page.evaluate(shown)
+    server.send(insertion("done", of="second", periods=40))  # another one is opened, and shown
+    until(page, "flexneedle.store.get('insertion second').periods === 40")
+    assert page.evaluate("flexneedle.store.get('view of')") is None
+    assert page.evaluate(shown)
+
+
+def test_without_an_insertion_a_second_run_is_beside_the_scene(visit, server):
+    """Also where the scene was chosen: there is nothing else to choose."""
+    server.news = [*opening(), insertion("done", of="second", periods=10), rows(0, 10, "second")]
+    page = visit(ready="[data-panel=section] canvas")
+    shown = """async () => (await import("/static/shown.js")).shownSecond(flexneedle.store)?.row.index"""
+    until(page, "flexneedle.store.get('rows second')?.length === 10")
+    for of in (None, "scene"):
+        page.evaluate(f"flexneedle.store.set('view of', {json.dumps(of)} ?? undefined)")
+        assert page.evaluate(shown) == 9
 
 
 def test_another_run_of_the_same_length_takes_the_place_of_the_last(player):
@@ -414,3 +434,13 @@ def test_it_fits_its_width(player, pictures, size, scheme):
     page.wait_for_timeout(200)
     assert too_wide(page) == []
     pictures(page, f"plots-{size[0]}-{scheme}")
+
+
+def test_a_line_without_a_change_is_in_the_middle_of_its_plot(player):
+    page = player()
+    ranges = page.evaluate("""async () => {
+      const { rangeOf } = await import("/static/plots/plot.js");
+      return [[0, 0], [-90, -90], [null, null], [0, 10]].map((each) => rangeOf(null, ...each));
+    }""")
+    assert ranges[:3] == [[-1, 1], [-135, -45], [None, None]]
+    assert ranges[3][0] <= 0 < 10 < ranges[3][1]

@@ -103,7 +103,10 @@ def test_during_an_insertion_all_views_name_the_true_and_the_measured_tip(views,
 
 @pytest.mark.parametrize(
     ("state", "text", "form"),
-    [(planned, "needle at the target, planned", "line"), (inserting, "predicted needle ± 2 sd", "area")],
+    [
+        (planned, "needle at the target, planned", "line"),
+        (inserting, "predicted needle at the target ± 2 sd", "area"),
+    ],
 )
 def test_all_legends_show_the_needle_at_the_target_alike(views, state, text, form):
     """As a line; as an area where it has a band."""
@@ -138,8 +141,9 @@ def test_a_plan_of_an_earlier_state_stays_where_there_is_no_estimate(views):
     assert page.evaluate(f"async () => {stale}")
 
 
-DRAWN = """async (stretch) => {
-  const { drawScene } = await import("/static/flat/section.js");
+DRAWN = """async ([stretch, right]) => {
+  const { drawSection } = await import("/static/flat/section.js");
+  const { layersIn } = await import("/static/flat/layers.js");
   const { mappingOf, planeOf } = await import("/static/flat/plane.js");
   const [scene, calls] = [flexneedle.store.get("scene"), []];
   const call = (name) => (...values) => {
@@ -147,9 +151,11 @@ DRAWN = """async (stretch) => {
     return { width: 6 * String(values[0]).length };  // of a text
   };
   const pen = new Proxy({}, { get: (_, name) => call(name), set: () => true });
-  const map = mappingOf({ left: -50, right: 50, half: 10 }, 400, 300, stretch);
+  const map = mappingOf({ left: -50, right, half: 10 }, 400, 300, stretch);
   const plane = planeOf("target", scene, scene.target);
-  drawScene(pen, { width: 400, height: 300, map, plane, name: "target", scene });
+  const [layers, target_] = [layersIn(scene), scene.target];
+  const what = { name: "target", scene, layers, guide: null, target: target_, parts: [], outline: [] };
+  drawSection(pen, { width: 400, height: 300, map, plane, ...what, store: flexneedle.store });
   const target = calls.find(([name]) => name === "ellipse");
   const words = calls.filter(([name]) => name === "fillText").map(([, text, x, y]) => ({ text, x, y }));
   return { scales: [map.sx, map.sy], radii: target.slice(3, 5), texts: words.map(({ text }) => text), words };
@@ -161,10 +167,19 @@ DRAWN = """async (stretch) => {
     [(1, 1.0, ""), (3, 3.0, ", lateral ×3"), (5, 3.81, ", lateral ×3.8")],  # as much as there is room for
 )
 def test_a_stretched_axis_is_named_and_the_target_is_1_mm_in_it(views, stretch, times, label):
-    drawn = views().evaluate(DRAWN, stretch)
+    drawn = views().evaluate(DRAWN, [stretch, 50])
     assert drawn["radii"] == drawn["scales"]
     assert drawn["scales"][1] / drawn["scales"][0] == pytest.approx(times, rel=0.01)
     assert f"from the axis (mm){label}" in drawn["texts"]
+
+
+@pytest.mark.parametrize(("right", "last"), [(60, "40"), (70, "60")])
+def test_a_number_at_the_edge_has_room_or_is_left_out(views, right, last):
+    """Numbers of the axis are each 20 mm; the edge is at `right`."""
+    words = views().evaluate(DRAWN, [1, right])["words"]
+    numbers = [each for each in words if each["text"].isdecimal() and each["y"] > 290]
+    assert numbers[-1]["text"] == last
+    assert all(each["x"] + 3 * len(each["text"]) <= 400 for each in numbers)
 
 
 def test_names_of_thin_layers_are_below_each_other(views):
@@ -175,7 +190,7 @@ def test_names_of_thin_layers_are_below_each_other(views):
         layers.append({"name": name, "top_mm": top, "bottom_mm": bottom, "shear_modulus_kpa": 5.0})
         top = bottom
     page = views([*opening(), scene().model_copy(update={"layers": layers})])
-    words = [each for each in page.evaluate(DRAWN, 1)["words"] if each["text"] in names]
+    words = [each for each in page.evaluate(DRAWN, [1, 50])["words"] if each["text"] in names]
     assert [each["text"] for each in words] == names
     assert len({each["y"] for each in words[:3]}) == 3
     assert words[0]["y"] == words[3]["y"]  # which is thick enough
@@ -369,3 +384,19 @@ def test_nothing_is_moved_where_another_steers_or_an_insertion_runs(views, news)
     page = views([*opening(), *news])
     until(page, "!document.querySelector('.handle')")
     assert page.locator(f"{SECTION} .legend li").count() > 0  # it is drawn
+
+
+def test_after_an_insertion_the_way_back_to_the_target_is_shown(views, server):
+    page = views([*inserting(10)])
+    note = page.locator(f"{SECTION} >> text=This is an insertion")
+    assert not note.is_visible()  # while it runs
+    server.send(insertion("done", periods=11))
+    note.wait_for()
+    assert not handle(page, "target").count()
+    server.send(people(2, steering=2))
+    note.wait_for(state="hidden")  # who watches can move nothing
+    server.send(people(2, steering=1))
+    page.locator(SECTION).get_by_role("button", name="Target and plan").click()
+    handle(page, "target").wait_for()
+    assert not note.is_visible()
+    assert page.locator("[data-panel=space] >> text=This is an insertion").count() == 1

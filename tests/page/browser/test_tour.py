@@ -2,6 +2,8 @@
 
 import pytest
 
+from flexneedle.page.messages import Job
+
 pytestmark = pytest.mark.page
 
 CARD = "[role=dialog][aria-label=Tour]"
@@ -23,9 +25,23 @@ def test_it_is_shown_once(visit, pictures, width, scheme):
     assert not page.is_visible(CARD)
 
 
+@pytest.mark.parametrize("width", [1280, 390])
+def test_it_leaves_the_work_at_the_foot_in_sight(visit, server, width):
+    """After installation that says for a minute what is waited for."""
+    page = visit(tour=True, width=width, ready=f"{CARD}:visible")
+    words = "compiled, the first time after installation this takes about a minute, and then never again"
+    for number, kind in enumerate(("needle", "estimate", "plan"), 101):
+        server.send(Job(job=number, kind=kind, state="running", text=words))
+    page.wait_for_selector("footer .job:nth-child(3)")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    card, foot = page.locator(CARD).bounding_box(), page.locator("footer").bounding_box()
+    assert card["y"] + card["height"] <= foot["y"]
+
+
 def test_it_is_followed_by_keys_to_its_end(visit):
     page = visit()
     page.click("text=Tour")
+    assert page.locator(f"{CARD} [aria-live=polite]").count() == 2  # the text, and which it is
     stops = []
     while page.is_visible(CARD):
         stops.append(page.evaluate("document.querySelector('.toured').className || 'settings'"))

@@ -66,6 +66,7 @@ def frame(**reading):
         ({"A": MotorState("3", 0.0)}, "channel A: position must be a number, not a str"),
         ({"A": MotorState(0.0, None)}, "channel A: commanded must be a number, not None"),
         ({"A": MotorState(0.0, 0.0, on="off")}, "channel A: on must be True or False, not a str"),
+        ({"A": MotorState(0.0, 0.0, repeated="no")}, "channel A: repeated must be True or False, not a str"),
         ({"A": MotorState(0.0, 0.0, stopped=None)}, "channel A: stopped must be text, not None"),
     ],
 )

@@ -1,5 +1,7 @@
 """States of motors from what the controller reports, with what the driver commanded."""
 
+from dataclasses import replace
+
 import pytest
 
 from flexneedle.rig.devices.galil.replies import GarbledError
@@ -135,3 +137,25 @@ def test_at_rest_without_a_command_no_stop_is_reported():
 def test_values_that_an_axis_cannot_have_are_refused(values):
     with pytest.raises(GarbledError):
         report(*values)
+
+
+def test_a_target_that_waits_is_given_up_where_the_controller_stops_the_axis():
+    """It rests then: who searches a limit switch waits for that. Another stop of its own is as good."""
+    channel = replace(
+        after(Channel(), (0, REST, ARRIVED)).follows(100, tracking=False), target=200, waiting=True
+    )
+    moved, at_switch = (50, MOVING, RUNS), (60, 0b0000_1011, 3)
+    assert [state.moving for state in states(channel, moved, at_switch, at_switch)] == [True, False, False]
+    assert not after(channel, moved, at_switch).waiting
+    ended_there = (
+        100,
+        0b0000_0111,
+        ARRIVED,
+    )  # its move ends just at the forward switch, to which the target leads
+    assert [state.moving for state in states(channel, moved, ended_there)] == [True, False]
+    ended_behind = (100, 0b0000_1011, ARRIVED)  # at the reverse switch, from which the target leads away
+    assert [state.moving for state in states(channel, moved, ended_behind)] == [True, True]
+    assert after(channel, moved).waiting
+    assert [state.moving for state in states(channel, (100, REST, ARRIVED))] == [
+        True
+    ]  # it is still to be sent

@@ -258,7 +258,7 @@ def test_a_repeated_frame_is_rejected_and_not_stored():
     again = Measurement(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
     after, verdict = monitor.check(again, at_rest, 0.075, 0.3, 2.0)
     assert str(verdict) == "stale: frame 2 after frame 2"
-    assert after is monitor
+    assert after == replace(monitor, rejected=True)
 
 
 def test_an_old_reading_is_stale():
@@ -352,7 +352,7 @@ def test_a_reading_with_an_invalid_time_does_not_change_the_verdict_on_the_field
     measurement = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
     after, verdict = monitor.check(measurement, at_rest, 1.0, 0.3, 2.0)
     assert str(verdict).startswith(("stale", "not a number"))
-    assert after is monitor
+    assert after == replace(monitor, rejected=True)
     assert str(after.check_field()[1]).startswith("field distorted")
 
 
@@ -397,6 +397,38 @@ def test_a_tip_missing_after_a_jump_does_not_take_that_back():
     gone = Measurement(time + 0.025, None, None, None, frame(time + 0.025, tip=None))
     monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
     assert monitor.last_good_before_dropout(gone, verdict) is None
+
+
+@pytest.mark.parametrize(
+    ("seconds", "values", "number"),
+    [
+        (0.025, {"y": math.nan}, 3),
+        (0.025, {"time": math.nan}, 3),
+        (0.025, {"time": -5.0}, 3),  # stale
+        (0.025, {}, 2),  # the frame before, again
+        (1.5, {"y": 9.0}, 3),  # a jump, which the window of the indicators has left
+    ],
+)
+def test_a_tip_missing_after_any_rejected_reading_holds_the_needle(seconds, values, number):
+    settings = SETTINGS.model_copy(update={"lost_after_s": 2.0})
+    monitor, _ = observed(Monitor(settings), (0.02, 0.02, 0.02), 0.0, 3)
+    last = monitor.good
+    time = last.time + 1.0 / RATE
+    bad = replace(Measurement(time, last.x, last.y, last.z, replace(frame(time), number=number)), **values)
+    monitor, verdict = monitor.check(bad, at_rest, time, 0.3, 2.0)
+    assert not verdict.ok
+    assert verdict.kind is not VerdictKind.MISSING
+    gone_at = time + seconds
+    gone = Measurement(gone_at, None, None, None, frame(gone_at, tip=None))
+    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
+    assert verdict.kind is VerdictKind.MISSING
+    assert monitor.last_good_before_dropout(gone, verdict) is None
+    good = Measurement(gone_at + 0.025, last.x, last.y, last.z, frame(gone_at + 0.025))
+    monitor, verdict = monitor.check(good, at_rest, good.time, 0.3, 2.0)
+    assert verdict.ok
+    gone = Measurement(good.time + 0.025, None, None, None, frame(good.time + 0.025, tip=None))
+    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
+    assert monitor.last_good_before_dropout(gone, verdict) == good
 
 
 def test_a_disabled_monitor_still_rejects_missing_and_improbable_readings():

@@ -1,6 +1,7 @@
 """The client waits for what its requests have changed, and takes no earlier report for it."""
 
 import os
+import threading
 from multiprocessing.connection import Connection
 from threading import Thread
 
@@ -92,8 +93,35 @@ def test_what_a_follower_raises_is_raised_where_the_client_waits_and_the_rig_can
             made.wait(5.0)
         assert made.ended is None
         made.stop()
-    assert len(seen) == 1
+        sent = made._sent
+        for move in (made.arm, lambda: made.move_to("insertion", 1.0)):
+            with pytest.raises(type(error), match=str(error)):
+                move()
+        assert made._sent == sent  # nothing was asked for
+        made.stop()
+    assert len(seen) > 1  # it goes on getting reports, as the others do
     assert made.ended == ""
+
+
+@pytest.mark.usefixtures("scripted")
+@pytest.mark.parametrize("waits", [True, False])
+def test_what_a_follower_raises_after_the_last_wait_is_printed(monkeypatch, waits):
+    """By the hook for errors of threads; once, also if it was raised before."""
+    printed, fails = [], []
+    monkeypatch.setattr(threading, "excepthook", printed.append)
+
+    def follower(_report):
+        if fails:
+            raise OSError("no space left")
+
+    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
+    with Supervisor(task, follower) as made:
+        fails.append(True)
+        made.stop()
+        if waits:
+            with pytest.raises(OSError, match="no space left"):
+                made.wait(5.0)
+    assert [str(one.exc_value) for one in printed] == ([] if waits else ["no space left"])
 
 
 def test_after_a_stop_a_reset_is_accepted(supervisor):

@@ -326,38 +326,6 @@ def test_after_homing_the_rig_is_not_armed(bench):
     assert bench.sent[-1].why.startswith("step: refused while idle")
 
 
-def at_switch(**keys):
-    """A bench whose guide rests at the reverse limit switch of its home."""
-    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0, **keys}))
-    motor = bench.stage.motors["C"]
-    motor.low = motor.position
-    bench.tick()
-    return bench.armed(), motor
-
-
-def test_an_axis_at_its_switch_is_at_home():
-    bench, _ = at_switch()
-    bench.core.request(say.Home(1, "guide_y"))
-    assert bench.until(1).why == ""
-    assert bench.position("guide_y") == pytest.approx(14.4, abs=2e-3)
-
-
-def test_a_switch_that_stays_active_is_no_home():
-    bench, motor = at_switch()
-    read = bench.stage.read
-
-    def stuck():
-        found = read()
-        found["C"] = found["C"].__class__(**{**vars(found["C"]), "reverse_limit": True})
-        return found
-
-    bench.stage.read = stuck
-    motor.low = -math.inf
-    bench.tick()
-    bench.core.request(say.Home(1, "guide_y"))
-    assert bench.until(1).why == "guide_y: the reverse-limit switch is still active away from it"
-
-
 def test_a_home_that_cannot_be_defined_is_a_fault(bench):
     bench.stage.define = lambda *_: bench.stage._called("define") or setattr(bench.stage, "lost", True)
     bench.core.request(say.Home(1, "rotation"))

@@ -84,16 +84,16 @@ def test_a_tip_that_is_not_measured_is_none():
 
 def test_operators_move_axes(supervisor):
     with pytest.raises(RefusedError, match="jog: refused while idle"):
-        supervisor.jog("guide_y", 1.0)
+        supervisor.move_to("guide_y", 1.0)
     supervisor.arm()
-    supervisor.jog("guide_y", 1.0)
+    supervisor.move_to("guide_y", 1.0)
     supervisor.move_to("insertion", 2.0)
     supervisor.retract(-1.0)
     supervisor.home("rotation")
     found = {name: round(axis.position, 1) for name, axis in supervisor.report.axes.items()}
     assert found == {"guide_y": 1.0, "insertion": -1.0, "rotation": 0.0}
     with pytest.raises(RefusedError, match="no axis nose; axes: insertion"):
-        supervisor.jog("nose", 1.0)
+        supervisor.move_to("nose", 1.0)
 
 
 def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
@@ -269,6 +269,16 @@ def test_a_motion_longer_than_the_heartbeat_is_kept_alive_by_its_client(supervis
     supervisor.arm()
     supervisor.move_to("insertion", 9.0)
     assert supervisor.report.axes["insertion"].position == pytest.approx(9.0, abs=0.02)
+
+
+def test_after_a_suspended_computer_nothing_goes_on_by_itself():
+    """The monotonic clock stands still meanwhile: no heartbeat is missed, and no tick late."""
+    with Supervisor(task("stages:suspended_motors")) as supervisor:
+        supervisor.arm()
+        with pytest.raises(StoppedError, match=r"the computer was suspended for 3600\.0 s"):
+            supervisor.step(0.0, {"insertion": 1.0}, 0.2)
+        supervisor.stop()
+        assert 0.3 < supervisor.report.axes["insertion"].position < 0.6
 
 
 def test_motors_of_a_dry_run_get_no_command(tmp_path):

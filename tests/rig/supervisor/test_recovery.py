@@ -128,14 +128,14 @@ def stall(supervisor, order, why):
     supervisor.arm()
     order("fault stall=A")
     with pytest.raises(DriverError, match=why):
-        supervisor.jog("insertion", 5.0)
+        supervisor.move_to("insertion", supervisor.positions["insertion"] + 5.0)
     supervisor.stop()
     supervisor.reset()
 
 
 def assert_moves(supervisor):
     at = supervisor.positions["insertion"]
-    supervisor.jog("insertion", 2.0)
+    supervisor.move_to("insertion", at + 2.0)
     assert supervisor.positions["insertion"] == pytest.approx(at + 2.0, abs=0.02)
 
 

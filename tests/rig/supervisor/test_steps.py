@@ -231,6 +231,22 @@ def test_arming_beyond_a_range_is_refused():
     assert bench.sent[0].why.startswith("arm: refused: insertion = -6.000 mm: must be within")
 
 
+@pytest.mark.parametrize(("beyond", "armed"), [(0.05, True), (0.2, False)])
+def test_a_rig_is_armed_where_lost_motion_may_have_left_it_and_refused_with_its_motors_off(beyond, armed):
+    """As after a retraction to the end of the range, which a new supervisor does not know of."""
+    bench = Bench(rig_file(insertion={"backlash_mm": 0.1}))
+    motor, low = bench.stage.motors["A"], rig_file().axes.insertion.limits[0]
+    motor.on = False
+    motor.position = motor.commanded = motor.target = 1000.0 * (low - beyond)
+    bench.tick()
+    bench.armed()
+    assert (bench.core.state is State.ARMED) == armed
+    assert motor.on == armed
+    if armed:
+        bench.core.request(step())
+        assert bench.until(1).why == ""
+
+
 def test_ticks_go_on_while_the_controller_thinks(bench):
     bench.core.request(step())
     bench.until(1)

@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
-from stages import Bench
+from stages import Bench, rig_file
 
 FAR = say.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 
@@ -175,13 +175,57 @@ def test_a_limit_switch_that_becomes_active_during_a_hold_is_a_fault(bench):
     assert bench.core.why == "guide_y: at rest, reverse limit switch active"
 
 
+def test_a_channel_of_no_axis_that_a_driver_begins_to_report_changes_nothing(bench):
+    read = bench.stage.read
+    bench.stage.read = lambda: read() | {"X": replace(read()["A"], forward_limit=True)}
+    bench.core.request(step())
+    assert bench.until(1).travelled["insertion"] == pytest.approx(1.0, abs=0.02)
+    assert bench.core.state is State.INSERTING
+
+
 @pytest.mark.parametrize("side", ["low", "high"])
-def test_a_limit_switch_that_was_active_before_is_none(side):
-    bench = Bench()
+def test_an_operator_may_move_an_axis_whose_limit_switch_is_active(side):
+    bench = Bench(tracked=False)
     setattr(bench.stage.motors["C"], side, 0.0)
     bench.tick()
     bench.armed().tick(20)
     assert bench.core.state is State.ARMED
+
+
+AWAY = ", but the home is at 15.000 mm"
+
+
+@pytest.mark.parametrize(
+    ("home", "at", "low", "high", "problem"),
+    [
+        ("here", 0.0, -math.inf, 0.0, "the forward limit switch is active at 0.000 mm"),
+        ("absolute", 0.0, 0.0, math.inf, "the reverse limit switch is active at 0.000 mm"),
+        ("reverse-limit", 0.0, 0.0, math.inf, f"the reverse limit switch is active at 0.000 mm{AWAY}"),
+        ("reverse-limit", -15.0, -math.inf, 7500.0, "the forward limit switch is active at -15.000 mm"),
+        ("reverse-limit", 14.69, 0.0, math.inf, f"the reverse limit switch is active at 14.690 mm{AWAY}"),
+        ("reverse-limit", 14.71, 0.0, math.inf, ""),
+        ("reverse-limit", 15.0, 0.0, math.inf, ""),
+        (
+            "reverse-limit",
+            15.0,
+            0.0,
+            -8000.0,
+            "both limit switches are active: check their wiring and polarity",
+        ),
+    ],
+)
+def test_no_insertion_begins_at_a_limit_switch_but_that_of_the_home_and_there(home, at, low, high, problem):
+    keys = {"home": home} | ({"home_mm": 15.0} if home == "reverse-limit" else {})
+    bench = Bench(rig_file(guide_y=keys))
+    motor = bench.stage.motors["C"]
+    motor.position = motor.commanded = motor.target = -500.0 * at
+    motor.low, motor.high = low, high
+    bench.tick()
+    bench.armed()
+    assert bench.core.state is (State.IDLE if problem else State.ARMED)
+    if problem:
+        assert bench.sent[-1].why == f"arm: refused: guide_y: {problem}"
+        assert ("power", "C", True) not in bench.stage.calls
 
 
 @pytest.mark.parametrize("state", ["armed", "inserting"])

@@ -159,7 +159,8 @@ def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[
     catching_up = fitted.lag + step / setup.insertion_speed_mm_s
     rests = max(memory.rests, sum(left <= distance * step + 1e-9 for distance in _RESTS))
     if rests > memory.rests or _surprised(fitted):
-        return catching_up, rests
+        # None where the needle was measured at rest for as long already, since the decision came late.
+        return max(0.0, catching_up), rests
     return 0.0, rests
 
 

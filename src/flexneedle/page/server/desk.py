@@ -266,11 +266,15 @@ class Desk:
 
     def _cancel(self, number: int) -> None:
         for jobs in (self._plans, self._insertions):
-            if number in jobs.numbers:
-                if number == self.rig.job:
-                    raise Refusal("it is an insertion on the rig: stop it instead")
-                jobs.cancel_job(number)
-                return
+            kind = next((work.kind for work in jobs.works if work.job == number), None)
+            if kind is None:
+                continue
+            if number == self.rig.job:
+                raise Refusal("it is an insertion on the rig: stop it instead")
+            if kind == "save":
+                raise Refusal("a run that is being saved is not cancelled: what is lost is nowhere else")
+            jobs.cancel_job(number)
+            return
         raise Refusal(f"job = {number}: does not run or wait")
 
     def _open(self, request: m.Open) -> None:
@@ -296,6 +300,8 @@ class Desk:
         self._plans.add(work)
 
     def _save(self, request: m.Save) -> None:
+        if any(work.kind == "save" for jobs in (self._plans, self._insertions) for work in jobs.works):
+            raise Refusal("another run is being saved: wait for its end")
         work = Work(job=0, do="save", kind="save", name=request.name)
         if request.of == "live":
             self.live.require_ended()

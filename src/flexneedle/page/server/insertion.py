@@ -5,7 +5,7 @@ from typing import Any
 
 from flexneedle.console.common import STILL_IN
 from flexneedle.page.frames import Source
-from flexneedle.page.messages import Disturb, Insertion
+from flexneedle.page.messages import Disturb, Disturbances, Insertion
 from flexneedle.page.orders import Work
 from flexneedle.page.server.hub import Hub
 from flexneedle.page.server.jobs import Jobs
@@ -25,6 +25,7 @@ class Live:
         """jobs: of the worker of insertions; rig: the connected one, with the insertion on it."""
         self._hub, self._jobs, self._limits, self._rig = hub, jobs, limits, rig
         self._job: int | None = None
+        self._stopped = ""
         self._pace = 1.0
         self._layers, self._in_a_field = 0, False
         self._news: dict[str, Any] | None = None
@@ -53,6 +54,7 @@ class Live:
             self._rig.stop(why)
             return
         job = self._require_running()
+        self._stopped = f"stopped: {why}"
         if self._jobs().signal(job, stop=why):
             self._jobs().expect_end(self._limits.stop_s)
         else:
@@ -83,14 +85,14 @@ class Live:
         if disturb.what == "plate" and not self._in_a_field:
             raise Refusal(
                 "the tracker of this scenario has no field that metal distorts: "
-                "set tracker.environment to ideal or noisy"
+                "set tracker.environment, for example to ideal"
             )
         self._signal("a disturbance", disturb=disturb.model_copy(update={"request": None}))
 
     def alone(self) -> None:
         """Nobody is connected: a virtual insertion ends; one on the rig rests since nobody steers."""
         if self._job is not None:
-            self._jobs().cancel_job(self._job)
+            self.stop("nobody was connected")
 
     def note(self, values: dict[str, Any]) -> None:
         """Keep what the worker has reported."""
@@ -114,7 +116,8 @@ class Live:
         if state == "failed" and work.rig and periods:
             text = "; ".join((text, STILL_IN.format(rig=work.rig)))
         if state != "done" and news["state"] in _RUNS:
-            outcome = "failed" if state == "failed" else "interrupted"
+            outcome = "failed" if state == "failed" and not self._stopped else "interrupted"
+            text = "; ".join(filter(None, (self._stopped, text)))
             over = {"state": outcome, "summary": text or outcome, "pace": 0.0, "periods": periods}
             self._hub.publish(Insertion.model_validate(news | over))
 
@@ -133,9 +136,10 @@ class Live:
 
     def _begin(self, work: Work, rig: str) -> None:
         """Forget the last insertion, and show that one waits, which anybody may stop. rig: its name, "" without one."""
-        self._layers, self._news = len(work.scenario["tissue"]), None
+        self._layers, self._news, self._stopped = len(work.scenario["tissue"]), None, ""
         self._in_a_field = work.scenario.get("tracker", {}).get("environment") is not None
-        self._hub.forget((_ROWS, "disturbances"))
+        self._hub.forget((_ROWS,))
+        self._hub.publish(Disturbances(active=[]))
         self._hub.forget_frames(Source.LIVE)
         target = work.scenario["target"]
         self._waiting = Insertion(

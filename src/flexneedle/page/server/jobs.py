@@ -83,9 +83,9 @@ class Jobs:
         self.worker = Worker(name, command, self._message, self._next, self._ended)
 
     @property
-    def numbers(self) -> list[int]:
-        """Numbers of the jobs that run or wait."""
-        return [job.work.job for job in self._all()]
+    def works(self) -> list[Work]:
+        """Orders of the jobs that run or wait."""
+        return [job.work for job in self._all()]
 
     def add(self, work: Work) -> int:
         """Add a job, with a number that it gets here, and return that. It replaces an older one of its kind."""

@@ -1,6 +1,7 @@
 """The web socket of a client: its requests one after the other, and the news as fast as it takes them."""
 
 import asyncio
+import re
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,8 @@ from flexneedle.scenario.problems import printable
 _TRY_LATER, _AGAINST_RULES = 1013, 1008
 _LONGEST_REASON = 120  # bytes of the reason of a close frame, of which 123 are allowed
 _LONGEST_STOP = 100
+_LONGEST_NUMBER = 40
+_NUMBER = re.compile(r'"request"\s*:\s*(\d{1,15})\s*\}\s*$')
 
 
 class _Gone(Exception):
@@ -97,7 +100,7 @@ def _is_stop(text: str | None) -> bool:
 
 def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:
     """Carry out a request, and answer it."""
-    what, number = "message", None
+    what, number = "message", _number(text)
     try:
         request = _parsed(text, desk.limits.file_bytes)
         what, number = request.type, request.request
@@ -115,6 +118,12 @@ def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:
     else:
         if number is not None:
             outbox.answer(Done(request=number))
+
+
+def _number(text: str | None) -> int | None:
+    """The number of a request of a page, which has it last, or None: for the answer where the rest is no request."""
+    found = _NUMBER.search((text or "")[-_LONGEST_NUMBER:])
+    return int(found[1]) if found else None
 
 
 def _parsed(text: str | None, longest: int) -> AnyRequest:

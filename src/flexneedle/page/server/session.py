@@ -18,6 +18,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import printable
+from flexneedle.scenario.sections.needle import GAUGES, Needle
 from flexneedle.scenario.sections.settings import Target
 
 _MOST_DOTS, _MOST_KEYS = 300, 1_000
@@ -53,7 +54,8 @@ class Session:
     def edited(self, values: Mapping[str, Any]) -> "Session":
         """The session with values of the scenario changed by key. Raises Refusal with the problems by key."""
         with _refused():
-            return self._changed(scenario=self.scenario.with_values(values))
+            changed = {**_cross_section(self.scenario.needle, values), **values}
+            return self._changed(scenario=self.scenario.with_values(changed))
 
     def with_preset(self, name: str) -> "Session":
         """The session with a scenario of the package. Raises Refusal."""
@@ -106,6 +108,17 @@ class Session:
         revision = self.revision + 1
         begun = replace(self, name=name, origin=scenario, scenario=scenario, notes=notes)
         return replace(begun, revision=revision, reach_since=revision)
+
+
+def _cross_section(needle: Needle, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by key that go with an edit of a needle's cross-section: gauge and diameters take each other's place."""
+    gauge, diameters = "needle.gauge", ("needle.outer_diameter_mm", "needle.inner_diameter_mm")
+    if values.get(gauge) is not None:
+        return dict.fromkeys(diameters)
+    given = any(values.get(key) is not None for key in diameters)
+    if needle.gauge is None or not (given or gauge in values):
+        return {}
+    return {gauge: None, **dict(zip(diameters, GAUGES[needle.gauge], strict=True))}
 
 
 def _of_the_reach(session: Session) -> tuple[Scenario, int, Strategy]:

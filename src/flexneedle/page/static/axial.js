@@ -1,7 +1,7 @@
 // The view along the axis, as the needle moves: z to the right, y upwards; the target is moved here.
 
 import { make, shown } from "./dom.js";
-import { drawAxial } from "./flat/axial.js";
+import { drawAxial, endsOf } from "./flat/axial.js";
 import { KEYS, Handles } from "./flat/handles.js";
 import { legendOf } from "./flat/legend.js";
 import { measuredTip, partsOf } from "./flat/parts.js";
@@ -9,7 +9,13 @@ import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
 
-const [LEAST, AROUND] = [4, 3]; // mm
+const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
+
+// Half of what is shown (mm): the target with room to move it, and the reach.
+function halfAround(target, ends) {
+  const far = ([, y, z]) => Math.max(Math.abs(y), Math.abs(z));
+  return Math.max(LEAST, Math.ceil(far(target) + AROUND), ...ends.map((end) => Math.ceil(far(end) + EDGE)));
+}
 
 export function mount(element, store, link) {
   const canvas = make("canvas", { role: "img", "aria-label": "View along the axis" });
@@ -22,10 +28,11 @@ export function mount(element, store, link) {
   const stage = new Stage(canvas, (pen, { width, height }) => {
     const [scene, target] = [shownScene(store), shownTarget(store)];
     if (!scene || !target) return;
-    if (!handles.dragged) half = Math.max(LEAST, Math.ceil(Math.max(Math.abs(target[1]), Math.abs(target[2])) + AROUND));
+    const ends = endsOf(store, target);
+    if (!handles.dragged) half = halfAround(target, ends);
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
-    const reached = drawAxial(pen, { width, height, map, scene, target, parts, store });
+    const reached = drawAxial(pen, { width, height, map, scene, target, parts, ends, store });
     legendOf(legend, [...parts, ...measuredTip(store)], reached);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });

@@ -2,11 +2,12 @@
 
 import { button, make } from "./dom.js";
 import { FieldView } from "./form/field.js";
-import { sectionsOf } from "./form/fields.js";
+import { editOf, sectionsOf, shownOf, valueOf, withLaw } from "./form/fields.js";
 import { followOptions } from "./form/options.js";
 import { maySteer } from "./shown.js";
 
 const ORDER = ["target", "needle", "needle.bevel", "tissue", "setup", "entry", "plan", "control", "tracker", "phantom"];
+const LAW = /^(tissue\.\d+)\.law$/;
 const OPEN = ["target", "needle.bevel"];
 
 export async function mount(element, store, link) {
@@ -50,6 +51,7 @@ class Form {
   #problems = {}; // by key
   #refusal = 0; // number of the newest that was read
   #revision;
+  #chosen = ""; // key of the field that was edited last
 
   constructor(element, schema, store, link) {
     [this.#element, this.#schema, this.#store, this.#link] = [element, schema, store, link];
@@ -87,10 +89,13 @@ class Form {
     const made = JSON.stringify([name, Object.keys(values), words]);
     if (made === this.#made) return false;
     const open = this.#sections.filter(({ element }) => element.open).map((section) => section.name);
+    const focused = this.#element.contains(document.activeElement) && document.activeElement.id;
     this.#made = made;
     const found = sectionsOf(this.#schema, values).sort((a, b) => place(a.name) - place(b.name));
+    if (this.#sections.length) open.push(this.#chosen); // a table that was just chosen
     this.#sections = found.map((section) => this.#sectionOf(section, open));
     this.#element.replaceChildren(...this.#sections.map((section) => section.element));
+    if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
     return true;
   }
 
@@ -112,8 +117,8 @@ class Form {
     if (section.views.length) return;
     const { values } = this.#store.get("session");
     section.views = section.fields.map((field) => {
-      const edit = (value) => this.#link.edit({ [field.key]: value });
-      return Object.assign(new FieldView(field, values[field.key], edit), { key: field.key });
+      const edit = (value) => this.#edit(field, value);
+      return Object.assign(new FieldView(field, valueOf(field, values), edit), { key: field.key, field });
     });
     if (section.description) section.element.append(make("p.quiet", {}, section.description));
     section.element.append(...section.views.map((view) => view.element));
@@ -121,14 +126,37 @@ class Form {
     this.#fill(section);
   }
 
+  // The problem of a field: its own, or of a part of its value that has no field; of a law that of a part of its layer.
+  #problemOf(field) {
+    const { [field.key]: own, ...others } = this.#problems;
+    const whole = field.key.replace(LAW, "$1") + ".";
+    const part = Object.keys(others).find((key) => key.startsWith(whole) && !this.#fields.has(key));
+    return own ?? (part && `${part.slice(whole.length)}: ${others[part]}`);
+  }
+
+  get #fields() {
+    return new Set(this.#sections.flatMap(({ fields }) => fields.map(({ key }) => key)));
+  }
+
+  #edit(field, value) {
+    this.#chosen = field.key;
+    const [, name] = LAW.exec(field.key) ?? [];
+    const { values } = this.#store.get("session");
+    if (!name) return this.#link.edit(editOf(field, value, values));
+    const [layers, layer] = [layersOf(values), Number(name.split(".")[1])];
+    return this.#link.edit({ tissue: layers.with(layer, withLaw(this.#schema, layers[layer], value)) });
+  }
+
   #fill(section) {
     const [{ values, changed }, draft] = [this.#store.get("session"), this.#store.get("draft") ?? {}];
     for (const view of section.views) {
-      const pending = view.key in draft;
-      const value = pending ? draft[view.key] : values[view.key] ?? null;
-      view.update(value, { changed: changed.includes(view.key), problem: this.#problems[view.key], pending });
+      const edited = editedOf(view.field, draft);
+      const pending = edited !== undefined;
+      const value = pending ? edited : valueOf(view.field, values);
+      const isChanged = changed.some((key) => isOf(view.field, key));
+      view.update(value, { changed: isChanged, problem: this.#problemOf(view.field), pending });
     }
-    const faulty = section.fields.some(({ key }) => this.#problems[key]);
+    const faulty = section.fields.some((field) => this.#problemOf(field));
     section.element.classList.toggle("faulty", faulty);
   }
 
@@ -141,7 +169,7 @@ class Form {
     this.#refusal = newest.number;
     this.#problems = newest.problems;
     const keys = Object.keys(newest.problems);
-    const first = this.#sections.find(({ fields }) => fields.some(({ key }) => keys.includes(key)));
+    const first = this.#sections.find(({ fields }) => fields.some((field) => keys.includes(field.key) || this.#problemOf(field)));
     if (first) first.element.open = true;
   }
 
@@ -155,6 +183,16 @@ class Form {
     return make("div.tools", {}, button("Add a layer above", add, { "aria-label": `Add a layer above layer ${layer + 1}` }), remove);
   }
 }
+
+// What a field shows of edits that are not answered yet; undefined where none is of it.
+function editedOf(field, draft) {
+  const [, name] = LAW.exec(field.key) ?? [];
+  if (name && draft.tissue) return draft.tissue[Number(name.split(".")[1])]?.law;
+  return field.key in draft ? shownOf(field, draft[field.key]) : undefined;
+}
+
+// Whether a key is that of a field, or of the table that it stands for.
+const isOf = (field, key) => key === field.key || (field.start && key.startsWith(`${field.key}.`));
 
 // Tables of the layers, from values by key.
 function layersOf(values) {

@@ -9,16 +9,18 @@ import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
 const SHOWN_BY = ["insertion live", "people", "welcome", "rig"];
+const BEFORE_IT = ["waiting", "planning"];
 const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 
 export function mount(element, store, link) {
   const state = make("p", { role: "status" });
+  const isPaused = () => store.get("insertion live")?.state === "paused";
   const start = button("Insert", () => link.ask({ type: "insert" }), { class: "primary", title: "On the virtual rig, in real time" });
   const slowly = button("Start paused", () => link.ask({ type: "insert", paused: true }));
-  const stop = button("Stop", () => link.ask({ type: "stop" }), { class: "danger" });
+  const stop = button("Stop", () => link.ask({ type: "stop" }), { class: "danger stop" });
   const pause = button("Pause", () => link.ask({ type: "pace", pace: pause.dataset.next === "go" ? Number(pace.value) : 0 }));
   const step = button("One period", () => link.ask({ type: "advance" }), { title: "Carry out one control period" });
-  const pace = make("select", { "aria-label": "Pace", change: () => link.ask({ type: "pace", pace: Number(pace.value) }) });
+  const pace = make("select", { "aria-label": "Pace", change: () => isPaused() || link.ask({ type: "pace", pace: Number(pace.value) }) }); // paused: “Continue” takes it
   pace.append(...PACES.map((each) => make("option", { value: String(each) }, `${each}×`)));
   pace.value = "1";
   let focused = null;
@@ -37,8 +39,8 @@ export function mount(element, store, link) {
   store.subscribe(SHOWN_BY, () => {
     const live = store.get("insertion live");
     const runs = isRunning(live);
-    const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
-    const signalled = steers && live?.state !== "waiting"; // one that waits can only be stopped
+    const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.state === "paused"];
+    const signalled = steers && !BEFORE_IT.includes(live?.state); // before it moves it can only be stopped
     state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;

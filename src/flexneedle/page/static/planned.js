@@ -24,12 +24,19 @@ export function plannedPaths(store, of) {
   };
 }
 
+// Sampled paths before an insertion: of the chosen strategy, while both are compared of the one that is searched, or null.
+export function sampledPaths(store) {
+  const comparing = store.get("job compare")?.state === "running";
+  const strategy = (comparing && store.get("view searched")) || strategyOf(store);
+  return fresh(store, `iteration ${strategy}`, `shape samples ${strategy}`) ?? null;
+}
+
 // The needle at the target {path, text, spread}: predicted with its standard deviation (column 4) during an insertion,
 // the last of the plan before one; path is null without any.
 export function foreseen(store, of) {
   const { shape, estimated } = of === "scene" ? present(store, "sweep") : { shape: shownShape(store, "predicted", of) };
   const path = of === "scene" ? last(shape) : first(shape);
-  if (path?.columns > 3) return { path, text: "predicted needle ± 2 sd", spread: 2 };
+  if (path?.columns > 3) return { path, text: "predicted needle at the target ± 2 sd", spread: 2 };
   return { path, text: `needle at the target, ${estimated ? "first estimate" : "planned"}`, spread: 0 };
 }
 

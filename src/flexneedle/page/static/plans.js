@@ -4,7 +4,7 @@ import { button, make, renew, shown } from "./dom.js";
 import { CostPlot } from "./plans/cost.js";
 import { SweepView } from "./plans/sweep.js";
 import { termsTable } from "./plans/terms.js";
-import { isStale, maySteer } from "./shown.js";
+import { isStale, maySteer, shownReach } from "./shown.js";
 
 const STRATEGIES = ["manipulation", "steering"];
 const WORK = [["Plan", "plan"], ["Both strategies", "compare"], ["Reach", "reach"]];
@@ -33,7 +33,7 @@ export function mount(element, store, link) {
     if ((job?.share ?? null) === null) progress.removeAttribute("value");
     else progress.value = job.share;
   });
-  store.subscribe(["session", "estimate", "plan "], () => {
+  store.subscribe(["session", "estimate", "plan ", "reach", "view of", "insertion "], () => {
     renew(words, lines(store).map(([text, stale]) => make("li", { class: stale ? "quiet" : "" }, text)));
   });
   store.subscribe(["session", "plan ", "iteration ", "view theme"], () => plot.update());
@@ -59,7 +59,11 @@ function lines(store) {
     const stale = isStale(store, plan);
     found.push([`${titled(plan.strategy)}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
   }
+  const reach = shownReach(store);
+  if (reach) found.push([`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not looked at.`, false]);
   return found;
 }
+
+const depth = ([x]) => shown(x, 0);
 
 const titled = (word) => word[0].toUpperCase() + word.slice(1);

@@ -3,9 +3,10 @@
 
 import { button, make, shown } from "./dom.js";
 import { SHOWN, shownOf, shownPeriod, startOf } from "./shown.js";
+import { TARGET_AND_PLAN } from "./still.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
-const NAMES = { scene: "Plan", live: "Insertion", first: "Recorded run" };
+const NAMES = { scene: TARGET_AND_PLAN, live: "Insertion", first: "Recorded run" };
 
 export function mount(element, store) {
   const player = new Player(store);

@@ -29,7 +29,7 @@ const PLOTS = [
     { name: "true", tone: "--true", of: (row) => row.true_energy_mj, dash: true },
   ] },
   {
-    title: "Tracker's distortion indicator", none: "This tracker has no indicator.",
+    title: "Tracker's largest indicator of distortion", none: "This tracker has no indicator.",
     lines: [{ name: "indicator", tone: "--measured", of: (row) => row.indicator }],
   },
 ];

@@ -7,12 +7,14 @@ import { boundaryEdit, guideEdit, guideOf, layersOf } from "./flat/layers.js";
 import { legendOf } from "./flat/legend.js";
 import { measuredTip, partsOf } from "./flat/parts.js";
 import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
-import { drawSection } from "./flat/section.js";
+import { drawSection, outlineOf } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
+import { stillNote } from "./still.js";
 
 const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Axis and target", "target"]];
 const STRETCHES = [1, 2, 5];
+const EDGE = 1; // mm, around the reach
 
 let view = null;
 
@@ -24,7 +26,7 @@ export function mount(element, store, link) {
   const planes = PLANES.map(([text, name]) => button(text, () => view.choose(name), { "data-plane": name }));
   const stretch = make("select", { "aria-label": "Stretch of the lateral axis", change: () => view.stretchBy(Number(stretch.value)) });
   stretch.append(...STRETCHES.map((each) => make("option", { value: String(each) }, each === 1 ? "to scale" : `lateral ×${each}`)));
-  element.append(stage, make("div.tools", { role: "toolbar", "aria-label": "Section" }, ...planes, stretch), legend);
+  element.append(stage, make("div.tools", { role: "toolbar", "aria-label": "Section" }, ...planes, stretch), stillNote(store), legend);
   view.changed = () => {
     for (const each of planes) each.setAttribute("aria-pressed", String(each.dataset.plane === view.plane));
   };
@@ -74,15 +76,13 @@ class SectionView {
   #draw(pen, width, height) {
     const [scene, target] = [shownScene(this.#store), shownTarget(this.#store)];
     if (!scene || !target) return;
-    if (!this.#handles.dragged) {
-      this.#box = boxOf(scene, target);
-      this.#frozen = planeOf(this.plane, scene, target);
-    }
-    const plane = this.#frozen;
+    const plane = this.#handles.dragged ? this.#frozen : planeOf(this.plane, scene, target);
+    const outline = outlineOf(plane, this.#store);
+    if (!this.#handles.dragged) [this.#frozen, this.#box] = [plane, around(boxOf(scene, target), outline)];
     const map = mappingOf(this.#box, width, height, this.#stretch);
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
-    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, store: this.#store });
+    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, outline, store: this.#store });
     legendOf(this.#legend, [...parts, ...measuredTip(this.#store)], reached);
     this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
   }
@@ -113,4 +113,10 @@ class SectionView {
     });
     return handles;
   }
+}
+
+// A box with room for the outline of the reach, too.
+function around({ left, right, half }, outline) {
+  const most = (values) => Math.ceil(Math.max(...values) + EDGE);
+  return { left, right: most([right - EDGE, ...outline.map(([x]) => x)]), half: most([half - EDGE, ...outline.map(([, u]) => Math.abs(u))]) };
 }

@@ -1,6 +1,7 @@
 // What the views show: the scene before an insertion, the running insertion, or a recorded one, at a period.
 //   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
 //   "view newest": "live" or "first", which of both began, or was opened, last
+//   "view searched": the strategy of the newest iteration of a search
 //   "view period": the period that is shown; undefined: the newest
 // An insertion that begins, and a recording that is opened, makes both undefined (store.js).
 
@@ -14,7 +15,7 @@ export const runs = (live) => RUNS.includes(live?.state);
 // Keys to subscribe to for all that this module gives.
 export const SHOWN = [
   "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "shape ", "plan ",
-  "iteration ", "reach", "estimate",
+  "iteration ", "job compare", "reach", "estimate",
 ];
 
 // "scene", "live" or "first".
@@ -55,9 +56,11 @@ export function startOf(store, of) {
   return store.get(`insertion ${of}`)?.rig ? store.get(`rows ${of}`)?.[0]?.time ?? 0 : 0;
 }
 
-// The second recorded run, {row, shape(kind)}, as long after its first period as what is shown; or null.
+// The second recorded run, {row, shape(kind)}, as long after its first period as what is shown; or null. Where the scene
+// was chosen instead of an insertion, no run is compared.
 export function shownSecond(store) {
-  if (!store.get("insertion second")) return null;
+  const chosen = store.get("view of") === "scene" && ["live", "first"].some((of) => store.get(`insertion ${of}`));
+  if (!store.get("insertion second") || chosen) return null;
   const of = shownOf(store);
   const [rows, row] = [store.get("rows second") ?? [], shownRow(store, of)];
   const since = row ? row.time - store.get(`rows ${of}`)[0].time : Infinity;

@@ -3,6 +3,7 @@
 
 import { button, make, shown } from "./dom.js";
 import { SHOWN, shownRow, shownTarget } from "./shown.js";
+import { stillNote } from "./still.js";
 
 const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 look at x–y, x–z and along the axis.";
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
@@ -27,7 +28,7 @@ export async function mount(element, store, link) {
   const legend = make("ul.legend", { "aria-label": "Legend" });
   const text = make("p.spoken", { id: "space-text" });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "View in space" });
-  element.append(make("div.stage", {}, canvas), tools, legend, text);
+  element.append(make("div.stage", {}, canvas), tools, stillNote(store), legend, text);
 
   const { SpaceView } = await import("./space/view.js");
   view = new SpaceView(context, legend, store, link);

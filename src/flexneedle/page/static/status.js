@@ -17,6 +17,7 @@ const CONTROL = {
   take: "To change the scenario, plan and insert. Anyone can stop an insertion.",
   release: "So that another page can take control. An insertion on a rig is then held.",
 };
+const OWN_END = ["insertion", "save"]; // no cancel: an insertion is stopped, and a run is saved as a whole
 const SHOWN_FOR = 12_000; // ms
 const LONG = 5; // s
 const SHORT = 1_000; // ms: work that ends sooner is not shown
@@ -28,6 +29,9 @@ export function mount(element, store, link) {
   const stop = button("Stop the insertion", () => link.ask({ type: "stop" }), { class: "danger", hidden: true });
   const refusals = make("div.refusals", { role: "alert" });
   element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
+  new ResizeObserver(([{ target }]) => { // above which the tour is
+    document.documentElement.style.setProperty("--status-height", `${target.offsetHeight}px`);
+  }).observe(element);
 
   store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
   followSteering(steering, store, link);
@@ -109,7 +113,8 @@ function followJobs(element, store, link) {
     entry.counts = !failed && (job.share ?? null) === null;
     tell(entry);
     text.classList.toggle("bad", failed);
-    bar.hidden = cancel.hidden = failed;
+    bar.hidden = failed;
+    cancel.hidden = failed || OWN_END.includes(kind);
     if ((job.share ?? null) === null) bar.removeAttribute("value");
     else bar.value = job.share;
   }

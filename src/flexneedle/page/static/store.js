@@ -66,6 +66,7 @@ export class Store {
     const key = keyOf(message);
     const earlier = this.get(key);
     if (message.type === "insertion") this.#announce(key, message);
+    if (message.type === "iteration") this.set("view searched", message.strategy);
     if (message.type === "welcome") this.#forgetAll();
     if (message.type === "session" && message.name !== earlier?.name) this.#forgetPlans();
     this.set(key, message);
@@ -121,6 +122,7 @@ export class Store {
     const opened = Boolean(known) && RECORDED.includes(message.of);
     if (earlier && !opened && !isAnother(message, earlier)) return;
     this.#forget(message.of);
+    if (message.of === "second" && this.get("view of") === "scene") this.set("view of", undefined); // nothing is compared with it
     if (message.of === "first" || (message.of === "live" && runs(message))) this.set("view newest", message.of);
   }
 

@@ -14,8 +14,8 @@ const STOPS = [
 ];
 
 export function mount(element) {
-  const text = make("p", { id: "tour-text" });
-  const count = make("span.quiet");
+  const text = make("p", { id: "tour-text", "aria-live": "polite" });
+  const count = make("span.quiet", { "aria-live": "polite" });
   const next = button("Next", () => show(at + 1), { class: "primary" });
   const skip = button("Skip", end);
   const card = make("div.tour", { role: "dialog", "aria-label": "Tour", "aria-describedby": "tour-text", hidden: true, tabindex: "-1" }, text, make("div.tools", {}, next, skip, count));

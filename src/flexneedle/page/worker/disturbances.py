@@ -18,6 +18,8 @@ from flexneedle.types import Frame, Measurement, SensorReading
 _MISSING = "missing"
 _METAL = "noisy"
 """The environment whose metal plate is brought where the scenario's has none."""
+_LISTED = 10
+"""Disturbances that the record of an insertion names."""
 _FAR_MM = 1e4
 """Distance of a metal plate that is taken away: it distorts nothing, to the last bit."""
 
@@ -96,6 +98,8 @@ class Disturber:
         environment = scenario.tracker.environment
         self._plate = None if environment is None or environment.plate is not None else _FAR_MM
         self._active: dict[str, str] = {}
+        self._taken: list[str] = []
+        self._unlisted = 0
         self._dropped_until = -math.inf
 
     def plant(self, truth: Truth, roll: float) -> DisturbedPlant:
@@ -123,11 +127,32 @@ class Disturber:
             "plate": f"metal plate at {size:g} mm",
         }[disturb.what]
         none = size == (1.0 if disturb.what == "stiffen" else 0.0)
+        if not none or key in self._active:
+            self._note(self._end(disturb) if none else text)
         self._active = {other: line for other, line in self._active.items() if other != key}
         if not none:
             self._active[key] = text
         self._disturb(disturb)
         self._report()
+
+    @property
+    def summary(self) -> str:
+        """What it has disturbed, and when, for the record; "" for nothing."""
+        return ", ".join((*self._taken, *([f"{self._unlisted} more"] if self._unlisted else [])))
+
+    def _end(self, disturb: Disturb) -> str:
+        return {
+            "push": "push ended",
+            "stiffen": f"layer {self._name(disturb.layer)} as stiff as before",
+            "drop": "tip measured again",
+            "plate": "metal plate taken away",
+        }[disturb.what]
+
+    def _note(self, text: str) -> None:
+        if len(self._taken) < _LISTED:
+            self._taken.append(f"{text} at {self._now():.1f} s")
+        else:
+            self._unlisted += 1
 
     def expire(self) -> None:
         """Report the end of what has ended by itself."""

@@ -57,7 +57,7 @@ def _insert_virtually(live: Live) -> Insertion:
     def planning(info: dict[str, Any]) -> None:
         task.signals.check()
         if task.signals.stopped:
-            raise Cancelled
+            raise StoppedError(f"stopped: {task.signals.stopped}")
         live.planning(info)
 
     plan = make_plan(task.scenario, strategy=task.work.strategy, seed=seed, progress=planning)
@@ -100,4 +100,4 @@ def _insert_virtually(live: Live) -> Insertion:
         on_period=on_period,
         on_decision=live.decided,
     )
-    return replace(insertion, phantom=DEFAULT_PLANT, tracker=SCENARIO_TRACKER)
+    return replace(insertion, phantom=DEFAULT_PLANT, tracker=SCENARIO_TRACKER, disturbed=disturber.summary)

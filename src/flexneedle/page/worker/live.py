@@ -14,8 +14,8 @@ from flexneedle.page.worker.rows import channel_of, frames_of, row_of
 from flexneedle.page.worker.task import Task
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
-_SHORT = (Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
-"""Ends of an insertion short of its target."""
+_ENDED = (Outcome.DONE, Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
+"""Ends of an insertion, after which a needle on a rig is left in."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Live:
         work, scenario = self.task.work, self.task.scenario
         running = state in ("running", "paused")
         error = None if ended is None or ended.error_mm != ended.error_mm else ended.error_mm
-        left_in = self.rig and self.periods and state in _SHORT
+        left_in = self.rig and self.periods and state in _ENDED
         lines = (summary, *self.notes, STILL_IN.format(rig=work.rig) if left_in else "")
         self.task.say(
             m.Insertion(

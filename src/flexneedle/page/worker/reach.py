@@ -49,7 +49,7 @@ def reach(task: Task) -> None:
                 known[depth] = _farther(scenario, ends, known.get(depth, ends))
                 searched[depth] = size
             done += 1
-            task.tell("running", done / len(passes), f"reach at {depth:.0f} mm")
+            task.tell("running", done / len(passes), f"targets {depth:.0f} mm deep")
         _show(task, known, angle)
 
 

@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Sequence
+from statistics import median
 from typing import Any
 
 import numpy as np
 
 from flexneedle.page.frames import Kind, ShapeFrame, Source, frame_of
 from flexneedle.page.messages import Row
+from flexneedle.rig.monitor.rules import has_indicator
+from flexneedle.rig.tracking.table import TIP
 from flexneedle.simulator.state import Contacts
 from flexneedle.types import Floats, Period, Plan, Shape, X
-
-_TIP = "tip"
 
 
 def row_of(period: Period, plan: Plan) -> Row:
@@ -48,9 +49,16 @@ def _from_path(plan: Plan, point: Sequence[float]) -> float:
 
 
 def _indicator(period: Period) -> float | None:
-    frame = period.measurement.frame
-    reading = None if frame is None else frame.readings.get(_TIP)
-    return None if reading is None else reading.indicator
+    """The largest median of the references' indicators over the period; without references that of the tip."""
+    found: dict[str, list[float]] = {}
+    for checked in period.readings:
+        frame = checked.measurement.frame
+        for name, reading in ({} if frame is None else frame.readings).items():
+            if has_indicator(reading):
+                found.setdefault(name, []).append(reading.indicator or 0.0)
+    medians = {name: median(values) for name, values in found.items()}
+    references = [value for name, value in medians.items() if name != TIP]
+    return max(references, default=medians.get(TIP))
 
 
 def frames_of(periods: Sequence[Period], source: Source) -> list[ShapeFrame]:

@@ -77,7 +77,7 @@ def _by_name(value: object, wanted: type, key: str, rule: Callable[[Any], str]) 
 
 
 def _state(state: MotorState) -> str:
-    flags = ("moving", "on", "reverse_limit", "forward_limit")
+    flags = ("moving", "on", "reverse_limit", "forward_limit", "repeated")
     return _numbers(state, "position", "commanded") or _flags(state, *flags) or _texts(state, "stopped")
 
 

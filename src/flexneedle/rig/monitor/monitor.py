@@ -100,8 +100,9 @@ class Monitor:
     """State of the monitor. Frozen: `check` and `check_field` return the next state.
 
     axes: lateral axes of the needle; recent: readings within the window; repeats: the newest readings with the same
-    position; good: the last good reading; jumped: the jump since then, if any; field: the last verdict on the field;
-    distorted: whether the field counts as distorted.
+    position; good: the last good reading; rejected: whether one was rejected since then for more than a missing tip;
+    jumped: the jump since then, if any; field: the last verdict on the field; distorted: whether the field counts as
+    distorted.
     """
 
     settings: MonitorSettings
@@ -109,6 +110,7 @@ class Monitor:
     recent: tuple[Measurement, ...] = ()
     repeats: _Repeats | None = None
     good: Measurement | None = None
+    rejected: bool = False
     jumped: _Jump | None = None
     field: Verdict = OK
     distorted: bool = False
@@ -130,7 +132,7 @@ class Monitor:
             )
         )
         if not verdict.ok:
-            return self, verdict
+            return replace(self, rejected=True), verdict
         since = measurement.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(one for one in self.recent if one.time > since)
         monitor = replace(self, recent=(*kept, measurement), repeats=self._repeats_with(measurement, tip_at))
@@ -138,7 +140,9 @@ class Monitor:
         verdict = rules.first_bad(
             monitor._verdicts(measurement, tip_at(measurement.time), max_innovation, jump)
         )
-        return (replace(monitor, good=measurement, jumped=None) if verdict.ok else monitor), verdict
+        if verdict.ok:
+            return replace(monitor, good=measurement, rejected=False, jumped=None), verdict
+        return replace(monitor, rejected=self.rejected or verdict.kind is not VerdictKind.MISSING), verdict
 
     def _after_jump(self, measurement: Measurement, tip_at: TipAt) -> "tuple[Monitor, Verdict]":
         """The state after the check of a reading for a jump, and its verdict."""
@@ -194,14 +198,11 @@ class Monitor:
         """Return the last good reading if only the tip is missing since then, for at most `lost_after_s`.
 
         verdict: on the newest frame; a stale one, or one with an invalid time, gives no information on the tip. None
-        for a tracker without frames, since it may have stopped, and if a tip was rejected since the last good reading.
+        for a tracker without frames, since it may have stopped, and if a reading was rejected since the last good one.
         """
-        if newest.frame is None or verdict.kind is not VerdictKind.MISSING:
+        if newest.frame is None or verdict.kind is not VerdictKind.MISSING or self.rejected:
             return None
-        good = self.last_good(newest.time, self.settings.lost_after_s)
-        if good is None or any(one.time > good.time and one.x is not None for one in self.recent):
-            return None
-        return good
+        return self.last_good(newest.time, self.settings.lost_after_s)
 
     def _frames(self) -> list[Frame]:
         return [one.frame for one in self.recent if one.frame is not None]

@@ -1,8 +1,10 @@
 """The axes of a rig over their motors: what was read of them last, and where they were last sent."""
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import isfinite
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.ports import Clock, MotorPaces, Motors, MotorState
@@ -13,14 +15,23 @@ from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
 from flexneedle.scenario.rig import RigFile
 
 _SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller takes
+_REST_S = (
+    0.02  # in which a servo that follows on shows it; two readings after a late tick may be closer together
+)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """The states of the motors by channel, and when they were read (s)."""
+    """The states of the motors by channel, and when they were asked for and known (s): they are of a time between."""
 
     states: Mapping[str, MotorState]
-    time: float
+    asked: float
+    known: float
+
+    @property
+    def time(self) -> float:
+        """When they most likely were (s)."""
+        return 0.5 * (self.asked + self.known)
 
 
 class RigAxes:
@@ -39,6 +50,8 @@ class RigAxes:
         self._finest = 0.0 if paces is None else paces.speeds[0]
         self.lost = False
         self.newest = self.before = self._read()
+        self._past = deque([self.newest])
+        self.goals = dict[str, float]()
         self.take_positions()
 
     @property
@@ -49,10 +62,13 @@ class RigAxes:
     @property
     def at_rest(self) -> bool:
         """Whether all motors are known to rest."""
-        return not self.lost and all(
-            rests(drive, self.state(drive), self.before.states[drive.axis.channel])
-            for drive in self.drives.values()
-        )
+        return not self.lost and all(map(self.rests, self.drives.values()))
+
+    def rests(self, drive: Drive) -> bool:
+        """Whether an axis rests, its servo included, as far as readings show that are long enough apart."""
+        past, channel = self._past[0], drive.axis.channel
+        apart = self.newest.asked - past.known >= _REST_S
+        return apart and rests(drive, self.newest.states[channel], past.states[channel])
 
     @property
     def positions(self) -> dict[str, float]:
@@ -77,11 +93,11 @@ class RigAxes:
         return self.newest.states[drive.axis.channel]
 
     def at_home(self, drive: Drive) -> bool:
-        """Whether an axis is at the limit switch of its home, and rests there."""
-        return at_home(drive, self.state(drive))
+        """Whether an axis is at the limit switch of its home, and rests there, its servo included."""
+        return at_home(drive, self.state(drive)) and self.rests(drive)
 
     def at_switch(self, drive: Drive) -> bool:
-        """Whether an axis is at the limit switch of its home, and perhaps not at rest yet."""
+        """Whether the limit switch of an axis's home is active; the axis may not be at rest yet."""
         return at_switch(drive, self.state(drive))
 
     def goal(self, name: str) -> float:
@@ -91,18 +107,20 @@ class RigAxes:
 
     # Where the axes are taken to be
 
-    def settle(self) -> None:
-        """Take where motors rest as where they were sent: a servo that lags still moves to where its controller has
-        it."""
-        self.goals = {
-            channel: state.commanded if state.on else state.position for channel, state in self.states.items()
-        }
+    def settle(self, *drives: Drive) -> None:
+        """Take where motors rest as where they were sent: those of axes, without any all.
+
+        A servo that lags still moves to where its controller has it.
+        """
+        for drive in drives or self.drives.values():
+            state = self.state(drive)
+            self.goals[drive.axis.channel] = state.commanded if state.on else state.position
 
     def take_positions(self) -> None:
         """Take where the motors are as where they were sent, and as reported."""
         self.settle()
         self._reported = self.positions
-        self.switches = {channel: switches(state) for channel, state in self.states.items()}
+        self.switches = {drive.axis.channel: switches(self.state(drive)) for drive in self.drives.values()}
 
     def take_travel(self) -> dict[str, float]:
         """The travel (mm or rad) by axis from where the motion before was reported to have ended, so that what motors
@@ -117,8 +135,11 @@ class RigAxes:
         """Read the states of all motors."""
         with self._reached():
             self.before, self.newest = self.newest, self._read()
+        self._past.append(self.newest)
+        while len(self._past) > 1 and self.newest.asked - self._past[1].known >= _REST_S:
+            self._past.popleft()
         self.switches = {
-            channel: self.switches[channel] & switches(state) for channel, state in self.states.items()
+            channel: active & switches(self.states[channel]) for channel, active in self.switches.items()
         }
 
     def power_on(self) -> str:
@@ -159,13 +180,22 @@ class RigAxes:
         if problems:
             raise DriverError("; ".join(problems.values()))
 
-    def call_home(self, name: str) -> None:
-        """Call the present position of an axis its home."""
-        drive = self.drives[name]
+    def from_home(self, drive: Drive) -> float:
+        """What is missing in the position of a motor (counts) whose axis is at its home now."""
+        now = self.drives[drive.name]
+        return now.counts(now.axis.at_home) - self.state(now).position
+
+    def shift(self, drive: Drive, counts: float) -> None:
+        """Shift the position of a motor where it rests, and with it where it was sent, and what was reported."""
+        self.read()  # a servo may have settled since
+        position = self.state(drive).position + counts
+        if not isfinite(position):
+            raise DriverError(f"{drive.name}: its home cannot be set at position {position:g}")
         with self._reached():
-            self._motors.define(drive.axis.channel, drive.counts(drive.axis.at_home))
+            self._motors.define(drive.axis.channel, position)
         self.read()
-        self.take_positions()
+        self.settle(drive)
+        self._reported[drive.name] = self.positions[drive.name]
 
     def stop(self) -> None:
         """Stop all motors; those that were lost are connected again before."""
@@ -207,7 +237,7 @@ class RigAxes:
             drive.axis.channel for drive in self.drives.values() if drive.axis.channel not in states
         ]:
             raise DriverError(f"the driver reports no state of channel {', '.join(missing)}")
-        return Reading(states, 0.5 * (begun + self._clock.now()))
+        return Reading(states, begun, self._clock.now())
 
     @contextmanager
     def _reached(self) -> Iterator[None]:

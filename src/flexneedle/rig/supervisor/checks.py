@@ -4,17 +4,24 @@ import math
 
 from flexneedle.rig.ports import MotorState
 from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.homes import homed_at, may_be_at_switch
 
+STILL = 2.0
+"""Times the tolerance of its goal a motor at rest may move."""
 _HASTE = 1.5  # times its speed an axis may seem to move between two ticks, whose times are not exact
 _CREEP = 0.1  # of the tolerance a servo that still follows moves at least between two readings
-_STILL = 2.0  # times the tolerance of its goal a motor at rest may move
+
+
+def number_problem(drive: Drive, state: MotorState) -> str:
+    """A position that is not a number."""
+    if math.isfinite(drive.error(state)):
+        return ""
+    return f"{drive.name}: the motor controller reports position {state.position:g}, commanded {state.commanded:g}"
 
 
 def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
     """A motor that is off, was stopped by the motor controller since the reading before, or does not follow."""
     error = drive.error(state)
-    if not math.isfinite(error):
-        return f"{drive.name}: the motor controller reports position {state.position:g}, commanded {state.commanded:g}"
     if not state.on:
         return f"{drive.name}: the motor is off{_because(state.stopped)}"
     if state.stopped and state.stopped != before.stopped:
@@ -55,7 +62,7 @@ def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: f
     A jump within what its speed allows is found by its direction alone.
     """
     back = -(state.position - before.position) * (1.0 if way > 0.0 else -1.0) / abs(drive.axis.scale)
-    if back > _STILL * drive.axis.tolerance:
+    if back > STILL * drive.axis.tolerance:
         return f"{drive.name}: the position went back by {drive.shown(back)} during a motion"
     return ""
 
@@ -77,7 +84,7 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
 def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
     """Whether a motor rests, its servo included, which may follow on when the controller's profile has ended.
 
-    A state that is repeated does not show it.
+    before: long enough ago that a servo that follows on has moved. A state that is repeated does not show it.
     """
     if state.repeated:
         return False
@@ -98,17 +105,37 @@ def at_home(drive: Drive, state: MotorState) -> bool:
 
 def switch_problem(drive: Drive, state: MotorState) -> str:
     """An axis that has left the limit switch of its home, which is still active."""
+    if not at_home(drive, state):
+        return ""
+    way = abs(homed_at(drive.axis) - drive.axis.at_home)
+    why = "it is stuck, or needs more room: a home further beyond the range"
     return (
-        f"{drive.name}: the {drive.axis.home} switch is still active away from it"
-        if at_home(drive, state)
-        else ""
+        f"{drive.name}: the {drive.axis.home} switch is still active {drive.shown(way)} away from it: {why}"
     )
+
+
+def stuck_problem(drive: Drive, state: MotorState) -> str:
+    """Limit switches of both ends, of which no axis can be at both."""
+    both = state.reverse_limit and state.forward_limit
+    return f"{drive.name}: both limit switches are active: check their wiring and polarity" if both else ""
+
+
+def resting_switch_problem(drive: Drive, state: MotorState) -> str:
+    """A limit switch that is active at an axis at rest, but for that of its home where the axis is there."""
+    if problem := stuck_problem(drive, state):
+        return problem
+    active, at = switches(state), drive.position(state.position)
+    is_home = drive.axis.to_home != 0 and at_switch(drive, state)
+    if not active or (is_home and may_be_at_switch(drive.axis, at)):
+        return ""
+    home = f", but the home is at {drive.shown(drive.axis.at_home)}" if is_home else ""
+    return f"{drive.name}: the {' '.join(active)} limit switch is active at {drive.shown(at)}{home}"
 
 
 def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     """A motor that is not where it was left; goal: that position (counts)."""
     off = abs((state.position - goal) / drive.axis.scale)
-    if off > _STILL * drive.axis.tolerance:
+    if off > STILL * drive.axis.tolerance:
         return f"{drive.name}: moved by {drive.shown(off)} without a command"
     return ""
 
@@ -132,7 +159,7 @@ def new_switch_problem(drive: Drive, state: MotorState, known: frozenset[str]) -
 
 def misplaced(drive: Drive, state: MotorState) -> bool:
     """Whether a motor at rest is further from where its controller has it than the checks at rest allow."""
-    return abs(drive.error(state)) > min(drive.axis.max_error, _STILL * drive.axis.tolerance)
+    return abs(drive.error(state)) > min(drive.axis.max_error, STILL * drive.axis.tolerance)
 
 
 def arrived(drive: Drive, state: MotorState, goal: float) -> bool:

@@ -3,6 +3,7 @@
 import socket
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -41,7 +42,8 @@ _ENOUGH = 9  # measurements for a median
 class Supervisor:
     """A supervisor in a process of its own. Use it as a context manager.
 
-    on_report: called with what each tick found, in a thread; what it raises is raised where the client waits next.
+    on_report: called with what each tick found, in a thread; what it raises is raised where the client waits next, or
+    given to `threading.excepthook` at the end, which prints it.
     Raises DriverError or StoppedError if the rig has a fault or is stopped, InputError if it refuses a request.
     """
 
@@ -53,7 +55,8 @@ class Supervisor:
         self._latest_at = monotonic()
         self._ended: str | None = None
         self._unopened = ""
-        self._failed: Exception | None = None  # of on_report, which is then not called again
+        self._failed: Exception | None = None  # the first of on_report
+        self._failure_raised = False
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
@@ -98,6 +101,11 @@ class Supervisor:
                 self._connection.close()
         finally:
             self._signals.close()
+            if self._failed is not None and not self._failure_raised:
+                error, self._failure_raised = self._failed, True
+                threading.excepthook(
+                    threading.ExceptHookArgs((type(error), error, error.__traceback__, self._thread))
+                )
 
     @property
     def rig(self) -> RigFile:
@@ -171,6 +179,7 @@ class Supervisor:
         A motor at rest that is more than its largest error from its commanded position is held where it is: it is
         switched off and on again. Returns a note of that, or "".
         """
+        self._check_follower()
         refused = None
         try:
             self._ask(say.Arm(deepest))
@@ -232,11 +241,6 @@ class Supervisor:
         """Move one axis alone to a position (mm or rad), at its largest speed or slower (mm/s or rad/s)."""
         return self._go(axis, position, speed, retract=False)
 
-    def jog(self, axis: str, distance: float, speed: float | None = None) -> say.Done:
-        """Move one axis alone by a distance (mm or rad)."""
-        self._known(axis)
-        return self._go(axis, self.report.axes[axis].position + distance, speed, retract=False)
-
     def retract(self, position: float, speed: float | None = None) -> say.Done:
         """Withdraw the base to a position of the insertion axis (mm)."""
         return self._go("insertion", position, speed, retract=True)
@@ -268,6 +272,7 @@ class Supervisor:
         return found[axis]
 
     def _carry_out(self, made: Callable[[int], say.Request]) -> say.Done:
+        self._check_follower()  # before anything begins to move
         self._number += 1
         number = self._number
         self._send(made(number))
@@ -278,6 +283,12 @@ class Supervisor:
             raise RefusedError(answer.why)
         self._check(answer.state, answer.why)
         return answer
+
+    def _check_follower(self) -> None:
+        """Raise what a follower of reports has raised: what it was to do is not done. The rig can still be stopped."""
+        if self._failed is not None:
+            self._failure_raised = True
+            raise self._failed
 
     def _ask(self, request: say.Request) -> None:
         """Have a request acted on, and return with the report of it. Raises RefusedError if it is refused."""
@@ -333,9 +344,8 @@ class Supervisor:
                 return True
             if self._ended is not None:
                 raise self._end()
-            if self._failed is not None:
-                failed, self._failed = self._failed, None
-                raise failed
+            if not stopped:
+                self._check_follower()
             if self._latest is not None:
                 silent = monotonic() - self._latest_at
                 if silent > _SILENT_S and not self._late_reports():
@@ -403,7 +413,7 @@ class Supervisor:
                 self._on_report(message)
             except Exception as error:  # noqa: BLE001  raised where the client waits: this thread must go on
                 with self._changed:
-                    self._failed, self._on_report = error, None
+                    self._failed = self._failed or error
                     self._changed.notify_all()
 
 

@@ -12,11 +12,11 @@ from flexneedle.errors import DriverError
 from flexneedle.rig.ports import Clock, Motors, Tracker
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.axes import RigAxes
-from flexneedle.rig.supervisor.checks import switch_problem
+from flexneedle.rig.supervisor.checks import resting_switch_problem, stuck_problem, switch_problem
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.inspection import Inspection
 from flexneedle.rig.supervisor.machine import Event, State, after, refusal
-from flexneedle.rig.supervisor.motion import Leg, Motion, beyond
+from flexneedle.rig.supervisor.motion import SETTLE_S, Leg, Motion, beyond
 from flexneedle.rig.supervisor.requested import back_off, going, homing, stepping
 from flexneedle.rig.supervisor.room import Room
 from flexneedle.rig.supervisor.stopping import Stopping
@@ -108,18 +108,28 @@ class Supervisor:
     def _arm(self, deepest: float) -> None:
         if not self._allowed(Event.ARM):
             return
+        if not self._possible(self._outside):  # as it most often is, before any motor is switched on
+            return
         try:
             changed = self._axes.power_on()
         except DriverError as error:
             self._unreachable(str(error))
             return
-        at = self._axes.positions
-        outside = beyond(self._axes.drives, list(at.items())) if self._task.tracked else ""
-        if not self._possible(outside and f"arm: refused: {outside}"):
+        if not self._possible(self._outside):
             return
         self._axes.take_positions()
-        self._deepest = at["insertion"] + deepest
+        self._deepest = self._axes.positions["insertion"] + deepest
         self._enter(Event.ARM, changed)
+
+    @property
+    def _outside(self) -> str:
+        """A problem with where an axis rests as an insertion begins, or ""; an operator may move it back."""
+        if not self._task.tracked:
+            return ""
+        axes = self._axes
+        problems = [beyond(axes.drives, list(axes.positions.items()), resting=True)]
+        problems += [resting_switch_problem(drive, axes.state(drive)) for drive in axes.drives.values()]
+        return next((f"arm: refused: {problem}" for problem in problems if problem), "")
 
     def _off(self) -> None:
         if not self._allowed(Event.OFF):
@@ -160,11 +170,15 @@ class Supervisor:
         if not self._possible(self._room.home_problem(home), home.number):
             return
         drive = self._axes.drives[home.axis]
+        if not self._possible(stuck_problem(drive, self._axes.state(drive)), home.number):
+            return
         self._enter(Event.HOME)
-        self._motion = motion = homing(home.number, drive, at_switch=self._axes.at_home(drive))
-        if motion.home is None:
-            self._set_home(motion, drive)
-        self._next_leg(self._clock.now())
+        self._motion = motion = homing(home.number, drive, at_switch=self._axes.at_switch(drive))
+        now = self._clock.now()
+        if motion.here is None:
+            self._next_leg(now)
+        else:
+            motion.until = now + SETTLE_S
 
     def _begin(self, event: Event, motion: Motion) -> None:
         """Begin a motion at once, not at the next tick."""
@@ -186,6 +200,8 @@ class Supervisor:
             self._stop_motors(self._stopping, now)
         elif self._motion is not None and self._motion.leg is not None:
             self._go_on(self._motion, self._motion.leg, now)
+        elif self._motion is not None and self._motion.here is not None:
+            self._call_home(self._motion, self._motion.here, now)
 
     def report(self, late: float, work: float, missed: int) -> say.Report:
         """What the last tick found, with the measurements since the last report."""
@@ -311,17 +327,20 @@ class Supervisor:
         axes = self._axes
         leg.note(axes.states, axes.newest.time)
         if motion.home is not None and axes.at_home(motion.home):
-            self._set_home(motion, motion.home)
-            motion.home, motion.leg = None, None
+            self._leave_switch(motion, motion.home)
             self._next_leg(now)
-        elif leg.has_arrived(axes.states, now):
+        elif leg.has_arrived(axes.states, now) and self._may_be_defined(motion):
             if motion.home is not None:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
             motion.spans.append(leg.span(now, done=True))
             axes.keep_goal(leg)
+            if motion.released is not None:
+                self._has_left(motion, motion.released)
             self._next_leg(now)
         elif leg.overdue(axes.states, now):
-            self._fault(f"the motors have not arrived: {leg.missing(axes.states)} from the goal")
+            restless = leg.has_arrived(axes.states, now) and motion.released
+            missing = f"the motors have not arrived: {leg.missing(axes.states)} from the goal"
+            self._fault(f"{restless.name}: does not rest" if restless else missing)
         elif motion.home is not None and axes.at_switch(motion.home):
             pass  # the motor controller slows it down, and takes no target meanwhile
         else:
@@ -331,6 +350,13 @@ class Supervisor:
             except DriverError as error:
                 self._not_followed(motion, str(error))
             self._tip.wait(now, leg.waited - waited)  # while the trajectory waits for its motors
+
+    def _may_be_defined(self, motion: Motion) -> bool:
+        """Whether the position may be shifted after this leg: of an axis off its home, once its servo rests, too.
+
+        Else the shift would count from a position that is no more true.
+        """
+        return motion.released is None or self._axes.rests(motion.released)
 
     def _not_followed(self, motion: Motion, why: str) -> None:
         """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
@@ -347,19 +373,41 @@ class Supervisor:
             return
         if motion.leg is not None:
             motion.spans.append(motion.leg.span(now, done=False))
-        if motion.released is not None and not motion.why:
-            motion.why = switch_problem(motion.released, self._axes.state(motion.released))
         if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
             self._enter(Event.ARRIVED)
         travelled, (begun, ended, turned) = self._axes.take_travel(), motion.times(now)
         self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why, turned))
 
-    def _set_home(self, motion: Motion, drive: Drive) -> None:
-        """Call the present position of an axis its home; from beyond its range it then moves into that."""
+    def _leave_switch(self, motion: Motion, drive: Drive) -> None:
+        """At rest at the switch that was searched: note where that is, and move off it."""
+        motion.shift = self._axes.from_home(drive)
+        self._axes.settle(drive)
+        motion.home, motion.released, motion.legs = None, drive, [back_off(drive)]
+
+    def _call_home(self, motion: Motion, drive: Drive, now: float) -> None:
+        """Call where an axis is its home, once it rests there."""
+        if self._axes.rests(drive):
+            self._set_home(drive, self._axes.from_home(drive))
+            self._finish(now)
+        elif now > motion.until:
+            self._fault(f"{drive.name}: does not rest")
+
+    def _has_left(self, motion: Motion, drive: Drive) -> None:
+        """Off the switch of the home, which must be released by now: it is searched, or the home is where it was.
+
+        A switch that is stuck shows no home, and then positions stay as they were.
+        """
+        motion.why = switch_problem(drive, self._axes.state(drive))
+        if motion.why:
+            motion.legs = []
+        elif motion.legs:
+            motion.home, motion.released = drive, None
+        else:
+            self._set_home(drive, motion.shift)
+
+    def _set_home(self, drive: Drive, shift: float) -> None:
+        """Shift the positions of an axis (counts), so that its home is where that was found."""
         try:
-            self._axes.call_home(drive.name)
+            self._axes.shift(drive, shift)
         except DriverError as error:
             self._unreachable(str(error))
-            return
-        if drive.axis.to_home:
-            motion.legs, motion.released = [back_off(drive)], drive

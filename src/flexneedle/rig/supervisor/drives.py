@@ -42,4 +42,5 @@ class Drive:
 
     def shown(self, value: float) -> str:
         """A position or distance with its unit."""
-        return f"{math.degrees(value):.2f}°" if self.unit == "rad" else f"{value:.3f} mm"
+        text, unit = (f"{math.degrees(value):.2f}", "°") if self.unit == "rad" else (f"{value:.3f}", " mm")
+        return (text.removeprefix("-") if float(text) == 0.0 else text) + unit

@@ -8,6 +8,7 @@ from flexneedle.rig.supervisor.checks import (
     at_switch,
     motor_problem,
     new_switch_problem,
+    number_problem,
     position_problem,
     rest_problem,
     reversal_problem,
@@ -39,7 +40,9 @@ class Inspection:
         state, last = self.newest.states[channel], self.before.states[channel]
         seconds = self.newest.time - self.before.time
         unlimited = motion is not None and motion.unlimited
-        problem = "" if self._is_stopped_at_home(drive) else motor_problem(drive, state, last)
+        problem = number_problem(drive, state)
+        if not self._is_stopped_at_home(drive):
+            problem = problem or motor_problem(drive, state, last)
         problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
         if not self._is_at_its_home(drive):
             problem = problem or new_switch_problem(drive, state, self.switches[channel])

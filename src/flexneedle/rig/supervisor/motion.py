@@ -132,7 +132,9 @@ class Motion:
     """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
 
     expected: of the tip; roll: whether the first leg is a roll alone; spans: begin and end of each leg that is done;
-    home: the axis whose home is searched, or None; released: the axis that leaves the switch of its home, or None;
+    here: the axis whose home is where it is, or None; until: when it must rest (s); home: the axis whose home is
+    searched, or None; released: the axis that leaves the switch of its home, or None; shift: of its positions, so that
+    the home is where that was found (counts);
     unlimited: positions count from nowhere yet, or the axis comes from its home beyond its range; why: why it ends
     before its goal, or "".
     """
@@ -141,8 +143,11 @@ class Motion:
     legs: list[tuple[Mapping[str, float], float]]
     expected: Expectation | None = None
     roll: bool = False
+    here: Drive | None = None
+    until: float = math.inf
     home: Drive | None = None
     released: Drive | None = None
+    shift: float = 0.0
     unlimited: bool = False
     leg: Leg | None = None
     spans: list[tuple[float, float]] = field(default_factory=list)
@@ -194,14 +199,16 @@ def positions(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> 
     return {name: drive.position(states[drive.axis.channel].position) for name, drive in drives.items()}
 
 
-def beyond(drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]]) -> str:
+def beyond(drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]], *, resting: bool = False) -> str:
     """A problem with the first of these positions by axis that is outside the axis's range, or "".
 
-    By less than the tolerance of a goal it is not: a motor may rest there.
+    By less than the tolerance of a goal it is not: a motor may rest there. resting: nor by what the lost motion adds,
+    for positions of motors that were sent within the range.
     """
     for name, position in ends:
-        (low, high), tolerance = drives[name].axis.limits, drives[name].axis.tolerance
-        if not low - tolerance <= position <= high + tolerance:
+        axis = drives[name].axis
+        (low, high), slack = axis.limits, axis.uncertainty if resting else axis.tolerance
+        if not low - slack <= position <= high + slack:
             shown = drives[name].shown
             return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
     return ""

@@ -25,6 +25,7 @@ from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.supervisor.dry import DryMotors
 from flexneedle.rig.supervisor.signals import listen, named
+from flexneedle.rig.supervisor.suspension import LONGEST_S, Suspension
 from flexneedle.scenario.problems import unexpected
 from flexneedle.types import Frame
 
@@ -114,9 +115,12 @@ def _tick(
 ) -> str:
     """Tick until the client ends; return why."""
     due, missed, ending, why = monotonic(), 0, None, ""
+    suspension = Suspension()
     while ending is None or (monotonic() < ending and not core.at_rest):
         sources: list[Any] = [signals] if ending is not None else [signals, connection]
         ready = wait(sources, max(0.0, due - monotonic()))
+        if (seconds := suspension.since()) > LONGEST_S:  # before anything that was requested is done
+            core.stop(f"the computer was suspended for {seconds:.1f} s")
         if signals in ready and (names := named(signals.recv(64))):
             core.stop(f"signal {names}")
         if connection in ready:

@@ -3,14 +3,10 @@
 from collections.abc import Mapping
 
 from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.homes import homed_at, homing_reach, homing_speed
 from flexneedle.rig.supervisor.messages import Go, Step
 from flexneedle.rig.supervisor.motion import Motion
 from flexneedle.rig.supervisor.trajectory import shortest
-from flexneedle.scenario.sections.axes import Axis
-
-_BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
-_HOMING_SHARE = 0.1  # of the largest speed
-_HOMING_REACH = 1.1  # of the range
 
 
 def stepping(step: Step) -> Motion:
@@ -28,34 +24,21 @@ def going(go: Go, drive: Drive, at: float) -> Motion:
 
 
 def homing(number: int, drive: Drive, *, at_switch: bool) -> Motion:
-    """The search of a home, with `home` the axis; without legs where there is none: it is here, or at the switch."""
-    motion = Motion(number, [], unlimited=True)
-    if drive.axis.to_home and not at_switch:
-        motion.legs = [_slowly(drive, homing_reach(drive.axis))]
-        motion.home = drive
-    return motion
+    """The search of a home, with `home` the axis; without legs, and with `here`, where the home is here.
+
+    From a switch that is active the axis moves away before, and is `released` then: one that is stuck is no home.
+    """
+    if not drive.axis.to_home:
+        return Motion(number, [], here=drive, unlimited=True)
+    search = _slowly(drive, homing_reach(drive.axis))
+    if at_switch:
+        return Motion(number, [back_off(drive), search], released=drive, unlimited=True)
+    return Motion(number, [search], home=drive, unlimited=True)
 
 
 def back_off(drive: Drive) -> tuple[Mapping[str, float], float]:
     """The leg of an axis from the limit switch of its home into its range, as (travel by axis, duration)."""
     return _slowly(drive, homed_at(drive.axis) - drive.axis.at_home)
-
-
-def homing_speed(axis: Axis) -> float:
-    """Speed (mm/s or rad/s) at which an axis searches its limit switch, and leaves it."""
-    return _HOMING_SHARE * axis.speed
-
-
-def homing_reach(axis: Axis) -> float:
-    """Largest travel (mm or rad, signed) of an axis to the limit switch of its home."""
-    low, high = axis.limits
-    return axis.to_home * _HOMING_REACH * (high - low)
-
-
-def homed_at(axis: Axis) -> float:
-    """Position (mm or rad) at which an axis rests after homing: inside its range, off the limit switch of its home."""
-    low, high = axis.limits
-    return min(max(axis.at_home, low), high) - axis.to_home * _BACK_OFF_SHARE * (high - low)
 
 
 def _slowly(drive: Drive, travel: float) -> tuple[Mapping[str, float], float]:

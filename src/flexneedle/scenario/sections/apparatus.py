@@ -234,7 +234,10 @@ class TrackerSettings(Section):
     """Center x, y, z of the environment's workspace in the frame of the insertion."""
     field_seed: AnySeed | None = None
     """Seed of the environment's error field. Not set: each insertion draws a field of its own from its seed."""
-    environment: Annotated[Environment | None, BeforeValidator(expanded)] = None
+    environment: Annotated[
+        Environment | None,
+        BeforeValidator(expanded, json_schema_input_type=Environment | Literal["ideal", "noisy"] | None),
+    ] = None
     """A shipped environment, "ideal" or "noisy", or a table with values of your own. "none" or not set: white noise."""
 
     registration: Registration | None = None

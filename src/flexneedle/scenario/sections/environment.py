@@ -85,7 +85,7 @@ class Plate(Section):
 class Environment(Section):
     """Section `tracker.environment`: statistics of a tracker's errors, from which a `field_seed` draws one field."""
 
-    name: Title
+    name: Annotated[Title, Field(examples=["own"])]
     """Name in tables."""
     field_seed: AnySeed = 0
     """Seed of the error field that `flexneedle em simulate` measures."""

@@ -50,7 +50,9 @@ class Registration(Section):
     """RMS error of a measured fiducial, estimated from the residual of the fit."""
     fiducials_mm: Annotated[
         tuple[Vector, ...],
-        Field(strict=False, min_length=3, max_length=100_000),
+        Field(
+            strict=False, min_length=3, max_length=100_000, examples=[[[0, 0, 0], [100, 0, 0], [0, 100, 0]]]
+        ),
         AfterValidator(_not_on_a_line),
     ]
     """Positions x, y, z of the fiducials in the stage's frame."""

@@ -17,11 +17,11 @@ _SECTION = "phantom.structure."
 class HiddenLayer(Section):
     """Section `phantom.structure.hidden_layer`: a layer of another modulus that the scenario does not have."""
 
-    top_mm: NonNegative
+    top_mm: Annotated[NonNegative, Field(examples=[10.0])]
     """Depth of the hidden layer's upper boundary."""
-    thickness_mm: Positive
+    thickness_mm: Annotated[Positive, Field(examples=[5.0])]
     """Thickness of the hidden layer; it may cross layer boundaries."""
-    modulus_factor: Positive
+    modulus_factor: Annotated[Positive, Field(examples=[2.0])]
     """Factor on the μ of the tissue that it replaces."""
 
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from flexneedle.scenario.tissue.layer import Layer
 
@@ -31,7 +31,7 @@ class Ogden(Layer):
 
     law: Literal["ogden"] = "ogden"
     """Law of radial compression: `ogden`, `linear` (without `alpha`), or `module:NAME` of your own."""
-    alpha: Alpha
+    alpha: Annotated[Alpha, Field(examples=[8.74])]
     """α, exponent of the Ogden law."""
 
     def energy(self, e: "Floats") -> "Floats":

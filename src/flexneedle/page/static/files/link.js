@@ -1,5 +1,6 @@
 // A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
 
+import { button } from "../dom.js";
 import { maySteer, steers } from "../shown.js";
 import { safe } from "./names.js";
 
@@ -13,7 +14,8 @@ export async function linkOf(store) {
   return `${location.origin}${location.pathname}${MARK}${packed}`;
 }
 
-// Load the state of the address once connected, and of each link that is followed later.
+// Load the state of the address once connected, and of each link that is followed later. Where changes of the scenario
+// would be lost it asks: any other page can send a browser to a link.
 export function followLink(store, link, status) {
   let waits = false; // until this page is in control
   const take = async () => {
@@ -32,17 +34,28 @@ export function followLink(store, link, status) {
     }
     history.replaceState(null, "", location.pathname + location.search); // a reload keeps what was changed since
     status.textContent = state ? "" : "The link is damaged: nothing was loaded";
-    if (state) await begin(link, state);
+    if (!state) return;
+    if (store.get("session").changed.length) ask(status, state.name, () => begin(link, state));
+    else await begin(link, state);
   };
   store.subscribe(["people", "welcome"], () => {
     if (waits && steers(store)) take(); // not as soon as nobody is: that may be between two connections of one who was
   });
-  const end = store.subscribe(["people"], () => {
-    if (!store.get("people")) return;
+  const end = store.subscribe(["people", "session"], () => {
+    if (!store.get("people") || !store.get("session")) return;
     end();
     take();
   });
   addEventListener("hashchange", take);
+}
+
+function ask(status, name, open) {
+  const choice = (text, then) => button(text, () => {
+    status.textContent = "";
+    then();
+  });
+  const words = `The link has the scenario ${safe(String(name))}. To open it drops the changes that were made here.`;
+  status.replaceChildren(words, " ", choice("Open the link", open), " ", choice("Keep this scenario", () => {}));
 }
 
 async function begin(link, { name, text, seed, strategy, controller }) {

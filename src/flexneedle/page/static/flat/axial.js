@@ -9,14 +9,20 @@ import { reachAt } from "./reach.js";
 const READINGS = 40; // measured positions that are shown, as crosses: what else there is a point for is a disc
 const BEVEL = 26; // px, length of the arrow
 
-// Returns whether the reach was drawn.
-export function drawAxial(pen, { width, height, map, scene, target, parts, store }) {
+// Ends of the reach at the target's depth [[x, y, z], …], none where it is not shown.
+export function endsOf(store, target) {
+  const outlines = store.get("shape reach scene");
+  return shownReach(store) && outlines ? reachAt(target[0], outlines) : [];
+}
+
+// ends: of the reach. Returns whether it was drawn.
+export function drawAxial(pen, { width, height, map, scene, target, parts, ends, store }) {
   const place = (_x, y, z) => [map.toX(z), map.toY(y)];
   const [of, row] = [shownOf(store), shownRow(store)];
   grid(pen, map, width, height, ["z (mm)", "y (mm)"]);
   let reached = false;
   inside(pen, width, height, () => {
-    reached = reach(pen, place, store, target[0]);
+    reached = reach(pen, place, ends);
     disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
     for (const part of parts) draw(pen, part, place, map);
     if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
@@ -39,9 +45,7 @@ function draw(pen, { path, tone, width = 1, alpha = 1, dash, thick, sampled, pre
   else polyline(pen, pointsOf(path, place), { tone, width, alpha, dash });
 }
 
-function reach(pen, place, store, depth) {
-  const outlines = store.get("shape reach scene");
-  const ends = shownReach(store) && outlines ? reachAt(depth, outlines) : [];
+function reach(pen, place, ends) {
   if (ends.length < 2) return false;
   const corners = ends.map((end) => place(...end));
   area(pen, corners, "--reach", 0.2);

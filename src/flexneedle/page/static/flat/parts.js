@@ -1,7 +1,7 @@
 // What moves, for views in two dimensions: {path, tone, width, alpha, dash, text, spread}, from back to front.
 
-import { first, fresh, pathOfRows, ranksOf } from "../paths.js";
-import { foreseen, plannedPaths } from "../planned.js";
+import { first, pathOfRows, ranksOf } from "../paths.js";
+import { foreseen, plannedPaths, sampledPaths } from "../planned.js";
 import { isMeasured, shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
 
 const STALE = 0.35;
@@ -25,10 +25,7 @@ export function partsOf(store, scene) {
 
 // Sampled paths: the cheaper, the stronger.
 function samples(store, of) {
-  const strategy = store.get("session")?.strategy;
-  const shape = of === "scene"
-    ? fresh(store, `iteration ${strategy}`, `shape samples ${strategy}`) ?? null
-    : shownShape(store, "samples", of);
+  const shape = of === "scene" ? sampledPaths(store) : shownShape(store, "samples", of);
   if (!shape) return [];
   const ranks = ranksOf(shape);
   const size = shape.points * shape.columns;

@@ -86,7 +86,7 @@ export function grid(pen, map, width, height, [across, up]) {
   const [low, high] = [map.fromY(bottom), map.fromY(0)];
   for (const x of ticks(left, right, map.sx)) {
     polyline(pen, [[map.toX(x), 0], [map.toX(x), bottom]], { tone: "--grid" });
-    words(pen, minus(x), [map.toX(x), height - 5]);
+    if (map.toX(x) + widthOf(pen, minus(x)) / 2 <= width) words(pen, minus(x), [map.toX(x), height - 5]);
   }
   for (const u of ticks(low, high, map.sy)) {
     polyline(pen, [[SIDE, map.toY(u)], [width, map.toY(u)]], { tone: "--grid" });

@@ -11,15 +11,22 @@ const GUIDE = [6, 3.2]; // mm, length and width
 const NAMES = { top: 24, step: 13, rows: 4, gap: 4 }; // px, of the names of layers; thin ones are below each other
 const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" };
 
-// Returns whether the reach was drawn.
-export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, parts, store }) {
+// The outline [[x, u], …] of the reach in a plane, none where it is not shown.
+export function outlineOf(plane, store) {
+  const news = shownReach(store);
+  return (news && reachIn(plane, news, store.get("shape reach scene"))) ?? [];
+}
+
+// outline: of the reach. Returns whether it was drawn.
+export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, parts, outline, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
   const row = shownRow(store);
   let reached = false;
   drawTissue(pen, map, layers, width, height);
   grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
   inside(pen, width, height, () => {
-    reached = reach(pen, map, plane, store);
+    drawNames(pen, map, layers, width);
+    reached = reach(pen, map, outline);
     for (const part of parts) draw(pen, part, place, map);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
     if (isMeasured(row)) cross(pen, place(...row.measured), { tone: "--measured" });
@@ -28,7 +35,7 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
   return reached;
 }
 
-// The scene alone, before an insertion.
+// The scene alone, before an insertion, small: layers without their names.
 export function drawScene(pen, { width, height, map, plane, name, scene }) {
   drawTissue(pen, map, layersIn(scene), width, height);
   grid(pen, map, width, height, ["x (mm)", upward(name, map)]);
@@ -54,7 +61,6 @@ function drawTissue(pen, map, layers, width, height) {
       area(pen, [[left, 0], [right, 0], [right, bottom], [left, bottom]], "--tissue", 0.12 + 0.3 * shadeOf(modulus));
       polyline(pen, [[left, 0], [left, bottom]], { tone: top === 0 ? "--skin" : "--tissue", width: top === 0 ? 2 : 1.25 });
     }
-    drawNames(pen, map, layers, width);
   });
 }
 
@@ -75,11 +81,8 @@ function drawNames(pen, map, layers, width) {
 
 const edgesOf = (map, top, bottom, width) => [map.toX(top), bottom === null ? width : Math.min(map.toX(bottom), width)];
 
-function reach(pen, map, plane, store) {
-  const news = shownReach(store);
-  if (!news) return false;
-  const outline = reachIn(plane, news, store.get("shape reach scene"));
-  if (!outline) return false;
+function reach(pen, map, outline) {
+  if (!outline.length) return false;
   const points = outline.map(([x, u]) => [map.toX(x), map.toY(u)]);
   area(pen, points, "--reach", 0.2);
   polyline(pen, [...points, points[0]], { tone: "--reach", width: 1 });

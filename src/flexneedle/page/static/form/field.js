@@ -48,7 +48,7 @@ export class FieldView {
     if (!problem && !pending) this.#taken = false;
     if (open && this.#taken) return;
     if (this.#field.kind === "switch") this.input.checked = Boolean(value);
-    else if (document.activeElement !== this.input) this.input.value = written(value);
+    else if (this.#field.kind === "choice" || document.activeElement !== this.input) this.input.value = written(value);
     if (this.#slider && document.activeElement !== this.#slider) this.#slider.value = value ?? this.#field.usual ?? 0;
   }
 

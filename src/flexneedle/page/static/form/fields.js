@@ -2,12 +2,15 @@
 
 // By the end of a key, the longest first.
 const UNITS = Object.entries({
-  _mrad_s: "mrad/s", _mn_per_mm: "mN/mm", _deg_s: "°/s", _mm_s: "mm/s", _per_mm: "/mm", _per_mj: "/mJ", _per_m: "1/m",
+  _mrad_per_mm: "mrad/mm", _mrad_s: "mrad/s", _mn_per_mm: "mN/mm", _deg_s: "°/s", _mm_s: "mm/s", _per_mm: "/mm", _per_mj: "/mJ", _per_m: "1/m",
   _kpa: "kPa", _gpa: "GPa", _mrad: "mrad", _percent: "%", _deg: "°", _hz: "Hz", _mm: "mm", _mn: "mN", _n: "N", _s: "s",
 });
 const TECHNICAL = 1e5; // a bound from here on only keeps out nonsense
 const FAR = 20; // a bound this many times the usual value is none for a slider
 const STEPS = 200; // of a slider
+const OWN = "own values"; // of a table, none of those that have a name
+const LAW = "Law of radial compression. One of your own is set in a scenario file.";
+const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by that of the value
 
 // Sections with their fields: [{name, title, description, fields}]; a layer of the tissue and a table is a section.
 export function sectionsOf(schema, values) {
@@ -28,29 +31,80 @@ function addSection(sections, schema, name, table, values) {
 
 function addValue(sections, section, schema, key, property, values) {
   const table = tableOf(schema, property);
-  const used = table && (!isNullable(property) || Object.keys(values).some((each) => each.startsWith(`${key}.`)));
-  if (used) addSection(sections, schema, key, table, values);
-  else if (!table || takesText(property)) section.fields.push(fieldOf(key, property));
+  if (!table || isNullable(property)) section.fields.push(table ? choiceOf(key, property, table) : fieldOf(key, property));
+  if (table && (!isNullable(property) || isUsed(values, key))) addSection(sections, schema, key, table, values);
+}
+
+// The field of a table that may be left out: not set, one of its names, or one to begin with (start).
+function choiceOf(key, property, table) {
+  const field = fieldOf(key, property);
+  return { ...field, kind: "choice", choices: [...(field.choices ?? []), OWN], start: startOf(table) };
+}
+
+// Values to begin a table with: an example of each that has no default, or what it had `before`.
+function startOf({ properties, required = [] }, before = {}) {
+  const kept = Object.entries(before).filter(([name]) => name in properties);
+  return { ...Object.fromEntries(required.map((name) => [name, properties[name].const ?? properties[name].examples?.[0]])), ...Object.fromEntries(kept) };
 }
 
 function addLayers(sections, schema, property, values) {
   for (let layer = 0; `tissue.${layer}.shear_modulus_kpa` in values; layer++) {
-    const law = values[`tissue.${layer}.law`] ?? "ogden";
-    const laws = property.items.anyOf.map((each) => resolved(schema, each));
-    const table = laws.find(({ properties }) => properties.law.const === law) ?? laws[0];
-    const { law: _, ...properties } = table.properties;
-    addSection(sections, schema, `tissue.${layer}`, { ...table, properties }, values);
+    const [name, laws] = [`tissue.${layer}`, lawsOf(schema)];
+    const law = values[`${name}.law`];
+    const table = laws[law] ?? ownLaw(Object.values(laws), name, values);
+    const choices = law in laws ? Object.keys(laws) : [law];
+    const properties = { ...table.properties, law: { enum: choices, description: LAW } };
+    addSection(sections, schema, name, { ...table, properties }, values);
   }
 }
 
+// The table of a layer whose law is the user's own: what all laws have, and its other values as they are.
+function ownLaw([table, ...others], name, values) {
+  const common = Object.entries(table.properties).filter(([part]) => others.every(({ properties }) => part in properties));
+  const parts = Object.keys(values).filter((key) => key.startsWith(`${name}.`)).map((key) => key.slice(name.length + 1));
+  const own = parts.map((part) => [part, { type: OWN_TYPES[typeof values[`${name}.${part}`]] ?? "array" }]);
+  return { description: "A layer with a law of your own.", properties: { ...Object.fromEntries(own), ...Object.fromEntries(common) } };
+}
+
+// A layer with another law: it keeps the values that both have.
+export function withLaw(schema, layer, law) {
+  const { law: _, ...before } = layer;
+  return { ...startOf(lawsOf(schema)[law], before), law };
+}
+
+// Tables of the layers by law.
+function lawsOf(schema) {
+  const tables = schema.properties.tissue.items.anyOf.map((each) => resolved(schema, each));
+  return Object.fromEntries(tables.map((table) => [table.properties.law.const, table]));
+}
+
+// What a field shows of the values by key: of a table its name, or that it has own values.
+export function valueOf({ key, start, choices }, values) {
+  if (!start) return values[key] ?? null;
+  if (!isUsed(values, key)) return null;
+  const name = values[`${key}.name`];
+  return choices.includes(name) ? name : OWN;
+}
+
+// The edit {key: value} of a field for what it shows: of a table with own values those that it has, or to begin with.
+export function editOf({ key, start }, value, values) {
+  if (!start || value !== OWN) return { [key]: value };
+  return isUsed(values, key) ? { [`${key}.name`]: start.name } : { [key]: start };
+}
+
+// What a field shows of a value that is in an edit.
+export const shownOf = ({ start }, value) => (start && typeof value === "object" && value ? OWN : value);
+
+const isUsed = (values, key) => Object.keys(values).some((each) => each.startsWith(`${key}.`));
+
 // {key, label, unit, kind, nullable, min, max, choices, description, usual}; kind: number, integer, switch, choice,
-// list (of numbers) or text.
+// list (of numbers), points (a list of them) or text.
 function fieldOf(key, property) {
   const all = [property, ...(property.anyOf ?? [])];
   const found = (name) => all.find((each) => each[name] !== undefined)?.[name];
   const choices = found("enum");
   const type = all.map((each) => each.type).find((each) => each && each !== "null");
-  const kinds = { number: "number", integer: "integer", boolean: "switch", array: "list" };
+  const kinds = { number: "number", integer: "integer", boolean: "switch", array: found("items")?.type === "array" ? "points" : "list" };
   const bounds = [found("minimum") ?? found("exclusiveMinimum"), found("maximum") ?? found("exclusiveMaximum")];
   return {
     key,
@@ -89,7 +143,13 @@ export function read({ kind, nullable }, text) {
   const words = text.trim();
   if (kind === "text" || kind === "choice") return { value: words === "" && nullable ? null : words };
   if (words === "") return nullable ? { value: null } : { problem: "must be a number" };
-  const numbers = words.replaceAll("−", "-").split(kind === "list" ? /[\s,;]+/ : /$^/).map(Number);
+  if (kind === "points") {
+    const points = words.replace(/;\s*$/, "").split(";").map((point) => read({ kind: "list" }, point));
+    const isPoint = ({ value }) => value?.length === 3;
+    return points.every(isPoint) ? { value: points.map(({ value }) => value) } : { problem: "must be points x, y, z, separated by semicolons" };
+  }
+  const parts = words.replaceAll("−", "-").split(kind === "list" ? /\s*[,;]\s*|\s+/ : /$^/);
+  const numbers = parts.map((part) => (part.trim() === "" ? NaN : Number(part))); // an empty one would be 0
   if (numbers.some((number) => !Number.isFinite(number))) {
     return { problem: kind === "list" ? "must be numbers, separated by commas" : "must be a number" };
   }
@@ -100,7 +160,8 @@ export function read({ kind, nullable }, text) {
 // A value as a user would write it.
 export function written(value) {
   if (value === null || value === undefined) return "";
-  return Array.isArray(value) ? value.join(", ") : String(value);
+  if (!Array.isArray(value)) return String(value);
+  return Array.isArray(value[0]) ? value.map(written).join("; ") : value.join(", ");
 }
 
 // 1, 2 or 5 times a power of ten, not below a number.
@@ -130,7 +191,6 @@ function firstSentence(text) {
 
 const resolved = (schema, property) => (property.$ref ? schema.$defs[property.$ref.split("/").at(-1)] : property);
 const isNullable = ({ anyOf }) => Boolean(anyOf?.some(({ type }) => type === "null"));
-const takesText = ({ anyOf }) => Boolean(anyOf?.some(({ type }) => type === "string"));
 
 // The table that a property is or may be, or null.
 function tableOf(schema, property) {

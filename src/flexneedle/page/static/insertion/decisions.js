@@ -6,9 +6,10 @@ import { SHOWN, shownOf, shownPeriod, shownRow, startOf } from "../shown.js";
 const MOST = 100; // entries: the newest
 
 export function followDecisions(element, store) {
+  const whose = make("p.quiet", { hidden: true });
   const now = make("p.now");
   const list = make("ol", { "aria-label": "Decisions" });
-  element.append(now, list);
+  element.append(whose, now, list);
   let made = { of: null, first: null, count: 0, text: "", buttons: [] };
 
   store.subscribe(SHOWN, () => {
@@ -16,6 +17,8 @@ export function followDecisions(element, store) {
     const rows = store.get(`rows ${of}`) ?? [];
     const row = shownRow(store, of);
     now.hidden = list.hidden = !row;
+    whose.hidden = of !== "first" || !store.get("insertion live");
+    whose.textContent = whose.hidden ? "" : `Decisions of ${store.get("insertion first").name}, which is shown:`;
     const start = startOf(store, of);
     now.textContent = row ? inWords(row, row.time - start) : "";
     if (made.of !== of || made.first !== rows[0] || rows.length < made.count) restart(of, rows[0]);

@@ -2,17 +2,17 @@
 
 import { button, make } from "../dom.js";
 
-const NO_FIELD = "The tracker of this scenario has no field that metal distorts. To have one, set its environment to ideal or noisy.";
+const NO_FIELD = "The tracker of this scenario has no field that metal distorts. To have one, set its environment to ideal.";
 
 // A form whose requests act at once; what is active is listed.
 export function disturbForm(store, link) {
   const active = make("p.quiet", { role: "status" });
-  const number = (label, value, more = {}) => make("input", { type: "number", min: "0", step: "any", value: String(value), "aria-label": label, ...more });
+  const number = (label, value, more = {}) => make("input", { type: "number", min: "0", max: "10000", step: "any", required: true, value: String(value), "aria-label": label, ...more });
   const [force, angle] = [number("Force on the tip in N", 0.02), number("Direction of the force in degrees", 0, { min: "-360", max: "360" })];
   const [layer, factor] = [make("select", { "aria-label": "Layer" }), number("Factor on its stiffness", 2)];
   const seconds = number("Seconds without the tracker", 1);
   const disturb = (what, size, more = {}) => {
-    if (Number.isFinite(size.valueAsNumber)) link.ask({ type: "disturb", what, size: size.valueAsNumber, ...more });
+    if (size.reportValidity()) link.ask({ type: "disturb", what, size: size.valueAsNumber, ...more });
   };
   const none = (what) => link.ask({ type: "disturb", what, size: 0 });
 
@@ -25,7 +25,7 @@ export function disturbForm(store, link) {
 
   const form = make(
     "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
-    line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
+    line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => angle.reportValidity() && disturb("push", force, { angle_deg: angle.valueAsNumber })), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
     line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
     line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
     line("Metal plate at", plate[0], "mm from the center of the tracker's workspace", plate[1], plate[2], why),
@@ -45,7 +45,6 @@ export function disturbForm(store, link) {
 }
 
 const line = (...parts) => make("div.tools", {}, ...parts);
-const angleOf = (input) => (Number.isFinite(input.valueAsNumber) ? { angle_deg: input.valueAsNumber } : {});
 
 const hasField = (session) => Object.keys(session?.values ?? {}).some((key) => key.startsWith("tracker.environment."));
 

@@ -82,7 +82,7 @@ export class PlotView {
       width: this.#place.clientWidth || 300,
       height: HEIGHT,
       padding: [6, 16, 0, 0],
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, y: { range: rangeOf } },
       legend: { show: false },
       cursor: { drag: { setScale: false, x: false, y: false }, y: false, points: { show: false } },
       axes: [{ ...axis, size: 24, values: (_, values) => values.map((value) => `${value} s`) }, { ...axis, size: 50, values: (_, values) => values.map((value) => String(Number(value.toPrecision(6)))) }],
@@ -111,6 +111,14 @@ export class PlotView {
     ctx.stroke();
     ctx.restore();
   }
+}
+
+// Range of the values about those that are shown; a line without a change is in the middle, not on the edge.
+export function rangeOf(_chart, low, high) {
+  if (low === null) return [null, null];
+  if (low !== high) return uPlot.rangeNum(low, high, 0.1, true);
+  const around = Math.abs(low) / 2 || 1;
+  return [low - around, high + around];
 }
 
 // Columns of two runs as those of one chart.

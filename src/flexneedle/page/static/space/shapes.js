@@ -1,12 +1,13 @@
 // What moves: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
 
 import {
-  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
+  Color, ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, SRGBColorSpace,
+  Vector3,
 } from "../vendor/three.js";
 import { planeOf } from "../flat/plane.js";
 import { isIn } from "../flat/reach.js";
-import { first, fresh, pathOfRows, ranksOf, tipOf } from "../paths.js";
-import { foreseen, plannedPaths, rollOf } from "../planned.js";
+import { first, pathOfRows, ranksOf, tipOf } from "../paths.js";
+import { foreseen, plannedPaths, rollOf, sampledPaths } from "../planned.js";
 import { isMeasured, shownReach, shownRow, shownSecond, shownShape, shownTarget } from "../shown.js";
 import { Lines } from "./lines.js";
 import { Outlines } from "./outlines.js";
@@ -35,7 +36,7 @@ export class Shapes {
     for (const name of ["path", "other", "estimated", "truth", "secondPath", "true", "foreseen"]) {
       this.#addTube(name, new MeshBasicMaterial({ transparent: true }), `--${name}`, 3);
     }
-    this.#addTube("channel", translucent({ vertexColors: true, opacity: 0.55 }), null, 4);
+    this.#addTube("channel", translucent({ vertexColors: true, opacity: 0.8 }), null, 4);
     this.#addTube("predicted", translucent({ opacity: 0.24 }), "--predicted", 5);
     this.#addGuide();
     this.#addBevel();
@@ -162,10 +163,7 @@ export class Shapes {
 
   // Sampled paths: the cheaper, the stronger.
   #samples(store, of) {
-    const strategy = store.get("session")?.strategy;
-    const shape = of === "scene"
-      ? fresh(store, `iteration ${strategy}`, `shape samples ${strategy}`) ?? null
-      : shownShape(store, "samples", of);
+    const shape = of === "scene" ? sampledPaths(store) : shownShape(store, "samples", of);
     if (this.#differs("samples", [shape])) {
       const rank = shape ? ranksOf(shape) : [];
       this.#paths.update(shape, paint("--estimate"), (path) => 0.55 - 0.45 * rank[path]);
@@ -230,9 +228,10 @@ export class Shapes {
 
 const translucent = (how) => new MeshBasicMaterial({ transparent: true, depthWrite: false, ...how });
 
-// Colour of the stretch scale at a share from 0 to 1.
+// Colour of the stretch scale at a share from 0 to 1, as three.js takes those of vertices: linear, not as on a screen.
 function rampAt(share) {
   const place = Math.min(Math.max(share, 0), 1) * (STRETCH.length - 1);
   const low = Math.min(Math.floor(place), STRETCH.length - 2);
-  return STRETCH[low].map((value, at) => value + (place - low) * (STRETCH[low + 1][at] - value));
+  const onScreen = STRETCH[low].map((value, at) => value + (place - low) * (STRETCH[low + 1][at] - value));
+  return new Color().setRGB(...onScreen, SRGBColorSpace).toArray();
 }

@@ -45,6 +45,16 @@ class Report:
         """Whether the controller counts the axis as in motion; in position tracking perhaps also at its target."""
         return bool(self.switches & _MOVING)
 
+    @property
+    def reverse_limit(self) -> bool:
+        """Whether the limit switch in the direction of falling counts is active."""
+        return not self.switches & _REVERSE_INACTIVE
+
+    @property
+    def forward_limit(self) -> bool:
+        """Whether the limit switch in the direction of rising counts is active."""
+        return not self.switches & _FORWARD_INACTIVE
+
 
 def report(position: float, commanded: float, switches: float, code: float) -> Report:
     """Return the report of these values. Raises GarbledError for values that an axis cannot have."""
@@ -62,8 +72,9 @@ class Channel:
 
     target: where it was commanded to go (counts); None: nothing was commanded since it was stopped, defined or
     switched, or the connection was opened. tracking: whether the driver has put it into position tracking, and the
-    controller has not ended that by a stop of its own. waiting: the target is not sent yet. commanded: at the last
-    report. code: stop code at the last report. old: stop codes that explain an earlier stop, not one of this motion.
+    controller has not ended that by a stop of its own. waiting: the target is not sent yet; it is given up where the
+    controller stops the axis by itself, or would at once, at a limit switch. commanded: at the last report.
+    code: stop code at the last report. old: stop codes that explain an earlier stop, not one of this motion.
     """
 
     target: int | None = None
@@ -96,16 +107,25 @@ def seen(channel: Channel, found: Report) -> tuple[Channel, MotorState]:
     stopped = _reason(found.code) if channel.target is not None and not good and found.code not in old else ""
     on = not found.switches & _OFF
     tracking = channel.tracking and on and not stopped
-    after = replace(channel, tracking=tracking, commanded=found.commanded, code=found.code, old=old)
+    waiting = channel.waiting and not stopped and not _is_blocked(channel, found)
+    after = replace(
+        channel, tracking=tracking, waiting=waiting, commanded=found.commanded, code=found.code, old=old
+    )
     return after, MotorState(
         position=found.position,
         commanded=found.commanded,
-        moving=(found.moving and not arrived) or channel.waiting,
+        moving=(found.moving and not arrived) or waiting,
         on=on,
-        reverse_limit=not found.switches & _REVERSE_INACTIVE,
-        forward_limit=not found.switches & _FORWARD_INACTIVE,
+        reverse_limit=found.reverse_limit,
+        forward_limit=found.forward_limit,
         stopped=stopped,
     )
+
+
+def _is_blocked(channel: Channel, found: Report) -> bool:
+    """Whether the target is beyond a limit switch that is active: the controller would not move there."""
+    way = 0.0 if channel.target is None else channel.target - found.commanded
+    return (found.reverse_limit and way < 0.0) or (found.forward_limit and way > 0.0)
 
 
 def _reason(code: int) -> str:

@@ -1,0 +1,23 @@
+// Where an insertion is shown, nothing can be moved by hand: a line that says so, with the way back.
+
+import { button, make } from "./dom.js";
+import { SHOWN, maySteer, runs, shownOf } from "./shown.js";
+
+export const TARGET_AND_PLAN = "Target and plan";
+
+// The line, for a view with handles; it is hidden while they are there, and while an insertion runs.
+export function stillNote(store) {
+  const back = button(TARGET_AND_PLAN, () => {
+    store.set("view of", "scene");
+    store.set("view period", undefined);
+    store.set("view playing", undefined);
+  });
+  const words = make("span");
+  const note = make("p.tools.quiet", { hidden: true }, words, back);
+  store.subscribe([...SHOWN, "people", "welcome"], () => {
+    const still = Boolean(store.get("scene")) && shownOf(store) !== "scene"; // a replay has no scene
+    words.textContent = `This is ${shownOf(store) === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
+    note.hidden = !still || !maySteer(store) || runs(store.get("insertion live"));
+  });
+  return note;
+}
