@@ -96,6 +96,29 @@ def test_operators_move_axes(supervisor):
         supervisor.move_to("nose", 1.0)
 
 
+def test_the_positions_after_a_motion_are_reported_before_its_end():
+    """A home shifts them; who reads them as soon as it has ended gets the new ones."""
+
+    class Received(Supervisor):
+        def _take(self, message):
+            super()._take(message)
+            received.append(message)
+
+    received = []
+    with Received(task()) as supervisor:
+        supervisor.arm()
+        supervisor.move_to("rotation", 0.5)
+        supervisor.arm()
+        supervisor.home("rotation")
+    at = None
+    for message in received:
+        if isinstance(message, say.Report):
+            at = message.axes["rotation"].position
+        elif isinstance(message, say.Done):
+            assert at == pytest.approx(0.5 if message.number == 1 else 0.0, abs=0.02)
+    assert [message.number for message in received if isinstance(message, say.Done)] == [1, 2]
+
+
 def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     shown = []
 

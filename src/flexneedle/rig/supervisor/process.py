@@ -99,21 +99,31 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: sock
         tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
         tracker = stack.enter_context(closing(tracked))
         motors = DryMotors(connected, clock) if task.dry else connected
-        core = Supervisor(task, motors, tracker, clock, outbox.put)
+        answers: list[Any] = []
+        core = Supervisor(task, motors, tracker, clock, answers.append)
         set_realtime_priority()
         gc.collect()
         gc.freeze()
         gc.disable()  # nothing here makes cycles; a collection would delay a tick
         try:
-            return _tick(connection, core, outbox, signals, 1.0 / task.rig.loop.rate_hz)
+            return _tick(connection, core, answers, outbox, signals, 1.0 / task.rig.loop.rate_hz)
         finally:
             motors.stop()
 
 
 def _tick(
-    connection: Connection, core: Supervisor, outbox: Outbox, signals: socket.socket, period: float
+    connection: Connection,
+    core: Supervisor,
+    answers: list[Any],
+    outbox: Outbox,
+    signals: socket.socket,
+    period: float,
 ) -> str:
-    """Tick until the client ends; return why."""
+    """Tick until the client ends; return why.
+
+    answers: what the core has to say. The report of a tick is sent before them: a client that gets the end of a motion
+    has the positions after it.
+    """
     due, missed, ending, why = monotonic(), 0, None, ""
     suspension = Suspension()
     while ending is None or (monotonic() < ending and not core.at_rest):
@@ -138,6 +148,8 @@ def _tick(
             due += period * (1 + skipped)
             core.tick()
             outbox.put(core.report(late, monotonic() - begun, missed))
+        while answers:
+            outbox.put(answers.pop(0))
     return why
 
 
