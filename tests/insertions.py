@@ -17,7 +17,7 @@ from flexneedle.types import STILL, VISIBLE, Measurement, Motion
 
 PHANTOM = flexneedle.load_scenario("phantom")
 READING = PHANTOM.tracker.period
-HELD, RESTING = "held", "waiting for the last reading"
+HELD, RESTING = "held: measurement missing: tip not measured", "waiting for the last reading"
 
 
 class Tank:

@@ -169,9 +169,15 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 @contextmanager
 def problems_printed(folder: Folder) -> Iterator[None]:
-    """At the end, print a line on stderr for each file that could not be written, and figure not drawn."""
+    """At the end, print a line on stderr for each file that could not be written, and figure not drawn.
+
+    After an error or an interrupt also where the record so far is, which no table names then.
+    """
     try:
         yield
+    except BaseException:
+        print(f"flexneedle: the record so far is in {folder.path}", file=sys.stderr)
+        raise
     finally:
         for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
             print(f"flexneedle: {line}", file=sys.stderr)

@@ -56,7 +56,8 @@ class Steering:
         """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
         reading = self.task.scenario.tracker.period
         if progress.hold is not None:
-            held = Decision(STILL, "held", predicted=progress.predicted)
+            why = f"held: measurement {progress.observation.verdict}"
+            held = Decision(STILL, why, predicted=progress.predicted)
             return Step(Action.HOLD, held, reading), replace(progress, late=None)
         if progress.arrived_at is not None:
             delay = begun - progress.observation.measurement.time

@@ -48,6 +48,41 @@ def test_a_file_is_loaded(files, server):
     assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
 
 
+ASKS = {
+    "preset": "To begin with phantom drops the changes that were made here.",
+    "world": "To begin with world:7 drops the changes",
+    "file": "To load my.toml drops the changes",
+}
+
+
+@pytest.mark.parametrize("opened", [True, False])
+@pytest.mark.parametrize("way", ASKS)
+def test_it_asks_before_changes_are_lost(files, server, way, opened):
+    page = files()
+    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
+    until(page, "flexneedle.store.get('session').changed.length")
+    if way == "preset":
+        page.select_option("#files-preset", "phantom")
+        page.click("[aria-label='Begin with the preset']")
+    elif way == "world":
+        page.fill("[aria-label='Number of a random world']", "7")
+        page.click("text=Random world")
+    else:
+        payload = {"name": "my.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
+        page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector(f"{FILES} >> text={ASKS[way]}")
+    assert not server.asked("preset")
+    assert not server.asked("load")
+    status = page.locator(f"{FILES} [role=status]", has_text="drops the changes")
+    if opened:
+        status.get_by_role("button", name="Load" if way == "file" else "Begin", exact=True).click()
+        server.wait_for("load" if way == "file" else "preset")
+    else:
+        status.get_by_role("button", name="Keep this scenario").click()
+    until(page, f"!document.querySelector('{FILES}').textContent.includes('drops the changes')")
+    assert opened or not (server.asked("preset") or server.asked("load"))
+
+
 def test_a_file_that_is_too_large_is_not_sent(files, server):
     page = files()
     payload = {"name": "large.toml", "mimeType": "application/toml", "buffer": b"x" * 200_001}

@@ -322,6 +322,23 @@ def test_a_search_opens_the_sections_of_what_it_finds(form):
     assert "1 setting" in page.inner_text(FORM)
 
 
+@pytest.mark.parametrize(
+    ("text", "found"), [("unknown seed", []), ("seed", ["seed"]), ("cross", []), ("steering", ["strategy"])]
+)
+def test_a_search_finds_the_options_too(form, text, found):
+    """By their names and choices."""
+    page = form()
+    shown = f"{FORM} .options input:visible, {FORM} .options select:visible"
+    names = "all => all.map((one) => one.id.replace('option-', ''))"
+    page.fill(f"{FORM} input[type=search]", text)
+    settings = page.locator(f"{FORM} .field[data-key]:visible").count()
+    assert page.locator(shown).evaluate_all(names) == found
+    count = len(found) + settings
+    assert f"{count} setting{'' if count == 1 else 's'}" in page.inner_text(f"{FORM} p[role=status]")
+    page.fill(f"{FORM} input[type=search]", "")
+    assert page.locator(shown).evaluate_all(names) == ["seed", "strategy", "controller"]
+
+
 def test_a_layer_is_added_and_removed(form, server):
     page = form()
     page.click("summary:has-text('Layer 1')")

@@ -308,6 +308,30 @@ def test_decisions_are_listed_where_they_change_and_show_their_period(panel, ser
     page.wait_for_selector(".decisions li:last-child[aria-current=step]")
 
 
+def test_numbers_alone_make_no_entry_among_the_decisions(panel):
+    said = [
+        "rolls at 20.1 mm; predicted miss 0.012 ± 0.034 mm",
+        "rolls at 20.1 mm; predicted miss -0.3 ± 1e-05 mm",
+        "bevel kept; predicted miss 0.01 ± 0.03 mm",
+        "bevel kept; predicted miss 0.02 ± 0.03 mm",
+    ]
+    made = [row(index).model_copy(update={"decision": text}) for index, text in enumerate(said)]
+    page = panel([*opening(), insertion("running", periods=4), rows(0, 4).model_copy(update={"rows": made})])
+    page.wait_for_selector(f".decisions .now >> text={said[-1]}")
+    assert page.locator(".decisions li span").all_inner_texts() == [said[2], said[0]]
+
+
+def test_a_needle_that_is_held_is_not_said_to_run_only(panel, server):
+    page = panel([*opening(), insertion("running", periods=2), rows(0, 2)])
+    page.wait_for_selector(f"{PANEL} >> text=Running: ")
+    assert "held" not in page.inner_text(f"{PANEL} [role=status]")
+    held = row(2).model_copy(update={"action": "hold", "decision": "held: measurement missing"})
+    server.send(rows(0, 3).model_copy(update={"first": 2, "rows": [held]}))
+    page.wait_for_selector(f"{PANEL} >> text=The needle is held, for the reason below.")
+    server.send(rows(0, 4).model_copy(update={"first": 3, "rows": [row(3)]}))
+    until(page, f"!document.querySelector('{PANEL} [role=status]').textContent.includes('held')")
+
+
 def test_anybody_can_stop_and_only_who_steers_can_do_more(panel, server):
     page = panel([*opening(), people(2, steering=2), insertion("running")])
     assert page.locator(PANEL).get_by_role("button", name="Pause", exact=True).is_disabled()

@@ -131,6 +131,7 @@ def test_searches_a_stopped_insertion_a_link_and_a_row_of_a_study(address, tab, 
     page.click("text=Copy a link")
     page.wait_for_selector(f"{FILES} >> text=Copied")
     page.click("[aria-label='Begin with the preset']")
+    page.locator(FILES).get_by_role("button", name="Begin", exact=True).click()
     page.evaluate("flexneedle.link.ask({ type: 'options', seed: 1 })")
     until(page, f"{state}[0] === 1 && {state}[1] !== 33")
     page.evaluate("location.hash = new URL(window.copied).hash")

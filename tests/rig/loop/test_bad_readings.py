@@ -70,7 +70,7 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, faul
     held = done.periods[first + 1 : first + len(bad) + 1]
     assert [period.command for period in held] == [STILL] * len(held)
     assert [period.applied for period in held] == [STILL] * len(held)
-    assert {period.decision for period in held} == {"held"}
+    assert [period.decision for period in held] == [f"held: measurement {each.verdict}" for each in bad]
     assert not [time for time, _ in tank.moves if bad[0].time - 1e-9 <= time < held[-1].time - 1e-9]
     assert len({period.true_tip for period in (bad[0], *held)}) == 1
     assert {period.innovation for period in bad} == {(0.0, 0.0, 0.0)}

@@ -1,6 +1,7 @@
 // Scenarios and runs: presets, files, a link to the present state, recorded runs with downloads, pictures.
 
 import { button, make } from "./dom.js";
+import { unlessChanged } from "./files/changes.js";
 import { followLink, linkOf } from "./files/link.js";
 import { safe } from "./files/names.js";
 import { saveGif, savePng } from "./files/pictures.js";
@@ -12,9 +13,10 @@ const MOST_WORLDS = 1e9;
 
 export function mount(element, store, link) {
   const preset = make("select", { id: "files-preset", "aria-label": "Preset" });
-  const begin = button("Begin", () => link.ask({ type: "preset", name: preset.value }), { "aria-label": "Begin with the preset" });
+  const begins = (name) => unlessChanged(store, status, `To begin with ${name}`, "Begin", () => link.ask({ type: "preset", name }));
+  const begin = button("Begin", () => begins(preset.value), { "aria-label": "Begin with the preset" });
   const world = make("input", { type: "number", min: "0", step: "1", value: "100012", "aria-label": "Number of a random world" });
-  const draw = button("Random world", () => beginWorld(world, link));
+  const draw = button("Random world", () => beginWorld(world, begins));
   const file = make("input.spoken", { type: "file", accept: ".toml", "aria-label": "Scenario file", tabindex: "-1" });
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
@@ -27,8 +29,8 @@ export function mount(element, store, link) {
   const runs = make("div.runs");
   element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), address, runs);
 
-  file.addEventListener("change", () => loadFile(file, link, status));
-  acceptDrops(element, link, status);
+  file.addEventListener("change", () => loadFile(file, store, link, status));
+  acceptDrops(element, store, link, status);
   store.subscribe(["welcome", "session"], () => choosePreset(preset, store));
   store.subscribe(["people", "welcome"], () => {
     steered.disabled = !maySteer(store);
@@ -44,37 +46,37 @@ function choosePreset(select, store) {
   if (names.includes(name)) select.value = name;
 }
 
-function beginWorld(input, link) {
+function beginWorld(input, begins) {
   const number = Number(input.value);
   if (!Number.isInteger(number) || number < 0 || number > MOST_WORLDS) input.setAttribute("aria-invalid", "true");
   else {
     input.removeAttribute("aria-invalid");
-    link.ask({ type: "preset", name: `world:${number}` });
+    begins(`world:${number}`);
   }
 }
 
-async function loadFile(input, link, status) {
+async function loadFile(input, store, link, status) {
   const [file] = input.files;
   input.value = ""; // so that the same file can be loaded again
-  if (file) await send(file, link, status);
+  if (file) await send(file, store, link, status);
 }
 
-async function send(file, link, status) {
+async function send(file, store, link, status) {
   const text = await file.text();
   if (text.length > LARGEST) {
     status.textContent = `${file.name}: has ${text.length} characters, must have at most ${LARGEST}`;
     return;
   }
-  status.textContent = "";
-  await link.ask({ type: "load", name: safe(file.name), text });
+  const name = safe(file.name);
+  await unlessChanged(store, status, `To load ${name}`, "Load", () => link.ask({ type: "load", name, text }));
 }
 
-function acceptDrops(element, link, status) {
+function acceptDrops(element, store, link, status) {
   element.addEventListener("dragover", (event) => event.preventDefault());
   element.addEventListener("drop", (event) => {
     event.preventDefault();
     const [file] = event.dataTransfer.files;
-    if (file) send(file, link, status);
+    if (file) send(file, store, link, status);
   });
 }
 

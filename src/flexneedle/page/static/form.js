@@ -18,13 +18,15 @@ export async function mount(element, store, link) {
   const sections = make("div.sections");
   const fields = make("fieldset.bare", {}, options, doubts, make("div.tools", {}, search), none, sections);
   element.append(fields);
-  followOptions(options, store, link);
+  const findOptions = followOptions(options, store, link);
 
   const answer = await fetch("/schema.json");
   if (!answer.ok) throw new Error(`the schema of scenarios: ${answer.status} ${answer.statusText}`);
   const form = new Form(sections, await answer.json(), store, link);
   const find = () => {
-    none.textContent = form.find(search.value.trim().toLowerCase());
+    const words = search.value.trim().toLowerCase().split(/\s+/).filter(Boolean);
+    const count = findOptions(words) + form.find(words);
+    none.textContent = words.length ? `${count} ${count === 1 ? "setting" : "settings"}` : "";
   };
   search.addEventListener("input", find);
   store.subscribe(["session", "draft", "refusals"], () => {
@@ -67,9 +69,8 @@ class Form {
     return remade;
   }
 
-  // Show the fields with all words of a text, and their sections; with none all. Returns the number in words.
-  find(text) {
-    const words = text.split(/\s+/).filter(Boolean);
+  // Show the fields with all of some words, and their sections; without words all. Returns how many with them.
+  find(words) {
     let count = 0;
     for (const section of this.#sections) {
       if (words.length) this.#make(section);
@@ -80,7 +81,7 @@ class Form {
       section.element.hidden = words.length > 0 && section.views.every((view) => view.element.hidden);
       if (words.length) section.element.open = !section.element.hidden;
     }
-    return words.length ? `${count} ${count === 1 ? "setting" : "settings"}` : "";
+    return count;
   }
 
   // The form is made again for another scenario, and when it has other layers or tables.

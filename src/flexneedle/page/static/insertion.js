@@ -36,12 +36,16 @@ export function mount(element, store, link) {
   );
   followDecisions(decisions, store);
 
+  store.subscribe(["insertion live", "rows live"], () => {
+    const live = store.get("insertion live");
+    const words = live ? inWords(live, store.get("rows live")) : NONE;
+    if (state.textContent !== words) state.textContent = words; // what is set anew is read out again
+  });
   store.subscribe(SHOWN_BY, () => {
     const live = store.get("insertion live");
     const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.state === "paused"];
     const signalled = steers && !BEFORE_IT.includes(live?.state); // before it moves it can only be stopped
-    state.textContent = live ? inWords(live) : NONE;
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
     stop.hidden = !runs;
     for (const each of [pause, step, pace]) each.hidden = !runs || real;

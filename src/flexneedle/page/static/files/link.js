@@ -1,7 +1,7 @@
 // A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
 
-import { button } from "../dom.js";
 import { maySteer, steers } from "../shown.js";
+import { unlessChanged } from "./changes.js";
 import { safe } from "./names.js";
 
 const MARK = "#state=";
@@ -35,8 +35,8 @@ export function followLink(store, link, status) {
     history.replaceState(null, "", location.pathname + location.search); // a reload keeps what was changed since
     status.textContent = state ? "" : "The link is damaged: nothing was loaded";
     if (!state) return;
-    if (store.get("session").changed.length) ask(status, state.name, () => begin(link, state));
-    else await begin(link, state);
+    const words = `The link has the scenario ${safe(String(state.name))}. To open it`;
+    await unlessChanged(store, status, words, "Open the link", () => begin(link, state));
   };
   store.subscribe(["people", "welcome"], () => {
     if (waits && steers(store)) take(); // not as soon as nobody is: that may be between two connections of one who was
@@ -47,15 +47,6 @@ export function followLink(store, link, status) {
     take();
   });
   addEventListener("hashchange", take);
-}
-
-function ask(status, name, open) {
-  const choice = (text, then) => button(text, () => {
-    status.textContent = "";
-    then();
-  });
-  const words = `The link has the scenario ${safe(String(name))}. To open it drops the changes that were made here.`;
-  status.replaceChildren(words, " ", choice("Open the link", open), " ", choice("Keep this scenario", () => {}));
 }
 
 async function begin(link, { name, text, seed, strategy, controller }) {

@@ -4,7 +4,8 @@ import { button, make } from "../dom.js";
 
 const MOST = 2 ** 53;
 
-// Fields of the options in `element`, which follow the session.
+// Fields of the options in `element`, which follow the session. Returns a function that shows those with all of some
+// words, and returns how many that are.
 export function followOptions(element, store, link) {
   const ask = async (options) => {
     const answer = await link.ask({ type: "options", ...options });
@@ -31,9 +32,10 @@ export function followOptions(element, store, link) {
   const controller = make("select", { id: "option-controller", change: () => ask({ controller: controller.value }) });
   const help = make("p.help.quiet", { id: "option-help" });
   controller.setAttribute("aria-describedby", "option-help");
-  element.append(
-    row("Seed", seed, next), problem, row("Strategy", strategy), row("Controller", controller), help,
-  );
+  const fields = [
+    [row("Seed", seed, next), problem], [row("Strategy", strategy)], [row("Controller", controller), help],
+  ].map((parts) => make("div.option", {}, ...parts));
+  element.append(...fields);
 
   function show() {
     const [session, welcome] = [store.get("session"), store.get("welcome")];
@@ -46,6 +48,11 @@ export function followOptions(element, store, link) {
     help.textContent = welcome.controllers.find(({ name }) => name === session.controller)?.summary ?? "";
   }
   store.subscribe(["session", "welcome"], show);
+
+  return (words) => {
+    for (const field of fields) field.hidden = !words.every((word) => field.textContent.toLowerCase().includes(word));
+    return fields.filter(({ hidden }) => !hidden).length;
+  };
 }
 
 const row = (name, input, ...more) =>

@@ -1,16 +1,17 @@
-// What the controller decided, in words: the decision of the shown period, and all changes of it.
+// What the controller decided, in words: the decision of the shown period, and a list of where its words change.
 
 import { button, make, shown } from "../dom.js";
 import { SHOWN, shownOf, shownPeriod, shownRow, startOf } from "../shown.js";
 
 const MOST = 100; // entries: the newest
+const NUMBER = /[-+−]?\d+(\.\d+)?(e[-+]\d+)?/g;
 
 export function followDecisions(element, store) {
   const whose = make("p.quiet", { hidden: true });
   const now = make("p.now");
   const list = make("ol", { "aria-label": "Decisions" });
   element.append(whose, now, list);
-  let made = { of: null, first: null, count: 0, text: "", buttons: [] };
+  let made = { of: null, first: null, count: 0, words: "", buttons: [] };
 
   store.subscribe(SHOWN, () => {
     const of = shownOf(store);
@@ -27,16 +28,17 @@ export function followDecisions(element, store) {
   });
 
   function restart(of, first) {
-    made = { of, first, count: 0, text: "", buttons: [] };
+    made = { of, first, count: 0, words: "", buttons: [] };
     list.replaceChildren();
   }
 
-  // An entry where the words differ from those of the period before.
+  // An entry where the words differ from those of the period before; numbers alone change nearly every period.
   function add(row, time) {
     made.count = row.index + 1;
     const text = textOf(row);
-    if (text === made.text) return;
-    made.text = text;
+    const words = text.replace(NUMBER, "#");
+    if (words === made.words) return;
+    made.words = words;
     const go = button(`${shown(time, 1)} s`, () => store.set("view period", row.index), { "aria-label": `Show period ${row.index + 1}` });
     const entry = make("li", {}, go, make("span", { class: row.warning || row.late ? "bad" : "" }, text));
     list.prepend(entry);

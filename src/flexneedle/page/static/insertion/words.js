@@ -9,12 +9,13 @@ const STATES = {
 
 const COUNTED = ["paused", "holding", "done", "held", "failed", "interrupted"]; // else the player counts the periods
 
-// insertion: the news of that type.
-export function inWords(insertion) {
+// insertion: the news of that type; rows: of its periods so far.
+export function inWords(insertion, rows = []) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
   const parts = [`${STATES[insertion.state] ?? insertion.state}${where}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
   if (insertion.summary) parts.push(insertion.summary);
+  else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason below.");
   else if ((insertion.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(insertion.error_mm, 3)} mm from the target.`);
   if (insertion.folder) parts.push(`Recorded as ${insertion.folder}.`);
   return parts.join(" ");
