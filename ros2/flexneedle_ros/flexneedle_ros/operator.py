@@ -84,6 +84,20 @@ def answer(done, states, seconds):
     return state if done else f"not done within {seconds:g} s: {state}"
 
 
+def carry_out(publish, states, wanted, seconds, *, repeat, missing):
+    """Carry out a service; return whether it is done, and the text of its answer.
+
+    missing: why no rig can report its state, or "".
+    """
+    if missing:
+        if repeat:  # a rig that reports no state is stopped all the same
+            publish()
+        return False, missing
+    shows = ARMED + UNDER_WAY if wanted is ARMED and states.last == "idle" else wanted
+    done = ask(publish, states, shows, seconds, repeat=repeat)
+    return done, answer(done, states, seconds)
+
+
 def main(args=None):
     """Run the node until Ctrl-C. Returns 2 without ROS 2."""
     try:
@@ -117,18 +131,15 @@ def main(args=None):
         publisher = node.create_publisher(Bool, topic, 1)
 
         def call(_request, response):
-            if node.count_publishers(given["state_topic"]) == 0:
-                if repeat:  # a rig that reports no state is stopped all the same
-                    publisher.publish(Bool(data=True))
-                response.success, response.message = False, f"no rig publishes {given['state_topic']}"
-                return response
-            shows = wanted
-            if wanted is ARMED and states.last == "idle":
-                shows = ARMED + UNDER_WAY
-            done = ask(
-                lambda: publisher.publish(Bool(data=True)), states, shows, given["answer_s"], repeat=repeat
+            reported = node.count_publishers(given["state_topic"]) > 0
+            response.success, response.message = carry_out(
+                lambda: publisher.publish(Bool(data=True)),
+                states,
+                wanted,
+                given["answer_s"],
+                repeat=repeat,
+                missing="" if reported else f"no rig publishes {given['state_topic']}",
             )
-            response.success, response.message = done, answer(done, states, given["answer_s"])
             return response
 
         node.create_service(Trigger, f"~/{name}", call, callback_group=group)

@@ -86,6 +86,21 @@ def run(
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
     steering = Steering(task, chosen, Guard.of(scenario, plan), rng, force, on_decision)
+    periods, ending = _run_to_end(steering, rig, on_period)
+    insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
+    if insertion.outcome is Outcome.DONE:
+        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
+        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
+    return insertion
+
+
+def _run_to_end(
+    steering: Steering, rig: Rig, on_period: Callable[[Period], None] | None
+) -> tuple[list[Period], _Ending]:
+    """All periods, and (outcome, reason), once the driver is stopped.
+
+    Raises DriverError if the driver cannot be stopped after another error or an interrupt.
+    """
     periods: list[Period] = []
     ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
     try:
@@ -105,12 +120,7 @@ def run(
         if still_on:
             raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error
         raise
-    ending = _stopped(rig.driver, ending)
-    insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
-    if insertion.outcome is Outcome.DONE:
-        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
-        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
-    return insertion
+    return periods, _stopped(rig.driver, ending)
 
 
 def _stopped(driver: Driver, ending: _Ending) -> _Ending:
