@@ -310,6 +310,7 @@ def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
     faster = of_rows("second", lambda k: {"time": 0.1 * k + 60.0})
     server.send(insertion("done", of="second", periods=50), faster, *shapes)
     until(page, "flexneedle.store.get('rows second')?.length === 50")
+    until(page, "flexneedle.store.track('needle', 'second', 49)?.period === 49")  # shapes come after the rows
     at = """async (period) => {
       const { shownSecond } = await import("/static/shown.js");
       flexneedle.store.set("view period", period);
