@@ -423,6 +423,7 @@ def test_a_period_without_a_shape_shows_none(player):
     path = np.zeros((1, 3), np.float32)
     shapes = frame_of(Kind.PREDICTED, Source.FIRST, 2, path + 2, path + np.nan, path + 4)
     page = player([*opening(), *recorded()[:2], packed(shapes)])
+    until(page, "flexneedle.store.track('predicted', 'first', 4)")
     read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
     assert page.evaluate(read) == [2, None, 4, None]
 
