@@ -145,11 +145,12 @@ docs: setup  ## build the documentation site into site/; warnings are errors
 	$(BIN)/python tools/docs/page_catalog.py
 	PYTHONPATH=tools/docs $(BIN)/zensical build --strict --clean
 
-lint: setup  ## style, types, layers
+lint: setup  ## style, types, layers, words
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/lint/words.py
 
 clean:  ## remove what make and the tools made
 	rm -rf .venv dist build site .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
