@@ -32,7 +32,7 @@ demo: setup  ## plan and steer one insertion on the phantom
 	@$(BIN)/flexneedle insert phantom --seed 0
 
 kernels: setup  ## compile the kernels, once before the tests start in several processes
-	@$(BIN)/python -c "from flexneedle.rig.kernels import compile_kernels; compile_kernels(1); compile_kernels(2)"
+	@$(BIN)/python -c "from flexneedle.phantom.kernels import compile_kernels; compile_kernels(1); compile_kernels(2)"
 
 test: kernels  ## run the tests but the long ones, on all cores
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGS)
@@ -41,7 +41,7 @@ test-all: kernels  ## run all tests but the slow ones and the page's: statistics
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not page" $(PYTEST_ARGS)
 
 test-page: kernels  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "page and not slow" tests/page $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "page and not slow" tests/lab/page $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py
@@ -57,27 +57,27 @@ bench-page: setup  ## measure the page in a browser against its bars; needs chro
 	$(BIN)/python benchmarks/page.py $(ARGS)
 
 rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
-	$(BIN)/python studies/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)
+	$(BIN)/python campaigns/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)
 
 rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (an hour and more)
-	$(BIN)/python studies/rig_faults.py --out $(or $(DIR),runs/rig-faults)
+	$(BIN)/python campaigns/rig_faults.py --out $(or $(DIR),runs/rig-faults)
 
 rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decision 0, 50 and 150 ms longer (hours)
-	$(BIN)/python studies/rig_wall_clock.py --out $(or $(DIR),runs/rig-wall-clock)
+	$(BIN)/python campaigns/rig_wall_clock.py --out $(or $(DIR),runs/rig-wall-clock)
 
 rig-families: setup  ## insertions on 100 random rigs, emulated and in simulated time (hours)
-	$(BIN)/python studies/rig_families.py --out $(or $(DIR),runs/rig-families)
+	$(BIN)/python campaigns/rig_families.py --out $(or $(DIR),runs/rig-families)
 
 rig-ros: setup  ## what ROS subscribers cost an insertion on an emulated rig, and stops over ROS (an hour)
-	$(BIN)/python studies/rig_ros.py --pairs 5 --out $(or $(DIR),runs/rig-ros)
+	$(BIN)/python campaigns/rig_ros.py --pairs 5 --out $(or $(DIR),runs/rig-ros)
 
 fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
-	$(BIN)/python studies/fuzz_galil.py
-	$(BIN)/python studies/fuzz_aurora.py
-	$(BIN)/python studies/fuzz_rig_file.py
+	$(BIN)/python campaigns/fuzz_galil.py
+	$(BIN)/python campaigns/fuzz_aurora.py
+	$(BIN)/python campaigns/fuzz_rig_file.py
 
 fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
-	$(BIN)/python studies/fuzz_ros.py
+	$(BIN)/python campaigns/fuzz_ros.py
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py
@@ -129,7 +129,7 @@ worlds-space: setup  ## 200 random worlds in space, each with every driver, and 
 	$(BIN)/flexneedle study worlds-space --resume --out $(or $(DIR),runs/worlds-space)
 	$(BIN)/flexneedle report $(or $(DIR),runs/worlds-space)
 
-tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/study/tuning (long)
+tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/lab/study/tuning (long)
 	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done

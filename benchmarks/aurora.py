@@ -16,8 +16,8 @@ from time import perf_counter
 import numpy as np
 import psutil
 
-from flexneedle.rig.devices.aurora.tracker import Aurora
-from flexneedle.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.clock import WallClock
 
 PERIOD_S = 0.02  # of the loop of the caller
 

@@ -31,7 +31,7 @@ US = 1e6
 FIRST_USE = """
 import time; begun = time.perf_counter()
 import flexneedle
-from flexneedle.rig.kernels import compile_kernels
+from flexneedle.phantom.kernels import compile_kernels
 compile_kernels()
 simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
 state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))

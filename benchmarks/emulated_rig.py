@@ -21,9 +21,9 @@ from time import monotonic
 import numpy as np
 import psutil
 
-from flexneedle.rig.devices.aurora.tracker import Aurora
-from flexneedle.rig.devices.clock import WallClock
-from flexneedle.rig.emulator.coupled.truth import read_truth
+from flexneedle.lab.emulators.emulated_rig.truth import read_truth
+from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.clock import WallClock
 
 SPEED_MM_S, COUNTS_PER_MM, PERIOD_S = 5.0, 2000, 0.025
 DEPTH_MM, AIR_MM, ROLL_AT_MM = 40.0, 28.5, 20.0
@@ -62,7 +62,7 @@ def measure(scenario: str, depth: float) -> dict[str, float]:
 
 def rig_in(folder: Path) -> str:
     """Write the emulated rig of the package with a free port and a link of its own; return its path."""
-    text = (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text(encoding="utf-8")
+    text = (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text(encoding="utf-8")
     path = folder / "rig.toml"
     path.write_text(
         text.replace(":2323", ":0").replace("/tmp/aurora", str(folder / "aurora")), encoding="utf-8"

@@ -20,7 +20,7 @@ from time import perf_counter
 import numpy as np
 import psutil
 
-from flexneedle.rig.devices.galil.motors import GalilMotors, factory
+from flexneedle.lab.rig.devices.galil.motors import GalilMotors, factory
 
 CHANNELS = "ABCD"
 BAR_MS, BUSY_MS = 2.0, 1.0

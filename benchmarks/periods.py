@@ -13,7 +13,7 @@ import argparse
 import numpy as np
 
 import flexneedle
-from flexneedle.rig.kernels import compile_kernels
+from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.scenario.worlds import PLANE, has_rig, world
 
 FIRST, COUNT = 100_000, 40

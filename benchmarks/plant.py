@@ -18,8 +18,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import flexneedle
-from flexneedle.rig.phantom.draw import draw
-from flexneedle.rig.phantom.plants import ExactPlant
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.plants import ExactPlant
 from reference import planar_rod
 
 DEPTH_MM, STEP_MM, PHANTOMS = 45.0, 0.25, 12

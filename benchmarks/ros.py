@@ -20,9 +20,9 @@ import psutil
 import rosbags.typesys.stores.ros2_humble as ros
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from flexneedle.ros.client import NodeClient, open_node
-from flexneedle.ros.profile import LATCHED, PUBLISHED, Profile, load_profile
-from flexneedle.ros.records import Stop
+from flexneedle.lab.ros.client import NodeClient, open_node
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, Profile, load_profile
+from flexneedle.lab.ros.records import Stop
 from flexneedle.types import Period, Plan, Shape
 from synthetic import make_periods, make_plan
 
@@ -108,7 +108,7 @@ def _periods(node: NodeClient, plan: Plan, periods: list[Period], count: int) ->
 
 
 def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict[str, float]:
-    from flexneedle.ros.dds import Writer, participant
+    from flexneedle.lab.ros.dds import Writer, participant
 
     writer = Writer(participant(), profile.subscribe.stop.topic, "std_msgs/msg/Bool")
     _await(lambda: writer.readers >= 2)
@@ -139,7 +139,7 @@ def subscribe(profile: Profile, *, slow: bool) -> int:
     """Read all topics until the standard input ends, and print how many messages; a slow one pauses for seconds."""
     from select import select
 
-    from flexneedle.ros.dds import Reader, participant
+    from flexneedle.lab.ros.dds import Reader, participant
 
     domain = participant()
     readers = [

@@ -23,13 +23,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import flexneedle
 from flexneedle.errors import StoppedError
-from flexneedle.rig.supervisor.client import Supervisor
-from flexneedle.rig.supervisor.messages import Task
-from flexneedle.rig.tracking.registration import identity
-from flexneedle.ros.bridge import Bridge
-from flexneedle.ros.dds import Writer, participant
-from flexneedle.ros.profile import load_profile
-from flexneedle.scenario.rig import RigFile, RosSettings
+from flexneedle.geometry.registration import identity
+from flexneedle.lab.rig.rig_file import RigFile, RosSettings
+from flexneedle.lab.rig.supervisor.client import Supervisor
+from flexneedle.lab.rig.supervisor.messages import Task
+from flexneedle.lab.ros.bridge import Bridge
+from flexneedle.lab.ros.dds import Writer, participant
+from flexneedle.lab.ros.profile import load_profile
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from ros import LOOPBACK
 from stages import RIG

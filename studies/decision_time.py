@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 
 import flexneedle
-from flexneedle.control.interface import Decision, Method
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT
+from flexneedle.control.interface import Controller, Decision
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.rig.loop import run
-from flexneedle.rig.ports import Clock
-from flexneedle.rig.virtual import Seeds, virtual_rig
+from flexneedle.loop.closed_loop import run
+from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.ports import Clock
 from flexneedle.types import Insertion, Outcome, Plan
 
 TARGETS = tuple(product((25.0, 30.0, 35.0, 40.0, 45.0), (-5.0, 0.0, 5.0)))
@@ -55,9 +55,9 @@ def plan_to(target: tuple[float, float]) -> Plan:
     return flexneedle.plan("phantom", target, seed=0, threads=1)
 
 
-def taking(seconds: float, clock: Clock) -> Method:
+def taking(seconds: float, clock: Clock) -> Controller:
     """The default controller, whose decisions take time on a clock."""
-    method = METHODS[DEFAULT]
+    method = CONTROLLERS[DEFAULT]
 
     def decide(task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Any]:
         if seconds > 0.0:

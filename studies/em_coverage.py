@@ -21,9 +21,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy import stats
 
-from flexneedle.em.evaluation.accuracy import accuracy
-from flexneedle.em.evaluation.evaluate import Options, read_table
-from flexneedle.em.evaluation.separation import separation
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import accuracy
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, read_table
+from flexneedle.lab.tracker_evaluation.evaluation.separation import separation
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 POINTS, SAMPLES = len(GRID), 20

@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from flexneedle.em.simulate import Experiment, measure
-from flexneedle.rig.tracking.table import REFERENCE, TIP
+from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure
+from flexneedle.phantom.tracking.table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
 
 Floats = NDArray[np.float64]

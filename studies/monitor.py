@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from flexneedle import Scenario, load_scenario
 from flexneedle.figures import style
+from flexneedle.loop.closed_loop import run as carry_out
+from flexneedle.loop.virtual import Seeds, virtual_rig, virtual_room
+from flexneedle.phantom.plants import DEFAULT_PLANT
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.rig.loop import run as carry_out
-from flexneedle.rig.phantom.plants import DEFAULT_PLANT
-from flexneedle.rig.virtual import Seeds, virtual_rig, virtual_room
 from flexneedle.types import Plan
 
 FIRST_SEED = 300_000

@@ -19,9 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import flexneedle
 from flexneedle import Control, Scenario
-from flexneedle.rig.phantom.draw import draw
-from flexneedle.rig.phantom.equilibrium import MAX_ITERATIONS
-from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.equilibrium import MAX_ITERATIONS
+from flexneedle.phantom.phantom import Phantom
 from flexneedle.simulator.control import MOVES, Limits
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, ROLL, SPIN
 from reference.draws import draw_scenario

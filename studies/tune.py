@@ -8,7 +8,7 @@ its own phantom (exact plant, preset `phantom`). The best two after twenty cases
 deviation of single errors is about their mean, so more settings with fewer cases each would be ranked by chance. The
 score is the mean true error plus a quarter of its 95 % quantile (mm); an unfinished insertion counts 5 mm. Planning
 is outside the budget. The table is printed on stdout; the record is written to DIR/METHOD.json (default: the shipped
-records, src/flexneedle/study/tuning), with the same bytes for any number of processes.
+records, src/flexneedle/lab/study/tuning), with the same bytes for any number of processes.
 
 Each trial sets all settings of the space, independent of the shipped values, so that the result can be reproduced after
 the shipped settings have been changed to it. All other settings are the shipped ones. The weights of `adaptive-mpc` are
@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 import flexneedle
-from flexneedle.trace.folder import versions
-from flexneedle.trace.plain import to_text
+from flexneedle.record.folder import versions
+from flexneedle.record.plain import to_text
 from flexneedle.types import Plan
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
@@ -44,7 +44,7 @@ PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
 # Remarks on a result, by method.
 NOTES: dict[str, str] = {}
-RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/study/tuning"
+RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/lab/study/tuning"
 Settings = dict[str, float]
 
 

@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from validation_figures import draw
-
 from flexneedle.figures import style
 from reference import closed_forms, elastica
 from reference import space_validation as in_space
 from reference import validation as problems
 from reference.cases import EI, FOUNDATION
+from validation_figures import draw
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = "*`python studies/validation.py`, or `make validation`*"
@@ -76,7 +75,7 @@ def wrapped(text: str) -> str:
 INTRODUCTION = (
     "The needle of the virtual phantom (`--phantom exact`, [theory.md](theory.md) section 11) is compared with closed"
     " forms, a second solver and the controller's model. A script computes every value of this page and draws the"
-    " figures; the tests assert them (`pytest tests/rig/phantom`). The page verifies the solution of the equations; it"
+    " figures; the tests assert them (`pytest tests/phantom`). The page verifies the solution of the equations; it"
     " does not validate the tissue model."
 )
 LIMITS = (
@@ -349,7 +348,7 @@ def space(found: in_space.Space) -> list[str]:
     return [
         "## In space",
         "The same kernel in the plane is what its planar predecessor was: tips within 1e-6 mm over random insertions"
-        " with all inputs, z exactly 0 (`pytest tests/rig/phantom/test_rod_plane.py`). All inputs turned about the axis"
+        " with all inputs, z exactly 0 (`pytest tests/phantom/test_rod_plane.py`). All inputs turned about the axis"
         " turn the needle (1e-9 mm), and a roll by π is a flip (`test_rod_rotation.py`).",
         "Rods of 100 mm with a natural bend, tilted and rolled at their base, under a force in any direction on their"
         " tip: distance of the tip (mm) from that of Kirchhoff's equations, integrated from the base with a search for"

@@ -33,14 +33,14 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flexneedle.errors import InputError
 from flexneedle.figures import style
+from flexneedle.lab.study.grid import Study, StudyInsertion, load_study
+from flexneedle.lab.study.plans import Plans, plan_key
+from flexneedle.loop.closed_loop import run as carry_out
+from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.phantom.draw import draw
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.rig.loop import run as carry_out
-from flexneedle.rig.phantom.draw import draw
-from flexneedle.rig.virtual import Seeds, virtual_rig
+from flexneedle.record.folder import STUDY_FILE
 from flexneedle.scenario.model import Scenario
-from flexneedle.study.grid import Study, StudyInsertion, load_study
-from flexneedle.study.plans import Plans, plan_key
-from flexneedle.trace.folder import STUDY_FILE
 from flexneedle.types import Outcome, Plan
 
 LAST_MM = 10.0  # tissue before the target

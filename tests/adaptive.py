@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import flexneedle
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.path import of_plan
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
@@ -19,7 +19,7 @@ QUICK = PHANTOM.with_values(
     }
 )
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-ADAPTIVE = METHODS["adaptive-mpc"]
+ADAPTIVE = CONTROLLERS["adaptive-mpc"]
 
 
 def estimate_of(state, scenario=PHANTOM, **fields):

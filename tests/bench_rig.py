@@ -5,8 +5,8 @@ import tomllib
 from dataclasses import replace
 
 from flexneedle.errors import DriverError
-from flexneedle.rig.ports import MotorState
-from flexneedle.scenario.rig import RigFile
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.ports import MotorState
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 TEXT = """\

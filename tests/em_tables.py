@@ -5,9 +5,9 @@ import csv
 import numpy as np
 import pytest
 
-from flexneedle.em.evaluation.evaluate import Options, evaluate
 from flexneedle.errors import InputError
-from flexneedle.rig.tracking.table import REQUIRED
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.phantom.tracking.table import REQUIRED
 
 GRID = np.stack(np.meshgrid(*[np.arange(3) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 

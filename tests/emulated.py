@@ -10,7 +10,7 @@ from time import monotonic
 
 import numpy as np
 
-from flexneedle.rig.emulator.motion import pose
+from flexneedle.lab.emulators.motion import pose
 
 DEADLINE_S = 20.0
 

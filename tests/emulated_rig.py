@@ -19,7 +19,7 @@ START_S = 60.0  # the first run compiles the kernels
 def rig_file(folder, **replaced):
     """Write the emulated rig of the package with a free port and a link in the folder; return its path. replaced: texts
     by the text that takes their place."""
-    text = (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text()
+    text = (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text()
     for before, after in {
         "127.0.0.1:2323": "127.0.0.1:0",
         "/tmp/aurora": str(folder / "aurora"),

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.errors import RunError
 from flexneedle.types import Insertion, Outcome
 from synthetic import make_periods, make_plan
@@ -40,7 +40,7 @@ def insert(
 ):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     del tracker  # nothing is measured
-    if not (plan.reached or force or METHODS[controller].predicts):
+    if not (plan.reached or force or CONTROLLERS[controller].predicts):
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, limited by {plan.limit}")
     periods = []
     for period in make_periods(plan, miss, seed):
@@ -54,8 +54,8 @@ def insert(
 
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
+    from flexneedle.loop import insert as insertion
     from flexneedle.planning import planner
-    from flexneedle.rig import insert as insertion
 
     plan_options = {"miss": options.pop("plan_miss", 0.0)}
     setattr_(planner, "plan", partial(plan, **plan_options))
@@ -65,7 +65,7 @@ def install(setattr_, **options):
 def draw_nothing(setattr_):
     """Put empty figures in the place of those of plans and insertions: drawing takes most of a command's time."""
     from flexneedle.figures.style import new_figure
-    from flexneedle.runs import figures
+    from flexneedle.record import figures
 
     for name in ("insertion_figure", "plan_figure"):
         setattr_(figures, name, lambda *_: new_figure(1.0))

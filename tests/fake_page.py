@@ -14,11 +14,11 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
-import flexneedle.page
-from flexneedle.page.messages import REQUESTS, Done, News, Refused
+import flexneedle.lab.page
+from flexneedle.lab.page.messages import REQUESTS, Done, News, Refused
 from recorded_page import TARGET, opening, people, scene, scene_frames, session
 
-STATIC = Path(flexneedle.page.__file__).parent / "static"
+STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

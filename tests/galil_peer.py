@@ -5,7 +5,7 @@ import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from flexneedle.rig.emulator.galil.controller import Device, advanced, reply
+from flexneedle.lab.emulators.galil.controller import Device, advanced, reply
 
 CLOSE = object()
 """In place of a reply: the connection is closed."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import flexneedle
-from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
+from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import POSITION, SENSORS

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.rig import loop as insertion
-from flexneedle.rig.phantom.draw import draw
-from flexneedle.rig.phantom.phantom import Phantom
-from flexneedle.rig.tracking.simulated import NoisyTracker
-from flexneedle.rig.virtual import Rig
+from flexneedle.loop import closed_loop as insertion
+from flexneedle.loop.virtual import Rig
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.types import STILL, VISIBLE, Measurement, Motion
 
 PHANTOM = flexneedle.load_scenario("phantom")

@@ -11,13 +11,13 @@ from time import monotonic
 
 from websockets.sync.client import connect
 
-from flexneedle.page.frames import unpacked
-from flexneedle.page.server.catalog import CONTROLLERS
-from flexneedle.page.server.desk import Setup
-from flexneedle.page.server.hub import frame_key, key_of
-from flexneedle.page.server.limits import Limits
-from flexneedle.page.server.serve import PageServer
-from flexneedle.page.server.session import Session
+from flexneedle.lab.page.frames import unpacked
+from flexneedle.lab.page.server.catalog import CONTROLLERS
+from flexneedle.lab.page.server.desk import Setup
+from flexneedle.lab.page.server.hub import frame_key, key_of
+from flexneedle.lab.page.server.limits import Limits
+from flexneedle.lab.page.server.serve import PageServer
+from flexneedle.lab.page.server.session import Session
 from flexneedle.scenario.files import load_scenario
 
 STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))

@@ -4,10 +4,10 @@ from contextlib import suppress
 from functools import cache
 
 from flexneedle.errors import FlexneedleError
-from flexneedle.page.messages import News
-from flexneedle.page.orders import Work
-from flexneedle.page.worker.signals import Cancelled, Signals
-from flexneedle.page.worker.task import Task
+from flexneedle.lab.page.messages import News
+from flexneedle.lab.page.orders import Work
+from flexneedle.lab.page.worker.signals import Cancelled, Signals
+from flexneedle.lab.page.worker.task import Task
 from flexneedle.scenario.files import load_scenario
 
 NO_WAIT = 1e9

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from queue import SimpleQueue
 
-from flexneedle.page.channel import packed, read
+from flexneedle.lab.page.channel import packed, read
 
 CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
 ROWS, SLOW, GATE = 600, "slow", ".gate"

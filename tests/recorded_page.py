@@ -5,8 +5,8 @@ The needle begins at x = -90 mm, its guide is at -41 mm, its tip at the start at
 
 import numpy as np
 
-from flexneedle.page.frames import Kind, Source, frame_of, packed
-from flexneedle.page.messages import (
+from flexneedle.lab.page.frames import Kind, Source, frame_of, packed
+from flexneedle.lab.page.messages import (
     Disturbances,
     Estimate,
     Insertion,

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from flexneedle.em.recording.record import Operator, open_session, record
+from flexneedle.lab.tracker_evaluation.recording.record import Operator, open_session, record
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 GRID = """\

@@ -5,7 +5,7 @@ from base64 import b64decode
 from dataclasses import dataclass, field, replace
 from html.parser import HTMLParser
 
-from flexneedle.page.worker.recording import recorded
+from flexneedle.lab.page.worker.recording import recorded
 from flexneedle.scenario.files import load_scenario
 from synthetic import make_insertion, make_plan
 

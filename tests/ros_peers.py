@@ -8,9 +8,9 @@ import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 
 from emulated import until
-from flexneedle.ros.dds import Reader, Writer, participant
-from flexneedle.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED
-from flexneedle.trace.messages import STORE
+from flexneedle.lab.ros.dds import Reader, Writer, participant
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED
+from flexneedle.record.messages import STORE
 
 Bool, JointState, PoseArray = (
     ros.std_msgs__msg__Bool,

@@ -12,7 +12,7 @@ import time
 import rosbags.typesys.stores.ros2_humble as ros
 from cyclonedds.core import Policy, Qos
 
-from flexneedle.ros.dds import Writer, participant
+from flexneedle.lab.ros.dds import Writer, participant
 from ros_peers import Bool, tip
 
 MESSAGES = {

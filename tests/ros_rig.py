@@ -14,7 +14,7 @@ import tomli_w
 
 import flexneedle
 from emulated import DEADLINE_S, until
-from flexneedle.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.types import Frame, SensorReading
 from ros_peers import Peer
@@ -143,11 +143,11 @@ class Started:
 
     def node(self):
         """The process of the insertion's node."""
-        return self._child("flexneedle.ros.node")
+        return self._child("flexneedle.lab.ros.node")
 
     def supervisor(self):
         """The process of the insertion's supervisor."""
-        return self._child("flexneedle.rig.supervisor.process")
+        return self._child("flexneedle.lab.rig.supervisor.process")
 
     def _child(self, module):
         children = psutil.Process(self.process.pid).children()

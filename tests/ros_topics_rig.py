@@ -11,8 +11,8 @@ import sys
 import time
 from pathlib import Path
 
-from flexneedle.ros.dds import Writer
-from flexneedle.ros.profile import load_profile
+from flexneedle.lab.ros.dds import Writer
+from flexneedle.lab.ros.profile import load_profile
 from ros_peers import Joints, tip
 
 PERIOD_S = 0.025

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from flexneedle.study import pools
-from flexneedle.study.runner import run_study
+from flexneedle.lab.study import pools
+from flexneedle.lab.study.runner import run_study
 
 STUDY = """\
 name = "mine"

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flexneedle.errors import DriverError
-from flexneedle.rig.devices.clock import WallClock
-from flexneedle.rig.ports import MotorState
-from flexneedle.rig.supervisor import messages as say
-from flexneedle.rig.supervisor import suspension
-from flexneedle.rig.supervisor.core import Supervisor
-from flexneedle.rig.tracking.registration import identity
-from flexneedle.scenario.rig import RigFile
+from flexneedle.geometry.registration import identity
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import suspension
+from flexneedle.lab.rig.supervisor.core import Supervisor
+from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Frame, SensorReading
 

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flexneedle.control.methods import DEFAULT, checked
+from flexneedle.control.controllers import DEFAULT, checked
 from flexneedle.scenario.files import load_scenario
 
 TARGETS = tuple((depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0))

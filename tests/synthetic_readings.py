@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from flexneedle.trace.columns import verdict_of
+from flexneedle.record.columns import verdict_of
 from flexneedle.types import Action, CheckedMeasurement, Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

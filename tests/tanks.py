@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flexneedle import Control, load_scenario
-from flexneedle.rig.phantom.draw import Truth, draw
-from flexneedle.rig.phantom.phantom import Phantom
-from flexneedle.rig.phantom.plants import PLANTS
+from flexneedle.phantom.draw import Truth, draw
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.phantom.plants import PLANTS
 from reference.rods import IDEAL
 
 PHANTOM = load_scenario("phantom")

@@ -3,12 +3,12 @@
 from types import SimpleNamespace
 
 from flexneedle.control import tables
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 
 
 def task_of(simulator, plan, controller=DEFAULT):
     """What a controller is to carry out, with its settings of the simulator's scenario."""
-    return tables.task(METHODS[controller], simulator, plan)
+    return tables.task(CONTROLLERS[controller], simulator, plan)
 
 
 def begun_with(simulator, roll=0.0, controller=DEFAULT):

@@ -7,7 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.arguments import point, whole
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.errors import FlexneedleError, InputError
 from flexneedle.scenario.files import dump_scenario
 from synthetic import make_plan
@@ -64,24 +64,24 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tup
         ),
         (
             lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
-            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.rig.ports",
+            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.ports",
         ),
         (
             lambda: flexneedle.Rig(1, 2, 3),
-            "clock = 1: must be an object with now, wait; see flexneedle.rig.ports.Clock",
+            "clock = 1: must be an object with now, wait; see flexneedle.ports.Clock",
         ),
         (
             lambda: flexneedle.Rig(BENCH, 2, 3),
-            "driver = 2: must be an object with apply, stop; see flexneedle.rig.ports.Driver",
+            "driver = 2: must be an object with apply, stop; see flexneedle.ports.Driver",
         ),
         (
             lambda: flexneedle.Rig(BENCH, BENCH, SimpleNamespace(read=1)),
             "tracker = namespace(read=1): must be an object with read, status; "
-            "see flexneedle.rig.ports.TipTracker",
+            "see flexneedle.ports.TipTracker",
         ),
         (
             lambda: flexneedle.Rig(float, BENCH, BENCH),
-            "clock = <class 'float'>: must be an object with now, wait; see flexneedle.rig.ports.Clock",
+            "clock = <class 'float'>: must be an object with now, wait; see flexneedle.ports.Clock",
         ),
         (
             lambda: flexneedle.Rig(BENCH, BENCH, BENCH, 0.0),
@@ -97,7 +97,7 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tup
         ),
         (
             lambda: flexneedle.insert("phantom", PLAN, controller=3),
-            f"controller = 3: must be one of {', '.join(METHODS)}, {OWN}, or a flexneedle.Method, "
+            f"controller = 3: must be one of {', '.join(CONTROLLERS)}, {OWN}, or a flexneedle.Controller, "
             "missing: name, summary, decide",
         ),
         (lambda: flexneedle.Scenario(needle=3), MISSING),
@@ -165,7 +165,7 @@ def test_a_scenario_may_be_given_by_name_or_path(tmp_path):
 
 def test_run_executes_a_plan_on_any_rig(quick_plan):
     """On the virtual phantom it gives the same result as `insert`."""
-    from flexneedle.rig.virtual import Seeds, virtual_rig
+    from flexneedle.loop.virtual import Seeds, virtual_rig
 
     phantom, tracker, control, room = np.random.SeedSequence(4).spawn(4)
     scenario = flexneedle.load_scenario("phantom")

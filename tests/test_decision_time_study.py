@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.methods import DEFAULT
+from flexneedle.control.controllers import DEFAULT
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import decision_time as study

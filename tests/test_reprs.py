@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
+from flexneedle.phantom.draw import draw
 from flexneedle.planning.terms import Trajectories
-from flexneedle.rig.phantom.draw import draw
 from flexneedle.types import Frame, SensorReading
 from synthetic import make_insertion, make_plan
 from tasks import begun_with, task_of
@@ -41,7 +41,7 @@ RECORDS = {
     "task": task_of(SIMULATOR, make_plan()),
     "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
     "identification": Identification().begin(begun_with(SIMULATOR)),
-    "controller": METHODS[DEFAULT],
+    "controller": CONTROLLERS[DEFAULT],
     "truth": draw(SCENARIO, np.random.default_rng(0)),
 }
 

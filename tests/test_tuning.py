@@ -12,12 +12,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import flexneedle
-from flexneedle.control.methods import METHODS, checked
-from flexneedle.study.findings.reading import read_tuning
-from flexneedle.trace.plain import to_text
+from flexneedle.control.controllers import CONTROLLERS, checked
+from flexneedle.lab.study.findings.reading import read_tuning
+from flexneedle.record.plain import to_text
 
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
-SHIPPED = files("flexneedle.study") / "tuning"
+SHIPPED = files("flexneedle.lab.study") / "tuning"
 TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
 NOT_TUNED = {"open-loop", "adaptive-mpc"}  # no settings; settings chosen on random worlds
 
@@ -50,7 +50,7 @@ def test_shipped_settings_are_those_chosen_by_tuning(method):
 
 def test_every_controller_with_a_space_has_a_record(tune):
     assert sorted(tune.SPACES) == TUNED
-    assert set(METHODS) - NOT_TUNED == set(TUNED)
+    assert set(CONTROLLERS) - NOT_TUNED == set(TUNED)
 
 
 @pytest.mark.parametrize("method", TUNED)

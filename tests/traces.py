@@ -2,7 +2,7 @@
 
 from mcap.reader import make_reader
 
-from flexneedle.trace.messages import STORE
+from flexneedle.record.messages import STORE
 
 
 def contents(folder):

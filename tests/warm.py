@@ -1,6 +1,6 @@
 """Imported once by the process that others are forked from: commands then begin at once."""
 
-import flexneedle.runs.recording  # noqa: F401
-from flexneedle.rig.kernels import compile_kernels
+import flexneedle.record.recording  # noqa: F401
+from flexneedle.phantom.kernels import compile_kernels
 
 compile_kernels(1)

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexneedle.control.interface import Decision, Method, travel_left
+    from flexneedle.control.interface import Controller, Decision, travel_left
     from flexneedle.errors import (
         CommandError,
         FlexneedleError,
@@ -20,16 +20,17 @@ if TYPE_CHECKING:
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
     from flexneedle.figures.record import plot
+    from flexneedle.lab.study.runner import run_study
+    from flexneedle.loop.closed_loop import run
+    from flexneedle.loop.insert import insert
+    from flexneedle.loop.virtual import Rig
+    from flexneedle.phantom.draw import Truth
+    from flexneedle.phantom.plants import Plant
     from flexneedle.planning.planner import plan
-    from flexneedle.rig.insert import insert
-    from flexneedle.rig.loop import run
-    from flexneedle.rig.phantom.draw import Truth
-    from flexneedle.rig.phantom.plants import Plant
-    from flexneedle.rig.ports import TipTracker
-    from flexneedle.rig.virtual import Rig
-    from flexneedle.runs.frame import to_dataframe
-    from flexneedle.runs.reading import load
-    from flexneedle.runs.saving import save
+    from flexneedle.ports import TipTracker
+    from flexneedle.record.frame import to_dataframe
+    from flexneedle.record.loading import load
+    from flexneedle.record.saving import save
     from flexneedle.scenario.files import load_scenario
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from flexneedle.simulator.control import controls
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
-    from flexneedle.study.runner import run_study
     from flexneedle.types import Control, Insertion, Measurement, Motion, Plan, Pose
 
 __version__ = "0.1.0"
@@ -45,6 +45,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CommandError",
     "Control",
+    "Controller",
     "Decision",
     "Estimate",
     "FlexneedleError",
@@ -52,7 +53,6 @@ __all__ = [
     "Insertion",
     "Layer",
     "Measurement",
-    "Method",
     "Motion",
     "Plan",
     "Plant",
@@ -84,7 +84,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.interface": ("Decision", "Method", "travel_left"),
+    "control.interface": ("Decision", "Controller", "travel_left"),
     "errors": (
         *("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "ScenarioWarning"),
         "StateError",
@@ -93,15 +93,15 @@ _HOMES = {
     "estimation.task": ("Task",),
     "figures.record": ("plot",),
     "planning.planner": ("plan",),
-    "rig.insert": ("insert",),
-    "rig.loop": ("run",),
-    "rig.phantom.draw": ("Truth",),
-    "rig.phantom.plants": ("Plant",),
-    "rig.ports": ("TipTracker",),
-    "rig.virtual": ("Rig",),
-    "runs.frame": ("to_dataframe",),
-    "runs.reading": ("load",),
-    "runs.saving": ("save",),
+    "loop.insert": ("insert",),
+    "loop.closed_loop": ("run",),
+    "phantom.draw": ("Truth",),
+    "phantom.plants": ("Plant",),
+    "ports": ("TipTracker",),
+    "loop.virtual": ("Rig",),
+    "record.frame": ("to_dataframe",),
+    "record.loading": ("load",),
+    "record.saving": ("save",),
     "scenario.files": ("load_scenario",),
     "scenario.model": ("Scenario",),
     "scenario.sections.fields": ("Section",),
@@ -109,7 +109,7 @@ _HOMES = {
     "simulator.control": ("controls",),
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
-    "study.runner": ("run_study",),
+    "lab.study.runner": ("run_study",),
     "types": ("Control", "Insertion", "Measurement", "Motion", "Plan", "Pose"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -8,8 +8,8 @@ import pytest
 import fake_engine
 from commands import run
 from flexneedle.cli import main as cli
-from flexneedle.trace.columns import COLUMNS
-from flexneedle.trace.reader import read_trace
+from flexneedle.record.columns import COLUMNS
+from flexneedle.record.reader import read_trace
 from flexneedle.types import CheckedMeasurement
 from synthetic import make_periods
 from synthetic_readings import with_readings

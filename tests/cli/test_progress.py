@@ -3,8 +3,8 @@
 import io
 import sys
 
-from flexneedle.console import progress as progress_module
-from flexneedle.console.progress import Progress
+from flexneedle.cli import progress as progress_module
+from flexneedle.cli.progress import Progress
 
 
 class Terminal(io.StringIO):

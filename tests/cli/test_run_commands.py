@@ -13,10 +13,10 @@ import pytest
 import fake_engine
 from commands import names, run
 from flexneedle.cli import main as cli
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.errors import RunError
-from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
-from flexneedle.trace.reader import read_trace
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
+from flexneedle.record.reader import read_trace
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 
@@ -115,15 +115,15 @@ def test_every_controller_is_listed_with_its_summary(capsys, in_tmp):
     status, out, err = run(capsys, "insert", "--list")
     assert (status, err, names(in_tmp)) == (0, "", [])
     lines = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert list(lines) == list(METHODS)
-    assert all(lines[name].startswith(method.summary) for name, method in METHODS.items())
+    assert list(lines) == list(CONTROLLERS)
+    assert all(lines[name].startswith(method.summary) for name, method in CONTROLLERS.items())
     assert [name for name, line in lines.items() if line.endswith("(default)")] == [DEFAULT]
 
 
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["--controller", "pid"], f"controller = 'pid': must be one of {', '.join(METHODS)}{OWN}"),
+        (["--controller", "pid"], f"controller = 'pid': must be one of {', '.join(CONTROLLERS)}{OWN}"),
         (["--phantom", "jelly"], f"phantom = 'jelly': must be one of exact, model{OWN}"),
         (["--tracker", "eye"], f"tracker = 'eye': must be one of scenario{OWN}"),
     ],
@@ -150,9 +150,9 @@ def test_an_insertion_that_fails_is_recorded_with_its_controller(engine, capsys,
 
 def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     engine()
-    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda _axes: False)
+    monkeypatch.setattr("flexneedle.phantom.kernels.all_compiled", lambda _axes: False)
     assert "Compiling kernels (first run only) …" in run(capsys, "plan")[2]
-    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda _axes: True)
+    monkeypatch.setattr("flexneedle.phantom.kernels.all_compiled", lambda _axes: True)
     assert "Compiling" not in run(capsys, "plan")[2]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.cli import main as cli
-from flexneedle.control.methods import METHODS, checked
+from flexneedle.control.controllers import CONTROLLERS, checked
 from flexneedle.errors import RunError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -50,7 +50,7 @@ def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenar
 def test_show_prints_the_settings_of_every_controller_and_round_trips(capsys, tmp_path):
     out = run(capsys, "scenario", "show", "phantom")[1]
     assert set(tomllib.loads(out)["control"]) >= {
-        method.table for method in METHODS.values() if method.settings is not None
+        method.table for method in CONTROLLERS.values() if method.settings is not None
     }
     path = tmp_path / "shown.toml"
     path.write_text(out)

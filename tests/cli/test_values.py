@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from flexneedle.console.values import finite, positive, seed
+from flexneedle.cli.values import finite, positive, seed
 
 
 @pytest.mark.parametrize(

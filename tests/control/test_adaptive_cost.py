@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
-from flexneedle.control.methods import adaptive_mpc
+from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.planning import terms
 from flexneedle.planning.planner import bevel_reach

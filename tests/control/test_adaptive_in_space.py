@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptive import ADAPTIVE, PHANTOM, estimate_of
-from flexneedle.control.methods import adaptive_mpc
+from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.control.outlook import Outlook
 from flexneedle.control.path import Ahead, GuidePath
 from flexneedle.simulator.control import controls

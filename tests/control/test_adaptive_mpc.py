@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import flexneedle
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, rolls_at, unrolled
+from flexneedle.control.controllers import DEFAULT, adaptive_mpc
 from flexneedle.control.interface import travel_left
-from flexneedle.control.methods import DEFAULT, adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation

@@ -7,7 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.ahead import along_plan, rest_of_plan
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, Motion, X
 from tasks import task_of
@@ -26,7 +26,7 @@ def plan(request):
 def estimates(plan, controller, steps):
     """The estimate before any motion, and after steps of the plan without a reading."""
     task = task_of(Simulator(plan.scenario, 1), plan, controller)
-    estimate = METHODS[controller].observer.begin(task)
+    estimate = CONTROLLERS[controller].observer.begin(task)
     for k, row in enumerate(plan.controls[:steps]):
         estimate = estimate.move(Motion(Control.of(row), 0.2 * k, 0.2 * (k + 1)))
     return task, estimate
@@ -61,7 +61,7 @@ def test_the_base_goes_to_its_planned_pose(plan):
     assert moved.min() > 0.03
 
 
-@pytest.mark.parametrize("controller", METHODS)
+@pytest.mark.parametrize("controller", CONTROLLERS)
 def test_each_period_of_each_controller_has_a_predicted_shape(plan, controller):
     """At the target, less sure ahead of the tip than where it was measured."""
     done = flexneedle.insert(

@@ -8,13 +8,13 @@ import pytest
 
 import flexneedle
 from flexneedle.control import bang_bang
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
-BEVEL = METHODS["bevel-only"]
+BEVEL = CONTROLLERS["bevel-only"]
 
 
 def command(plan, estimate, **settings):

@@ -12,14 +12,14 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import lsq_linear
 
 import flexneedle
-from flexneedle.control.methods import METHODS
-from flexneedle.control.methods import broyden_mpc as bm
+from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.control.controllers import broyden_mpc as bm
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DG_Y, Control, X, Y
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
-BROYDEN = METHODS["broyden-mpc"]
+BROYDEN = CONTROLLERS["broyden-mpc"]
 SETTINGS = bm.BroydenMpc()
 RNG = np.random.default_rng(0)
 NUMBERS = st.floats(-2.0, 2.0)

@@ -5,13 +5,13 @@ import pytest
 
 import flexneedle
 from flexneedle.control import mpc
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.guide import check_guide, guide_may_move, most_guide_step
-from flexneedle.control.methods import METHODS
 from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
-from flexneedle.runs.recording import Choices, record_insertion
+from flexneedle.record.folder import Folder
+from flexneedle.record.recording import Choices, record_insertion
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.trace.folder import Folder
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
@@ -36,17 +36,17 @@ def test_the_guide_may_move_where_there_is_one_and_the_plan_does_not_leave_it_st
     assert most_guide_step(scenario.setup, strategy) == (0.5 if free else 0.0)
 
 
-@pytest.mark.parametrize("name", list(METHODS))
+@pytest.mark.parametrize("name", list(CONTROLLERS))
 def test_only_controllers_of_the_guide_are_refused_without_one(name):
-    check_guide(METHODS[name], PHANTOM.setup, "manipulation")
+    check_guide(CONTROLLERS[name], PHANTOM.setup, "manipulation")
     if name not in GUIDE_CONTROLLERS:
-        check_guide(METHODS[name], BARE.setup, "manipulation")
-        check_guide(METHODS[name], PHANTOM.setup, "steering")
+        check_guide(CONTROLLERS[name], BARE.setup, "manipulation")
+        check_guide(CONTROLLERS[name], PHANTOM.setup, "steering")
         return
     with pytest.raises(InputError, match=rf"'{name}': needs a guide that moves: set setup\.guide_to_skin_mm"):
-        check_guide(METHODS[name], BARE.setup, "manipulation")
+        check_guide(CONTROLLERS[name], BARE.setup, "manipulation")
     with pytest.raises(InputError, match=rf"'{name}': .* strategy = 'steering' does not move it"):
-        check_guide(METHODS[name], PHANTOM.setup, "steering")
+        check_guide(CONTROLLERS[name], PHANTOM.setup, "steering")
 
 
 @pytest.mark.parametrize("name", GUIDE_CONTROLLERS)

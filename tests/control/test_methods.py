@@ -10,10 +10,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, method
 from flexneedle.control.interface import travel_left
-from flexneedle.control.methods import DEFAULT, METHODS, method
 from flexneedle.errors import InputError
-from flexneedle.rig.phantom.plants import PLANTS
+from flexneedle.phantom.plants import PLANTS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, STILL, THETA, X, Y
 from reference.cases import MIRROR
@@ -28,7 +28,7 @@ WITHOUT_GUIDE = ("open-loop", "bevel-only")
 def drive(name, plan, scenario, estimated, readings, *, steps, plant=None):
     """Commands of a controller whose model is the plant itself and whose readings are a step late, plus `readings`."""
     task = task_of(Simulator(scenario, threads=1), plan, name)
-    chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
+    chosen, simulator = CONTROLLERS[name], Simulator(plant or scenario, threads=1)
     memory, rng = chosen.begin(task), np.random.default_rng(0)
     state, last, commands = simulator.start(plan.roll), None, []
     for off in readings[:steps]:
@@ -43,7 +43,7 @@ def drive(name, plan, scenario, estimated, readings, *, steps, plant=None):
 
 
 def test_they_are_there_under_their_names():
-    assert set(FIELD) <= set(METHODS)
+    assert set(FIELD) <= set(CONTROLLERS)
     assert DEFAULT not in FIELD
     for name in FIELD:
         assert method(name).name == name
@@ -172,7 +172,7 @@ def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limi
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(quick_plan, name, plant):
     """What a motor leaves out of a step is less than its resolution; nothing else is cut from a command."""
     few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}

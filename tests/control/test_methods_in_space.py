@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import flexneedle
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.forecast import probability_beyond
-from flexneedle.control.methods import METHODS
 from flexneedle.scenario.worlds import world
 from flexneedle.types import DG_Z, ROLL
 
@@ -99,7 +99,7 @@ def test_the_guide_moves_about_its_home_on_each_axis(plans, controller):
 
 
 def test_every_controller_is_among_those_above():
-    assert set(METHODS) == {
+    assert set(CONTROLLERS) == {
         *("adaptive-mpc", "bevel-only", "broyden-mpc", "ce-mpc", "open-loop", "resolved-rate")
     }
 

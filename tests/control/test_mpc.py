@@ -7,8 +7,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control import bang_bang, mpc
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import at_depth
-from flexneedle.control.methods import METHODS
 from flexneedle.estimation.task import Task
 from flexneedle.planning.terms import Trajectories, cost
 from flexneedle.simulator.simulator import Simulator
@@ -31,7 +31,7 @@ def choose(plan, state, scenario=PHANTOM, seed=0, *, roll=0.0):
 def decide(plan, estimate, seed=0):
     """What the paper's controller decides."""
     task = task_of(Simulator(PHANTOM, threads=1), plan, "ce-mpc")
-    return METHODS["ce-mpc"].decide(task, None, estimate, np.random.default_rng(seed))[0]
+    return CONTROLLERS["ce-mpc"].decide(task, None, estimate, np.random.default_rng(seed))[0]
 
 
 @pytest.mark.parametrize("periods", [0, 20, 45, 70])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
-OPEN = METHODS["open-loop"]
+OPEN = CONTROLLERS["open-loop"]
 RNG = np.random.default_rng(0)
 MOTORS = [DB_X, DG_Y]
 

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import flexneedle
-from flexneedle.control.methods import METHODS, resolved_rate
+from flexneedle.control.controllers import CONTROLLERS, resolved_rate
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DG_Y, ROLL, STILL, Control, X, Y
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
-RATE = METHODS["resolved-rate"]
+RATE = CONTROLLERS["resolved-rate"]
 
 
 def decide(plan, estimate, **settings):

@@ -7,8 +7,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control import tables
-from flexneedle.control.interface import Method
-from flexneedle.control.methods import DEFAULT, METHODS, checked, used
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, checked, used
+from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.scenario.model import Scenario
@@ -29,11 +29,11 @@ def decide(*_):
     raise AssertionError("tables are checked without a decision")
 
 
-OWN = Method("my-pid", "a controller of one's own", decide=decide, settings=Gains)
+OWN = Controller("my-pid", "a controller of one's own", decide=decide, settings=Gains)
 
 
 def test_the_default_controller_is_first_and_the_others_are_in_order():
-    names = list(METHODS)
+    names = list(CONTROLLERS)
     assert names[0] == DEFAULT
     assert names[1:] == sorted(names[1:])
     assert {"ce-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc"} <= set(names)
@@ -48,13 +48,13 @@ def test_a_scenario_keeps_a_table_as_it_is_given():
 
 def test_all_defaults_are_filled_in_and_nothing_else_changes():
     full = checked(PHANTOM.with_values({"control.bevel_only.curvature_per_m": 0.3}), OWN)
-    for name, method in METHODS.items():
+    for name, method in CONTROLLERS.items():
         if method.settings is not None:
             own = full.control.tables[method.table]
             assert set(own) == set(method.settings.model_fields), name
     assert full.control.tables["my_pid"] == {"gain": 0.5}
     assert full.control.tables["bevel_only"] == {
-        **METHODS["bevel-only"].settings().model_dump(),
+        **CONTROLLERS["bevel-only"].settings().model_dump(),
         "curvature_per_m": 0.3,
     }
     assert full.values() | {"control": 0} == PHANTOM.values() | {"control": 0}
@@ -65,7 +65,7 @@ def test_a_task_has_the_settings_of_its_controller():
     scenario = PHANTOM.with_values({"control.my_pid.gain": 0.25})
     task = tables.task(OWN, Simulator(scenario, 1), None)
     assert task.settings == Gains(gain=0.25)
-    assert tables.task(METHODS["open-loop"], Simulator(scenario, 1), None).settings is None
+    assert tables.task(CONTROLLERS["open-loop"], Simulator(scenario, 1), None).settings is None
 
 
 @pytest.mark.parametrize(

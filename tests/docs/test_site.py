@@ -16,9 +16,9 @@ import flexneedle
 import math_fence
 import rig_reference
 import scenario_reference
-from flexneedle.rig.fit import fit_problems
+from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.rig import load_rig
 from markdown_examples import ROOT, blocks
 
 DOCS = ROOT / "docs"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
+from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.lateral import facing
 from flexneedle.estimation.moves import Move

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.estimation.moves import Move, along, place
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA, Control, Measurement, Motion, X, Y, Z
@@ -263,7 +263,7 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
 def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(name, estimates):
     """In air no base offset, in tissue no load; the others keep both."""
     simulator = Simulator(PHANTOM)
-    begin = METHODS[name].observer.begin(begun_with(simulator, controller=name))
+    begin = CONTROLLERS[name].observer.begin(begun_with(simulator, controller=name))
     for steps in (10, 40):
         state = in_tissue(simulator, steps)
         moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(Motion(AHEAD, 0.0, 1.0))

@@ -14,9 +14,9 @@ from flexneedle.figures.curves import held_spans, worst_indicator
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import NEEDLE, save
+from flexneedle.record.columns import verdict_of
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.trace.columns import verdict_of
 from flexneedle.types import ROLL, THETA, CheckedMeasurement, Insertion, Measurement, Outcome
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings

@@ -10,8 +10,8 @@ from mpl_toolkits.mplot3d import proj3d
 from drawn import names, texts
 from flexneedle.figures.perspective import perspective_figure
 from flexneedle.figures.style import save
-from flexneedle.runs.figures import draw_run
-from flexneedle.runs.saving import save as save_run
+from flexneedle.record.figures import draw_run
+from flexneedle.record.saving import save as save_run
 from flexneedle.scenario.files import load_scenario
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_space import in_space

@@ -7,9 +7,9 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError
+from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.phantom.plants import DEFAULT_PLANT
 from flexneedle.planning.origin import check_origin
-from flexneedle.rig.phantom.plants import DEFAULT_PLANT
-from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.scenario.worlds import CASES, world
 from synthetic import make_plan
 

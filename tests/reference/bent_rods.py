@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexneedle.mechanics.law import tables
-from flexneedle.rig.phantom import equilibrium, loads
-from flexneedle.rig.phantom.rod import move_nodes
+from flexneedle.phantom import equilibrium, loads
+from flexneedle.phantom.rod import move_nodes
 from flexneedle.scenario.tissue.ogden import Ogden
 from reference.rods import Bench
 

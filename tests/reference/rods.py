@@ -6,10 +6,10 @@ import numpy as np
 
 from flexneedle import Control, load_scenario
 from flexneedle.mechanics.law import tables
-from flexneedle.rig.phantom import rod as rd
-from flexneedle.rig.phantom.draw import Truth
-from flexneedle.rig.phantom.equilibrium import step
-from flexneedle.rig.phantom.plants import ExactPlant
+from flexneedle.phantom import rod as rd
+from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.equilibrium import step
+from flexneedle.phantom.plants import ExactPlant
 from flexneedle.scenario.tissue.ogden import Ogden
 from flexneedle.types import THETA, X, Y
 

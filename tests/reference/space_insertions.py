@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexneedle import Control, controls
-from flexneedle.rig.phantom import rod as rd
-from flexneedle.rig.phantom.equilibrium import step
+from flexneedle.phantom import rod as rd
+from flexneedle.phantom.equilibrium import step
 from flexneedle.types import COLUMNS
 from reference.rods import IDEAL, plant
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from flexneedle import Control, Simulator, controls
-from flexneedle.rig.phantom.draw import Truth
+from flexneedle.phantom.draw import Truth
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, THETA
 from reference import closed_forms, elastica, space_validation
 from reference.cases import EI, FOUNDATION, long_beam

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from flexneedle.control.bang_bang import BevelRule
-from flexneedle.control.methods import checked
+from flexneedle.control.controllers import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario, check_target

@@ -8,7 +8,7 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexneedle.control.methods import checked
+from flexneedle.control.controllers import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario

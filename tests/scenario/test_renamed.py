@@ -6,7 +6,7 @@ import warnings
 import pytest
 import tomli_w
 
-from flexneedle.control.methods import checked
+from flexneedle.control.controllers import checked
 from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from flexneedle.rig.devices.trackers import AuroraSettings, ReplaySettings
-from flexneedle.ros.settings import DriverSettings, TrackerSettings
-from flexneedle.scenario.rig import RigFile
+from flexneedle.lab.rig.devices.trackers import AuroraSettings, ReplaySettings
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings
 from flexneedle.scenario.sections.axes import LINEAR_AXES
 from scenario_reference import Key, Table, heading, section, tables
 

@@ -5,7 +5,7 @@ python tools/docs/rig_states.py
 
 from pathlib import Path
 
-from flexneedle.rig.supervisor.machine import MOVING, Event, State, after
+from flexneedle.lab.rig.supervisor.machine import MOVING, Event, State, after
 
 PAGE = Path(__file__).parents[2] / "docs" / "safety.md"
 BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flexneedle.control.methods import METHODS
+from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.tables import typed_scenario
 
 HERE = Path(__file__).parent
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 def schema() -> dict[str, Any]:
     """Return the JSON schema of a scenario with the tables of all controllers, as `flexneedle scenario schema` does."""
-    return typed_scenario(tuple(METHODS.values())).model_json_schema()
+    return typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
 
 
 def tables(root: dict[str, Any]) -> Iterator[Table]:

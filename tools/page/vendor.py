@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-VENDOR = Path(__file__).parents[2] / "src/flexneedle/page/static/vendor"
+VENDOR = Path(__file__).parents[2] / "src/flexneedle/lab/page/static/vendor"
 
 PACKAGES = {  # version, and integrity as the registry publishes it
     "three": (

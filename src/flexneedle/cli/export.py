@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from flexneedle.console.commands import Commands, add_command
+from flexneedle.cli.commands import Commands, add_command
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
@@ -58,8 +58,8 @@ def add_parser(commands: Commands) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from flexneedle.runs.reading import load_insertion
-    from flexneedle.trace.export import write_csv, write_readings
+    from flexneedle.record.export import write_csv, write_readings
+    from flexneedle.record.loading import load_insertion
 
     if args.csv is not None:
         write, name, default = write_csv, args.csv, _PERIODS

@@ -12,9 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.cli.inserted import print_still_in, report
-from flexneedle.console.commands import Commands, add_command
-from flexneedle.console.common import (
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import (
     ARMS,
     add_run_arguments,
     add_strategy,
@@ -27,18 +26,19 @@ from flexneedle.console.common import (
     run_name,
     with_target,
 )
-from flexneedle.console.values import seed
+from flexneedle.cli.inserted import print_still_in, report
+from flexneedle.cli.values import seed
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
 from flexneedle.interrupts import SIGNALS
 
 if TYPE_CHECKING:
-    from flexneedle.console.progress import Progress
-    from flexneedle.rig.supervisor.client import Supervisor
-    from flexneedle.ros.bridge import Bridge
-    from flexneedle.runs.recording import Choices
+    from flexneedle.cli.progress import Progress
+    from flexneedle.lab.rig.rig_file import RigFile, RosSettings
+    from flexneedle.lab.rig.supervisor.client import Supervisor
+    from flexneedle.lab.ros.bridge import Bridge
+    from flexneedle.record.folder import Folder
+    from flexneedle.record.recording import Choices
     from flexneedle.scenario.model import Scenario
-    from flexneedle.scenario.rig import RigFile, RosSettings
-    from flexneedle.trace.folder import Folder
     from flexneedle.types import Insertion, Period
 
 
@@ -121,8 +121,8 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
 
 
 def _insert(args: argparse.Namespace) -> int:
-    from flexneedle.runs.recording import check_choices
-    from flexneedle.trace.folder import Folder
+    from flexneedle.record.folder import Folder
+    from flexneedle.record.recording import check_choices
 
     if args.list:
         return _list()
@@ -157,14 +157,14 @@ def _bridge(args: argparse.Namespace, choices: Choices, stack: ExitStack) -> Bri
         return None
     if settings.target and args.target is not None:
         raise InputError("--target: not with target = true in [ros] of the rig file, which takes it from ROS")
-    from flexneedle.ros.bridge import Bridge
+    from flexneedle.lab.ros.bridge import Bridge
 
     return stack.enter_context(Bridge(settings, partial(print, file=sys.stderr, flush=True)))
 
 
 def _ros(args: argparse.Namespace, choices: Choices) -> RosSettings | None:
     """The settings of --ros or of the rig file. Raises InputError for both, RigError for a name that is none."""
-    from flexneedle.scenario.rig import RosSettings, settings_of
+    from flexneedle.lab.rig.rig_file import RosSettings, settings_of
 
     if choices.rig is None:
         return None if args.ros is None else settings_of(RosSettings, {"profile": args.ros})
@@ -174,7 +174,7 @@ def _ros(args: argparse.Namespace, choices: Choices) -> RosSettings | None:
 
 
 def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
-    from flexneedle.rig.parts import own_controllers
+    from flexneedle.loop.parts import own_controllers
     from flexneedle.scenario.files import load_registration
 
     rig, scenario = choices.rig, chosen_scenario(args, *own_controllers([choices.controller]))
@@ -186,7 +186,7 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
         return load_registration(args.registration, scenario)
     if rig is None or choices.dry_run:
         return scenario
-    from flexneedle.rig.supervised import registered
+    from flexneedle.lab.rig.supervised import registered
 
     return registered(rig, scenario)
 
@@ -198,9 +198,9 @@ def _execute(
     choices: Choices,
     bridge: Bridge | None,
 ) -> Insertion:
-    from flexneedle.console.progress import Progress
-    from flexneedle.rig.supervised import Watchers
-    from flexneedle.runs.recording import record_insertion
+    from flexneedle.cli.progress import Progress
+    from flexneedle.lab.rig.supervised import Watchers
+    from flexneedle.record.recording import record_insertion
     from flexneedle.types import Outcome
 
     with Progress() as progress:
@@ -254,7 +254,7 @@ def _refusal(
     folder: Folder | None, target: Sequence[float] | None, choices: Choices, reason: str
 ) -> dict[str, Any]:
     """The object of an insertion that ended with an error: the recorded result, or one without a plan."""
-    from flexneedle.trace.results import NO_TIMING, refused_result
+    from flexneedle.record.results import NO_TIMING, refused_result
 
     run_dir = None if folder is None else str(folder.path)
     if folder is not None and folder.values["result"] is not None:
@@ -266,7 +266,7 @@ def _refusal(
 
 
 def _choices(args: argparse.Namespace) -> Choices:
-    from flexneedle.runs.recording import Choices
+    from flexneedle.record.recording import Choices
 
     chosen = {"controller": args.controller, "phantom": args.phantom, "tracker": args.tracker}
     named = {name: value for name, value in chosen.items() if value is not None}
@@ -285,7 +285,7 @@ def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
         raise InputError(
             f"{' and '.join(virtual)}: not with --rig, which has a needle and a tracker of its own"
         )
-    from flexneedle.scenario.rig import load_rig
+    from flexneedle.lab.rig.rig_file import load_rig
 
     return load_rig(args.rig)
 
@@ -307,17 +307,17 @@ def _confirm(progress: Progress, scenario: Scenario, supervisor: Supervisor, que
 
     Raises RunError for any answer but yes.
     """
-    from flexneedle.rig.start import announced
+    from flexneedle.lab.rig.start import announced
 
     with progress.paused():
         confirm_motions([*announced(supervisor.rig, scenario, supervisor.positions), ARMS], question)
 
 
 def _list() -> int:
-    from flexneedle.control.methods import DEFAULT, METHODS
+    from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 
-    width = max(map(len, METHODS))
-    for name, method in METHODS.items():
+    width = max(map(len, CONTROLLERS))
+    for name, method in CONTROLLERS.items():
         print(f"{name:{width}}  {method.summary}{' (default)' if name == DEFAULT else ''}")
     return 0
 

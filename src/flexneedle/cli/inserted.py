@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import STILL_IN, entry_rows, print_json, print_table, target_row
+from flexneedle.cli.common import STILL_IN, entry_rows, print_json, print_table, target_row
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,8 +21,8 @@ def print_still_in(rig: str) -> None:
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     """Print how an insertion ended, and where its record is; return the exit status."""
-    from flexneedle.runs.recording import BY_USER
-    from flexneedle.trace.results import insertion_result, insertion_timing
+    from flexneedle.record.recording import BY_USER
+    from flexneedle.record.results import insertion_result, insertion_timing
     from flexneedle.types import Outcome
 
     if insertion.outcome is Outcome.INTERRUPTED:
@@ -40,7 +40,7 @@ def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path
 
 
 def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
-    from flexneedle.trace.results import insertion_result, insertion_timing
+    from flexneedle.record.results import insertion_result, insertion_timing
 
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
@@ -83,7 +83,7 @@ def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
 
 
 def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
-    from flexneedle.rig.tracking.registration import expected_error
+    from flexneedle.geometry.registration import expected_error
 
     if scenario.tracker.registration is None:
         return []

@@ -14,11 +14,16 @@ from importlib import import_module
 from typing import Any
 
 from flexneedle import __version__
-from flexneedle.cli import emulate, export, insert, plan, report, rig, scenario, serve, study, view
-from flexneedle.console.commands import help_texts
+from flexneedle.cli import export, insert, plan, scenario, view
+from flexneedle.cli.commands import help_texts
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
+from flexneedle.lab.emulators import commands as emulate
+from flexneedle.lab.page import commands as serve
+from flexneedle.lab.rig import commands as rig
+from flexneedle.lab.study import commands as study
+from flexneedle.lab.study import report_command as report
 
-_EM = import_module("flexneedle.em.commands.group")  # by name: no other layer imports em
+_EM = import_module("flexneedle.lab.tracker_evaluation.commands.group")  # by name: no other layer imports em
 _COMMANDS = (plan, insert, serve, study, report, view, export, scenario, _EM, rig, emulate)
 
 

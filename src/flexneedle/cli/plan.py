@@ -6,8 +6,8 @@ import argparse
 from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.commands import Commands, add_command
-from flexneedle.console.common import (
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import (
     STRATEGIES,
     add_run_arguments,
     add_strategy,
@@ -43,9 +43,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from flexneedle.console.progress import Progress
-    from flexneedle.runs.recording import record_plans
-    from flexneedle.trace.folder import Folder
+    from flexneedle.cli.progress import Progress
+    from flexneedle.record.folder import Folder
+    from flexneedle.record.recording import record_plans
 
     scenario = chosen_scenario(args)
     compile_first(scenario.setup.axes)
@@ -63,7 +63,7 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _report(scenario: Scenario, plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
-    from flexneedle.trace.results import plan_result, plan_timing
+    from flexneedle.record.results import plan_result, plan_timing
 
     if as_json:
         results = {name: {**plan_result(plan), "timing": plan_timing(plan)} for name, plan in plans.items()}

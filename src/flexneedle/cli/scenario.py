@@ -6,7 +6,7 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING
 
-from flexneedle.console.commands import Commands, add_command, add_group
+from flexneedle.cli.commands import Commands, add_command, add_group
 
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
@@ -120,8 +120,8 @@ def _check(args: argparse.Namespace) -> int:
 
 def _checked(args: argparse.Namespace) -> Scenario:
     """Return the scenario with all defaults, including those of the controllers."""
-    from flexneedle.control.methods import checked
-    from flexneedle.rig.parts import controller_of
+    from flexneedle.control.controllers import checked
+    from flexneedle.loop.parts import controller_of
     from flexneedle.scenario.files import load_scenario
 
     own = [controller_of(name)[1] for name in args.controller]
@@ -131,9 +131,9 @@ def _checked(args: argparse.Namespace) -> Scenario:
 def _schema(_args: argparse.Namespace) -> int:
     import json
 
-    from flexneedle.control.methods import METHODS
+    from flexneedle.control.controllers import CONTROLLERS
     from flexneedle.control.tables import typed_scenario
 
-    schema = typed_scenario(tuple(METHODS.values())).model_json_schema()
+    schema = typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
     print(json.dumps(schema, indent=2, ensure_ascii=False))
     return 0

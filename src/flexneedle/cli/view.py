@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.commands import Commands, add_command
+from flexneedle.cli.commands import Commands, add_command
 from flexneedle.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _view(args: argparse.Namespace) -> int:
         raise InputError(f"{folder}: is a study: choose a row with --row INDEX")
     if args.html is not None:
         return _replay(folder, args.html, args.compare)
-    from flexneedle.runs.figures import draw_run
+    from flexneedle.record.figures import draw_run
 
     for path in drawn or draw_run(folder, _note):
         print(path)
@@ -76,17 +76,17 @@ def _view(args: argparse.Namespace) -> int:
 
 
 def _has_study(folder: Path) -> bool:
-    from flexneedle.trace.folder import RUN_FILE, STUDY_FILE
+    from flexneedle.record.folder import RUN_FILE, STUDY_FILE
 
     return (folder / STUDY_FILE).is_file() and not (folder / RUN_FILE).exists()
 
 
 def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
     """The folder of a row's run, and the figures that were drawn with it: none if it was there before."""
-    from flexneedle.console.common import compile_first
-    from flexneedle.runs.saving import save
-    from flexneedle.study.recompute import row_folder
-    from flexneedle.trace.folder import RUN_FILE
+    from flexneedle.cli.common import compile_first
+    from flexneedle.lab.study.recompute import row_folder
+    from flexneedle.record.folder import RUN_FILE
+    from flexneedle.record.saving import save
 
     folder = row_folder(study, index) if out is None else out
     if (folder / RUN_FILE).exists():
@@ -100,8 +100,8 @@ def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
 
 
 def _recomputed(study: Path, index: int) -> Insertion:
-    from flexneedle.console.progress import Progress
-    from flexneedle.study.recompute import recompute
+    from flexneedle.cli.progress import Progress
+    from flexneedle.lab.study.recompute import recompute
 
     begun = time.monotonic()
     with Progress() as progress:
@@ -118,7 +118,7 @@ def _recomputed(study: Path, index: int) -> Insertion:
 
 def _replay(folder: Path, html: str, compare: Path | None) -> int:
     from flexneedle.files import replace_file
-    from flexneedle.page.replay.document import replay_of
+    from flexneedle.lab.page.replay.document import replay_of
 
     data = replay_of(folder, compare, _note).encode()
     if html == _STDOUT:

@@ -1,6 +1,6 @@
 """Whether a controller may move the guide: there is one, and the plan's strategy moves it."""
 
-from flexneedle.control.interface import Method
+from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
@@ -30,7 +30,7 @@ def guide_axes(setup: Setup, strategy: str) -> int:
     return setup.moved_guide_axes if strategy != _STILL else 0
 
 
-def check_guide(method: Method, setup: Setup, strategy: str) -> None:
+def check_guide(method: Controller, setup: Setup, strategy: str) -> None:
     """Raise InputError if a controller needs the guide and may not move it."""
     if not method.needs_guide or guide_may_move(setup, strategy):
         return

@@ -97,7 +97,7 @@ def _nothing(_task: Task) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Method:
+class Controller:
     """A controller. Memory is a frozen value of the controller's own type, carried from one period to the next.
 
     name: as in `--controller`, lower-case letters, digits and hyphens; summary: one line for lists; observer: provides
@@ -135,7 +135,7 @@ class Method:
         _check_settings(self.name, self.settings)
 
     def __repr__(self) -> str:
-        return f"<Method {self.name}: {self.summary}>"
+        return f"<Controller {self.name}: {self.summary}>"
 
     @property
     def table(self) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import create_model
 
-from flexneedle.control.interface import Method
+from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.model import Scenario
@@ -21,7 +21,7 @@ from flexneedle.types import Plan
 
 
 @cache
-def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
+def typed_scenario(methods: tuple[Controller, ...]) -> type[Scenario]:
     """Return the class of scenarios in which the tables of these controllers have the controllers' settings classes.
 
     Raises InputError if two of them would share a table.
@@ -40,7 +40,7 @@ def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
     return create_model("Scenario", __base__=Scenario, __doc__=Scenario.__doc__, **fields)
 
 
-def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -> Scenario:
+def completed(scenario: Scenario, methods: Iterable[Controller], source: str = "") -> Scenario:
     """Return the scenario with all settings of these controllers, other tables unchanged.
 
     Raises ScenarioError with one line for each problem, which opens with `source`.
@@ -48,13 +48,13 @@ def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -
     return Scenario.from_values(_typed(scenario, tuple(methods), source).values())
 
 
-def task(method: Method, simulator: Simulator, plan: Plan) -> Task:
+def task(method: Controller, simulator: Simulator, plan: Plan) -> Task:
     """Return the task of `method`, with its settings from the simulator's scenario. Raises ScenarioError."""
     control = _typed(simulator.scenario, (method,), "").control
     return Task(simulator, plan, getattr(control, method.table) if method.settings else None)
 
 
-def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> list[str]:
+def unowned(scenario: Scenario, methods: Iterable[Controller], source: str = "") -> list[str]:
     """Return a line for each table below `control` that belongs to none of these controllers."""
     known = [method.table for method in methods if method.settings]
     opening = f"{source}: " if source else ""
@@ -68,5 +68,5 @@ def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> 
     return lines
 
 
-def _typed(scenario: Scenario, methods: tuple[Method, ...], source: str) -> Scenario:
+def _typed(scenario: Scenario, methods: tuple[Controller, ...], source: str) -> Scenario:
     return typed_scenario(methods).from_record(scenario.model_dump(exclude_none=True), source)

@@ -12,7 +12,7 @@ from flexneedle.types import Plan
 class Task:
     """A plan, the scenario's model, and the controller's own settings.
 
-    settings: checked, of the class `Method.settings`; None for a controller without any.
+    settings: checked, of the class `Controller.settings`; None for a controller without any.
     """
 
     simulator: Simulator

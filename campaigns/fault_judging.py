@@ -1,0 +1,224 @@
+"""Whether a trial was as required: what the supervisor has recorded, the outcome, the times, and the true motions."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import degrees, inf
+from typing import Any
+
+import numpy as np
+
+from fault_list import RESTED, Fault
+from flexneedle.lab.emulators.emulated_rig.truth import Truth
+from flexneedle.lab.rig.rig_file import load_rig
+from flexneedle.types import DB_X, DG_Y, Floats
+from rig_trials import moved_between, rests
+
+MOTION_MM = 0.5
+"""The most that the base may move after detection."""
+END = "end"
+"""The state of a rig whose controller has stopped it, at the end of an insertion."""
+_BY_CONTROLLER = "the controller"  # who stops the motors then
+_RECORDED = ("holding", "stopped", "fault")  # states with a reason of their own
+_AT_REST = 1e-3  # from where an axis is at the end (mm, rad)
+_COLUMNS = {"guide_y": DG_Y}  # of a control, by axes that move seldom
+_UNSEEN = 2.0  # tolerances of an axis: a stall in less need not be detected
+_PAUSE_S = 0.02  # of the base between two motions; within one it is somewhere else after 4 ms
+_REST_S = (
+    0.06  # of base and guides between two steps; within one a guide that moves by a few counts pauses less
+)
+_TOGETHER = {"insertion", "guide_y", "guide_z"}
+
+
+@dataclass(frozen=True)
+class State:
+    """A state that the supervisor has entered: when (s, monotonic), which, and why."""
+
+    time: float
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
+    taken effect (s, monotonic), true states, `run.json`, messages, how many processes were left, and for an axis that
+    moves seldom the commands (m, 9). step: of the base (mm).
+
+    A supervisor may detect a fault before that is reported, but not before it was ordered.
+    """
+
+    fault: Fault
+    axis: str
+    ordered: float
+    injected: float
+    truth: Truth
+    run: Mapping[str, Any]
+    errors: str
+    left: int = 0
+    commands: Floats | None = None
+    step: float = 1.0
+
+    def row(self) -> dict[str, Any]:
+        """All that the table, the picture and the judgement need, as plain values."""
+        states = entered(self.run, self.ordered)
+        detection = next((one for one in states if one.name in self.fault.reaction.detected), None)
+        resumed = next((one.time for one in states if one.name == "inserting"), inf)
+        span = self._span(detection, resumed)
+        return {
+            "outcome": self.run.get("status", "none"),
+            "reason": self.run.get("reason", ""),
+            "states": " ".join(one.name for one in states),
+            "why": detection.why if detection else "",
+            "detection_s": max(0.0, detection.time - self.injected) if detection else None,
+            "from_motion_s": self._from_motion(detection.time) if detection else None,
+            "rest_s": self._rest(*span) if span and span[0] == self.injected else None,
+            "motion_mm": None if span is None else self._moved("insertion", *span),
+            "rolled_deg": None if span is None else degrees(self._moved("rotation", *span)),
+            "travelled_mm": self._travelled(),
+            "commanded_mm": self._commanded(),
+            "during": self._during(),
+            "rests": rests(self.truth),
+            "left": self.left,
+            "errors": self.errors[-4000:],
+        }
+
+    def _span(self, detection: State | None, resumed: float) -> tuple[float, float] | None:
+        """From when to when only the rest of a motion may move: from detection until the insertion is taken up again;
+        from the fault on if a process is killed and nothing is recorded; during a late decision. None: at no time.
+        """
+        if self.fault.reaction is RESTED:
+            return self.injected, self.injected + self.fault.decision_s
+        if detection is not None:
+            return detection.time, resumed
+        return (self.injected, inf) if "" in self.fault.reaction.outcomes else None
+
+    def _rest(self, since: float, until: float) -> float:
+        """Time from the fault until all axes are where they are at the end of a span."""
+        at = (self.truth.time >= since) & (self.truth.time <= until)
+        moving = [
+            self.truth.time[at][np.abs(place[at] - place[at][-1]) > _AT_REST]
+            for place in self.truth.positions.values()
+        ]
+        return max((float(times[-1]) - since for times in moving if len(times)), default=0.0)
+
+    def _moved(self, axis: str, since: float, until: float) -> float:
+        return moved_between(self.truth, since, until, axis)
+
+    def _from_motion(self, time: float) -> float | None:
+        """Time since the fault, or since the axis was to begin to move if that is later; None if it never was.
+
+        Base and guide move together, so that those which are not faulty show when the other was to begin. For a guide,
+        which moves seldom, the last time before detection counts; for a base the first one after the fault, and that
+        only if the fault found it at rest, or next to the end of a step.
+        """
+        others = [
+            self.truth.positions[axis] for axis in _TOGETHER - {self.axis} if axis in self.truth.positions
+        ]
+        moving = np.any([np.diff(place) != 0.0 for place in others], axis=0)
+        moved = self.truth.time[:-1][moving & (self.truth.time[:-1] <= time)]
+        begins = moved[np.diff(moved, prepend=-np.inf) > _REST_S]
+        if self.axis not in _COLUMNS:
+            later = begins[begins >= self.injected] if self._rested() else begins[:0]
+            begins = np.append(later, self.injected)[:1]
+        return float(time - max(begins[-1], self.injected)) if len(begins) else None
+
+    def _rested(self) -> bool:
+        """Whether the base was at rest as the fault was injected, or nearer to the end of a step than must be seen."""
+        short = -self._travelled() % self.step
+        return self._during() != "advance" or min(short, self.step - short) <= _unseen_mm(self.axis)
+
+    def _commanded(self) -> float | None:
+        """The farthest (mm) that the faulty axis was to be from where the fault found it, by commands after that."""
+        if self.commands is None or not len(self.commands):
+            return None
+        before = np.cumsum(self.commands[:, DB_X]) - self.commands[:, DB_X]
+        after = np.cumsum(self.commands[before > self._travelled(), _COLUMNS[self.axis]])
+        return float(np.abs(after).max(initial=0.0))
+
+    def _travelled(self) -> float:
+        """How far (mm) the base had moved as the fault was injected."""
+        base = self.truth.positions["insertion"]
+        return float(np.interp(self.injected, self.truth.time, base) - base[0])
+
+    def _during(self) -> str:
+        """What the needle did as the fault was injected."""
+        for axis, name in (("rotation", "roll"), ("insertion", "advance")):
+            if self._moved(axis, self.injected - _PAUSE_S, self.injected) > 1e-4:
+                return name
+        return "rest"
+
+
+def entered(run: Mapping[str, Any], since: float) -> Sequence[State]:
+    """The states that a supervisor has entered since a time, by its record; changes of the reason alone are none."""
+    ticks = (run.get("timing") or {}).get("ticks") or {}
+    return [one for one in _changes(ticks.get("states", ())) if one.time >= since]
+
+
+def _changes(states: Sequence[Mapping[str, Any]]) -> Iterator[State]:
+    before = ""
+    for one in states:
+        name = END if (one["state"], one["why"]) == ("stopped", _BY_CONTROLLER) else one["state"]
+        if name != before:
+            yield State(one["time_s"], name, one["why"])
+        before = name
+
+
+def good(fault: Fault, row: Mapping[str, Any]) -> bool:
+    """Whether a trial was as required."""
+    return not problems(fault, row)
+
+
+def problems(fault: Fault, row: Mapping[str, Any]) -> list[str]:
+    """What was not as required."""
+    reaction = fault.reaction
+    required = [
+        outcome for pattern, outcome in reaction.outcomes.items() if re.fullmatch(pattern, row["states"])
+    ]
+    checks = {
+        f"states: {row['states'] or 'none'}": required,
+        f"outcome: {row['outcome']}": not required or row["outcome"] in required,
+        f"reason: {_reason(fault, row)}": _is_because(fault, row),
+        f"{'rest' if fault.timed == 'rest_s' else 'detection'}: {seconds_of(fault, row)}": _is_timely(
+            fault, row
+        ),
+        f"motion: {row['motion_mm']} mm": row["motion_mm"] is None or row["motion_mm"] <= MOTION_MM,
+        "no rest": row["rests"],
+        f"processes left: {row['left']}": row["left"] == 0,
+    }
+    return [problem for problem, fine in checks.items() if not fine]
+
+
+def seconds_of(fault: Fault, row: Mapping[str, Any]) -> float | None:
+    """The time that counts in a trial: to detection or to rest; None without one."""
+    found: float | None = row[fault.timed]
+    return found
+
+
+def _reason(fault: Fault, row: Mapping[str, Any]) -> str:
+    """The reason of the detection: that of the state, and where that has none that of the outcome."""
+    return str(row["why" if set(fault.reaction.detected) & set(_RECORDED) else "reason"])
+
+
+def _is_because(fault: Fault, row: Mapping[str, Any]) -> bool:
+    """Whether the reason is that of the fault; without a detection by the supervisor there is none to compare."""
+    if row["detection_s"] is None and set(fault.reaction.detected) & set(_RECORDED):
+        return True
+    return re.search(fault.because.format(axis=row["axis"]), _reason(fault, row)) is not None
+
+
+def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
+    """Whether it was in time. What shows only in a motion need not be detected, if there is none before the end."""
+    seconds = seconds_of(fault, row)
+    if fault.within is None:
+        return True
+    if seconds is None:
+        seldom = fault.axis in _COLUMNS and row["detection_s"] is None
+        return seldom and (row["commanded_mm"] or 0.0) <= _unseen_mm(fault.axis)
+    return seconds <= fault.within
+
+
+@cache
+def _unseen_mm(axis: str) -> float:
+    return _UNSEEN * dict(load_rig("emulated").axes.items())[axis].tolerance

@@ -1,0 +1,288 @@
+"""ROS and an insertion on an emulated rig: what subscribers cost it, and how soon a stop from there ends its motion.
+
+python campaigns/rig_ros.py [--pairs 3] [--stops 10] [--out runs/rig-ros] [--seed N]
+
+Each insertion has an emulated rig of its own (processes for motors, tracker and phantom), and a section `[ros]`.
+
+Cost: each insertion runs twice, without subscribers and with four processes that subscribe to all topics, one of which
+reads nothing for seconds at a time. A witness, a process that only sleeps, records the machine's own stalls: a tick
+that was left out counts as missed unless the witness was late at the same time.
+
+Stops: another process arms the rig, and at a random time of the insertion it publishes `true` on the topic of stops or
+`false` on that of arms, or the node of the insertion is killed. The record has when the supervisor reported the stop,
+at its first tick after it; the true positions have how far the base moved, and until when.
+
+Results are appended to OUT/results.jsonl as they end, and not repeated: the study can be interrupted. DDS is kept on
+the loopback interface. Exit status 1 if an insertion that was stopped moved by more than 0.5 mm after the stop, or did
+not end as interrupted with all axes at rest; or if one with subscribers was not done, left out a tick that no stall of
+the machine explains, or had a late decision. Those of an insertion without subscribers are no cost of theirs.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from itertools import chain, product
+from math import isnan
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import psutil
+
+import flexneedle
+from flexneedle.lab.emulators.emulated_rig.truth import Truth
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_between, rests, shipped_rig, witness
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+LOOPBACK = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    '<Peers><Peer Address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+KINDS = ("slow", "fast", "fast", "fast")
+STOPS = {"true on stop": "stop true", "false on arm": "arm false", "node killed": None}
+RESULTS = "results.jsonl"
+NUMBERS = ("speed_mm_s", "reported_ms", "rest_ms", "moved_mm", "moved_after_mm")
+_FIRST_SEED = 410_000
+_EARLIEST_S, _LATEST_S = 1.0, 13.0  # after the first motion, while the needle is driven
+_MOST_MM = 0.5  # the most that the base may move after the stop
+_INTERRUPTED = 130  # exit status
+_PIPE = subprocess.PIPE
+
+Row = dict[str, Any]
+
+
+def resumed(path: Path, key: Row, run: Callable[[], Row]) -> Row:
+    """The row with these values in a file of rows (JSON, a line each); where it is missing it is made and appended."""
+    rows = map(json.loads, path.read_text().splitlines()) if path.exists() else ()
+    found = next((row for row in rows if key.items() <= row.items()), None)
+    if found is not None:
+        return found
+    row = key | run()
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    return row
+
+
+@contextmanager
+def rig_with(section: str, seed: int, out: Path) -> Iterator[EmulatedRig]:
+    """An emulated rig with a section in its file. out: folder of the record; one that was interrupted is removed."""
+    shutil.rmtree(out, ignore_errors=True)
+    with tempfile.TemporaryDirectory() as folder:
+        text = shipped_rig().replace("[tracker]", f"{section}\n\n[tracker]")
+        with emulated_rig(Path(folder), "phantom", seed, text=text) as rig:
+            yield rig
+
+
+# What subscribers cost
+
+
+@contextmanager
+def subscribers(count: int) -> Iterator[list[int]]:
+    """Processes that subscribe to all topics of `neutral`; the first is slow. Gives their messages, once ended."""
+    command = [sys.executable, BENCHMARKS / "ros.py", "--profile", "neutral", "--subscriber"]
+    others = [subprocess.Popen([*command, kind], stdin=_PIPE, stdout=_PIPE) for kind in KINDS[:count]]
+    received: list[int] = []
+    try:
+        yield received
+    finally:
+        for other in others:
+            other.stdin.close()
+        received += [int(other.stdout.read()) for other in others]
+        for other in others:
+            other.wait()
+
+
+def cost(seed: int, count: int, out: Path) -> Row:
+    """Carry out an insertion with so many subscribers."""
+    with rig_with("[ros]", seed, out) as rig, subscribers(count) as received, witness() as seen:
+        status, _, errors = ended(insertion(rig.rig, "phantom", out, "--seed", str(seed)), 180.0)
+    if status not in (0, 1):
+        raise SystemExit(f"seed {seed}: exit status {status}\n{errors}")
+    done, timing = flexneedle.load(out), json.loads((out / "run.json").read_text())["timing"]
+    ticks = timing["ticks"]
+    return {
+        "outcome": str(done.outcome),
+        "periods": len(done.periods),
+        "late": done.late,
+        "ticks": ticks["count"],
+        "tick_99_ms": ticks["ended_p99_ms"],
+        "latest_ms": ticks["late_max_ms"],
+        "missed": ticks["missed"],
+        "unexplained": sum(not seen.explains(one["time_s"], one["late_s"]) for one in ticks["stalls"]),
+        "received": min(received, default=0),
+    }
+
+
+# How soon a stop ends the motion
+
+
+class Operator:
+    """A process that publishes on the topics of stops and arms, once it has found the insertion."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, BENCHMARKS / "ros_stop.py", "--publisher"]
+        self._process = subprocess.Popen(command, stdin=_PIPE, stdout=_PIPE, text=True)
+
+    def __enter__(self) -> "Operator":
+        if not self._process.stdout.readline():
+            raise SystemExit("the nodes have not found each other")
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._process.communicate()
+
+    def publish(self, order: str) -> float:
+        """Publish as an order such as `stop true` says; return when (s, monotonic)."""
+        self._process.stdin.write(f"{order} 0\n")
+        self._process.stdin.flush()
+        return float(self._process.stdout.readline())
+
+
+def stop(how: str, timing: int, out: Path) -> Row:
+    """Stop an insertion at a random time."""
+    seed = crc32(f"{how} {timing}".encode())
+    after = float(np.random.default_rng(seed).uniform(_EARLIEST_S, _LATEST_S))
+    with rig_with("[ros]\narm = true", seed % 1000, out) as rig:
+        process = insertion(rig.rig, "phantom", out, "--seed", str(seed % 1000))
+        _await_line(process, b"waits for an arm")
+        with Operator() as operator:
+            operator.publish("arm true")
+            sleep(max(0.0, rig.first_motion(process) + after - monotonic()))
+            order = STOPS[how]
+            sent = _killed(process.pid) if order is None else operator.publish(order)
+            status, _, errors = ended(process)
+        sleep(1.0)
+        truth = rig.read_truth()
+    run = json.loads((out / "run.json").read_text())
+    return {"status": status, "reason": run["reason"] or errors[-300:], **_judged(truth, sent, run)}
+
+
+def _await_line(process: "subprocess.Popen[bytes]", text: bytes) -> None:
+    """Wait for a line on stderr with a text."""
+    lines = []
+    for line in process.stderr:
+        if text in line:
+            return
+        lines.append(line.decode())
+    raise SystemExit("".join(["the insertion has ended\n", *lines]))
+
+
+def _killed(pid: int) -> float:
+    """Kill the ROS node of an insertion; return when."""
+    children = psutil.Process(pid).children()
+    node = next(child for child in children if "flexneedle.lab.ros.node" in child.cmdline())
+    now = monotonic()
+    node.send_signal(signal.SIGKILL)
+    return now
+
+
+def _judged(truth: Truth, sent: float, run: Row) -> Row:
+    """Speed of the base (mm/s) at an order; times (ms) from it to the report of the stop and to the end of all motion;
+    how far the base moved (mm) after the order and after the report.
+    """
+    states = run["timing"]["ticks"]["states"]
+    later = (one["time_s"] for one in states if one["state"] == "stopped" and one["time_s"] >= sent)
+    reported = next(later, float("nan"))
+    turned = np.any([np.diff(counts) != 0.0 for counts in truth.counts.values()], axis=0)
+    before, at = np.interp([sent - 0.02, sent], truth.time, truth.positions["insertion"])
+    return {
+        "speed_mm_s": float(at - before) / 0.02,
+        "reported_ms": 1e3 * (reported - sent),
+        "rest_ms": 1e3 * max(0.0, float(truth.time[1:][turned][-1]) - sent),
+        "moved_mm": moved_between(truth, sent),
+        "moved_after_mm": moved_between(truth, reported),
+        "rests": rests(truth),
+    }
+
+
+def good(row: Row) -> bool:
+    """Whether an insertion ended as it must."""
+    stopped = row["status"] == _INTERRUPTED and not isnan(row["reported_ms"])
+    return bool(stopped and row["rests"] and row["moved_after_mm"] <= _MOST_MM)
+
+
+def costs_nothing(row: Row) -> bool:
+    """Whether an insertion is done, with no tick left out but for stalls of the machine and no late decision."""
+    return bool(row["outcome"] == "done" and row["unexplained"] == 0 and row["late"] == 0)
+
+
+# Tables
+
+
+def costs(pairs: int, first: int, out: Path) -> bool:
+    """Run pairs of insertions, and print their table; return whether subscribers cost nothing."""
+    fine = True
+    print(
+        "subscribers    seed outcome   periods  late  ticks     99 %     latest  missed  not by a stall  received"
+    )
+    for seed in range(first, first + pairs):
+        for count in (0, len(KINDS)):
+            key = {"subscribers": count, "seed": seed}
+            row = resumed(out / RESULTS, key, partial(cost, seed, count, out / f"{seed}-{count}"))
+            bad = bool(count) and not costs_nothing(row)
+            fine &= not bad
+            print(
+                f"{count:11} {seed:7} {row['outcome']:8} {row['periods']:8} {row['late']:5} {row['ticks']:6} "
+                f"{row['tick_99_ms']:5.2f} ms {row['latest_ms']:6.1f} ms {row['missed']:7} {row['unexplained']:15} "
+                f"{row['received']:9}{' not as required' if bad else ''}",
+                flush=True,
+            )
+    return fine
+
+
+def stops(count: int, out: Path) -> bool:
+    """Run insertions that are stopped, and print their table and a summary; return whether all ended as they must."""
+    print("stop           no   mm/s  reported      rest    moved  after the report  reason")
+    rows: dict[str, list[Row]] = {how: [] for how in STOPS}
+    for timing, how in product(range(count), STOPS):
+        folder = out / f"{how}-{timing}".replace(" ", "-")
+        row = resumed(out / RESULTS, {"stop": how, "timing": timing}, partial(stop, how, timing, folder))
+        rows[how].append(row)
+        mark = "" if good(row) else "not as required: "
+        print(f"{_line(how, str(timing), row)} {mark}{row['reason']}", flush=True)
+    for how, found in rows.items():
+        fit = [row for row in found if good(row)]
+        for name, of in (("median", np.median), ("most", np.max)) if fit else ():
+            numbers = {key: float(of([row[key] for row in fit])) for key in NUMBERS}
+            print(f"{_line(how, name, numbers)} of {len(fit)} as required, {len(found) - len(fit)} not")
+    return all(map(good, chain(*rows.values())))
+
+
+def _line(how: str, name: str, row: Row) -> str:
+    speed, reported, rest, moved, after = (row[key] for key in NUMBERS)
+    return (
+        f"{how:12} {name:>6} {speed:5.1f} {reported:6.0f} ms {rest:6.0f} ms {moved:5.3f} mm {after:14.3f} mm"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run what is missing, and print both tables; exit status 1 if an insertion was not as required."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--stops", type=int, default=10, help="of each kind (default: 10)")
+    parser.add_argument("--out", type=Path, default=Path("runs/rig-ros"))
+    parser.add_argument("--seed", type=int, default=_FIRST_SEED, help="of the first pair")
+    args = parser.parse_args(argv)
+    os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
+    os.environ.setdefault("ROS_DOMAIN_ID", str(40 + os.getpid() % 150))
+    args.out.mkdir(parents=True, exist_ok=True)
+    costless = costs(args.pairs, args.seed, args.out)
+    stopped = stops(args.stops, args.out)
+    return int(not (costless and stopped))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

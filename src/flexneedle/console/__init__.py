@@ -1,1 +1,0 @@
-"""Shared by commands: arguments, progress, tables and JSON on stdout."""

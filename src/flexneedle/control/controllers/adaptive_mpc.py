@@ -1,0 +1,314 @@
+"""`adaptive-mpc`, the default: each period, a plan to the target with a model that is fitted to the readings.
+
+Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
+the depths at which the bevel rolls, is first the plan's (`control.path`). Cross-entropy searches for a better one
+among its corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. The cost
+is a length: the miss plus weighted tissue energy, guide slope, rolls and distance from the line to the target,
+each relative to a scale of the scenario, so that one setting serves every needle.
+
+Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import cast
+
+import numpy as np
+from pydantic import Field
+
+from flexneedle.control.forecast import probability_beyond, size_text
+from flexneedle.control.guide import guide_may_move
+from flexneedle.control.interface import Controller, Decision
+from flexneedle.control.outlook import UNCORRECTED, Outlook
+from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.identification import Identification, Identified
+from flexneedle.estimation.lateral import facing
+from flexneedle.estimation.prior import Priors
+from flexneedle.estimation.task import Task
+from flexneedle.planning import terms
+from flexneedle.planning.cross_entropy import Search, elite_count
+from flexneedle.planning.horizon import Found, Variables, best
+from flexneedle.planning.terms import Term, Trajectories
+from flexneedle.scenario.sections.fields import NonNegative, count
+from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
+
+_ELITE_FRACTION = 0.125
+_SMOOTHING = 0.3
+_TOLERANCE = 1e-6
+_RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
+_SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, from which the needle rests
+_CERTAIN = 1e-9  # mm: standard deviation of a distance that is known
+_STILL = 1e-6  # rad: of a needle that did not roll
+
+_FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
+_LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
+
+
+class AdaptiveMpc(Priors):
+    """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
+
+    samples: int = count(24, least=12, most=100_000)
+    """Number of paths in an iteration of the search."""
+    iterations: int = count(2, least=1, most=1_000)
+    """Iterations of the search in a control period."""
+    effort: int = count(3, least=1, most=1_000)
+    """Factor on `samples` in the first period, and in a search again if none ends within `control.miss_limit_mm`."""
+    urgency: float = Field(default=1.5, ge=0.0, le=10.0)
+    """Exponent u of the factor r^(−u) on a predicted miss above its standard deviation; r is the share of the path that
+    is left, at least five control steps. 0: no factor."""
+    energy_weight_mm: NonNegative = 0.7
+    """Weight of the tissue energy, in units of the energy of all tissue down to the target displaced by 1 mm."""
+    unguided_energy_weight_mm: NonNegative = 1.0
+    """`energy_weight_mm` where the guide may not move."""
+    line_weight: NonNegative = 0.4
+    """Weight of the mean distance of the tip from the line to the target, times the share of the path that is left."""
+    unguided_line_weight: NonNegative = 0.0
+    """`line_weight` where the guide may not move."""
+    slope_weight_mm: NonNegative = 0.5
+    """Weight of the mean square slope of the guide's path, times the share of the path that is left."""
+    roll_weight_mm: NonNegative = 0.03
+    """Cost of a roll of the bevel."""
+    reach_weight: NonNegative = 1.0
+    """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
+    unguided_reach_weight: NonNegative = 100.0
+    """`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone."""
+    unguided_reach_margin: NonNegative = 3.0
+    """Factor there on the standard deviation of that distance: reach is kept until as much is to spare."""
+    late_roll_weight: NonNegative = 1.0
+    """Weight of the standard deviation of the tip's motion in a roll just before the target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """The memory from period to period: the current path, and the derivatives ahead of the tip.
+
+    path: as decided; rolled: the same after the roll of the command; roll: the needle's angle (rad) before the command.
+    The next estimate shows which of the two is current: a needle that is held or rests does not roll.
+    scale: energy (mJ) of the tissue down to the target displaced by 1 mm; rests: number of rests already made;
+    blur: standard deviation (mm) of a miss that is corrected as long as it can be.
+    """
+
+    path: GuidePath
+    rolled: GuidePath
+    roll: float
+    scale: float
+    outlook: Outlook | None = None
+    rests: int = 0
+    blur: float = 0.0
+
+
+def begin(task: Task) -> Memory:
+    """The memory at the start: the plan's path."""
+    path, scale = of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
+    return Memory(path, path, task.plan.roll, scale)
+
+
+def decide(
+    task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator
+) -> tuple[Decision, Memory]:
+    """The first step of the best path found."""
+    fitted = cast(Identified, estimate)  # METHOD below names its observer
+    settings = task.settings
+    current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
+    ahead = Ahead.of(task, fitted.state, current)
+    found = search_path(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
+    if not math.isfinite(found.cost):
+        return Decision(STILL, "no path converges on the fitted model", found.cost), memory
+    outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
+    if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
+        ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
+        found = search_path(task, fitted, ahead, memory, settings.effort, rng)
+        outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
+    path = ahead.corrected(found.z)
+    command, rolled = ahead.first(path)
+    rest, rests = _rest(task, memory, fitted, ahead.left)
+    why = f"{_rolls_text(rolled, fitted.axes)}; predicted miss {size_text(miss)} ± {sd:.3f} mm"
+    spread = float(np.sqrt(found.search_state.covariance[0, 0]))
+    after = Memory(
+        path,
+        rolled,
+        fitted.state.roll,
+        memory.scale,
+        outlook,
+        rests,
+        outlook.sd_to_come(fitted, task.plan.target[0]),
+    )
+    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
+
+
+def _rolls_text(path: GuidePath, axes: int) -> str:
+    """Where the needle rolls, in space with its angles after that."""
+    if not len(path.rolls):
+        return "no roll"
+    if axes == 1:
+        return f"rolls at {', '.join(f'{depth:.1f}' for depth, _ in path.rolls)} mm"
+    return f"rolls at {', '.join(f'{depth:.1f} mm to {math.degrees(angle):.0f}°' for depth, angle in path.rolls)}"
+
+
+def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
+    """Time (s) to rest in this period, and number of rests before the target.
+
+    Readings are late: at rest they arrive, and the error that they show can still be corrected. So it rests at a
+    few distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not explain.
+    """
+    setup = task.scenario.setup
+    step = setup.max_advance_mm
+    catching_up = fitted.lag + step / setup.insertion_speed_mm_s
+    rests = max(memory.rests, sum(left <= distance * step + 1e-9 for distance in _RESTS))
+    if rests > memory.rests or _surprised(fitted):
+        # None where the needle was measured at rest for as long already, since the decision came late.
+        return max(0.0, catching_up), rests
+    return 0.0, rests
+
+
+def _surprised(fitted: Identified) -> bool:
+    """Whether the residual of the fit to the readings of a step in the tissue is improbably large."""
+    stepped = bool(fitted.moves) and fitted.moves[-1].applied.db_x > 0.0
+    off = math.hypot(*fitted.innovation[1:]) / math.sqrt(fitted.reading_variance)
+    return stepped and float(fitted.state.tip[X]) > 0.0 and off > _SURPRISE
+
+
+def search_path(
+    task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
+) -> Found:
+    """The best correction of the current path, which is itself among the samples."""
+    settings = task.settings
+    samples = effort * settings.samples
+    first = proposals(ahead, samples, rng, _aim(task, fitted, ahead))
+    lower, upper = ahead.bounds
+    variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
+    elite = elite_count(samples, _ELITE_FRACTION)
+    search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
+    charged = cost_terms(task, fitted, memory, ahead)
+    return best(variables, partial(measured_rollout, fitted), charged, search, rng, first=first)
+
+
+def _aim(task: Task, fitted: Identified, ahead: Ahead) -> complex:
+    """Direction in which the current path misses the target by too little, for a needle that rolls to any angle."""
+    if ahead.setup.half_turns:
+        return 1.0
+    along = measured_rollout(fitted, ahead.controls(ahead.current[None])[0])
+    return complex(-terms.past(along, task.plan.target)[0])
+
+
+def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
+    """Trajectories of controls (N, m, 9) on the fitted model; tips as a tracker without errors would measure them."""
+    predicted = fitted.simulator.rollout(fitted.state, controls, limits=False, rough=True)
+    tips, energy, converged = predicted[:3]
+    off = fitted.run_out * facing(fitted.state.bevel, controls, fitted.axes) + fitted.residual
+    tips[:, :, Y] += off.real
+    tips[:, :, Z] += off.imag
+    return Trajectories(controls, tips, energy, converged)
+
+
+def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
+    settings, target = task.settings, task.plan.target
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
+    energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
+    line = settings.line_weight if guided else settings.unguided_line_weight
+    alone = _bevel_alone_across(task, ahead)
+    spare = guided and not alone
+    reach = settings.reach_weight if spare else settings.unguided_reach_weight
+    margin = 1.0 if spare else settings.unguided_reach_margin
+    uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
+    late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
+    whole = max(target[0], uncorrected)
+    share = min(1.0, ahead.left / whole)  # of the path
+    urgent = min(1.0, max(ahead.left, uncorrected) / whole)
+    miss = partial(terms.miss, target=target, blur=memory.blur * share)
+    large = partial(terms.large_miss, target=target, blur=memory.blur * share, sd=memory.blur)
+    start = Pose.of(fitted.tip).point
+    return (
+        Term("miss", 1.0, miss),
+        Term("large miss", urgent**-settings.urgency - 1.0, large),
+        Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
+        Term("line", line * share, partial(terms.distance_from_line, start=start, target=target)),
+        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
+        Term("flips", settings.roll_weight_mm, terms.flips),
+        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
+        Term("reach", reach, out_of_reach(task, fitted, ahead, memory, margin)),
+    )
+
+
+def out_of_reach(
+    task: Task, fitted: Identified, ahead: Ahead, memory: Memory, margin: float
+) -> Callable[[Trajectories], Floats]:
+    """Expected distance (N,), mm, of the target from the bevel's reach after the first step of trajectories.
+
+    The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
+    the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
+    bounds are normally distributed, `margin` times as widely as the estimate is, since reach that no later step will
+    need may be given away. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the
+    tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects, so that only
+    the distance across it counts.
+    """
+    trajectories = measured_rollout(fitted, ahead.constant)
+    if not trajectories.converged.all():
+        return partial(terms.out_of_reach, expected=np.zeros(2))
+    past = terms.past(trajectories, task.plan.target).reshape(2, 2)
+    middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
+    if ahead.setup.half_turns:
+        low, high = past.real.min(axis=1), past.real.max(axis=1)
+        sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
+        return partial(terms.out_of_reach, expected=above_zero(low, sd) + above_zero(-high, sd))
+    # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
+    # the middle towards the target or away from it: the ends are that much farther, or nearer.
+    away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
+    if _bevel_alone_across(task, ahead):
+        away = 1j * away.imag
+    sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
+    angle = float(np.angle(complex(away) * fitted.state.bevel.conjugate()))
+    return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
+
+
+def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
+    """Whether the guide moves along y only, and a bevel that turns to any angle steers along z."""
+    setup = ahead.setup
+    guided = guide_may_move(setup, task.plan.strategy)
+    return guided and setup.moved_guide_axes < setup.axes and not setup.half_turns
+
+
+def above_zero(mean: Floats, sd: Floats) -> Floats:
+    """Mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
+    z = mean / np.maximum(sd, _CERTAIN)
+    below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
+    part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return part
+
+
+def _forecast(
+    task: Task, memory: Memory, fitted: Identified, ahead: Ahead, found: Found
+) -> tuple[Outlook, complex, float, Shape]:
+    """Derivatives ahead of the tip, the predicted miss (mm; y + iz in space), its standard deviation on an axis (mm),
+    and the predicted shape at the target.
+    """
+    past = complex(terms.past(found.trajectories, task.plan.target)[0])
+    miss = past.real if fitted.axes == 1 else past
+    both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.leaning(found.z)[None])[0]])
+    shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, shapes=True).shapes
+    nodes, leaning = shapes[:, -1]
+    before = memory.outlook or Outlook.of(fitted)
+    outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
+    sd = outlook.sd(fitted, task.plan.target[0], miss, guided=guided)
+    by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]
+    guide, bevel = (
+        moved / moved[-1] if abs(moved[-1]) > _STILL else 0.0 * moved for moved in (by_guide, by_bevel)
+    )
+    share = min(1.0, _FURTHEST_LEVER / max(float(np.abs(guide).max()), 1.0)) if guide.any() else 0.0
+    lever = share * guide + (1.0 - share) * bevel
+    return outlook, miss, sd, Shape(nodes, outlook.shape_sd(fitted, task.plan.target[0], lever, sd))
+
+
+METHOD = Controller(
+    "adaptive-mpc",
+    "plans to the target each period, with a model that is fitted to the readings",
+    Identification(),
+    begin=begin,
+    decide=decide,
+    settings=AdaptiveMpc,
+    predicts=True,
+)

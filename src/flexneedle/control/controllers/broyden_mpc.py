@@ -1,0 +1,195 @@
+"""`broyden-mpc`: a Jacobian estimated from readings, and linear MPC of the guide; no model of needle or tissue.
+
+Bernardes et al., Data-driven adaptive needle insertion assist for transperineal prostate interventions (Phys. Med.
+Biol. 2023, doi:10.1088/1361-6560/accefa): the Jacobian from inputs (insertion, guide position) to the measured
+tip takes 0.65 of Broyden's rank-one update after each step; the guide positions of four steps, within 6 mm of the
+axis, minimise the distance of the predicted tip from its reference; the first is applied. The bevel is
+never rolled. Two things differ here: an MPC step is a control step and not 10 mm of insertion by
+hand, and the reference is the planned path where theirs is a target straight ahead.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexneedle.control.interface import Controller, Decision, travel_left
+from flexneedle.control.mpc import planned_base
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import StateCorrection
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
+from flexneedle.types import DB_X, DG_Y, Control, Floats, Plan, X
+
+_LEAST_INSERTION_MM = 0.5  # between two updates: in a shorter one the tracker's noise dominates
+_RIDGE = 1e-9  # mm² per squared millimetre of the guide: a unique solution where the guide has no effect
+_RELEASE = 1e-12  # gradient of the cost that counts as rounding
+_KEPT = 8  # control steps; readings are not older
+
+
+class BroydenMpc(Section):
+    """Section `control.broyden_mpc`: a Jacobian estimated from readings, and linear MPC of the guide."""
+
+    update_gain: Fraction = 0.65
+    """Share of Broyden's update of the Jacobian; 1: the Jacobian reproduces the newest motion exactly."""
+    horizon: int = count(4, least=1, most=20)
+    """Prediction horizon of the linear MPC, in control steps."""
+    max_guide_travel_mm: Positive = 6.0
+    """Largest lateral distance of the guide from the insertion axis; not beyond `setup.max_guide_travel_mm`."""
+    guide_weight: NonNegative = 0.000316
+    """Weight of the squared guide steps (mm²) against the squared deviation of the tip (mm²)."""
+    guide_effect: NonNegative = 0.982
+    """Initial Jacobian: lateral motion of the tip per that of the guide; without that it moves straight."""
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianEstimate:
+    """Jacobian (1 + a, 1 + g) from insertion and guide, on g axes, to the tip, on a lateral axes; the last (tip x,
+    insertion, guide) as commanded.
+
+    last_update: tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading.
+    """
+
+    jacobian: Floats
+    history: tuple[tuple[float, ...], ...] = ()
+    last_update: tuple[Floats, Floats] | None = None
+
+
+def begin(task: Task) -> JacobianEstimate:
+    """The initial Jacobian: a tip that continues straight and follows the guide laterally."""
+    setup = task.scenario.setup
+    jacobian = np.eye(1 + setup.axes, 1 + setup.moved_guide_axes)
+    jacobian[1:, 1:] *= task.settings.guide_effect
+    return JacobianEstimate(jacobian)
+
+
+def decide(
+    task: Task, estimated: JacobianEstimate, estimate: Estimate, _rng: np.random.Generator
+) -> tuple[Decision, JacobianEstimate]:
+    """Update the Jacobian by a new reading, predict the present tip, and take the first of the best guide steps."""
+    scenario, state = task.scenario, estimate.state
+    settings, setup = task.settings, scenario.setup
+    inputs = np.array([state.travel[DB_X], *state.guide[: setup.moved_guide_axes]])
+    estimated = remember(estimated, float(state.tip[X]), inputs)
+    left = travel_left(scenario, task.plan, state)
+    advance = min(setup.max_advance_mm, left)
+    row = Control(advance, *planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist())
+    if estimate.measured is None or left <= 0.0:
+        return Decision(row, "no reading yet"), estimated
+    tip = np.array(estimate.measured[: 1 + setup.axes])
+    then = inputs_at(estimated, float(tip[0]))
+    estimated = updated(estimated, tip, then, settings.update_gain)
+    tip = tip + estimated.jacobian @ (inputs - then)
+    ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
+    moves, cost = guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
+    slopes, effects = estimated.jacobian[1:, 0], np.diag(estimated.jacobian[1:, 1:])
+    moves_by = f"tip moves {_listed(slopes)} laterally with insertion, {_listed(effects)} with the guide"
+    why = f"bevel kept: never rolled; {moves_by}"
+    return Decision(Control(*row[:DG_Y], *moves[0].tolist()), why, cost), estimated
+
+
+def _listed(values: Floats) -> str:
+    """A number for each axis."""
+    return " and ".join(f"{value:.3f}" for value in values.tolist())
+
+
+def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
+    """Record the inputs with the tip at depth x (mm), to which later readings are assigned."""
+    history = (*estimated.history, (x, *inputs.tolist()))[-_KEPT:]
+    return JacobianEstimate(estimated.jacobian, history, estimated.last_update)
+
+
+def inputs_at(estimated: JacobianEstimate, x: float) -> Floats:
+    """Inputs (1 + g,) with the tip at depth x (mm), within the recorded range."""
+    depth, *inputs = np.array(estimated.history).T
+    return np.array([np.interp(x, depth, values) for values in inputs])
+
+
+def updated(estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float) -> JacobianEstimate:
+    """The estimate updated by a reading of the tip, if the insertion since the last update is long enough."""
+    if estimated.last_update is None:
+        return JacobianEstimate(estimated.jacobian, estimated.history, (tip, inputs))
+    last_tip, last_inputs = estimated.last_update
+    if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
+        return estimated
+    jacobian = broyden(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
+    return JacobianEstimate(jacobian, estimated.history, (tip, inputs))
+
+
+def broyden(jacobian: Floats, moved: Floats, measured: Floats, gain: float) -> Floats:
+    """The nearest matrix that maps `moved` to `measured` (Broyden 1965), or the share `gain` of that change."""
+    return jacobian + gain * np.outer(measured - jacobian @ moved, moved) / (moved @ moved)
+
+
+def guide_moves(
+    settings: BroydenMpc,
+    scenario: Scenario,
+    plan: Plan,
+    jacobian: Floats,
+    tip: Floats,
+    ahead: Floats,
+    guide: Floats,
+) -> tuple[Floats, float]:
+    """Guide positions (n, g), mm, relative to the present ones (g,), after n steps that end `ahead` (n,) of the tip,
+    and their cost.
+
+    Cost: squared distance (mm²) of tip and planned path, and `guide_weight` times the squared guide steps.
+    """
+    n, axes = len(ahead), guide.size
+    goal = np.array([np.interp(tip[0] + ahead, *_path(plan, k)) for k in range(1, tip.size)])
+    effort = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
+    matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort)])
+    left = goal - tip[1:, None] - np.multiply.outer(jacobian[1:, 0], ahead)
+    right = np.concatenate([left.ravel(), np.zeros(axes * n)])
+    setup, home = scenario.setup, scenario.guide_home
+    reach = min(settings.max_guide_travel_mm, setup.max_guide_travel_mm)
+    guide = guide - np.array([home.real, home.imag])[:axes]
+    furthest, place = np.tile(setup.max_guide_step_mm * np.arange(1, n + 1), axes), np.repeat(guide, n)
+    lower, upper = np.maximum(-furthest, -reach - place), np.minimum(furthest, reach - place)
+    moves = bounded_least_squares(matrix, right, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
+    return moves.reshape(axes, n).T, float(np.sum((matrix @ moves - right) ** 2))
+
+
+def _path(plan: Plan, k: int) -> tuple[Floats, Floats]:
+    """Depth and a lateral position, column k, of the planned path, with the target as its end."""
+    depth, lateral = (np.append(plan.tips[:-1, column], plan.target[column]) for column in (0, k))
+    return depth, lateral
+
+
+def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:
+    """Least ‖A z − b‖² for lower ≤ 0 ≤ upper, exact: the primal active-set method from z = 0.
+
+    For a singular A the solution nearest to 0, by a ridge.
+    """
+    hessian = matrix.T @ matrix + _RIDGE * np.eye(len(lower))
+    slope = matrix.T @ right
+    z, held = np.zeros(len(lower)), np.zeros(len(lower), dtype=bool)
+    for _ in range(10 * len(lower)):  # a few in practice; each lowers the cost
+        best = np.where(held, z, 0.0)
+        free = np.ix_(~held, ~held)
+        best[~held] = np.linalg.solve(hessian[free], (slope - hessian @ best)[~held])
+        bound = np.clip(best, lower, upper)
+        if (bound == best).all():
+            z, push = best, (slope - hessian @ best) * held
+            push = np.where(z == lower, np.maximum(push, 0.0), np.minimum(push, 0.0)) * (lower < upper)
+            if np.abs(push).max() <= _RELEASE:
+                break
+            held[np.abs(push).argmax()] = False
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.where(bound != best, (bound - z) / (best - z), np.inf)
+        first = int(part.argmin())
+        z = z + part[first] * (best - z)
+        z[first], held[first] = bound[first], True
+    return z
+
+
+METHOD = Controller(
+    "broyden-mpc",
+    "guide by linear MPC with a Jacobian estimated from readings (Broyden), no model",
+    StateCorrection(),
+    begin=begin,
+    decide=decide,
+    settings=BroydenMpc,
+    needs_guide=True,
+)

@@ -1,0 +1,1 @@
+"""The laboratory: studies, rigs, ROS, emulators, evaluation of trackers, and the page. The core never imports it."""

@@ -1,0 +1,217 @@
+"""`flexneedle emulate`: an emulated tracker or motion controller, for tests without hardware."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flexneedle.cli.commands import Commands, add_command, add_group
+from flexneedle.cli.common import add_seed
+
+if TYPE_CHECKING:
+    from flexneedle.lab.emulators.emulated_rig.job import Job
+    from flexneedle.lab.emulators.orders import Orders
+
+_LAST_PORT = 65535
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    add_group(
+        commands,
+        "emulate",
+        "emulate a device, for tests without hardware",
+        (_add_aurora, _add_galil, _add_rig),
+        "flexneedle emulate aurora --link /tmp/aurora",
+        "flexneedle emulate rig emulated phantom",
+        title="devices",
+    )
+
+
+def _add_aurora(commands: Commands) -> None:
+    aurora = add_command(
+        commands,
+        "aurora",
+        "an NDI Aurora on a pseudo-terminal",
+        _emulate_aurora,
+        "flexneedle emulate aurora --link /tmp/aurora",
+        "flexneedle emulate aurora --still --sensors 2 --seed 3",
+        about="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
+        "The tip moves along an arc; a line X Y Z on stdin (mm, tracker frame) stops it at that position.",
+    )
+    aurora.add_argument(
+        "--link",
+        type=Path,
+        metavar="PATH",
+        help="path of the device (default: one in a new folder under /tmp)",
+    )
+    _add_fault(aurora, "a fault at SECONDS after the start of tracking", "docs/tracking/aurora.md")
+    aurora.add_argument("--still", action="store_true", help="start with the tip at rest")
+    aurora.add_argument(
+        "--sensors", type=int, choices=range(1, 5), default=4, help="number of connected sensors (default: 4)"
+    )
+    aurora.add_argument(
+        "--firmware", metavar="TEXT", help="firmware tag in the reply to VER (default: AURORA Rev 008)"
+    )
+    aurora.add_argument(
+        "--no-bx", action="store_true", help="do not support binary readings (BX), as old firmware"
+    )
+    add_seed(aurora, "seed of jitter and corrupted bytes")
+
+
+def _add_galil(commands: Commands) -> None:
+    galil = add_command(
+        commands,
+        "galil",
+        "a Galil DMC-4143 on a TCP port",
+        _emulate_galil,
+        "flexneedle emulate galil --port 2323",
+        "flexneedle emulate galil --port 2323 --fault stall=A@5",
+        about="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
+        "Its four motors move in real time.",
+    )
+    galil.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
+    )
+    galil.add_argument(
+        "--port", type=_port, default=0, metavar="N", help="port to listen on (default: one that is free)"
+    )
+    _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
+    add_seed(galil, "seed of changed bytes")
+
+
+def _add_rig(commands: Commands) -> None:
+    rig = add_command(
+        commands,
+        "rig",
+        "a whole rig: motors that move a virtual needle, and a tracker that measures its tip",
+        _emulate_rig,
+        "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
+        "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
+        about="Emulate the controller and the tracker of a rig file, with the virtual phantom of a scenario "
+        "between them, in three processes, until interrupted (Ctrl-C). Print one line when all are ready, and one for "
+        "each event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all.",
+    )
+    rig.add_argument("rig", metavar="RIG", help="rig file: its path, or emulated for the one of the package")
+    rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
+    add_seed(rig, "seed of phantom and noise: the phantom is that of flexneedle insert --seed N")
+    rig.add_argument(
+        "--plan",
+        type=Path,
+        metavar="DIR",
+        help="folder with the plan, where the scenario leaves the entry to it",
+    )
+    rig.add_argument("--truth", type=Path, metavar="FILE", help="write the true states to a new CSV file")
+    _add_fault(
+        rig,
+        "a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion",
+        "docs/rig/emulate.md",
+        device="DEVICE:",
+    )
+
+
+def _add_fault(parser: argparse.ArgumentParser, fault: str, page: str, *, device: str = "") -> None:
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar=f"{device}KIND[=DETAIL]@SECONDS[:DURATION]",
+        help=f"inject {fault}; repeatable; see {page}",
+    )
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) <= _LAST_PORT):
+        raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (one that is free) to {_LAST_PORT}")
+    return int(text)
+
+
+def _emulate_aurora(args: argparse.Namespace) -> int:
+    from time import monotonic
+
+    from flexneedle.lab.emulators.aurora import FAULTS, FIRMWARE, fresh
+    from flexneedle.lab.emulators.faults import parse_fault
+    from flexneedle.lab.emulators.motion import CENTRE, CIRCLE, Rest
+    from flexneedle.lab.emulators.server import EmulatorSession, Serial, execute, serve
+    from flexneedle.lab.rig.devices.priority import set_realtime_priority
+
+    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
+    device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
+    with Serial(args.link) as serial:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then too
+        set_realtime_priority()  # a real device does not wait for other processes on this machine
+        try:
+            print(serial.link, flush=True)
+            tip = Rest(CENTRE) if args.still else CIRCLE
+            session = EmulatorSession(device, faults, args.seed, monotonic(), tip=tip)
+            serve(session, serial, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
+        except KeyboardInterrupt:
+            return 0
+
+
+def _emulate_galil(args: argparse.Namespace) -> int:
+    from time import monotonic
+
+    from flexneedle.lab.emulators.faults import parse_fault
+    from flexneedle.lab.emulators.galil.controller import Device
+    from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp, execute, serve
+    from flexneedle.lab.rig.devices.priority import set_realtime_priority
+
+    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
+    with Tcp(args.host, args.port) as tcp:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        set_realtime_priority()  # a real device does not wait for other processes on this machine
+        try:
+            print("{}:{}".format(*tcp.address), flush=True)
+            session = GalilSession(Device(), faults, monotonic(), args.seed)
+            serve(session, tcp, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
+        except KeyboardInterrupt:
+            return 0
+
+
+def _emulate_rig(args: argparse.Namespace) -> int:
+    from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig, split_fault
+
+    faults = tuple(split_fault(given) for given in args.fault)
+    job = _job(args, faults)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with EmulatedRig(job, _print_message) as rig:
+            rig.serve(_orders())
+    except KeyboardInterrupt:
+        return 0
+
+
+def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> Job:
+    from flexneedle.lab.emulators.emulated_rig.job import checked_job
+    from flexneedle.lab.rig.rig_file import load_rig
+    from flexneedle.record.loading import load
+    from flexneedle.scenario.files import load_scenario
+
+    record = None if args.plan is None else load(args.plan)
+    return checked_job(
+        load_rig(args.rig), load_scenario(args.scenario), record, args.seed, args.truth, faults
+    )
+
+
+def _print_message(message: Mapping[str, Any]) -> None:
+    """Print a message of an emulated rig: a line of JSON, or on stderr a note for a person."""
+    if "note" in message:
+        _print_line(f"flexneedle: {message['note']}")
+    else:
+        print(json.dumps(message), flush=True)
+
+
+def _orders() -> Orders:
+    from flexneedle.lab.emulators.orders import Orders
+
+    return Orders(None if sys.stdin is None else sys.stdin.fileno())
+
+
+def _print_line(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

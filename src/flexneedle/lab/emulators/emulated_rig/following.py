@@ -1,0 +1,61 @@
+"""A tip that follows the records of the true needle: the source of an emulated tracker's frames."""
+
+from collections import deque
+from collections.abc import Iterable
+from math import floor, inf
+
+import numpy as np
+
+from flexneedle.geometry.quaternion import along
+from flexneedle.lab.emulators.emulated_rig.stream import Record
+from flexneedle.lab.emulators.motion import RATE_HZ
+from flexneedle.types import Point, Quaternion
+
+VALUES = 6
+"""Numbers of a record: position x, y, z (mm) of the sensor and direction of the needle, in the tracker's frame."""
+
+_LONGEST = 4000  # records: 16 s of motion
+
+
+class Followed:
+    """The tip's sensor between records, linear in time. Frame n is taken n periods after `power_on` (s).
+
+    Its roll, which one coil does not measure, is that of the shortest rotation of the z axis to the needle's direction.
+    A frame is there when the needle is known at its time: none is extrapolated. While the needle moves, that is a few
+    milliseconds after it was taken.
+    """
+
+    def __init__(self, power_on: float, first: Record) -> None:
+        self._power_on, self._known = power_on, -inf
+        self._records = deque([first], maxlen=_LONGEST)
+        self._last: tuple[int, tuple[Point, Quaternion]] | None = None
+
+    def add(self, records: Iterable[Record]) -> None:
+        """Add records, oldest first."""
+        self._records.extend(records)
+
+    def newest(self, number: int) -> int:
+        """Number of the newest frame, up to this one, in which the pose is known; it never decreases."""
+        last = self._records[-1]
+        known = floor((last.time - self._power_on) * RATE_HZ) if last.moving else number
+        self._known = max(self._known, known)
+        return int(min(number, self._known))
+
+    def at(self, number: int) -> tuple[Point, Quaternion]:
+        """Position (mm) and orientation in a frame up to the newest, of the last 16 s of motion."""
+        if self._last is None or self._last[0] != number:
+            self._last = number, self._between(self._power_on + number / RATE_HZ)
+        return self._last[1]
+
+    def _between(self, time: float) -> tuple[Point, Quaternion]:
+        after = self._records[-1]
+        for before in reversed(self._records):
+            if before.time <= time:
+                break
+            after = before
+        span = after.time - before.time
+        part = min(1.0, max(0.0, time - before.time) / span) if span > 0.0 else 0.0
+        values = np.array(before.values) + part * np.subtract(after.values, before.values)
+        x, y, z = values[:3].tolist()
+        w, i, j, k = along(values[3:] / np.linalg.norm(values[3:])).tolist()
+        return (x, y, z), (w, i, j, k)

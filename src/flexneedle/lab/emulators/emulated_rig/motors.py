@@ -1,0 +1,82 @@
+"""The motors of an emulated rig: a Galil whose travel is sent to the phantom, as a process of its own.
+
+`python -m flexneedle.lab.emulators.emulated_rig.motors SINK`, with the descriptor of the pipe to the phantom.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from time import monotonic
+
+from flexneedle.errors import RigError
+from flexneedle.lab.emulators.emulated_rig.axes import carriages_of, channels_of
+from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, note, obey, run, send
+from flexneedle.lab.emulators.emulated_rig.stream import Sink
+from flexneedle.lab.emulators.faults import parse_fault
+from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
+from flexneedle.lab.emulators.galil.controller import Device
+from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp, serve
+from flexneedle.lab.rig.devices.priority import set_realtime_priority
+from flexneedle.lab.rig.rig_file import RigFile
+
+_REST_S = 0.05  # between two records at rest
+_PORT, _LAST_PORT = 23, 65535
+
+
+def main(job: Job, descriptors: list[int]) -> None:
+    """Serve the controller at its address until the process that has started this one ends."""
+    (descriptor,) = descriptors
+    sink = Sink(descriptor, len(CHANNELS), "phantom")
+    faults = [parse_fault(text, FAULTS) for text in job.faults_of("galil")]
+    lifeline = Lifeline(sys.stdin.fileno())
+    with Tcp(*address_of(job.rig)) as tcp:
+        set_realtime_priority()
+        session = GalilSession(device_of(job), faults, monotonic())
+        session.observe = _Observer(session, sink)
+        send(ready="{}:{}".format(*tcp.address))
+        serve(session, tcp, lifeline, lambda order: obey(session.schedule, order), note)
+
+
+def device_of(job: Job) -> Device:
+    """The controller at power-on, with the limit switches of its axes."""
+    carriages, channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
+    axes = list(Device().axes)
+    for name, carriage in carriages.items():
+        axes[channels[name]] = replace(axes[channels[name]], switches=carriage.switches)
+    return Device(tuple(axes))
+
+
+def address_of(rig: RigFile) -> tuple[str, int]:
+    """Host and port of the controller in a rig file. Raises RigError."""
+    given = rig.driver.settings.get("address")
+    rule = f'driver.address = {given!r}: must be "HOST:PORT", such as "127.0.0.1:2323"'
+    if not isinstance(given, str):
+        raise RigError(rule)
+    host, colon, port = given.partition(":")
+    if not host or not (port.isascii() and port.isdigit() if colon else True):
+        raise RigError(rule)
+    number = int(port) if colon else _PORT
+    if number > _LAST_PORT:
+        raise RigError(rule)
+    return host, number
+
+
+class _Observer:
+    """Sends the travel of the motors: every few samples while one moves, else now and then."""
+
+    def __init__(self, session: GalilSession, sink: Sink) -> None:
+        self._session, self._sink = session, sink
+        self._sent, self._was_moving, self._announced = -1.0, False, False
+
+    def __call__(self, time: float, travel: Sequence[float], moving: bool) -> None:
+        due = time - self._sent >= _REST_S
+        if (moving != self._was_moving) or (moving and time > self._sent) or due:
+            self._sink.write(time, travel, moving)
+            self._sent, self._was_moving = time, moving
+        if not self._announced and self._session.moved_since is not None:
+            self._announced = True
+            send(event="first motion", time_s=self._session.moved_since)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,141 @@
+"""The phantom of an emulated rig: the true needle follows the motors, as a process of its own.
+
+`python -m flexneedle.lab.emulators.emulated_rig.phantom SOURCE SINK`, with the descriptors of the pipes from the motors
+and to the tracker.
+"""
+
+import gc
+import select
+import sys
+from collections import deque
+from contextlib import ExitStack
+from time import monotonic, process_time
+
+import numpy as np
+
+from flexneedle.lab.emulators.emulated_rig import following
+from flexneedle.lab.emulators.emulated_rig.axes import (
+    NAMES,
+    carriages_of,
+    channels_of,
+    positions_after,
+    starts,
+)
+from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, note, run, send
+from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, SensorOfTip
+from flexneedle.lab.emulators.emulated_rig.stream import Record, Sink, Source, StreamEnded
+from flexneedle.lab.emulators.emulated_rig.truth import Row, TruthWriter
+from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
+from flexneedle.lab.rig.devices.priority import set_realtime_priority
+from flexneedle.loop.virtual import Seeds, registration_error, to_stage
+from flexneedle.phantom.draw import Truth, draw
+from flexneedle.phantom.kernels import compile_kernels
+
+_LATE_S, _WARN_S = 0.1, 5.0  # a longer lag is reported, at most this often
+_KEPT = 50_000  # lags: 200 s of motion
+
+
+def drawn(job: Job) -> Truth:
+    """The true phantom, that of `insert` with the seed of the job."""
+    return draw(job.scenario, np.random.default_rng(Seeds.of(job.seed).phantom))
+
+
+def sensor_of(job: Job, truth: Truth) -> SensorOfTip:
+    """The tip's sensor with the errors of the draw. The rig file's registration takes the place of the scenario's."""
+    registration = job.rig.registration or job.scenario.tracker.registration
+    error = registration_error(registration, Seeds.of(job.seed).room)
+    to_tracker = to_stage(registration).inverse().after(error)
+    return SensorOfTip(to_tracker, job.scenario.tracker.tip_offset_mm, truth.bias)
+
+
+class World:
+    """The true needle, moved by the records of the motors. truth: where its states are written, or None."""
+
+    def __init__(self, job: Job, sink: Sink, truth: TruthWriter | None) -> None:
+        self._carriages, self._channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
+        self._positions = starts(self._carriages)
+        drawn_truth = drawn(job)
+        self._needle = DrivenNeedle(drawn_truth, self._positions)
+        self._sensor, self._sink, self._truth = sensor_of(job, drawn_truth), sink, truth
+        self._seen = self._sensor.at(self._needle.tip)
+        self._lags: deque[float] = deque(maxlen=_KEPT)
+        self._steps, self._warned, self._failed = 0, -_WARN_S, False
+
+    def begin(self) -> None:
+        """Send the pose of the tip before the motors turn."""
+        self.follow(Record(monotonic(), (0.0,) * len(CHANNELS), False))
+
+    def follow(self, record: Record) -> None:
+        """Follow the motors, and send where the tip is then."""
+        self._positions = positions_after(self._carriages, self._channels, self._positions, record.values)
+        if parts := self._needle.follow(self._positions, exactly=not record.moving):
+            self._steps += parts
+            self._seen = self._sensor.at(self._needle.tip)
+        self._sink.write(record.time, self._seen, record.moving)
+        lag = monotonic() - record.time
+        if self._truth is not None:
+            self._truth.write(self._row(record, lag))
+        if record.moving:
+            self._lags.append(lag)
+        self._report(lag)
+
+    def _row(self, record: Record, lag: float) -> Row:
+        needle = self._needle
+        return Row(
+            record.time,
+            [record.values[self._channels[name]] for name in self._carriages],
+            [float(self._positions[NAMES.index(name)]) for name in self._carriages],
+            needle.tip,
+            needle.strain_energy,
+            needle.least_stretch,
+            needle.converged,
+            lag,
+        )
+
+    def _report(self, lag: float) -> None:
+        """Report a long lag, and once that the needle has no equilibrium."""
+        if lag > _LATE_S and monotonic() - self._warned > _WARN_S:
+            self._warned = monotonic()
+            note(f"the phantom is {1e3 * lag:.0f} ms behind the motors")
+        if not self._failed and not self._needle.converged:
+            self._failed = True
+            note("the phantom did not converge: its tip is not to be trusted")
+
+    def summary(self) -> dict[str, float]:
+        """Steps of the plant, lag behind the motors while they moved (ms), and processor time (s)."""
+        lags = 1e3 * np.array(self._lags or [0.0])
+        median, most = np.percentile(lags, (50, 99)).tolist()
+        figures = {"lag_median_ms": median, "lag_99_ms": most, "lag_max_ms": float(lags.max())}
+        return {"steps": self._steps, **figures, "cpu_s": process_time()}
+
+
+def main(job: Job, descriptors: list[int]) -> None:
+    """Follow the motors until they or the process that has started this one end."""
+    source, sink = Source(descriptors[0], len(CHANNELS)), Sink(descriptors[1], following.VALUES, "tracker")
+    lifeline = Lifeline(sys.stdin.fileno())
+    with ExitStack() as stack:
+        axes = [name for name, _ in job.rig.axes.items()]
+        truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
+        compile_kernels(job.scenario.setup.axes)  # not while the motors turn
+        world = World(job, sink, truth)
+        world.begin()
+        gc.collect()
+        gc.freeze()
+        set_realtime_priority()  # a real needle does not wait for other processes on this machine
+        send(ready=True)
+        try:
+            _follow(world, source, lifeline)
+        except StreamEnded:
+            send(ended=world.summary())
+
+
+def _follow(world: World, source: Source, lifeline: Lifeline) -> None:
+    while True:
+        ready, _, _ = select.select([source.descriptor, *lifeline.sources], [], [])
+        lifeline.read(ready)
+        for record in source.read():
+            world.follow(record)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,254 @@
+"""The emulated Aurora on a pseudo-terminal, with its cable and clock. Runs until interrupted."""
+
+import os
+import pty
+import select
+import tempfile
+import tty
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import nan
+from pathlib import Path
+from time import monotonic
+from typing import NoReturn, Self
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.lab.emulators import aurora, codec
+from flexneedle.lab.emulators.aurora import AuroraState, EmulatedFrame
+from flexneedle.lab.emulators.faults import Fault, Schedule, is_order
+from flexneedle.lab.emulators.motion import (
+    CIRCLE,
+    ORDINARY,
+    RATE_HZ,
+    SENSORS,
+    EmulatedPose,
+    Noise,
+    Rest,
+    TipSource,
+    is_missing,
+    pose,
+)
+from flexneedle.lab.emulators.orders import Orders, parse_position
+
+_TICK_S = 0.005  # longest sleep of the loop
+_LONGEST_STEP_S = 2 * _TICK_S
+_CATCH_UP_RATE, _MOST_BEHIND_S = 1.1, 0.2
+_LONGEST_LINE = 4096
+
+
+@dataclass
+class EmulatorSession:
+    """The device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
+
+    faults: scheduled, from when tracking first begins; tip: where it is; noise: errors of the tip's sensor.
+    on_tracking: called when tracking first begins.
+    """
+
+    device: AuroraState
+    faults: Sequence[Fault]
+    seed: int
+    power_on: float
+    tracked_since: float | None = None
+    tip: TipSource = CIRCLE
+    noise: Noise = ORDINARY
+    on_tracking: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self._random = np.random.default_rng((self.seed, 1))
+        self._repeated: dict[Fault, EmulatedPose] = {}
+        self.schedule = Schedule(aurora.FAULTS, self.faults)
+
+    def faults_at(self, now: float) -> dict[str, Fault]:
+        """Return the active faults by kind; of the scheduled ones none before tracking first begins."""
+        return {fault.kind: fault for fault in self._present(now)}
+
+    def _present(self, now: float) -> tuple[Fault, ...]:
+        return self.schedule.at(now, self.tracked_since)
+
+    def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
+        """Return time and data of the reply to a command (b"": no reply)."""
+        faults = self.faults_at(now)
+        if "silence" in faults:
+            return now, b""
+        if "error" in faults:
+            return now, codec.text(f"ERROR{faults['error'].detail}")
+        self.device, complete = aurora.reply(self.device, line, self._frame(now, faults))
+        if self.device.mode == "tracking" and self.tracked_since is None:
+            self.tracked_since = now
+            self.on_tracking()
+        delay = float(faults["delay"].detail) if "delay" in faults else 0.0
+        return now + delay, self._damaged(complete, faults)
+
+    def _frame(self, now: float, faults: dict[str, Fault]) -> EmulatedFrame:
+        taken = faults["frozen"].start if "frozen" in faults else now
+        number = self.tip.newest(int((taken - self.power_on) * RATE_HZ))
+        present = self._present(now)
+        by_sensor = {fault.detail: fault.kind for fault in present if fault.kind in aurora.OF_STATUS}
+        if is_missing(number, self.seed, self.noise):
+            by_sensor.setdefault(SENSORS[0], "missing")
+        poses = {name: self._pose(name, number, present) for name in SENSORS}
+        system = int(faults["system"].detail, 16) if "system" in faults else 0
+        return EmulatedFrame(number & 0xFFFF_FFFF, poses, by_sensor, system)
+
+    def _pose(self, name: str, number: int, present: Sequence[Fault]) -> EmulatedPose:
+        """Pose of a sensor in a frame, with the faults that change its values."""
+        made = pose(name, number, self.seed, self.tip, self.noise)
+        for fault in present:
+            if fault.kind == "stuck" and fault.detail == name:
+                made = self._repeated.setdefault(fault, made)
+            made = changed(name, made, fault)
+        return made
+
+    def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
+        if "cut" in faults:
+            return complete[: len(complete) // 2]
+        if "garbled" not in faults:
+            return complete
+        at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
+        return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
+
+
+def changed(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
+    """The pose of a sensor with the values of a fault that reports wrong ones."""
+    if fault.kind == "nan" and fault.detail == name:
+        return EmulatedPose((nan, nan, nan), (nan, nan, nan, nan), nan)
+    if fault.kind == "jump" and name == SENSORS[0]:
+        x, y, z = made.position
+        return replace(made, position=(x, y + float(fault.detail), z))
+    if fault.kind == "indicator":
+        return replace(made, indicator=float(fault.detail))
+    return made
+
+
+def _is_left_over(link: Path) -> bool:
+    """Whether it is a link to a terminal that no longer exists, left by an emulator that was killed."""
+    return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
+
+
+def _left(error: OSError) -> str:
+    return ": remove it, unless another emulator uses it" if isinstance(error, FileExistsError) else ""
+
+
+class Serial:
+    """A pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
+
+    link: path of the link, or None for one in a new folder. Raises InputError if the path exists.
+    """
+
+    def __init__(self, link: Path | None) -> None:
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        if link is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="flexneedle-")
+            link = Path(self._folder.name) / "aurora"
+        self.link = link
+        if os.path.lexists(self.link) and not _is_left_over(self.link):
+            raise InputError(f"{self.link}: already exists: choose another path, or remove it")
+        self.ends: tuple[int, int] | None = None
+        """Descriptors of the device's end and of the host's, which must stay open: the former would fail otherwise."""
+
+    def __enter__(self) -> Self:
+        self.plug()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.unplug()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def plug(self) -> None:
+        """Create the pseudo-terminal and the link. Raises InputError if the link cannot be created."""
+        device, host = pty.openpty()
+        self.ends = device, host
+        tty.setraw(host)  # no echo, no line editing, before the first host opens it
+        os.set_blocking(device, False)
+        try:
+            if _is_left_over(self.link):
+                self.link.unlink()
+            self.link.symlink_to(os.ttyname(host))
+        except OSError as error:
+            raise InputError(
+                f"{self.link}: the link cannot be created: {error.strerror}{_left(error)}"
+            ) from None
+
+    def unplug(self) -> None:
+        """Close the terminal and remove the link."""
+        if self.ends is not None:
+            # A newer link of another process is kept.
+            if self.link.is_symlink() and self.link.readlink() == Path(os.ttyname(self.ends[1])):
+                self.link.unlink()
+            for end in self.ends:
+                os.close(end)
+        self.ends = None
+
+    @property
+    def sources(self) -> list[int]:
+        """The device's end to wait for, or none."""
+        return [] if self.ends is None else [self.ends[0]]
+
+    def read(self) -> bytes:
+        """Return the data that the host has written, without waiting."""
+        with suppress(BlockingIOError):
+            return b"".join(os.read(source, _LONGEST_LINE) for source in self.sources)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        """Send to the host; data that it does not accept are lost, as on a wire."""
+        if self.ends is not None and data:
+            with suppress(BlockingIOError):
+                os.write(self.ends[0], data)
+
+
+def device_time(before: float, served: float, now: float) -> float:
+    """Return the device's time (s) at `now`; before: that of the last call, at `served` (s).
+
+    It follows real time, but does not jump when the process was not scheduled: it stops meanwhile and then runs 10 %
+    faster until it has caught up. Otherwise a pause of the process by a frame period (virtual machines have pauses of
+    tens of ms) would lose frames that a real device does not lose. After more than 0.2 s it jumps, so that frames are
+    not stale: the process was stopped.
+    """
+    stepped = before + _CATCH_UP_RATE * min(now - served, _LONGEST_STEP_S)
+    return max(now - _MOST_BEHIND_S, min(now, stepped))
+
+
+def serve(
+    session: EmulatorSession,
+    serial: Serial,
+    orders: Orders,
+    obey: Callable[[str], None],
+    say: Callable[[str], None],
+) -> NoReturn:
+    """Reply to commands until interrupted. obey: called with each line of the orders; say: called with a line when the
+    cable is unplugged or plugged in.
+    """
+    received, due = b"", list[tuple[float, bytes]]()
+    now = served = monotonic()
+    while True:
+        unplugged = "unplug" in session.faults_at(now)
+        if unplugged != (serial.ends is None):
+            (serial.unplug if unplugged else serial.plug)()
+            received, due = b"", []
+            say("unplugged" if unplugged else f"plugged in again: {serial.link}")
+        idle = max(0.0, min([_TICK_S, *(time - now for time, _ in due)]))
+        ready, _, _ = select.select([*serial.sources, *orders.sources], [], [], idle)
+        now, served = device_time(now, served, real := monotonic()), real
+        for order in orders.read(ready):
+            obey(order)
+        received += serial.read()
+        *lines, received = received[-_LONGEST_LINE:].split(b"\r")
+        due += [session.reply(line, now) for line in lines]
+        while due and due[0][0] <= now:
+            serial.write(due.pop(0)[1])
+
+
+def execute(session: EmulatorSession, order: str) -> str:
+    """Rest the tip at the position in a line, or inject the fault in it; return a message on that, or the error."""
+    try:
+        if is_order(order):
+            return f"{session.schedule.obey(order, monotonic())} from now on"
+        session.tip = Rest(parse_position(order))
+    except InputError as error:
+        return str(error)
+    return "the tip rests at {:g} {:g} {:g} mm".format(*session.tip.position)

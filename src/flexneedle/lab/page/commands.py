@@ -1,0 +1,131 @@
+"""`flexneedle serve`: the page on which insertions are planned, watched and replayed."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
+
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.errors import InputError
+from flexneedle.files import RUNS
+
+if TYPE_CHECKING:
+    from flexneedle.lab.page.server.desk import Setup
+    from flexneedle.lab.page.server.rig import ConnectedRig
+
+_HOST, _PORT, _LAST_PORT = "127.0.0.1", 8472, 65535
+_WORKER = (sys.executable, "-m", "flexneedle.lab.page.worker")
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = add_command(
+        commands,
+        "serve",
+        "open a page in the browser to plan, insert and replay",
+        _serve,
+        "flexneedle serve",
+        "flexneedle serve mine.toml --rig rig.toml",
+        about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
+        "access. Prints its address; Ctrl-C ends it. One page at a time is in control; any may watch, and stop.",
+    )
+    parser.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        nargs="?",
+        default="phantom",
+        help="preset name, world:NUMBER or path of the scenario to begin with (default: phantom)",
+    )
+    parser.add_argument(
+        "--rig",
+        metavar="FILE",
+        help="rig file (its path, or emulated for the one of the package), on which the page can insert once it is "
+        "prepared and armed there; nothing moves before (default: virtual rigs alone)",
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
+    )
+    parser.add_argument(
+        "--host",
+        default=_HOST,
+        metavar="HOST",
+        help="address to listen on; with another than this computer's own, the page needs the token in the printed "
+        f"address (default: {_HOST})",
+    )
+    parser.add_argument(
+        "--port",
+        type=_port,
+        default=_PORT,
+        metavar="N",
+        help=f"port to listen on, 0 for any free one (default: {_PORT})",
+    )
+    parser.add_argument(
+        "--open",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="open the page in a browser (default: if there is a display)",
+    )
+
+
+def _port(text: str) -> int:
+    """A port. Raises ArgumentTypeError for anything else."""
+    if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to {_LAST_PORT}")
+    return int(text)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    try:
+        from flexneedle.lab.page.server.serve import PageServer
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in ("starlette", "uvicorn", "websockets", "anyio"):
+            raise
+        raise InputError(
+            "the page needs starlette, uvicorn and websockets: pip install 'flexneedle[page]'"
+        ) from None
+    server = PageServer(_setup(args), args.host, args.port)
+    opens = _has_display() if args.open is None else args.open
+    server.on_start = partial(_announce, server.address, opens)
+    server.serve_until_interrupted()
+    return 0
+
+
+def _setup(args: argparse.Namespace) -> Setup:
+    from flexneedle.lab.page.server.catalog import CONTROLLERS
+    from flexneedle.lab.page.server.desk import Setup
+    from flexneedle.lab.page.server.limits import RIG, Limits
+    from flexneedle.lab.page.server.session import Session
+    from flexneedle.scenario.files import load_scenario
+
+    session = Session.of(Path(args.scenario).name, load_scenario(args.scenario), CONTROLLERS[0]["name"])
+    rig = None if args.rig is None else _connected(args.rig)
+    workers = (*_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (*_WORKER, "insertion")
+    return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)
+
+
+def _connected(source: str) -> ConnectedRig:
+    """The rig of a file. Raises RigError for one that the page cannot insert on. No device is opened."""
+    from flexneedle.lab.page.rigs import usable_rig
+    from flexneedle.lab.page.server.rig import ConnectedRig
+
+    return ConnectedRig(usable_rig(source).name, source)
+
+
+def _announce(address: str, opens: bool) -> None:
+    """Print the address, and open it. A browser may take its time to start, which the server does not wait for."""
+    print(address, flush=True)
+    print("flexneedle: Ctrl-C ends the server", file=sys.stderr)
+    if opens:
+        from webbrowser import open as open_page
+
+        Thread(target=open_page, args=(address,), daemon=True).start()
+
+
+def _has_display() -> bool:
+    """Whether a browser could open a window; in a terminal without one a text browser would start."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,183 @@
+"""What disturbs a virtual insertion: its true needle, its true tissue and its tracker. The controller does not know."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from flexneedle.lab.page.messages import Disturb, Disturbances
+from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.plants import ExactPlant
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.ports import TipTracker
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.environment import ENVIRONMENTS
+from flexneedle.types import Frame, Measurement, SensorReading
+
+_MISSING = "missing"
+_METAL = "noisy"
+"""The environment whose metal plate is brought where the scenario's has none."""
+_LISTED = 10
+"""Disturbances that the record of an insertion names."""
+_FAR_MM = 1e4
+"""Distance of a metal plate that is taken away: it distorts nothing, to the last bit."""
+
+
+def with_plate(scenario: Scenario) -> Scenario:
+    """The scenario with a metal plate in the tracker's environment, if it has an environment without one."""
+    environment = scenario.tracker.environment
+    if environment is None or environment.plate is not None:
+        return scenario
+    return scenario.with_values({"tracker.environment.plate": ENVIRONMENTS.shipped(_METAL)["plate"]})
+
+
+class DisturbedPlant(ExactPlant):
+    """The true needle, which can be pushed at its tip, and whose tissue can be stiffened."""
+
+    def __init__(self, truth: Truth, roll: float) -> None:
+        super().__init__(truth, roll)
+        self._load, self._foundation = np.array(truth.load), self.rod.foundation.copy()
+
+    def push(self, force: complex) -> None:
+        """Let a force y + iz (N) act on the tip, beside that of the phantom, in place of the push before."""
+        self.state["load"][1:] = self._load + np.array([force.real, force.imag])
+
+    def stiffen(self, top: float, bottom: float, factor: float) -> None:
+        """Make the tissue between two depths (mm) `factor` times as stiff as it was drawn."""
+        middle = (np.arange(len(self._foundation)) + 0.5) * self.rod.cell
+        inside = (middle >= top) & (middle < bottom)
+        self.rod.foundation[inside] = factor * self._foundation[inside]
+
+
+class DisturbedTracker:
+    """A `TipTracker` that can lose the tip for a time."""
+
+    def __init__(self, tracker: TipTracker) -> None:
+        self._tracker = tracker
+        self._lost = (math.inf, -math.inf)
+
+    def drop(self, begin: float, end: float) -> None:
+        """Lose the tip between two times (s) on the clock of the run."""
+        self._lost = begin, end
+
+    def read(self) -> tuple[Measurement, ...]:
+        """The readings since the last call, oldest first."""
+        begin, end = self._lost
+        return tuple(_without_tip(one) if begin <= one.time < end else one for one in self._tracker.read())
+
+    @property
+    def status(self) -> str:
+        """Status of the tracker."""
+        return self._tracker.status
+
+
+def _without_tip(one: Measurement) -> Measurement:
+    frame = None if one.frame is None else _frame_without_tip(one.frame)
+    return Measurement(one.time, None, None, None, frame)
+
+
+def _frame_without_tip(frame: Frame) -> Frame:
+    return replace(frame, readings={**frame.readings, TIP: SensorReading(None, status=_MISSING)})
+
+
+class Disturber:
+    """Disturbs the parts of a virtual rig, and reports what disturbs it.
+
+    plant, plate_distance_at: for `virtual_rig`; its tracker is given by `watch`.
+    """
+
+    def __init__(
+        self, scenario: Scenario, now: Callable[[], float], say: Callable[[Disturbances], None]
+    ) -> None:
+        """now: the time (s) of the run; say: is called when something else disturbs it than before."""
+        self._scenario, self._now, self._say = scenario, now, say
+        self._plant: DisturbedPlant | None = None
+        self._layers: tuple[float, ...] = ()
+        self._tracker: DisturbedTracker | None = None
+        environment = scenario.tracker.environment
+        self._plate = None if environment is None or environment.plate is not None else _FAR_MM
+        self._active: dict[str, str] = {}
+        self._taken: list[str] = []
+        self._unlisted = 0
+        self._dropped_until = -math.inf
+
+    def plant(self, truth: Truth, roll: float) -> DisturbedPlant:
+        """The factory of the plant."""
+        self._plant, self._layers = DisturbedPlant(truth, roll), (*truth.layer_tops, math.inf)
+        return self._plant
+
+    def plate_distance_at(self, _time: float) -> float | None:
+        """Distance (mm) of the metal plate of `with_plate`; None: that of the scenario."""
+        return self._plate
+
+    def watch(self, tracker: TipTracker) -> TipTracker:
+        """The tracker, which can lose the tip."""
+        self._tracker = DisturbedTracker(tracker)
+        return self._tracker
+
+    def take(self, disturb: Disturb) -> None:
+        """Disturb the rig from now on."""
+        size, layer = disturb.size, disturb.layer
+        key = f"stiffen {layer}" if disturb.what == "stiffen" else disturb.what
+        text = {
+            "push": f"push of {size:g} N at {disturb.angle_deg:g}°",
+            "stiffen": f"layer {self._name(layer)} {size:g} times as stiff",
+            "drop": f"tip not measured for {size:g} s",
+            "plate": f"metal plate at {size:g} mm",
+        }[disturb.what]
+        none = size == (1.0 if disturb.what == "stiffen" else 0.0)
+        if not none or key in self._active:
+            self._note(self._end(disturb) if none else text)
+        self._active = {other: line for other, line in self._active.items() if other != key}
+        if not none:
+            self._active[key] = text
+        self._disturb(disturb)
+        self._report()
+
+    @property
+    def summary(self) -> str:
+        """What it has disturbed, and when, for the record; "" for nothing."""
+        return ", ".join((*self._taken, *([f"{self._unlisted} more"] if self._unlisted else [])))
+
+    def _end(self, disturb: Disturb) -> str:
+        return {
+            "push": "push ended",
+            "stiffen": f"layer {self._name(disturb.layer)} as stiff as before",
+            "drop": "tip measured again",
+            "plate": "metal plate taken away",
+        }[disturb.what]
+
+    def _note(self, text: str) -> None:
+        if len(self._taken) < _LISTED:
+            self._taken.append(f"{text} at {self._now():.1f} s")
+        else:
+            self._unlisted += 1
+
+    def expire(self) -> None:
+        """Report the end of what has ended by itself."""
+        if "drop" in self._active and self._now() >= self._dropped_until:
+            del self._active["drop"]
+            self._report()
+
+    def _disturb(self, disturb: Disturb) -> None:
+        if self._plant is None or self._tracker is None:
+            raise RuntimeError("there is no rig yet")
+        match disturb.what:
+            case "push":
+                angle = math.radians(disturb.angle_deg)
+                self._plant.push(disturb.size * complex(math.cos(angle), math.sin(angle)))
+            case "stiffen":
+                top, bottom = self._layers[disturb.layer : disturb.layer + 2]
+                self._plant.stiffen(top, bottom, disturb.size)
+            case "drop":
+                self._dropped_until = self._now() + disturb.size
+                self._tracker.drop(self._now(), self._dropped_until)
+            case "plate":
+                self._plate = disturb.size or _FAR_MM
+
+    def _name(self, layer: int) -> str:
+        return self._scenario.tissue[layer].name or str(layer + 1)
+
+    def _report(self) -> None:
+        self._say(Disturbances(active=list(self._active.values())))

@@ -1,0 +1,316 @@
+"""Comparing a rig with its file: it reads each device, and moves, powers and changes nothing."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from math import isfinite
+from statistics import median
+from typing import Protocol, TypeVar
+
+from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.lab.rig.devices.registry import OpenTracker, open_motors, open_tracker
+from flexneedle.lab.rig.fit import fit_problems, queued, room_problems
+from flexneedle.lab.rig.moves import uncertain
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.speeds import kept, step_time
+from flexneedle.lab.rig.supervisor.checks import resting_switch_problem
+from flexneedle.lab.rig.supervisor.drives import Drive
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.axes import Axis
+from flexneedle.types import VISIBLE, Frame, is_reference
+
+_PAUSE_S = 0.01
+_READINGS = 5  # of the motors, for the time of a reply
+_MOST_UNMEASURED = (
+    0.1  # share of the frames in which a sensor has no position; one such frame is allowed in any case
+)
+_RATE_TOLERANCE = 0.1
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+Device = TypeVar("Device", bound=_Closable)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check: the part of the rig, what was checked, what was found, and the problem, "" if there is
+    none."""
+
+    part: str
+    item: str
+    found: str
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A scenario, and the strategy of its plan, that the rig is checked for."""
+
+    scenario: Scenario
+    strategy: str = "manipulation"
+
+
+def check_rig(rig: RigFile, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what was found at each device. seconds: for which frames of the tracker are counted; clock: real time.
+
+    A device that cannot be reached is a finding, too.
+    """
+    found = [*_of_file(rig), *(_of_scenario(rig, wanted) if wanted is not None else ())]
+    found += with_device(
+        "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: motors(rig, m, clock, wanted)
+    )
+    found += with_device(
+        "tracker",
+        rig.tracker.kind,
+        lambda: open_tracker(rig, clock),
+        lambda t: tracker(t, clock, seconds, wanted),
+    )
+    return found
+
+
+def with_device(
+    part: str, kind: str, connect: Callable[[], Device], read: Callable[[Device], list[Finding]]
+) -> list[Finding]:
+    """Return the findings of one device; where it fails, its error in place of what was not found."""
+    connected: list[Finding] = []
+    try:
+        with closing(connect()) as device:
+            connected = [Finding(part, "connection", f"{kind}{_identity(device)}")]
+            return connected + read(device)
+    except FlexneedleError as error:
+        return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
+
+
+def _identity(device: object) -> str:
+    identity = getattr(device, "identity", "")
+    return f", {identity}" if identity else ""
+
+
+def _of_file(rig: RigFile) -> Iterator[Finding]:
+    for name, distance in queued(rig):
+        yield Finding(name, "queued motion", distance)
+    for name, speed in kept(rig):
+        yield Finding(name, "speed", speed)
+
+
+def _of_scenario(rig: RigFile, wanted: Wanted) -> list[Finding]:
+    problems = fit_problems(rig, wanted.scenario, wanted.strategy)
+    name = wanted.scenario.name
+    found = [Finding("scenario", "fit", name, line) for line in problems] or [
+        Finding("scenario", "fit", name)
+    ]
+    return [*found, _step(rig, wanted.scenario)]
+
+
+def _step(rig: RigFile, scenario: Scenario) -> Finding:
+    """How long the largest step takes: with a slow acceleration an insertion is slower than its scenario."""
+    way, planned = scenario.setup.max_advance_mm, scenario.setup.step_time
+    time = step_time(rig.axes.insertion, rig.loop, way, planned)
+    return Finding("insertion", "largest step", f"{way:g} mm in {time:.2g} s, planned for {planned:.2g} s")
+
+
+# Motors
+
+
+def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what a few readings of the motors show. Raises DriverError if they cannot be read."""
+    states, seconds = _read(device, clock)
+    found = [_reply(rig, seconds)]
+    setups = _setups(device)
+    positions: dict[str, float] = {}
+    for name, axis in rig.axes.items():
+        state = states.get(axis.channel)
+        if state is None:
+            rule = f"the driver has no channel {axis.channel}; it has {', '.join(states) or 'none'}"
+            found.append(Finding(name, "motor", axis.channel, rule))
+            continue
+        found += _of_axis(name, axis, state)
+        if axis.channel in setups:
+            found += _of_setup(name, axis, setups[axis.channel])
+        positions[name] = state.position / axis.scale
+    return found + _rooms(rig, positions, wanted)
+
+
+def _read(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
+    """The last of a few readings, and the median time (s) of one."""
+    states: Mapping[str, MotorState] = {}
+    times = []
+    for _ in range(_READINGS):
+        begun = clock.now()
+        states = device.read()
+        times.append(clock.now() - begun)
+    return states, median(times)
+
+
+def _setups(device: Motors) -> Mapping[str, MotorSetup]:
+    """How the controller is set up, by channel; empty where its driver does not report that."""
+    found: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
+    return found
+
+
+def _reply(rig: RigFile, seconds: float) -> Finding:
+    tick = 1.0 / rig.loop.rate_hz
+    late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
+    return Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)
+
+
+def _of_axis(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
+    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _at_rest(state))
+    yield Finding(name, "position", _position(axis, state.position), _beyond(axis, state.position))
+    yield Finding(
+        name, "limit switches", _switches(state) or "none active", _switch_problem(name, axis, state)
+    )
+    if state.on:
+        yield _following(name, axis, state)
+
+
+def _of_setup(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
+    """What the controller itself does at limits and errors, beside what the rig file has."""
+    off = f"{setup.disabled} disabled in the controller: it does not stop the motor" if setup.disabled else ""
+    yield Finding(name, "switches in use", "all" if not off else "not all", off)
+    low, high = sorted((setup.lowest / axis.scale, setup.highest / axis.scale))
+    narrow = low > axis.limits[0] + axis.tolerance or high < axis.limits[1] - axis.tolerance
+    held = ", also while its home is searched" if axis.to_home and (isfinite(low) or isfinite(high)) else ""
+    limits = f"{axis.shown(axis.limits[0])} to {axis.shown(axis.limits[1])} {axis.unit}"
+    rule = f"narrower than range_{axis.unit}, {limits}: motions would end there" if narrow else ""
+    yield Finding(name, "controller's limits", _limits(axis, low, high) + held, rule)
+    yield _error_limit(name, axis, setup)
+
+
+def _limits(axis: Axis, low: float, high: float) -> str:
+    if not (isfinite(low) or isfinite(high)):
+        return "none"
+    ends = (axis.shown(end) if isfinite(end) else "none" for end in (low, high))
+    return f"{' to '.join(ends)} {axis.unit}"
+
+
+def _error_limit(name: str, axis: Axis, setup: MotorSetup) -> Finding:
+    """The controller's own reaction to an error; it shall not come before that of the supervisor."""
+    error = setup.most_error / abs(axis.scale)
+    if not (setup.off_on_error and isfinite(error)):
+        return Finding(name, "motor off on error", "no")
+    most = axis.shown(axis.max_error)
+    rule = (
+        f"below max_error_{axis.unit} ({most}): it comes before the fault" if error < axis.max_error else ""
+    )
+    return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
+
+
+def _at_rest(state: MotorState) -> str:
+    moving = "moves, though this command does not move it" if state.moving else ""
+    return "; ".join(filter(None, (moving, state.stopped)))
+
+
+def _position(axis: Axis, counts: float) -> str:
+    slack = f", {uncertain(axis)}" if axis.backlash else ""
+    return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts){slack}"
+
+
+def _beyond(axis: Axis, counts: float) -> str:
+    position, (low, high) = counts / axis.scale, axis.limits
+    if not isfinite(position):
+        return "is not a number"
+    if low - axis.uncertainty <= position <= high + axis.uncertainty:
+        return ""
+    return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+
+
+def _switches(state: MotorState) -> str:
+    active = ("reverse", state.reverse_limit), ("forward", state.forward_limit)
+    return " and ".join(name for name, is_active in active if is_active)
+
+
+def _switch_problem(name: str, axis: Axis, state: MotorState) -> str:
+    """An axis may rest at the switch of its home, where that is."""
+    return resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
+
+
+def _following(name: str, axis: Axis, state: MotorState) -> Finding:
+    error = abs((state.commanded - state.position) / axis.scale)
+    most = axis.max_error
+    limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    rule = "" if error <= most else f"{limit}: free the axis; the next motion begins where it then is"
+    return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
+
+
+def _rooms(rig: RigFile, positions: Mapping[str, float], wanted: Wanted | None) -> list[Finding]:
+    """Whether the insertion of a scenario could start from where the axes are."""
+    if wanted is None:
+        return []
+    return [
+        Finding(name, "room", "from here", line)
+        for name, line in room_problems(rig, wanted.scenario, positions, wanted.strategy)
+    ]
+
+
+# Tracker
+
+
+def tracker(device: OpenTracker, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what the frames of `seconds` show. Raises RunError if the tracker fails."""
+    frames = _frames(device, clock, seconds)
+    if not frames:
+        reason = "no frame" if device.status == VISIBLE else f"no frame: {device.status}"
+        return [Finding("tracker", "frames", f"none in {seconds:g} s", reason)]
+    status = device.status
+    return [
+        _rate(frames, wanted),
+        Finding("tracker", "status", status, "" if status == VISIBLE else "must be ok while frames arrive"),
+        *_sensors(frames),
+        *_needed_sensors(frames, wanted),
+    ]
+
+
+def _frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
+    begun, frames = clock.now(), list[Frame]()
+    while clock.now() - begun < seconds:
+        frames += device.read()
+        clock.wait(_PAUSE_S)
+    return frames
+
+
+def _rate(frames: Sequence[Frame], wanted: Wanted | None) -> Finding:
+    span, missed = frames[-1].time - frames[0].time, frames[-1].number - frames[0].number + 1 - len(frames)
+    rate = (len(frames) - 1) / span if span > 0.0 else 0.0
+    shown = f"{rate:.1f} Hz, {len(frames)} frames, {missed} missed"
+    if rate == 0.0:
+        return Finding("tracker", "frames", shown, "too few for a rate")
+    expected = None if wanted is None else wanted.scenario.tracker.rate_hz
+    if expected is not None and abs(rate / expected - 1.0) > _RATE_TOLERANCE:
+        return Finding("tracker", "frames", shown, f"tracker.rate_hz of the scenario is {expected:g}")
+    return Finding("tracker", "frames", shown)
+
+
+def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
+    names = dict.fromkeys(name for frame in frames for name in frame.readings)
+    for name in names:
+        readings = [frame.readings[name] for frame in frames if name in frame.readings]
+        numbers = [reading for reading in readings if all(map(isfinite, reading.position or ()))]
+        measured = [reading for reading in numbers if reading.position is not None]
+        share, unmeasured, at = len(measured) / len(frames), len(frames) - len(measured), ""
+        if measured and (position := measured[-1].position) is not None:
+            at = " at {:.2f}, {:.2f}, {:.2f} mm".format(*position)
+        last = next((r.status for r in reversed(readings) if r.status != VISIBLE), "not in every frame")
+        last = last if len(numbers) == len(readings) else "its position is not a number"
+        enough = measured and unmeasured <= max(1.0, _MOST_UNMEASURED * len(frames))
+        problem = "" if enough else f"measured in too few frames: {last}"
+        yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)
+
+
+def _needed_sensors(frames: Sequence[Frame], wanted: Wanted | None) -> Iterator[Finding]:
+    names = {name for frame in frames for name in frame.readings}
+    if TIP not in names:
+        yield Finding(
+            "tracker", f"sensor {TIP}", "not found", f"the needle's sensor must have the name {TIP}"
+        )
+    if wanted is None or not wanted.scenario.monitor.enabled:
+        return
+    references, needed = sum(map(is_reference, names)), wanted.scenario.monitor.references
+    if references < needed:
+        rule = f"monitor.references of the scenario is {needed}: a sensor whose name begins with ref is one"
+        yield Finding("tracker", "reference sensors", str(references), rule)

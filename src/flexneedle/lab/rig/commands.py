@@ -1,0 +1,380 @@
+"""`flexneedle rig`: check a rig, and move its axes one by one."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+from flexneedle.cli.commands import Commands, add_command, add_group
+from flexneedle.cli.common import ARMS, add_strategy, confirm_motions, print_json
+from flexneedle.cli.values import finite, positive
+from flexneedle.errors import DriverError
+
+if TYPE_CHECKING:
+    from flexneedle.lab.rig.check import Finding, Wanted
+    from flexneedle.lab.rig.moves import Homing, Move
+    from flexneedle.lab.rig.rig_file import RigFile
+
+_SECONDS = 2.0
+_FALLS = "A vertical axis falls unless something holds it: support it first."
+_NEGATIVE = re.compile(r"^-[\d.]")
+
+
+class Operator(Protocol):
+    """The supervisor of a rig, for an operator's motions; each call returns when the motion has ended.
+
+    Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
+    """
+
+    def arm(self) -> str:
+        """Switch the motors on; return what else that has changed, or ""."""
+        ...
+
+    @property
+    def positions(self) -> Mapping[str, float]:
+        """Where the axes are (mm or rad) by name."""
+        ...
+
+    def move_to(self, axis: str, position: float, speed: float) -> object:
+        """Move an axis to a position (mm or rad), at most at a speed (mm/s or rad/s)."""
+        ...
+
+    def home(self, axis: str) -> object:
+        """Find the home of an axis."""
+        ...
+
+    def retract(self, position: float, speed: float) -> object:
+        """Withdraw the base to a position of the insertion axis (mm), at most at a speed (mm/s)."""
+        ...
+
+    def off(self) -> None:
+        """Switch the motors off."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all axes."""
+        ...
+
+
+def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
+    """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
+    from flexneedle.lab.rig.supervisor.client import Supervisor
+
+    return Supervisor.of_operator(rig)
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    add_group(
+        commands,
+        "rig",
+        "check the motors and the tracker of a rig, and move its axes",
+        (_add_check, _add_jog, _add_home, _add_retract, _add_off),
+        "flexneedle rig check rig.toml --scenario phantom",
+        "flexneedle rig jog rig.toml insertion -5mm",
+    )
+
+
+def _add_check(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "check",
+        "compare a rig with its file; moves nothing",
+        _check,
+        "flexneedle rig check rig.toml",
+        "flexneedle rig check rig.toml --scenario phantom --json",
+        about="Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
+        "sensors of the tracker, publishers of ROS topics. Moves, powers, publishes and changes nothing. One line "
+        "for each thing that was checked; exit status 1 if there is a problem.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--scenario",
+        metavar="S",
+        help="also check that the rig can do what this scenario needs (name or path)",
+    )
+    add_strategy(parser, "strategy of the scenario's plan; steering moves neither guide nor base sideways")
+    parser.add_argument(
+        "--seconds",
+        type=positive,
+        default=_SECONDS,
+        metavar="S",
+        help=f"time for which frames of the tracker and messages are counted (default: {_SECONDS:g})",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
+
+
+def _add_jog(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "jog",
+        "move one axis by a distance",
+        _jog,
+        "flexneedle rig jog rig.toml insertion -5mm",
+        "flexneedle rig jog rig.toml rotation 180deg --speed 90",
+        about="Move one axis by a distance from where it is, within its soft limits. Prints what would move and asks "
+        "for confirmation; Ctrl-C stops.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "axis", metavar="AXIS", help="axis of the rig file, such as insertion, rotation or guide_y"
+    )
+    parser.add_argument(
+        "distance", metavar="DISTANCE", help="distance with its sign, such as 5, -2.5mm or 90deg"
+    )
+    _add_speed(parser, "mm/s or deg/s")
+    _add_yes(parser)
+    # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
+    parser._negative_number_matcher = _NEGATIVE
+
+
+def _add_home(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "home",
+        "find the zero of axes",
+        _home,
+        "flexneedle rig home rig.toml",
+        "flexneedle rig home rig.toml insertion --yes",
+        about="Find the zero of axes by the key home of the rig file, one after the other, the insertion first. "
+        "Only without a needle in tissue. Prints what would move and asks for confirmation; Ctrl-C stops.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "axes", nargs="*", metavar="AXIS", help="axes (default: all but those with an absolute encoder)"
+    )
+    _add_yes(parser)
+
+
+def _add_retract(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "retract",
+        "withdraw the needle",
+        _retract,
+        "flexneedle rig retract rig.toml",
+        "flexneedle rig retract rig.toml --to 10 --speed 1 --yes",
+        about="Move the insertion axis backwards, within its soft limits and short of the limit switch of its home; "
+        "rotation and guide stay where they are. Prints what would move and asks for confirmation; Ctrl-C stops.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--to",
+        type=finite,
+        metavar="MM",
+        help="position at which the retraction ends (default: where rig home leaves the axis, or without a limit "
+        "switch behind it the lowest of range_mm)",
+    )
+    _add_speed(parser, "mm/s")
+    _add_yes(parser)
+
+
+def _add_speed(parser: argparse.ArgumentParser, unit: str) -> None:
+    parser.add_argument(
+        "--speed",
+        type=positive,
+        metavar="V",
+        help=f"largest speed, {unit} (default: a fifth of the axis's)",
+    )
+
+
+def _add_off(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "off",
+        "switch the motors off",
+        _off,
+        "flexneedle rig off rig.toml",
+        "flexneedle rig off rig.toml --yes",
+        about="Stop all axes and switch their motors off, as before something is freed by hand. A vertical axis may "
+        "fall. Asks for confirmation; the next motion switches the motors on again.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--yes", action="store_true", help="switch off without asking; needed without a terminal"
+    )
+
+
+def _add_rig(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "rig",
+        metavar="RIG",
+        help="rig file: its path, or emulated for the one of the package (docs/rig/file.md)",
+    )
+
+
+def _add_yes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--yes", action="store_true", help="move without asking; needed without a terminal")
+
+
+# Check
+
+
+def _check(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.check import check_rig
+    from flexneedle.lab.rig.devices.clock import WallClock
+    from flexneedle.lab.rig.rig_file import load_rig
+    from flexneedle.lab.ros.check import check_ros
+
+    rig, clock = load_rig(args.rig), WallClock()
+    findings = [
+        *check_rig(rig, clock, args.seconds, _wanted(args)),
+        *check_ros(rig, clock, args.seconds),
+    ]
+    problems = sum(1 for finding in findings if finding.problem)
+    if args.json:
+        print_json(_values(rig, findings))
+    else:
+        _print_findings(findings)
+        print(f"\n{args.rig}: {_counted(problems)}")
+    return 1 if problems else 0
+
+
+def _wanted(args: argparse.Namespace) -> Wanted | None:
+    from flexneedle.lab.rig.check import Wanted
+    from flexneedle.scenario.files import load_scenario
+
+    return None if args.scenario is None else Wanted(load_scenario(args.scenario), args.strategy)
+
+
+def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
+    lines = [
+        {"part": one.part, "item": one.item, "found": one.found, "problem": one.problem or None}
+        for one in findings
+    ]
+    return {"rig": rig.name, "ok": not any(one.problem for one in findings), "findings": lines}
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    parts, items = (
+        max(map(len, column)) for column in zip(*((one.part, one.item) for one in findings), strict=True)
+    )
+    for one in findings:
+        verdict = f"PROBLEM  {one.part:{parts}}  {one.item:{items}}" if one.problem else ""
+        line = verdict or f"ok       {one.part:{parts}}  {one.item:{items}}"
+        print(f"{line}  {'; '.join(filter(None, (one.found, one.problem)))}")
+
+
+def _counted(problems: int) -> str:
+    return f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
+
+
+# Motions
+
+
+def _jog(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.moves import axis_of, jog
+    from flexneedle.lab.rig.rig_file import load_rig
+
+    rig = load_rig(args.rig)
+    axis_of(rig, args.axis)
+    move = jog(rig, args.axis, args.distance, _positions(rig)[args.axis], args.speed)
+    return _carried_out(
+        rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
+    )
+
+
+def _home(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.moves import homings
+    from flexneedle.lab.rig.rig_file import load_rig
+
+    rig = load_rig(args.rig)
+    chosen = homings(rig, args.axes)
+    if not chosen:
+        print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
+        return 0
+
+    def home(operator: Operator) -> None:
+        for number, homing in enumerate(chosen):
+            if number > 0:
+                _arm(operator)
+            operator.home(homing.name)
+
+    return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")
+
+
+def _retract(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.moves import retraction, withdrawn
+    from flexneedle.lab.rig.rig_file import load_rig
+
+    rig = load_rig(args.rig)
+    position = _positions(rig)["insertion"]
+    move = retraction(rig, position, args.to, args.speed)
+    if move is None:
+        at, end = map(rig.axes.insertion.shown, (position, withdrawn(rig)))
+        print(
+            f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
+            file=sys.stderr,
+        )
+        return 0
+    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
+
+
+def _off(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.moves import switched_off
+    from flexneedle.lab.rig.rig_file import load_rig
+
+    rig = load_rig(args.rig)
+    confirm_motions([*switched_off(rig, _positions(rig)), _FALLS], "" if args.yes else "Switch off?")
+    with supervised(rig) as operator, _stopped_on_error(operator):
+        operator.off()
+    print("done", file=sys.stderr)
+    return 0
+
+
+def _positions(rig: RigFile) -> dict[str, float]:
+    """Where the axes are, mm or rad. Raises DriverError if the driver has no such channel, or cannot be read."""
+    from flexneedle.lab.rig.devices.registry import open_motors
+
+    with closing(open_motors(rig)) as motors:
+        states = motors.read()
+    missing = [axis.channel for _, axis in rig.axes.items() if axis.channel not in states]
+    if missing:
+        raise DriverError(
+            f"the driver has no channel {', '.join(missing)}; it has {', '.join(states) or 'none'}"
+        )
+    return {name: states[axis.channel].position / axis.scale for name, axis in rig.axes.items()}
+
+
+def _carried_out(
+    rig: RigFile,
+    moves: Sequence[Move | Homing],
+    yes: bool,
+    command: Callable[[Operator], object],
+    *notes: str,
+) -> int:
+    """Print the motions, command them once they are confirmed, and return the exit status."""
+    from flexneedle.lab.rig.moves import Move, require_start
+
+    confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
+    with supervised(rig) as operator, _stopped_on_error(operator):
+        for move in moves:
+            if isinstance(move, Move):
+                require_start(move, operator.positions[move.name])
+        _arm(operator)
+        command(operator)
+    print("done", file=sys.stderr)
+    return 0
+
+
+def _arm(operator: Operator) -> None:
+    """Switch the motors on, and print what else that has changed."""
+    if changed := operator.arm():
+        print(f"flexneedle: {changed}", file=sys.stderr)
+
+
+@contextmanager
+def _stopped_on_error(operator: Operator) -> Iterator[None]:
+    """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
+    from flexneedle.interrupts import uninterrupted
+
+    try:
+        yield
+    except BaseException:
+        with uninterrupted():
+            operator.stop()
+        raise

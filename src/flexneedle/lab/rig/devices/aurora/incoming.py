@@ -1,0 +1,173 @@
+"""Frames, counts and status from the messages of one link after another."""
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from threading import Lock
+from time import monotonic
+from typing import Any
+
+from flexneedle.lab.rig.devices.aurora.messages import LONGEST_LINE, in_words, parse
+from flexneedle.lab.rig.devices.aurora.readings import readings, sensor_name
+from flexneedle.lab.rig.devices.aurora.timing import Numbering, Timeline
+from flexneedle.types import VISIBLE, Frame
+
+RATE_HZ = 40.0
+"""Frame rate of an Aurora."""
+
+_QUEUE = 4000  # frames: 100 s without a call of `read`
+_LATE_S = 0.15  # six frames
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Counts since the start: frames received, frame numbers missed, frames dropped before they were read, connections
+    after the first, and errors by kind ("garbled", "no reply", "error", "system", "unplugged"; "crash": the link ended
+    without a reason, or what it sent is not a message)."""
+
+    frames: int
+    missed: int
+    dropped: int
+    reconnections: int
+    errors: Mapping[str, int]
+
+
+class Incoming:
+    """What the links sent. One thread feeds it, others may read.
+
+    names: of the sensors at ports 1, 2, …; offset (s): from the monotonic clock to that of the run; now: the monotonic
+    clock.
+    """
+
+    def __init__(self, names: Sequence[str], offset: float, now: Callable[[], float] = monotonic) -> None:
+        self._names, self._offset, self._now = tuple(names), offset, now
+        self._frames: deque[Frame] = deque(maxlen=_QUEUE)
+        self._numbering = Numbering(RATE_HZ)
+        self._lock = Lock()
+        self._received = self._missed = self._dropped = 0
+        self._connections = 0
+        self._errors: Counter[str] = Counter()
+        self._last: tuple[int, float] | None = None
+        self._reason = "connecting"
+        self.begin()
+
+    def begin(self) -> None:
+        """A new link: it has sent nothing yet."""
+        self._rest = b""
+        self._named: dict[str, str] = {}
+        self._newest = -1, self._now()
+        self._ended = False
+        self._timeline = Timeline(RATE_HZ)
+
+    def feed(self, data: bytes) -> bool:
+        """Take data of the link; return whether a message was complete. Raises ValueError if they are no message.
+
+        The link is then not to be trusted again, since what follows may belong to anything.
+        """
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            self._take(line)
+        if len(self._rest) > LONGEST_LINE:
+            raise ValueError(f"not a message: more than {LONGEST_LINE} bytes without the end of a line")
+        return bool(lines)
+
+    def finish(self) -> None:
+        """The link has ended. Raises ValueError if it was in the middle of a message."""
+        if self._rest:
+            raise ValueError(f"an incomplete message: {self._rest[:60]!r}")
+
+    def crashed(self, reason: str) -> None:
+        """Count a link that ended without a reason of its own."""
+        with self._lock:
+            self._errors["crash"] += 1
+            self._reason = in_words(reason)
+
+    def explain(self, reason: str) -> None:
+        """Set the reason why there are no frames."""
+        with self._lock:
+            self._reason = in_words(reason)
+
+    def read(self) -> tuple[Frame, ...]:
+        """The frames since the last call, oldest first."""
+        with self._lock:
+            frames = tuple(self._frames)
+            self._frames.clear()
+        return frames
+
+    @property
+    def reason(self) -> str:
+        """VISIBLE after a frame, else the reason why there is none."""
+        with self._lock:
+            return self._reason
+
+    @property
+    def status(self) -> str:
+        """VISIBLE while frames arrive, else the reason in a few words."""
+        with self._lock:
+            last, reason = self._last, self._reason
+        if reason != VISIBLE:
+            return reason
+        silent = self._now() - last[1] if last is not None else 0.0
+        return VISIBLE if silent < _LATE_S else f"no frame for {silent:.1f} s"
+
+    @property
+    def connections(self) -> int:
+        """How many links were ready."""
+        with self._lock:
+            return self._connections
+
+    @property
+    def counts(self) -> Counts:
+        """Counts since the start."""
+        with self._lock:
+            again = max(0, self._connections - 1)
+            return Counts(self._received, self._missed, self._dropped, again, dict(self._errors))
+
+    def _take(self, line: bytes) -> None:
+        message = parse(line)
+        tracks = bool(self._named) and not self._ended
+        match message:
+            case ("ready", ports) if not (self._named or self._ended):
+                self._set_names(ports)
+            case ("frame", number, requested, found) if tracks:
+                self._add_frame(number, requested, found)
+            case ("error", kind, description) if tracks:
+                with self._lock:
+                    self._errors[kind] += 1
+                    self._reason = in_words(description)
+            case ("end", reason) if not self._ended:
+                self._ended = True
+                self.explain(reason)
+            case _:
+                raise ValueError(f"a message out of order: {line[:60]!r}")
+
+    def _set_names(self, ports: Mapping[str, tuple[str, str]]) -> None:
+        named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
+        if len(set(named.values())) < len(named):
+            raise ValueError(f"two sensors of one name: {', '.join(named.values())}")
+        self._named = named
+        with self._lock:
+            self._connections += 1
+
+    def _add_frame(self, device_number: int, requested: float, found: Mapping[str, Sequence[Any]]) -> None:
+        self._check_frame(device_number, requested, found)
+        self._newest = device_number, requested
+        number = self._numbering.count(device_number, requested)
+        time = self._timeline.stamp(number, requested) + self._offset
+        frame = Frame(time, number, readings(found, device_number, self._named))
+        with self._lock:
+            self._missed += 0 if self._last is None else number - self._last[0] - 1
+            self._dropped += len(self._frames) == _QUEUE
+            self._received += 1
+            self._last, self._reason = (number, requested), VISIBLE
+            self._frames.append(frame)
+
+    def _check_frame(self, number: int, requested: float, found: Mapping[str, Sequence[Any]]) -> None:
+        """Raise ValueError for a frame that is not new, of the future, or without a sensor or with a foreign one."""
+        newest, last_requested = self._newest
+        if number <= newest:
+            raise ValueError(f"frame {number} after frame {newest}")
+        if not last_requested <= requested <= self._now():
+            raise ValueError(f"frame {number} was requested at {requested:.3f} s, before or after its time")
+        if found.keys() != self._named.keys():
+            raise ValueError(f"frame {number} has sensors {', '.join(found)}, not {', '.join(self._named)}")

@@ -1,0 +1,153 @@
+"""The TCP line to a Galil controller: a line of commands, and the replies to them, within a time limit.
+
+A reply belongs to the line before it and to no other. Where that is in doubt (no reply in time, garbled or surplus
+bytes, a message that was not asked for, a broken connection), the connection is closed, so that what comes late is
+attributed to nothing; until `open`, every call is refused.
+"""
+
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from time import monotonic
+
+from flexneedle.errors import DriverError
+from flexneedle.lab.rig.devices.galil.replies import GarbledError, Reply, lines, parse, printable
+
+_LARGEST_REPLY = 4096  # bytes; a reply to the longest line has a few hundred
+_MOST_UNREAD = 1 << 20
+_END = b"\r"
+_REMEDY = "check the power, the cable and the address of the controller, and start again"
+
+
+class Link:
+    """A connection to a controller. It opens none by itself. Not for several threads.
+
+    farewell: a line that is sent before a connection is closed because of a failure, its replies not waited for: the
+    stop of motors whose state is unknown. Deadlines are times of the monotonic clock; a reply that is there in time
+    counts even if this process notices it late. Raises DriverError if the host is unknown (that look-up, and no later
+    call, may take seconds).
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self.farewell = ""
+        self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise DriverError(f"{self.name}: unknown host: {reason}") from None
+        # IPv4 first, which is all that the controllers have.
+        best = min(found, key=lambda each: each[0] != socket.AF_INET)
+        self._family, self._address = best[0], best[4]
+        self._socket: socket.socket | None = None
+        self._closed = "not connected yet"
+
+    @property
+    def address(self) -> str:
+        """IP address and port, by whichever name the host was given."""
+        return ":".join(map(str, self._address[:2]))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a line can be sent."""
+        return self._socket is not None
+
+    def open(self, deadline: float) -> None:
+        """Drop the connection, if there is one, and open a new one. Raises DriverError."""
+        self.close()
+        connection = socket.socket(self._family, socket.SOCK_STREAM)
+        try:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.settimeout(_left(deadline))
+            connection.connect(self._address)
+        except OSError as error:
+            connection.close()
+            self._closed = f"no connection: {_reason(error)}"
+            raise DriverError(f"{self.name}: {self._closed}; {_REMEDY}") from None
+        self._socket = connection
+
+    def ask(self, commands: Sequence[str], deadline: float) -> tuple[Reply, ...]:
+        """Send commands, and return the reply to each. Commands that fit into a line are executed one after another.
+
+        Raises DriverError, and closes the connection, if the replies are not there at the deadline or are not replies
+        to these commands.
+        """
+        return tuple(reply for line in lines(tuple(commands)) for reply in self._exchange(line, deadline))
+
+    def _exchange(self, line: tuple[str, ...], deadline: float) -> tuple[Reply, ...]:
+        if self._socket is None:
+            raise DriverError(f"{self.name}: not connected: {self._closed}; {_REMEDY}")
+        shown = printable(line)
+        if monotonic() >= deadline:  # before anything is sent: later replies are not in doubt
+            raise DriverError(f"{self.name}: no time left for {shown}")
+        try:
+            _require_silence(self._socket)
+            self._socket.settimeout(_left(deadline))
+            self._socket.sendall(";".join(line).encode("ascii") + _END)
+        except OSError as error:  # perhaps in the middle of a line: nothing may follow
+            self.close(_reason(error))
+            raise DriverError(f"{self.name}: {shown} not sent: {_reason(error)}; {_REMEDY}") from None
+        except GarbledError as error:
+            raise self.failed(f"{error} (before {shown})") from None
+        try:
+            return self._received(self._socket, len(line), deadline)
+        except (OSError, GarbledError) as error:
+            raise self.failed(f"{_reason(error)} (to {shown})") from None
+
+    def _received(self, connection: socket.socket, count: int, deadline: float) -> tuple[Reply, ...]:
+        received = b""
+        while (replies := parse(received, count)) is None:
+            connection.settimeout(max(0.0, deadline - monotonic()))
+            data = connection.recv(_LARGEST_REPLY)
+            if not data:
+                raise ConnectionResetError
+            received += data
+            if len(received) > _LARGEST_REPLY:
+                raise GarbledError(f"a reply of more than {_LARGEST_REPLY} bytes")
+        return replies
+
+    def failed(self, problem: str) -> DriverError:
+        """Send the farewell and close a connection whose replies are in doubt; return the error to raise."""
+        if self._socket is not None and self.farewell:
+            with suppress(OSError):
+                self._socket.setblocking(False)
+                self._socket.send(self.farewell.encode("ascii") + _END)
+                self._socket.shutdown(socket.SHUT_WR)
+                self._socket.recv(
+                    _MOST_UNREAD
+                )  # unread data would make closing a reset, and the farewell be lost
+        self.close(problem)
+        return DriverError(f"{self.name}: {problem}; {_REMEDY}")
+
+    def close(self, why: str = "closed") -> None:
+        """Close the connection."""
+        if self._socket is None:
+            return
+        self._closed = why
+        self._socket.close()
+        self._socket = None
+
+
+def _require_silence(connection: socket.socket) -> None:
+    """Raise GarbledError if there is data before anything was asked: replies and commands would no longer match."""
+    connection.setblocking(False)
+    with suppress(BlockingIOError):
+        data = connection.recv(_LARGEST_REPLY)
+        if not data:
+            raise ConnectionResetError
+        raise GarbledError(f"data that was not asked for: {data[:40]!r}")
+
+
+def _left(deadline: float) -> float:
+    left = deadline - monotonic()
+    if left <= 0.0:
+        raise TimeoutError
+    return left
+
+
+def _reason(error: OSError | GarbledError) -> str:
+    if isinstance(error, TimeoutError | BlockingIOError):
+        return "no reply in time"
+    if isinstance(error, ConnectionError) and error.strerror is None:
+        return "the controller closed the connection"
+    return error.strerror or str(error) if isinstance(error, OSError) else str(error)

@@ -1,0 +1,132 @@
+"""What the controller reports of an axis, and what the driver knows of it: together the state of a motor.
+
+Source of the bits and codes: Galil, Command Reference, DMC-4103, TS and SC.
+"""
+
+from dataclasses import dataclass, replace
+
+from flexneedle.lab.rig.devices.galil.replies import GarbledError
+from flexneedle.ports import MotorState
+
+_MOVING, _OFF, _FORWARD_INACTIVE, _REVERSE_INACTIVE = 1 << 7, 1 << 5, 1 << 3, 1 << 2  # bits of TS
+_FARTHEST = 2_147_483_648.0
+_LARGEST_BYTE = 255.0
+
+RUNNING, ARRIVED, STOPPED, ABORTED = 0, 1, 4, 7
+_REASONS = {
+    2: "at the forward limit: its switch, or FL",
+    3: "at the reverse limit: its switch, or BL",
+    STOPPED: "stopped by an ST that is not the driver's",
+    6: "abort input",
+    ABORTED: "aborted by an AB that is not the driver's",
+    8: "off on error: position error, amplifier error or abort",
+    11: "abort input of this axis",
+    12: "encoder failure",
+    15: "amplifier error",
+    16: "stepper position error",
+    41: "the controller's computer was overloaded",
+    70: "EtherCAT communication failed",
+    71: "EtherCAT drive error",
+    99: "not in position in time",
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """One axis at one time, as reported: positions (counts), switches (TS), stop code (SC)."""
+
+    position: float
+    commanded: float
+    switches: int
+    code: int
+
+    @property
+    def moving(self) -> bool:
+        """Whether the controller counts the axis as in motion; in position tracking perhaps also at its target."""
+        return bool(self.switches & _MOVING)
+
+    @property
+    def reverse_limit(self) -> bool:
+        """Whether the limit switch in the direction of falling counts is active."""
+        return not self.switches & _REVERSE_INACTIVE
+
+    @property
+    def forward_limit(self) -> bool:
+        """Whether the limit switch in the direction of rising counts is active."""
+        return not self.switches & _FORWARD_INACTIVE
+
+
+def report(position: float, commanded: float, switches: float, code: float) -> Report:
+    """Return the report of these values. Raises GarbledError for values that an axis cannot have."""
+    if max(abs(position), abs(commanded)) > _FARTHEST:
+        raise GarbledError(f"no position: {position:.12g}, {commanded:.12g}")
+    for value in (switches, code):
+        if not (0.0 <= value <= _LARGEST_BYTE and value == int(value)):
+            raise GarbledError(f"no byte: {value:.12g}")
+    return Report(position, commanded, int(switches), int(code))
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What the driver knows of an axis.
+
+    target: where it was commanded to go (counts); None: nothing was commanded since it was stopped, defined or
+    switched, or the connection was opened. tracking: whether the driver has put it into position tracking, and the
+    controller has not ended that by a stop of its own. waiting: the target is not sent yet; it is given up where the
+    controller stops the axis by itself, or would at once, at a limit switch. commanded: at the last report.
+    code: stop code at the last report. old: stop codes that explain an earlier stop, not one of this motion.
+    """
+
+    target: int | None = None
+    tracking: bool = False
+    waiting: bool = False
+    commanded: float | None = None
+    code: int = ARRIVED
+    old: frozenset[int] = frozenset()
+
+    def follows(self, target: int, *, tracking: bool) -> "Channel":
+        """The channel on its way to a new target. The stop code is old until another one is reported."""
+        old = self.old | {self.code}
+        return replace(self, target=target, tracking=tracking, waiting=False, old=old)
+
+    def rests(self, *codes: int) -> "Channel":
+        """The channel without a target; codes: stop codes that this will cause."""
+        old = frozenset({self.code, *codes})
+        return replace(self, target=None, tracking=False, waiting=False, old=old)
+
+
+def seen(channel: Channel, found: Report) -> tuple[Channel, MotorState]:
+    """Return the channel after a report, and the state of the motor.
+
+    In position tracking the maker does not say whether an axis at its target counts as in motion. It rests if two
+    reports in succession have the commanded position at the target: passing it, the axis is there in one at most.
+    """
+    arrived = channel.tracking and found.commanded == channel.target == channel.commanded
+    good = found.code in (RUNNING, ARRIVED)
+    old = channel.old if found.code in channel.old and not good else frozenset[int]()
+    stopped = _reason(found.code) if channel.target is not None and not good and found.code not in old else ""
+    on = not found.switches & _OFF
+    tracking = channel.tracking and on and not stopped
+    waiting = channel.waiting and not stopped and not _is_blocked(channel, found)
+    after = replace(
+        channel, tracking=tracking, waiting=waiting, commanded=found.commanded, code=found.code, old=old
+    )
+    return after, MotorState(
+        position=found.position,
+        commanded=found.commanded,
+        moving=(found.moving and not arrived) or waiting,
+        on=on,
+        reverse_limit=found.reverse_limit,
+        forward_limit=found.forward_limit,
+        stopped=stopped,
+    )
+
+
+def _is_blocked(channel: Channel, found: Report) -> bool:
+    """Whether the target is beyond a limit switch that is active: the controller would not move there."""
+    way = 0.0 if channel.target is None else channel.target - found.commanded
+    return (found.reverse_limit and way < 0.0) or (found.forward_limit and way > 0.0)
+
+
+def _reason(code: int) -> str:
+    return _REASONS.get(code, f"stop code {code}")

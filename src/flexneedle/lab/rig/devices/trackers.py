@@ -1,0 +1,92 @@
+"""The trackers that come with the package, as rig files name them, and as `flexneedle em` opens them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from flexneedle.errors import InputError
+from flexneedle.lab.rig.devices.aurora.readings import NAMES
+from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.recording import read_frames
+from flexneedle.lab.rig.devices.replay import Replay
+from flexneedle.lab.rig.rig_file import settings_of
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.ports import Clock
+from flexneedle.record.folder import TRACE_FILE
+from flexneedle.scenario.sections.fields import Positive, Section, one_line
+from flexneedle.types import Frame, Measurement, SensorReading
+
+PathText = Annotated[str, Field(max_length=4000), AfterValidator(one_line)]
+
+
+def _different(names: tuple[str, ...]) -> tuple[str, ...]:
+    if not names or not all(name.isidentifier() for name in names) or len({*names}) < len(names):
+        raise ValueError("sensor names must be different identifiers, such as tip, ref1")
+    return names
+
+
+class AuroraSettings(Section):
+    """Settings of the tracker `aurora`, an NDI Aurora."""
+
+    port: PathText
+    """Serial port."""
+    sensors: Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_different)] = NAMES
+    """Names of the sensors at the tracker's ports 1, 2, …."""
+
+
+class ReplaySettings(Section):
+    """Settings of the tracker `replay`, a recording in real time."""
+
+    file: PathText
+    """A recording (`flexneedle em watch --record`), a table of measurements, or the folder of a run."""
+    speed: Positive = 1.0
+    """The frames arrive this many times as fast as they were recorded."""
+
+
+def aurora(settings: Mapping[str, Any], clock: Clock) -> Aurora:
+    """Return an NDI Aurora, tracking. Raises RigError for invalid settings, and as `Aurora`."""
+    chosen = settings_of(AuroraSettings, settings)
+    return Aurora(chosen.port, clock, chosen.sensors)
+
+
+def replay(settings: Mapping[str, Any], clock: Clock) -> Replay:
+    """Return a replay that starts now. Raises RigError for invalid settings, InputError for an invalid recording."""
+    chosen = settings_of(ReplaySettings, settings)
+    path = Path(chosen.file)
+    frames = frames_of_run(path) if path.is_dir() else read_frames(path)
+    return Replay(_faster(frames, chosen.speed), clock)
+
+
+def frames_of_run(folder: Path) -> tuple[Frame, ...]:
+    """Return the tracker's frames of a recorded insertion, each once, in the tracker's frame of reference.
+
+    Measurements without frames (a tracker of the tip alone) become frames with the sensor tip, in the stage's frame and
+    with z = 0 if unknown. Raises InputError if the run has no readings.
+    """
+    from flexneedle.record.reader import read_trace
+
+    periods = read_trace(folder / TRACE_FILE).periods
+    measurements = [judged.measurement for period in periods for judged in period.readings]
+    frames = {frame.number: frame for frame in (_frame(n, one) for n, one in enumerate(measurements))}
+    if not frames:
+        raise InputError(f"{folder}: the run has no tracker readings")
+    return tuple(frames.values())
+
+
+def _faster(frames: Sequence[Frame], speed: float) -> tuple[Frame, ...]:
+    return tuple(frames) if speed == 1.0 else tuple(replace(one, time=one.time / speed) for one in frames)
+
+
+def _frame(number: int, measurement: Measurement) -> Frame:
+    if measurement.frame is not None:
+        return measurement.frame
+    known = measurement.x is not None and measurement.y is not None
+    position = (measurement.x or 0.0, measurement.y or 0.0, measurement.z or 0.0)
+    return Frame(
+        measurement.time,
+        number,
+        {TIP: SensorReading(position) if known else SensorReading(None, status="missing")},
+    )

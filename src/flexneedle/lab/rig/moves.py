@@ -1,0 +1,212 @@
+"""Motions that an operator commands, outside of an insertion: what would move, from where to where. Pure functions."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+
+from flexneedle.arguments import shown as text_of
+from flexneedle.errors import InputError, RefusedError
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.supervisor.checks import STILL
+from flexneedle.lab.rig.supervisor.homes import homed_at, homing_reach, homing_speed
+from flexneedle.scenario.sections.axes import Axis
+
+_SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
+
+_ROUNDING = 1e-9
+_DISTANCE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z°]*)")
+
+
+@dataclass(frozen=True)
+class Move:
+    """A motion of one axis from `start` to `goal` (mm or rad), at most at `speed` (mm/s or rad/s)."""
+
+    name: str
+    axis: Axis
+    start: float
+    goal: float
+    speed: float
+
+    @property
+    def distance(self) -> float:
+        """Distance with its sign, mm or rad."""
+        return self.goal - self.start
+
+    def __str__(self) -> str:
+        at, unit = self.axis.shown, self.axis.unit
+        way = f"from {at(self.start)} to {at(self.goal)} {unit} ({at(self.distance)} {unit})"
+        slack = f"; the start is {uncertain(self.axis)}" if self.axis.backlash else ""
+        return f"{self.name}: {way}, at most at {at(self.speed)} {unit}/s{slack}"
+
+
+def require_start(move: Move, position: float) -> None:
+    """Raise RefusedError if an axis at a position (mm, rad) is not where its motion begins, or beyond its goal."""
+    axis, turns = move.axis, (move.goal - position) * move.distance <= 0.0
+    if turns or not abs(position - move.start) <= STILL * axis.tolerance:
+        now, then = (_with_unit(axis, at) for at in (position, move.start))
+        raise RefusedError(
+            f"{move.name}: is at {now} now, not at {then} any more: nothing was moved; try again"
+        )
+
+
+@dataclass(frozen=True)
+class Homing:
+    """Finding the home of one axis."""
+
+    name: str
+    axis: Axis
+
+    def __str__(self) -> str:
+        axis = self.axis
+        home = _with_unit(axis, axis.at_home)
+        if axis.to_home == 0:
+            return f"{self.name}: stays where it is, and its position is called {home}"
+        reach, back = homing_reach(axis), homed_at(axis) - axis.at_home
+        speed = f"at {_with_unit(axis, homing_speed(axis))}/s"
+        search = f"in its {_direction(reach)} direction to the {_switch(axis)}"
+        there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
+        off = f"in its {_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
+        to = f"off the switch to {_with_unit(axis, homed_at(axis))}"
+        return f"{self.name}: {search}, {there}; then {off}, {to}. If the switch is active now, first {off}"
+
+
+def _direction(travel: float) -> str:
+    return "positive" if travel > 0.0 else "negative"
+
+
+def _switch(axis: Axis) -> str:
+    return f"{axis.home.replace('-', ' ')} switch"
+
+
+def _with_unit(axis: Axis, value: float) -> str:
+    return f"{axis.shown(value)} {axis.unit}"
+
+
+def uncertain(axis: Axis) -> str:
+    """Return by how much the position of an axis with backlash is uncertain before its first motion, in words."""
+    return f"uncertain by {_with_unit(axis, 0.5 * axis.backlash)} (half of backlash_{axis.unit})"
+
+
+def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis: where it is (mm or rad, by name), and how fast it moves at most."""
+    return [
+        f"{name}: at {_with_unit(axis, positions[name])}, moves at most at {_with_unit(axis, axis.speed)}/s"
+        + (f"; the start is {uncertain(axis)}" if axis.backlash else "")
+        for name, axis in rig.axes.items()
+    ]
+
+
+def switched_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis whose motor is switched off: where it is (mm or rad, by name)."""
+    return [
+        f"{name}: at {axis.shown(positions[name])} {axis.unit}, its motor will be switched off"
+        for name, axis in rig.axes.items()
+    ]
+
+
+def axis_of(rig: RigFile, name: str) -> Axis:
+    """Return an axis by its name. Raises InputError, with the axes of the rig, for another name."""
+    axes = dict(rig.axes.items())
+    if name not in axes:
+        raise InputError(f"axis {text_of(name)}: must be one of {', '.join(axes)}")
+    return axes[name]
+
+
+def distance_of(text: str, name: str, axis: Axis) -> float:
+    """Return the distance (mm or rad) of a text such as "5", "-2.5mm" or "90deg". Raises InputError."""
+    found = _DISTANCE.fullmatch(text.strip())
+    units = (axis.unit, "°") if axis.unit == "deg" else (axis.unit,)
+    if found is None or not isfinite(float(found[1])):
+        raise InputError(f"distance {text_of(text)}: must be a number, such as 5 or -5{axis.unit}")
+    if found[2] not in ("", *units):
+        raise InputError(f"distance {text_of(text)}: the unit of {name} is {axis.unit}")
+    return float(found[1]) * axis.size
+
+
+def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | None = None) -> Move:
+    """Return the motion of one axis by a distance from its position (mm or rad). speed: in the unit of the axis, per s.
+
+    Raises InputError for another axis or unit, no distance, a goal beyond the soft limits, a speed above the axis's.
+    """
+    axis = axis_of(rig, name)
+    move = _checked(
+        Move(name, axis, position, position + distance_of(distance, name, axis), _speed(name, axis, speed))
+    )
+    # A driver whose counts are no steps of an encoder, such as m, has a finer resolution.
+    if abs(move.distance) < min(1.0 / abs(axis.scale), axis.tolerance):
+        raise InputError(f"distance {text_of(distance)}: must be at least one count of {name}")
+    return move
+
+
+def withdrawn(rig: RigFile) -> float:
+    """Return where a retraction ends (mm): where homing leaves the base off a switch behind it, else its lowest
+    position."""
+    axis = rig.axes.insertion
+    return homed_at(axis) if axis.to_home < 0 else axis.limits[0]
+
+
+def retraction(
+    rig: RigFile, position: float, to_mm: float | None = None, speed: float | None = None
+) -> Move | None:
+    """Return the motion of the base back to `to_mm`; without it to where it is withdrawn, None if it is there.
+
+    speed: mm/s. Raises InputError if that is not backwards, beyond the soft limits or at the limit switch of the home,
+    or for a speed above the axis's.
+    """
+    axis = rig.axes.insertion
+    if to_mm is None and position - withdrawn(rig) < 1.0 / abs(axis.scale):
+        return None
+    goal = withdrawn(rig) if to_mm is None else to_mm
+    move = _checked(Move("insertion", axis, position, goal, _speed("insertion", axis, speed)))
+    _check_switch(axis, goal)
+    if move.distance > -1.0 / abs(axis.scale):
+        at = axis.shown(position)
+        raise InputError(
+            f"to {axis.shown(goal)} mm: must be below {at} mm, where the insertion axis is: it only retracts"
+        )
+    return move
+
+
+def _check_switch(axis: Axis, goal: float) -> None:
+    """Raise InputError for a goal (mm) at which an axis may be at the limit switch behind it, its home."""
+    least = axis.at_home + axis.max_error
+    if axis.to_home < 0 and goal < least - _ROUNDING:
+        at = axis.shown
+        why = f"the {_switch(axis)} is at {at(axis.at_home)} mm, and max_error_mm is {at(axis.max_error)}"
+        raise InputError(f"to {at(goal)} mm: must be at least {at(least)} mm: {why}")
+
+
+def homings(rig: RigFile, names: Iterable[str]) -> list[Homing]:
+    """Return how axes find their homes, in the order of the file, the insertion first; all that need it, without names.
+
+    Raises InputError for another axis, or one with an absolute encoder.
+    """
+    chosen = list(names)
+    for name in chosen:
+        if axis_of(rig, name).home == "absolute":
+            raise InputError(f'axis {name}: has home = "absolute": its encoder needs no homing')
+    wanted = [Homing(name, axis) for name, axis in rig.axes.items() if name in chosen or not chosen]
+    return [homing for homing in wanted if homing.axis.home != "absolute"]
+
+
+def _speed(name: str, axis: Axis, given: float | None) -> float:
+    if given is None:
+        return _SHARE * axis.speed
+    speed = given * axis.size
+    if not 0.0 < speed <= axis.speed * (1.0 + _ROUNDING):
+        rule = f"must be above 0 and at most {axis.shown(axis.speed)}, speed_{axis.unit}_s of {name}"
+        raise InputError(f"speed {given:g}: {rule}")
+    return speed
+
+
+def _checked(move: Move) -> Move:
+    """The move. Raises InputError if it leaves the soft limits; from beyond them it may return."""
+    axis, (low, high) = move.axis, move.axis.limits
+    if not (isfinite(move.start) and isfinite(move.goal)):
+        raise InputError(f"{move.name}: its position is not a number")
+    if not min(low, move.start) - _ROUNDING <= move.goal <= max(high, move.start) + _ROUNDING:
+        limits = f"{axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+        rule = f"beyond the soft limits, {limits}; it is at {axis.shown(move.start)} {axis.unit}"
+        raise InputError(f"{move.name} to {axis.shown(move.goal)} {axis.unit}: {rule}")
+    return move

@@ -1,0 +1,41 @@
+"""How fast the axes of a rig are with their acceleration and the queue of the loop. Pure functions."""
+
+import math
+
+from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
+from flexneedle.lab.rig.supervisor.drives import Drive
+from flexneedle.lab.rig.supervisor.trajectory import between, shortest
+from flexneedle.scenario.sections.axes import Axis
+
+_ROUNDING = 1e-9
+
+
+def attained(axis: Axis, loop: LoopSettings, speed: float) -> float:
+    """Return the speed (mm/s or rad/s) that an axis keeps in a long motion at `speed`, at most that.
+
+    A motor goes no faster than it can brake from before its target, v²/2a. That is a queue ahead of it, less the way
+    v/f of a tick, after which it gets the next one.
+    """
+    tick, queue, a = 1.0 / loop.rate_hz, loop.queue_of(axis, speed), axis.acceleration
+    return min(speed, a * (math.sqrt(tick**2 + 2.0 * queue / a) - tick))
+
+
+def step_time(axis: Axis, loop: LoopSettings, way: float, duration: float) -> float:
+    """Return the time (s) in which an axis does a step (mm or rad) that is planned for a duration (s)."""
+    channel, drive = axis.channel, Drive("", axis)
+    made = between({channel: drive}, {channel: 0.0}, {channel: drive.counts(way)}, duration)
+    fastest = made.speeds[channel] / abs(axis.scale)
+    return max(made.duration, shortest(way, attained(axis, loop, fastest), axis.acceleration))
+
+
+def kept(rig: RigFile) -> list[tuple[str, str]]:
+    """Return for each axis its name and the speed that it keeps, such as `10 mm/s`, or `5.93 of 10 mm/s: …`."""
+    return [(name, _kept(axis, attained(axis, rig.loop, axis.speed))) for name, axis in rig.axes.items()]
+
+
+def _kept(axis: Axis, speed: float) -> str:
+    unit, most = axis.unit, axis.shown(axis.speed)
+    if speed >= axis.speed * (1.0 - _ROUNDING):
+        return f"{most} {unit}/s"
+    why = f"acceleration_{unit}_s2 = {axis.shown(axis.acceleration)} brakes from no more within the queue"
+    return f"{speed / axis.size:.3g} of {most} {unit}/s: {why}"

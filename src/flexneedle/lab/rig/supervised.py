@@ -1,0 +1,301 @@
+"""A rig of a rig file with the ports of the closed loop: its driver, tracker and clock are those of a supervisor."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any, Protocol
+
+import numpy as np
+
+from flexneedle.errors import DriverError, RefusedError, RigError
+from flexneedle.estimation.estimate import Estimate, after
+from flexneedle.lab.rig.fit import fit_problems, start_problems
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.start import checked_start, deepest, needed
+from flexneedle.lab.rig.supervisor.client import Supervisor
+from flexneedle.lab.rig.supervisor.messages import Done, Expectation, Report, Task
+from flexneedle.loop.virtual import Rig, never, to_stage
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.control import MOVES, Limits, half_turned
+from flexneedle.simulator.pace import ROUNDING_S, roll_time, travel_time
+from flexneedle.types import (
+    DB_X,
+    DB_Y,
+    DB_Z,
+    DG_Y,
+    DG_Z,
+    ROLL,
+    SPIN,
+    STILL,
+    Control,
+    Motion,
+    Plan,
+    Pose,
+    Z,
+)
+
+_SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
+_MOST_TICKS = 200_000  # an hour and more
+_MOST_KEPT = 10_000
+_GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a control as travel of the rig's axes. slope: dy/dx + i dz/dx of the axis on which the base moves."""
+
+    slope: complex
+
+    @property
+    def _stretch(self) -> float:
+        """Length of the insertion axis for each mm along x."""
+        return math.sqrt(1.0 + abs(self.slope) ** 2)
+
+    def travel(self, row: Control) -> dict[str, float]:
+        """Travel (mm or rad) by axis, of the axes that move."""
+        base_y, base_z = row.db_y - self.slope.real * row.db_x, row.db_z - self.slope.imag * row.db_x
+        travel = {
+            "insertion": self._stretch * row.db_x,
+            "base_y": base_y,
+            "base_z": base_z,
+            "rotation": row.spin,
+            "base_theta": row.db_theta,  # turns of the base: no rig has them, and the supervisor refuses them
+            "base_psi": row.db_psi,
+            **{name: row[column] for name, column in _GUIDE.items()},
+        }
+        return {name: way for name, way in travel.items() if abs(way) > 1e-12}
+
+    def control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
+        """The control that travelled axes have carried out, with the roll and the spin (rad) of their rotation."""
+        row = np.zeros(len(STILL))
+        row[DB_X] = travelled.get("insertion", 0.0) / self._stretch
+        row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
+        row[DB_Z] = travelled.get("base_z", 0.0) + self.slope.imag * row[DB_X]
+        for name, column in _GUIDE.items():
+            row[column] = travelled.get(name, 0.0)
+        row[ROLL], row[SPIN] = roll, spin
+        return Control.of(row.tolist())
+
+
+@dataclass
+class Ticks:
+    """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
+    those before which others were left out; changes of the rig's state, at the end of the tick that found them. Times
+    are on the monotonic clock.
+
+    queued: the largest motion in the queue of each axis (mm or rad).
+    """
+
+    started: float = 0.0
+    late: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
+    work: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
+    missed: int = 0
+    stalls: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
+    states: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
+    queued: dict[str, float] = field(default_factory=dict)
+
+    def add(self, report: Report) -> None:
+        """Add the tick of a report."""
+        time = self.started + report.time
+        self.late.append(report.late)
+        self.work.append(report.work)
+        if report.missed > self.missed:
+            self.stalls.append((time, report.late))
+        self.missed = report.missed
+        for name, axis in report.axes.items():
+            self.queued[name] = max(self.queued.get(name, 0.0), axis.queued)
+        if not self.states or self.states[-1][1:] != (report.state, report.why):
+            self.states.append((time + report.work, report.state, report.why))
+
+    def summary(self) -> dict[str, Any]:
+        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and
+        states; largest motion in the queue by axis, in mm or degrees.
+        """
+        found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
+        ended = [late + work for late, work in zip(self.late, self.work, strict=True)]
+        for name, values in (("late", self.late), ("work", self.work), ("ended", ended)):
+            for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
+                found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
+        found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
+        found["states"] = [{"time_s": time, "state": state, "why": why} for time, state, why in self.states]
+        found["queued"] = dict(_with_unit(name, way) for name, way in self.queued.items())
+        return found
+
+
+def _with_unit(axis: str, way: float) -> tuple[str, float]:
+    """Key and value of a way (mm or rad) of an axis in a record: in mm or degrees."""
+    return (f"{axis}_deg", math.degrees(way)) if axis == "rotation" else (f"{axis}_mm", way)
+
+
+class Follower(Protocol):
+    """What follows the insertion on a rig, such as a connection to other programs."""
+
+    def opened(self, supervisor: Supervisor) -> None:
+        """Take the supervisor of a rig that is connected and not armed; the rig is armed when this returns."""
+        ...
+
+    def report(self, report: Report) -> None:
+        """Take what a tick found; called in a thread, and shall return at once."""
+        ...
+
+
+@dataclass(frozen=True)
+class Watchers:
+    """What is given each tick of a rig: the record of ticks, and what follows the insertion.
+
+    confirm: called with the supervisor before the rig is armed; what it raises ends the insertion before anything has
+    moved. hold: as for `Rig`.
+    """
+
+    ticks: Ticks = field(default_factory=Ticks)
+    followers: tuple[Follower, ...] = ()
+    confirm: Callable[[Supervisor], None] | None = None
+    hold: Callable[[], str] = never
+
+    def opened(self, supervisor: Supervisor) -> None:
+        """Hand out the supervisor before the rig is armed, and have the motions confirmed."""
+        for follower in self.followers:
+            follower.opened(supervisor)
+        if self.confirm is not None:
+            self.confirm(supervisor)
+
+    def report(self, report: Report) -> None:
+        """Hand out what a tick found, to all also where one of them fails; raises the first error."""
+        self.ticks.add(report)
+        errors = []
+        for follower in self.followers:
+            try:
+                follower.report(report)
+            except Exception as error:  # noqa: BLE001  raised below
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+
+class SupervisedDriver:
+    """The port `Driver` of a supervisor that is armed."""
+
+    def __init__(self, supervisor: Supervisor, scenario: Scenario, roll: float) -> None:
+        self._supervisor, self._scenario = supervisor, scenario
+        self._columns = Columns(scenario.entry.slope)
+        self._limits = Limits.of(scenario)
+        self._moved, self._rolled = np.zeros(MOVES), roll
+        self._expected: Expectation | None = None
+
+    def expect(self, estimate: Estimate, command: Control) -> None:
+        """Take the estimated tip before a command, and where about it will be after it, for the check of readings."""
+        moved = after(estimate.simulator, estimate.state, command).tip - estimate.state.tip
+        x, y, z = (estimate.tip + moved)[: Z + 1].tolist()
+        limit = self._scenario.control.innovation_limit_mm + _SDS * estimate.tip_sd
+        self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit)
+
+    def apply(self, command: Control, duration: float) -> Motion:
+        """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.
+
+        A motion that the monitor ended is returned as far as it went. Raises CommandError if the command breaks a limit
+        of the scenario, RefusedError if it breaks one of the rig or is faster than the scenario's speeds, DriverError
+        after a fault, StoppedError after a stop.
+        """
+        self._limits.check(self._moved, np.array([command]), self._rolled)
+        if not duration >= (shortest := travel_time(self._scenario.setup, command)) - 2.0 * ROUNDING_S:
+            raise RefusedError(
+                f"travel in {duration:g} s: must take at least {shortest:g} s, at the speeds of the scenario"
+            )
+        roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
+        travel, roll_duration = self._columns.travel(command), roll_time(self._scenario.setup, roll)
+        done = self._supervisor.step(roll, travel, duration, self._expected, roll_duration)
+        row = self._columns.control(done.travelled, *self._rotation(done, command, roll))
+        self._moved += np.array(row[:MOVES])
+        self._rolled += row.roll + row.spin
+        return Motion(row, done.begun, done.ended, done.turned, done.why)
+
+    def _rotation(self, done: Done, command: Control, roll: float) -> tuple[float, float]:
+        """Roll and spin of what was turned.
+
+        A half turn was confirmed by its position and counts as one, so that half turns to and fro do not drift. Else
+        all rotation is the roll, or the spin after it where one was commanded.
+        """
+        turned = done.travelled.get("rotation", 0.0)
+        if not self._limits.half_turns:
+            return (roll, turned - roll) if command.spin != 0.0 or roll == 0.0 else (turned, 0.0)
+        if roll == 0.0:
+            return 0.0, 0.0
+        if min(abs(turned), abs(turned - roll)) > self._tolerance:
+            at = f"{math.degrees(turned):.1f}° of {math.degrees(roll):.0f}°"
+            raise DriverError(f"the roll was interrupted at {at}: the bevel is not known")
+        return (roll if abs(turned) > self._tolerance else 0.0), 0.0
+
+    @property
+    def _tolerance(self) -> float:
+        return 2.0 * dict(self._supervisor.rig.axes.items())["rotation"].tolerance
+
+    def stop(self) -> None:
+        """Stop all axes, and return when they rest."""
+        self._supervisor.stop()
+
+
+def start_advance(supervisor: Supervisor, scenario: Scenario, plan: Plan, *, dry: bool = False) -> float:
+    """How far the base may advance (mm) for a plan, from where it is and the tip is measured now.
+
+    dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
+    """
+    supervisor.read()  # measurements before may be of a needle that somebody has moved since
+    measured = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
+    depth, tip = plan.target[0], None if dry else measured[0]
+    need = needed(scenario, depth, tip)
+    if problems := start_problems(supervisor.rig, scenario, supervisor.positions, plan.strategy, need):
+        raise RigError(*problems)
+    return deepest(scenario, depth, tip)
+
+
+def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
+    """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
+    if problems := fit_problems(rig, scenario, strategy):
+        raise RigError(*problems)
+
+
+def registered(rig: RigFile, scenario: Scenario) -> Scenario:
+    """The scenario with the registration of the rig file, if that has one."""
+    if rig.registration is None:
+        return scenario
+    return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
+
+
+@contextmanager
+def supervised(
+    rig: RigFile, scenario: Scenario, plan: Plan, watchers: Watchers, *, dry: bool = False
+) -> Iterator[Rig]:
+    """Open a rig, arm it, roll the needle as the plan begins, and give its ports. watchers: are given its ticks.
+
+    Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
+    Raises RigError if the rig does not fit the scenario or has no room for the insertion from where its axes are,
+    DriverError or RunError if a device fails, StoppedError if it is stopped.
+    """
+    settings, scenario = scenario.tracker, registered(rig, scenario)
+    task = Task(
+        rig,
+        monotonic(),
+        scenario.setup.axes,
+        scenario.monitor,
+        to_stage(scenario.tracker.registration),
+        settings.tip_offset_mm,
+        scenario.control.stale_after_s,
+        dry,
+    )
+    watchers.ticks.started = task.started
+    with Supervisor(task, watchers.report) as supervisor:
+        # What cannot begin is refused before anybody is asked.
+        start_advance(supervisor, scenario, plan, dry=dry)
+        watchers.opened(supervisor)
+        supervisor.arm(start_advance(supervisor, scenario, plan, dry=dry))
+        if rig.axes.rotation is not None:
+            speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
+            supervisor.move_to("rotation", plan.roll, speed)
+        if scenario.monitor.enabled and scenario.monitor.references:
+            supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
+        driver = SupervisedDriver(supervisor, scenario, plan.roll)
+        deadline = 1e-3 * rig.loop.decision_ms
+        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline, hold=watchers.hold)

@@ -1,0 +1,423 @@
+"""The client of the supervisor, which it starts: motions with their ends, and what each tick found."""
+
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import inf, isfinite
+from multiprocessing.connection import Connection
+from statistics import median
+from threading import Condition, Lock, Thread
+from time import monotonic
+from typing import Any, Self
+
+from flexneedle.errors import DriverError, RefusedError, StoppedError
+from flexneedle.geometry.registration import identity
+from flexneedle.interrupts import uninterrupted
+from flexneedle.lab.processes import end_process
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor.signals import SignalLine
+from flexneedle.scenario.sections.axes import Axis
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import Measurement, Point
+
+CONTROLLER = "the controller"
+"""Who stops the motors at the end of an insertion."""
+_HEARTBEAT_S = 0.1
+_SILENT_S = 1.0  # without a report: the supervisor hangs
+_PATIENCE_S = 0.3  # for reports that have not been taken, after a time without Python's lock
+_OPEN_S = 60.0  # to find a tracker
+_END_S = 5.0
+_MOST_KEPT = 4000  # measurements: 100 s without a reader
+_STDERR = 2  # its descriptor: sys.stderr may be another object, without one
+_ENOUGH = 9  # measurements for a median
+
+
+class Supervisor:
+    """A supervisor in a process of its own. Use it as a context manager.
+
+    on_report: called with what each tick found, in a thread; what it raises is raised where the client waits next, or
+    given to `threading.excepthook` at the end, which prints it.
+    Raises DriverError or StoppedError if the rig has a fault or is stopped, InputError if it refuses a request.
+    """
+
+    def __init__(self, task: say.Task, on_report: Callable[[say.Report], None] | None = None) -> None:
+        self._clock = WallClock(start=task.started)
+        self._task, self._on_report = task, on_report
+        self._changed, self._sending = Condition(), Lock()  # a stop may be requested in any thread
+        self._latest: say.Report | None = None
+        self._latest_at = monotonic()
+        self._ended: str | None = None
+        self._unopened = ""
+        self._failed: Exception | None = None  # the first of on_report
+        self._failure_raised = False
+        self._answers: dict[int, say.Done | say.Refused] = {}
+        self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
+        self._number = 0
+        self._sent = -1  # requests; the task, which is sent first, is none
+        ours, theirs = socket.socketpair()
+        self._signals = SignalLine()
+        passed = (theirs.fileno(), *self._signals.descriptors)
+        command = [sys.executable, "-m", f"{__package__}.process", *map(str, passed)]
+        # What a user's own device prints must not get into what a command prints, such as JSON.
+        self._process = subprocess.Popen(command, pass_fds=passed, stdin=subprocess.DEVNULL, stdout=_STDERR)
+        theirs.close()
+        self._connection = Connection(ours.detach())
+        self._thread = Thread(target=self._receive, name="supervisor", daemon=True)
+        self._thread.start()
+        try:
+            self._send(task)
+            self._wait(lambda: self._latest is not None, _OPEN_S, "the rig does not open")
+        except BaseException:  # also on Ctrl-C: the devices must be released
+            self.close()
+            raise
+
+    @classmethod
+    def of_operator(cls, rig: RigFile) -> Self:
+        """The supervisor of a rig without its tracker, for motions of single axes."""
+        monitor = MonitorSettings(enabled=False)
+        return cls(say.Task(rig, monotonic(), 2, monitor, identity(), 0.0, inf, tracked=False))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the motors, and end the supervisor."""
+        try:
+            if self._ended is None:
+                self._send(say.Close(), lost=True)
+            end_process(self._process, _END_S)
+            self._thread.join()  # it ends with the supervisor's end of the line
+            with uninterrupted(), self._sending:
+                self._connection.close()
+        finally:
+            self._signals.close()
+            if self._failed is not None and not self._failure_raised:
+                error, self._failure_raised = self._failed, True
+                threading.excepthook(
+                    threading.ExceptHookArgs((type(error), error, error.__traceback__, self._thread))
+                )
+
+    @property
+    def rig(self) -> RigFile:
+        """The rig."""
+        return self._task.rig
+
+    def now(self) -> float:
+        """Seconds since the start of the run."""
+        return self._clock.now()
+
+    @property
+    def pid(self) -> int:
+        """Number of the supervisor's process."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> str | None:
+        """Why the supervisor has ended, "" at a request; None while it works."""
+        with self._locked():
+            return self._ended
+
+    @property
+    def report(self) -> say.Report:
+        """What the last tick found."""
+        with self._locked():
+            if self._latest is None:
+                raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
+            return self._latest
+
+    @property
+    def positions(self) -> dict[str, float]:
+        """Where the axes are, mm or rad. Raises DriverError after a fault, StoppedError after a stop."""
+        found = self.report
+        self._check(found.state, found.why)
+        return {name: axis.position for name, axis in found.axes.items()}
+
+    def read(self) -> tuple[Measurement, ...]:
+        """The measurements since the last call, oldest first."""
+        with self._locked():
+            found = tuple(self._measurements)
+            self._measurements.clear()
+        return found
+
+    def tip(self, within: float) -> Point | None:
+        """Position (mm) of the tip at rest, the median of at least 9 measurements or all within a time (s); None: none.
+
+        `read` returns them, too.
+        """
+        until, found = monotonic() + within, list[Point]()
+
+        def enough() -> bool:
+            found[:] = filter(None, map(_position, self._measurements))
+            return len(found) >= _ENOUGH or monotonic() >= until
+
+        self._wait(enough, within + 1.0, "the clock does not advance")
+        if not found:
+            return None
+        x, y, z = (median(values) for values in zip(*found, strict=True))
+        return x, y, z
+
+    @property
+    def status(self) -> str:
+        """Status of the tracker."""
+        return self.report.tracker
+
+    # Requests
+
+    def arm(self, deepest: float = inf) -> str:
+        """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop.
+
+        A motor at rest that is more than its largest error from its commanded position is held where it is: it is
+        switched off and on again. Returns a note of that, or "".
+        """
+        self._check_follower()
+        refused = None
+        try:
+            self._ask(say.Arm(deepest))
+        except RefusedError as error:
+            refused = error
+        report = self.report
+        self._check(report.state, report.why)
+        if refused is not None:
+            raise refused
+        return report.why
+
+    def reset(self) -> None:
+        """Leave the states stopped and fault. It is refused while motors move: `stop` returns when they rest."""
+        self._ask(say.Reset())
+
+    def stop(self, who: str = CONTROLLER) -> None:
+        """Stop all motors, and return when they rest, so that a reset is accepted."""
+        if self._ended is not None:
+            return
+        sent = self._send(say.Stop(who))
+        self._wait(lambda: self._stopped(sent), _END_S, "the motors do not come to rest", stopped=True)
+
+    def off(self) -> None:
+        """Stop all motors, and switch them off. Raises DriverError, with the reason, if one is still on."""
+        self.stop("rig off")
+        self._ask(say.Off())
+        if any(axis.motor.on for axis in self.report.axes.values()):
+            raise DriverError(self.report.why)
+
+    def request_stop(self, who: str) -> None:
+        """Request that all motors stop, without waiting for it. It may be called in any thread, and at any time.
+
+        Where the supervisor has ended nothing is done: it has stopped the motors.
+        """
+        self._send(say.Stop(who), lost=True)
+
+    def take_signals(self) -> None:
+        """Have each signal of this process that has a handler of Python stop the motors, until the end.
+
+        The supervisor gets it from the system, whatever this process is busy with. Call it in the main thread.
+        """
+        self._signals.take()
+
+    def step(
+        self,
+        roll: float,
+        travel: Mapping[str, float],
+        duration: float,
+        expected: say.Expectation | None = None,
+        roll_duration: float = 0.0,
+    ) -> say.Done:
+        """Carry out a step of an insertion: roll (rad) in `roll_duration` s, then travel (mm or rad by axis) in
+        `duration` s, or as soon after that as the axes can."""
+        return self._carry_out(
+            lambda number: say.Step(number, roll, travel, duration, expected, roll_duration)
+        )
+
+    def move_to(self, axis: str, position: float, speed: float | None = None) -> say.Done:
+        """Move one axis alone to a position (mm or rad), at its largest speed or slower (mm/s or rad/s)."""
+        return self._go(axis, position, speed, retract=False)
+
+    def retract(self, position: float, speed: float | None = None) -> say.Done:
+        """Withdraw the base to a position of the insertion axis (mm)."""
+        return self._go("insertion", position, speed, retract=True)
+
+    def home(self, axis: str) -> say.Done:
+        """Find the home of an axis. The rig has to be armed again after it."""
+        return self._arrived(lambda number: say.Home(number, axis))
+
+    def wait(self, seconds: float) -> None:
+        """Wait while nothing moves."""
+        until = monotonic() + seconds
+        self._wait(lambda: monotonic() >= until, seconds + 1.0, "the clock does not advance", every=seconds)
+
+    def _go(self, axis: str, position: float, speed: float | None, *, retract: bool) -> say.Done:
+        fastest = self._known(axis).speed if speed is None else speed
+        return self._arrived(lambda number: say.Go(number, axis, position, fastest, retract))
+
+    def _arrived(self, made: Callable[[int], say.Request]) -> say.Done:
+        """Carry out a motion. Raises DriverError if it ended before its goal."""
+        done = self._carry_out(made)
+        if done.why:
+            raise DriverError(done.why)
+        return done
+
+    def _known(self, axis: str) -> Axis:
+        found = dict(self._task.rig.axes.items())
+        if axis not in found:
+            raise RefusedError(f"the rig has no axis {axis}; axes: {', '.join(found)}")
+        return found[axis]
+
+    def _carry_out(self, made: Callable[[int], say.Request]) -> say.Done:
+        self._check_follower()  # before anything begins to move
+        self._number += 1
+        number = self._number
+        self._send(made(number))
+        self._wait(lambda: number in self._answers, inf, "")
+        answer = self._answers.pop(number)
+        if isinstance(answer, say.Refused):
+            self._check(answer.state, answer.cause)
+            raise RefusedError(answer.why)
+        self._check(answer.state, answer.why)
+        return answer
+
+    def _check_follower(self) -> None:
+        """Raise what a follower of reports has raised: what it was to do is not done. The rig can still be stopped."""
+        if self._failed is not None:
+            self._failure_raised = True
+            raise self._failed
+
+    def _ask(self, request: say.Request) -> None:
+        """Have a request acted on, and return with the report of it. Raises RefusedError if it is refused."""
+        self._answers.pop(0, None)
+        sent = self._send(request)
+        self._wait(lambda: self.report.requests >= sent, _END_S, "no answer to a request", stopped=True)
+        if isinstance(refused := self._answers.pop(0, None), say.Refused):
+            raise RefusedError(refused.why)
+
+    # Waiting
+
+    def _send(self, message: Any, *, lost: bool = False) -> int:
+        """Send a message; return how many requests were sent with it."""
+        try:
+            with uninterrupted(), self._sending:
+                self._connection.send(message)
+                self._sent += 1
+        except OSError:
+            if not lost:
+                raise self._end() from None
+        return self._sent
+
+    def _end(self) -> DriverError:
+        """The error after the supervisor's end: its reason alone, such as that of a device, if the rig did not open."""
+        if self._unopened:
+            return DriverError(self._unopened)
+        return DriverError(f"the supervisor has ended{f': {self._ended}' if self._ended else ''}")
+
+    def _wait(
+        self,
+        condition: Callable[[], bool],
+        limit: float,
+        problem: str,
+        *,
+        stopped: bool = False,
+        every: float = _HEARTBEAT_S,
+    ) -> None:
+        """Wait for a condition, with heartbeats. stopped: whether it can come about in a rig that is stopped.
+
+        Raises DriverError: the limit (s) is reached, or the supervisor has ended or hangs.
+        """
+        until = monotonic() + limit
+        over = False
+        while not self._came(condition, until, stopped=stopped, every=every):
+            if over:
+                raise DriverError(f"{problem}: waited for {limit:g} s")
+            over = monotonic() > until  # looked at once more
+
+    def _came(self, condition: Callable[[], bool], until: float, *, stopped: bool, every: float) -> bool:
+        """Whether a condition has come about, or after a wait for a report and a heartbeat may have."""
+        with self._locked():
+            if condition():
+                return True
+            if self._ended is not None:
+                raise self._end()
+            if not stopped:
+                self._check_follower()
+            if self._latest is not None:
+                silent = monotonic() - self._latest_at
+                if silent > _SILENT_S and not self._late_reports():
+                    raise DriverError(f"the supervisor has not reported for {silent:.1f} s")
+                if not stopped:
+                    self._check(self._latest.state, self._latest.why)
+            self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - monotonic())))
+            if self._latest is not None:
+                self._send(say.Heartbeat())
+        return False
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """The lock of what the thread has received, which an interrupt must not leave locked."""
+        with uninterrupted(), self._changed:
+            yield
+
+    def _late_reports(self) -> bool:
+        """Whether reports are there that this process has had no time to take."""
+        before = self._latest_at
+        self._changed.wait(_PATIENCE_S)
+        return self._latest_at > before
+
+    @staticmethod
+    def _check(state: State, why: str) -> None:
+        if state is State.FAULT:
+            raise DriverError(why)
+        if state is State.STOPPED:
+            raise StoppedError(f"stopped: {why}")
+
+    def _stopped(self, sent: int) -> bool:
+        """Whether the rig has acted on these requests, and its motors rest."""
+        report = self.report
+        return report.requests >= sent and report.at_rest and report.state in (State.STOPPED, State.FAULT)
+
+    # The thread
+
+    def _receive(self) -> None:
+        why = "it was killed"
+        while True:
+            try:
+                message = self._connection.recv()
+            except (EOFError, OSError):
+                break
+            if isinstance(message, say.Ended):
+                why = message.why
+                self._unopened = why if self._latest is None else ""
+                break
+            self._take(message)
+        with self._changed:
+            self._ended = why
+            self._changed.notify_all()
+
+    def _take(self, message: say.Report | say.Done | say.Refused) -> None:
+        with self._changed:
+            match message:
+                case say.Report():
+                    self._latest, self._latest_at = message, monotonic()
+                    self._measurements.extend(message.measurements)
+                case _:
+                    self._answers[message.number] = message
+            self._changed.notify_all()
+        if self._on_report is not None and isinstance(message, say.Report):
+            try:
+                self._on_report(message)
+            except Exception as error:  # noqa: BLE001  raised where the client waits: this thread must go on
+                with self._changed:
+                    self._failed = self._failed or error
+                    self._changed.notify_all()
+
+
+def _position(measurement: Measurement) -> Point | None:
+    """Position (mm) of a measurement, z = 0 in the plane; None if it is not measured."""
+    x, y, z = measurement.x, measurement.y, 0.0 if measurement.z is None else measurement.z
+    return None if x is None or y is None or not all(map(isfinite, (x, y, z))) else (x, y, z)

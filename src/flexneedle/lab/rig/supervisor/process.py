@@ -1,0 +1,167 @@
+"""The process of the supervisor: `python -m flexneedle.lab.rig.supervisor.process DESCRIPTORS`.
+
+Its sockets come from the client, which starts it: for requests, and for signals that the client gets. It ticks on the
+monotonic clock: a tick that comes too late for the next one is counted, and left out. It is a process because a planner
+that keeps Python busy would delay ticks, and so that either one may be killed: without the client it stops the motors
+and ends, and without it motors stop at the end of what is queued.
+"""
+
+import gc
+import socket
+import sys
+from contextlib import ExitStack, closing
+from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
+from threading import Thread
+from time import monotonic
+from typing import Any
+
+from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.lock import held
+from flexneedle.lab.rig.devices.priority import set_realtime_priority
+from flexneedle.lab.rig.devices.registry import address_of, open_motors, open_tracker
+from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor.core import Supervisor
+from flexneedle.lab.rig.supervisor.dry import DryMotors
+from flexneedle.lab.rig.supervisor.signals import listen, named
+from flexneedle.lab.rig.supervisor.suspension import LONGEST_S, Suspension
+from flexneedle.scenario.problems import unexpected
+from flexneedle.types import Frame
+
+_MOST_WAITING = 400  # reports that a client has not taken: 10 s
+_REST_S = 2.0  # longest wait for motors to rest before the end
+
+
+class Outbox:
+    """Messages to the client, sent by a thread: a client that does not read delays nothing, and loses reports."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._waiting = connection, SimpleQueue[Any]()
+        self._thread = Thread(target=self._send, name="outbox", daemon=True)
+        self._thread.start()
+
+    def put(self, message: Any) -> None:
+        """Send a message, later."""
+        if not isinstance(message, say.Report) or self._waiting.qsize() < _MOST_WAITING:
+            self._waiting.put(message)
+
+    def close(self) -> None:
+        """Send what waits, within a second."""
+        self._waiting.put(None)
+        self._thread.join(1.0)
+
+    def _send(self) -> None:
+        while (message := self._waiting.get()) is not None:
+            try:
+                self._connection.send(message)
+            except OSError:  # the client is gone, which the ticks notice
+                return
+
+
+class Untracked:
+    """No tracker, for motions of the operator."""
+
+    status = "not opened"
+
+    def read(self) -> tuple[Frame, ...]:
+        """No frames."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def main(requests: int, received: int, sent: int) -> None:
+    """Serve the client until it closes or ends. received, sent: the ends of the socket of signals."""
+    connection, signals = Connection(requests), listen(received, sent)
+    task = connection.recv()
+    outbox = Outbox(connection)
+    why = "the supervisor failed"
+    try:
+        why = _serve(connection, task, outbox, signals)
+    except FlexneedleError as error:
+        why = one_line(error)
+    except Exception as error:
+        why = f"the supervisor failed: {unexpected(error)}"
+        raise
+    finally:
+        outbox.put(say.Ended(why))
+        outbox.close()
+
+
+def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: socket.socket) -> str:
+    """Open the devices, tick until the end, and return its reason."""
+    clock = WallClock(start=task.started)
+    with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
+        if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
+            stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
+        tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
+        tracker = stack.enter_context(closing(tracked))
+        motors = DryMotors(connected, clock) if task.dry else connected
+        answers: list[Any] = []
+        core = Supervisor(task, motors, tracker, clock, answers.append)
+        set_realtime_priority()
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # nothing here makes cycles; a collection would delay a tick
+        try:
+            return _tick(connection, core, answers, outbox, signals, 1.0 / task.rig.loop.rate_hz)
+        finally:
+            motors.stop()
+
+
+def _tick(
+    connection: Connection,
+    core: Supervisor,
+    answers: list[Any],
+    outbox: Outbox,
+    signals: socket.socket,
+    period: float,
+) -> str:
+    """Tick until the client ends; return why.
+
+    answers: what the core has to say. The report of a tick is sent before them: a client that gets the end of a motion
+    has the positions after it.
+    """
+    due, missed, ending, why = monotonic(), 0, None, ""
+    suspension = Suspension()
+    while ending is None or (monotonic() < ending and not core.at_rest):
+        sources: list[Any] = [signals] if ending is not None else [signals, connection]
+        ready = wait(sources, max(0.0, due - monotonic()))
+        if (seconds := suspension.since()) > LONGEST_S:  # before anything that was requested is done
+            core.stop(f"the computer was suspended for {seconds:.1f} s")
+        if signals in ready and (names := named(signals.recv(64))):
+            core.stop(f"signal {names}")
+        if connection in ready:
+            try:
+                closed = _requested(connection, core)
+            except (EOFError, OSError):
+                closed, why = True, "the controller has ended"
+            if closed:
+                core.stop(why or "closed")
+                ending = monotonic() + _REST_S
+        late = monotonic() - due
+        if late >= 0.0:
+            begun, skipped = monotonic(), int(late / period)
+            missed += skipped
+            due += period * (1 + skipped)
+            core.tick()
+            outbox.put(core.report(late, monotonic() - begun, missed))
+        while answers:
+            outbox.put(answers.pop(0))
+    return why
+
+
+def _requested(connection: Connection, core: Supervisor) -> bool:
+    """Act on what the client has sent; True at the request to end."""
+    while connection.poll():
+        request = connection.recv()
+        if isinstance(request, say.Close):
+            return True
+        core.request(request)
+    return False
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

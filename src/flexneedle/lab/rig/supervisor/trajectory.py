@@ -1,0 +1,88 @@
+"""A motion of several motors over time: all start and end together, with one trapezoid of speed. Pure functions.
+
+With accelerating time h of a motion that takes T, a motor that travels d has the largest speed d/(T − h) and the
+acceleration d/((T − h) h). T and h are the smallest that keep the limits of every axis.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flexneedle.lab.rig.supervisor.drives import Drive
+
+_SHORTEST_S = 1e-3
+_ROUNDING = 1e-9
+_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion: motor positions at start and goal by channel (counts), its duration and accelerating time (s)."""
+
+    start: Mapping[str, float]
+    goal: Mapping[str, float]
+    duration: float
+    ramp: float
+
+    def share(self, time: float) -> float:
+        """Share of the way that is done `time` (s) after the start."""
+        if time <= 0.0:
+            return 0.0
+        if time >= self.duration:
+            return 1.0
+        near = min(time, self.duration - time)
+        cruise = self.cruise
+        part = near**2 / (2.0 * self.ramp * cruise) if near < self.ramp else (near - 0.5 * self.ramp) / cruise
+        return part if near == time else 1.0 - part
+
+    def at(self, share: float) -> dict[str, float]:
+        """Positions (counts) by channel with this share of the way done."""
+        if share == 1.0:  # exactly, without rounding
+            return dict(self.goal)
+        return {name: begin + share * (self.goal[name] - begin) for name, begin in self.start.items()}
+
+    @property
+    def cruise(self) -> float:
+        """Time (s) of the whole way at its largest speed."""
+        return self.duration - self.ramp
+
+    @property
+    def speeds(self) -> dict[str, float]:
+        """Largest speed (counts/s) by channel."""
+        return {name: abs(self.goal[name] - begin) / self.cruise for name, begin in self.start.items()}
+
+
+def between(
+    drives: Mapping[str, Drive], start: Mapping[str, float], goal: Mapping[str, float], duration: float
+) -> Trajectory:
+    """The motion from start to goal (counts by channel) within `duration` s, or longer where an axis cannot keep that.
+
+    drives: by channel, those that move.
+    """
+    travels = [
+        (abs((goal[channel] - start[channel]) / drive.axis.scale), drive.axis)
+        for channel, drive in drives.items()
+    ]
+    fastest = (shortest(travel, axis.speed, axis.acceleration) for travel, axis in travels)
+    total = max(duration, _SHORTEST_S, *fastest)
+    ramp = 0.5 * total
+    for _ in range(_ROUNDS):
+        ramp = max(_SHORTEST_S / 4, *(_ramp(travel, axis.acceleration, total) for travel, axis in travels))
+        needed = max(travel / axis.speed for travel, axis in travels) + ramp
+        if needed <= total * (1.0 + _ROUNDING):
+            break
+        total = needed
+    return Trajectory(dict(start), dict(goal), total, ramp)
+
+
+def shortest(travel: float, speed: float, acceleration: float) -> float:
+    """Shortest duration (s) of a travel with this largest speed and acceleration."""
+    if travel > speed**2 / acceleration:
+        return travel / speed + speed / acceleration
+    return 2.0 * math.sqrt(travel / acceleration)
+
+
+def _ramp(travel: float, acceleration: float, duration: float) -> float:
+    """Smallest h with travel/((T − h) h) ≤ acceleration."""
+    left = duration**2 - 4.0 * travel / acceleration
+    return 0.5 * (duration - math.sqrt(max(0.0, left)))

@@ -1,0 +1,135 @@
+"""The rig's end of its ROS node. No call waits, but for the start."""
+
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib.util import find_spec
+from select import select
+from time import monotonic
+from typing import Self
+
+from flexneedle.errors import InputError, RunError
+from flexneedle.lab.processes import end_process, last_line
+from flexneedle.lab.ros.pipe import Pipe
+from flexneedle.lab.ros.profile import OF_THE_LOOP, Profile
+from flexneedle.lab.ros.records import Beat, Lost, Published, Request, RigState, Setup, Target
+from flexneedle.types import VISIBLE, Period, Plan
+
+_START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
+
+
+def check_installed() -> None:
+    """Raises InputError if cyclonedds is not installed."""
+    if find_spec("cyclonedds") is None:
+        raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
+
+
+def open_node(profile: Profile, *, epoch: float = 0.0) -> "NodeClient":
+    """Start the node of an insertion: it publishes what the profile lists, and reads stop, arm and target.
+
+    epoch: Unix time (s) of the records' time 0, for the stamps of messages (default: stamps are the records' times).
+    Raises InputError if cyclonedds is not installed or ROS_DOMAIN_ID is invalid, RunError if the node does not start.
+    """
+    publish, subscribe = OF_THE_LOOP
+    return NodeClient(profile.only(publish, subscribe), epoch=epoch)
+
+
+class NodeClient:
+    """A node that publishes and reads all that its profile lists. Use it as a context manager, or call `close`.
+
+    subscribers, publishers: how many nodes have each topic, by key of `publish` and `subscribe`, as of the last `poll`.
+    """
+
+    def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
+        check_installed()
+        ours, theirs = socket.socketpair()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the node
+        command = [sys.executable, "-m", "flexneedle.lab.ros.node", "--fd", str(theirs.fileno())]
+        # In a separate session, so that Ctrl-C reaches only the rig.
+        self._process = subprocess.Popen(
+            command, pass_fds=(theirs.fileno(),), stderr=self._errors, start_new_session=True
+        )
+        theirs.close()
+        self._pipe, self._lost = Pipe(ours), ""
+        self._beat_at: float | None = None
+        self._early: list[Request] = []
+        self.subscribers: Mapping[str, int] = {}
+        self.publishers: Mapping[str, int] = {}
+        self._pipe.send(Setup(profile, epoch))
+        try:
+            self._await_ready()
+        except BaseException:  # also on Ctrl-C: the process must end
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def publish(self, record: Plan | Period | Published) -> None:
+        """Publish a record. Where the node does not keep up, the oldest periods and joint targets are dropped."""
+        light = replace(record, shapes=record.shapes[:0], history=()) if isinstance(record, Plan) else record
+        self._pipe.send(light, keep=isinstance(record, Plan | Target | RigState))
+
+    def poll(self) -> list[Request]:
+        """What was received since the last call, oldest first. A `Lost` is the last record of all."""
+        self._pipe.flush()
+        requests, self._early = self._early, []
+        for record in self._pipe.receive():
+            if isinstance(record, Beat):
+                self._beat_at = record.time
+                self.subscribers, self.publishers = record.subscribers, record.publishers
+            else:
+                requests.append(record)
+        if not self._lost and (reason := self._silent()):
+            requests.append(Lost(monotonic(), reason))
+        self._lost = next((one.reason for one in requests if isinstance(one, Lost)), self._lost)
+        return requests
+
+    def wait(self, seconds: float) -> None:
+        """Wait until something is received, at most for `seconds`."""
+        select([self._pipe.socket], [], [], seconds)
+
+    @property
+    def status(self) -> str:
+        """VISIBLE while the node shows signs of life, else the reason in a few words."""
+        return self._lost or self._silent() or VISIBLE
+
+    @property
+    def pid(self) -> int:
+        """Identifier of the node's process."""
+        return self._process.pid
+
+    @property
+    def dropped(self) -> int:
+        """Records that were not published, because the node did not keep up."""
+        return self._pipe.dropped
+
+    def close(self) -> None:
+        """End the node."""
+        self._pipe.close()
+        end_process(self._process, _STOP_S)
+        self._errors.close()
+
+    def _silent(self) -> str:
+        """Why nothing is received any more, or ""."""
+        if self._pipe.ended:
+            words = last_line(self._errors)
+            return f"the ROS node has ended: {words}" if words else "the ROS node has ended"
+        silent = 0.0 if self._beat_at is None else monotonic() - self._beat_at
+        return f"the ROS node does not answer for {silent:.1f} s" if silent > _SILENT_S else ""
+
+    def _await_ready(self) -> None:
+        deadline = monotonic() + _START_S
+        while self._beat_at is None:
+            if monotonic() > deadline:
+                raise RunError(f"the ROS node has not started within {_START_S:g} s")
+            select([self._pipe.socket], [], [], 0.1)
+            self._early = self.poll()  # a stop may come first
+            if self._lost:
+                raise RunError(self._lost)

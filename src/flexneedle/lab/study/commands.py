@@ -1,0 +1,237 @@
+"""`flexneedle study`: run many insertions on all cores or on a cluster and write tables."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import compile_first, print_json
+
+if TYPE_CHECKING:
+    from flexneedle.cli.progress import Progress
+    from flexneedle.lab.study.grid import Study
+    from flexneedle.lab.study.runner import Advance
+
+
+_TABLE_WIDTH = 120  # at least, so that rows are not wrapped in a file
+_STAGES = ("Planning", "Inserting")
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = add_command(
+        commands,
+        "study",
+        "run many insertions and write their results to tables",
+        _study,
+        "flexneedle study phantom --out runs/accuracy",
+        "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
+    )
+    parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path to a TOML file")
+    parser.add_argument(
+        "--worlds",
+        nargs=2,
+        type=int,
+        metavar=("FROM", "COUNT"),
+        help="number of the first world and count, for a study of worlds (default: as in the study file)",
+    )
+    parser.add_argument(
+        "--workers", type=_workers, metavar="N", help="number of local processes (default: one per core)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="run on the Dask cluster at this scheduler address"
+    )
+    parser.add_argument("--resume", action="store_true", help="resume the study in --out")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+
+
+def _workers(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) >= 1):
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, at least 1")
+    return int(text)
+
+
+def _study(args: argparse.Namespace) -> int:
+    from flexneedle.cli.progress import Progress
+    from flexneedle.errors import InputError, RunError
+    from flexneedle.files import new_folder
+    from flexneedle.lab.study.grid import load_study
+    from flexneedle.lab.study.pools import check_address
+    from flexneedle.lab.study.runner import run_study
+
+    if args.resume and args.out is None:
+        raise InputError("--resume needs the folder of the study: add --out DIR")
+    if args.workers is not None and args.scheduler is not None:
+        raise InputError("--workers sets local processes: remove it, or remove --scheduler")
+    if args.scheduler is not None:
+        check_address(args.scheduler)
+    study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
+    folder = args.out or new_folder("study", study.name)
+    compile_first(*study.axes)
+    begun = time.monotonic()
+    try:
+        with Progress() as progress:
+            progress.print_line(f"{study.title}: {len(study)} insertions, folder {folder}")
+            run_study(
+                study,
+                folder,
+                workers=args.workers,
+                scheduler=args.scheduler,
+                resume=args.resume,
+                on_advance=_StudyProgress(progress).advance,
+                on_no_workers=lambda: progress.print_line(f"{args.scheduler}: no workers yet, waiting"),
+                command=_command(args, folder),
+            )
+    except KeyboardInterrupt:
+        print(f"flexneedle: interrupted; resume with: {_command(args, folder, '--resume')}", file=sys.stderr)
+        return 130
+    except RunError as error:
+        raise RunError(f"{error}: {_command(args, folder, '--resume')}") from error
+    return _report(study, folder, args.json, time.monotonic() - begun)
+
+
+def _command(args: argparse.Namespace, folder: Path, *options: str) -> str:
+    """The command line, with the folder and further options."""
+    words = ["flexneedle", "study", args.study]
+    words += ["--worlds", *map(str, args.worlds)] if args.worlds is not None else []
+    words += ["--workers", str(args.workers)] if args.workers is not None else []
+    words += ["--scheduler", args.scheduler] if args.scheduler is not None else []
+    return shlex.join([*words, "--out", str(folder), *options])
+
+
+class _StudyProgress:
+    """Shows the progress reports of the runner, with rate and remaining time."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._planning, self._inserting = _Pace(), _Pace()
+        self._planned = False  # whether completed planning has been shown
+
+    def advance(self, advance: Advance) -> None:
+        planning, inserting = _STAGES
+        if not self._planned:
+            self._planned = advance.plans == advance.all_plans
+            left = self._planning.left(advance.plans, advance.all_plans)
+            note = f"{advance.plans} of {advance.all_plans} plans{left}"
+            total = max(advance.all_plans, 1)
+            self._progress.show(planning, total if self._planned else advance.plans, total, note)
+        note = f"{advance.insertions} of {advance.all_insertions}"
+        note += self._inserting.left(advance.insertions, advance.all_insertions)
+        note += f", {advance.unfinished} not finished" if advance.unfinished else ""
+        self._progress.show(inserting, advance.insertions, advance.all_insertions, note)
+
+
+class _Pace:
+    """Rate of a stage, timed from its first completed item; earlier runs and other stages do not count."""
+
+    def __init__(self) -> None:
+        self._before: int | None = None  # completed by an earlier run of the study
+        self._first: tuple[float, int] | None = None  # time and count at the first completion
+
+    def left(self, done: int, total: int) -> str:
+        """Return rate and remaining time to append to a note; empty while unknown."""
+        rate = self._rate(time.monotonic(), done)
+        return f", {rate:.2g}/s, {_duration((total - done) / rate)} left" if rate else ""
+
+    def _rate(self, now: float, done: int) -> float:
+        if self._before is None:
+            self._before = done
+        if self._first is None and done > self._before:
+            self._first = now, done
+        begun, first = self._first or (now, done)
+        return (done - first) / (now - begun) if now > begun else 0.0
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
+    from flexneedle.lab.study.summary import summarise
+    from flexneedle.scenario.problems import printable
+
+    summary = summarise(folder, study)
+    summary["time"]["wall_s"] = seconds
+    if as_json:
+        print_json(summary)
+    else:
+        _table(summary)
+    if "done" in summary["outcomes"]:
+        return 0
+    if summary["first_failure"] is not None:
+        message = printable(summary["first_failure"])
+        print(f"flexneedle: no insertion finished; the first failure: {message}", file=sys.stderr)
+    return 1
+
+
+def _table(summary: Mapping[str, Any]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(soft_wrap=True, highlight=False)
+    console.width = max(console.width, _TABLE_WIDTH)
+    table = Table(box=box.SIMPLE, show_edge=False)
+    heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="right" if number else "left")
+    for name, part in ((_label(group["settings"]), group) for group in summary["groups"]):
+        table.add_row(*map(Text, (name, *_cells(part))))
+    table.add_row(*map(Text, ("all", *_cells(summary))))
+    spent, unconverged = summary["time"], summary["unconverged_periods"]
+    console.print(Text(summary["title"], style="bold"), table, sep="\n\n")
+    console.print(
+        "\nFinished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
+        "periods, relative to the plan."
+    )
+    if summary["coverage"]["tip"]["half"] is not None:
+        shares = "; ".join(f"{part} {_percents(of)}" for part, of in summary["coverage"].items())
+        console.print(f"Within ±1.96 sd of the prediction at ¼, ½ and ¾ of the depth: {shares}.")
+    if unconverged:
+        console.print(
+            f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet."
+        )
+    console.print(
+        f"Time, all workers: planning {spent['plan_s']:.1f} s, control {spent['control_s']:.1f} s, "
+        f"plant {spent['plant_s']:.1f} s, other {spent['rest_s']:.1f} s; wall-clock time {spent['wall_s']:.1f} s"
+    )
+    console.print(Text(f"Tables: {summary['folder']}"))
+
+
+def _label(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" if "." in key else str(value) for key, value in settings.items())
+
+
+def _cells(part: Mapping[str, Any]) -> Sequence[str]:
+    error, periods = part["true_error_mm"], part["period_ratio"]
+    done = part["outcomes"].get("done", 0)
+    return (
+        f"{done} of {part['insertions']}",
+        f"{_number(error['mean'])} ± {_number(error['sd'])}",
+        *(_number(error[name]) for name in ("median", "p95", "max")),
+        f"{_number(part['flips'], 1)} ({_number(part['planned_flips'], 1)})",
+        _number(part["energy_ratio"], 2),
+        _number(periods["max"], 2),
+    )
+
+
+def _percents(shares: Mapping[str, float | None]) -> str:
+    """Shares as text in one unit, "–" where unknown."""
+    texts = ("–" if share is None else f"{100.0 * share:.0f}" for share in shares.values())
+    return f"{', '.join(texts)} %"
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,273 @@
+"""Statistics of the rows of a study: groups, paired differences, endings, worst insertions."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+from math import isnan, nan
+
+import numpy as np
+
+from flexneedle.lab.study.findings.design import Design, Factor
+from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Codes, Flags, Floats, Rows
+from flexneedle.lab.study.findings.statistics import (
+    IntervalEstimate,
+    beyond_largest,
+    estimates,
+    mean,
+    quantile,
+    ratio,
+    sd,
+)
+
+DONE = "done"
+HIT_MM = 1.0  # radius of the paper's target circles
+_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
+_NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Insertions with the same levels of the factors.
+
+    name: levels in one line; levels: name of the level by factor; count, finished: insertions; known: finished
+    insertions with a known true error; missed: those that ended more than 1 mm from the target; unconverged: insertions
+    with a period that did not converge, finished or not; unconverged_periods: number of such periods; seeds: number of
+    distinct seeds; largest_mm: largest true error; largest_period_ratio: largest number of periods relative to the
+    plan; beyond_largest: upper bound (95 % confidence) on the share of all insertions beyond largest_mm; estimates: by
+    name, over finished insertions.
+    """
+
+    name: str
+    levels: dict[str, str]
+    count: int
+    finished: int
+    known: int
+    missed: int
+    unconverged: int
+    unconverged_periods: int
+    seeds: int
+    largest_mm: float
+    largest_period_ratio: float
+    beyond_largest: float
+    estimates: dict[str, IntervalEstimate]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean paired difference (mm) of true errors, `name` minus `against`, between insertions otherwise identical.
+
+    pairs: both finished; left_out: pairs with an unfinished insertion; verdict: "better" if the interval of the
+    difference is below 0, "worse" if above, otherwise "not separable"; None without an interval.
+    """
+
+    name: str
+    against: str
+    controller: str
+    pairs: int
+    left_out: int
+    mean_mm: IntervalEstimate
+    verdict: str | None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Endings with the same outcome and kind of reason: count, first row, and its reason."""
+
+    outcome: str
+    count: int
+    first: int
+    reason: str
+
+
+def finished(rows: Rows) -> Flags:
+    """Return which rows (n,) finished."""
+    return np.array([outcome == DONE for outcome in rows.text("outcome")], dtype=bool)
+
+
+def groups_of(rows: Rows, factors: Sequence[Factor]) -> list[Group]:
+    """Return a group for each combination of levels that occurs, in the order of the factors."""
+    done, title = finished(rows), {f.key: dict(zip(f.names, f.titles, strict=True)) for f in factors}
+    return [
+        _group(rows, members, done, ", ".join(title[key][name] for key, name in levels.items()), levels)
+        for levels, members in members_of(factors)
+    ]
+
+
+def members_of(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Codes]]:
+    """Yield each combination of levels, by key of the factor, with its rows, in the order of the factors."""
+    combined = np.stack([factor.codes for factor in factors], axis=1)
+    levels, codes = np.unique(combined, axis=0, return_inverse=True)
+    for number, chosen in enumerate(levels.tolist()):
+        names = {factor.key: factor.names[k] for factor, k in zip(factors, chosen, strict=True)}
+        yield names, np.flatnonzero(codes.ravel() == number)
+
+
+def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str, str]) -> Group:
+    ended = members[done[members]]
+    error = rows.number("true_error_mm")[ended]
+    known = error[~np.isnan(error)]
+    seeds = rows.codes("seed")[ended]
+    unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
+    ratios = quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
+    return Group(
+        name=name,
+        levels=levels,
+        count=len(members),
+        finished=len(ended),
+        known=len(known),
+        missed=int((known > HIT_MM).sum()),
+        unconverged=int((unconverged > 0).sum()),
+        unconverged_periods=int(unconverged.sum()),
+        seeds=len(np.unique(seeds)),
+        largest_mm=_largest(known),
+        largest_period_ratio=_largest(ratios[~np.isnan(ratios)]),
+        beyond_largest=beyond_largest(len(known)),
+        estimates=_estimates(rows, ended, seeds),
+    )
+
+
+def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, IntervalEstimate]:
+    def column(name: str) -> Floats:
+        return rows.number(name)[ended]
+
+    error = column("true_error_mm")
+    energy, planned_energy = column("strain_energy_mj"), column("planned_strain_energy_mj")
+    statistics = {
+        "mean_mm": mean(error),
+        "sd_mm": sd(error),
+        "median_mm": quantile(error, 0.5),
+        "p95_mm": quantile(error, 0.95),
+        "residual_mm": mean(column("residual_mm")),
+        "flips": mean(column("flips")),
+        "planned_flips": mean(column("planned_flips")),
+        "energy_mj": mean(energy),
+        "planned_energy_mj": mean(planned_energy),
+        "energy_ratio": ratio(energy, planned_energy),
+        "period_ratio": ratio(column("periods"), column("planned_periods")),
+    }
+    return estimates(statistics, _dense(seeds))
+
+
+def controller_differences(rows: Rows, design: Design, among: Flags | None = None) -> list[Difference]:
+    """Return the first controller minus each other one, in insertions with the same seed, target and settings.
+
+    among (n,): rows to compare (default: all).
+    """
+    chosen = np.ones(len(rows), dtype=bool) if among is None else among
+    keys, controller = pair_keys(rows, design.besides(design.controller)), design.controller
+    ours, *others = (chosen & (controller.codes == k) for k in range(len(controller.names)))
+    return [
+        _difference(rows, keys, (ours, theirs), (controller.names[0], name, ""))
+        for theirs, name in zip(others, controller.names[1:], strict=True)
+    ]
+
+
+def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
+    """Return `controller_differences` at each target depth, by the name of the depth."""
+    depth = depths(rows)
+    return {
+        name: controller_differences(rows, design, depth.codes == k) for k, name in enumerate(depth.names)
+    }
+
+
+def case_differences(rows: Rows, design: Design) -> list[Difference]:
+    """Return each case minus the base case, the first, for each controller."""
+    keys, cases = pair_keys(rows, design.besides(design.cases)), design.cases
+    return [
+        _difference(rows, keys, ((cases.codes == case) & own, (cases.codes == 0) & own), names)
+        for number, name in enumerate(design.controller.names)
+        for own in (design.controller.codes == number,)
+        for case in range(1, len(cases.names))
+        for names in ((cases.names[case], cases.names[0], name),)
+    ]
+
+
+def depths(rows: Rows) -> Factor:
+    """Return the target depth as a factor; many depths are grouped into bands."""
+    depth = rows.number("target_depth_mm")
+    levels, codes = np.unique(depth, return_inverse=True)
+    names = [f"{level:g}" for level in levels.tolist()]
+    if len(levels) > _MOST_DEPTHS:
+        edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
+        used, codes = np.unique(np.searchsorted(edges[1:-1], depth, side="right"), return_inverse=True)
+        names = [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
+    positions = np.arange(len(names), dtype=float)
+    return Factor("depth", "target depth (mm)", tuple(names), tuple(names), positions, codes)
+
+
+def endings(rows: Rows) -> list[Ending]:
+    """Return the endings of insertions that did not finish, or finished with a remark, the most frequent first.
+
+    Reasons that differ only in numbers are grouped.
+    """
+    found: dict[tuple[str, str], list[int]] = {}
+    reasons = rows.text("reason")
+    for row, outcome in enumerate(rows.text("outcome")):
+        if outcome != DONE or reasons[row]:
+            found.setdefault((outcome, _NUMBER.sub("#", reasons[row])), []).append(row)
+    kinds = [Ending(outcome, len(at), at[0], reasons[at[0]]) for (outcome, _), at in found.items()]
+    return sorted(kinds, key=lambda kind: (kind.outcome == DONE, -kind.count))
+
+
+def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]:
+    """Return the rows with the largest true error minus reach, finished or not, the largest first.
+
+    An unknown reach counts as 0; among (n,): rows to consider (default: all).
+    """
+    excess = rows.number("true_error_mm") - np.nan_to_num(rows.number("reach_mm"))
+    excess = excess if among is None else np.where(among, excess, nan)
+    order = np.argsort(-excess, kind="stable")  # NaN last
+    return [int(row) for row in order[:number] if not isnan(excess[row])]
+
+
+def _difference(
+    rows: Rows, keys: Codes, sides: tuple[Flags, Flags], names: tuple[str, str, str]
+) -> Difference:
+    error, done = rows.number("true_error_mm"), finished(rows)
+    one, other = (_by_key(keys, np.flatnonzero(side)) for side in sides)
+    both = np.array([(one[key], other[key]) for key in one if key in other], dtype=np.int64).reshape(-1, 2)
+    known = (done & ~np.isnan(error))[both].all(axis=1)
+    pairs = both[known]
+    difference = error[pairs[:, 0]] - error[pairs[:, 1]]
+    found = estimates({"mean": mean(difference)}, _dense(rows.codes("seed")[pairs[:, 0]]))["mean"]
+    name, against, controller = names
+    return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _verdict(found))
+
+
+def _verdict(difference: IntervalEstimate) -> str | None:
+    if isnan(difference.low):
+        return None
+    if difference.high < 0.0:
+        return "better"
+    return "worse" if difference.low > 0.0 else "not separable"
+
+
+def pair_keys(rows: Rows, factors: Sequence[Factor]) -> Codes:
+    """Return an integer key (n,) for each row, equal for rows with the same seed, target, repeat and factors."""
+    names = ("seed", "plan_seed", *TARGET_COLUMNS, "repeat")
+    columns = np.stack([*map(rows.codes, names), *(factor.codes for factor in factors)], axis=1)
+    return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
+
+
+def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
+    """Return rows by key and occurrence of the key, so that no row is paired twice."""
+    occurrences: dict[int, count[int]] = {}
+    return {
+        (key, next(occurrences.setdefault(key, count()))): row
+        for key, row in zip(keys[members].tolist(), members.tolist(), strict=True)
+    }
+
+
+def _dense(codes: Codes) -> Codes:
+    return np.unique(codes, return_inverse=True)[1].astype(np.int64)
+
+
+def quotient(over: Floats, under: Floats) -> Floats:
+    """Return `over / under` (n,), NaN where `under` is not positive or unknown."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(under > 0, over / under, nan)
+
+
+def _largest(values: Floats) -> float:
+    return float(values.max()) if len(values) else nan

@@ -1,0 +1,166 @@
+"""The folder of a study: `study.json`, `journal.jsonl`, `plans/`, and the tables, written at the end.
+
+`study.json` contains the definition of the study, the package versions and the first command. It is written once.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import InputError, one_line
+from flexneedle.files import RUNS, new_folder, replace_file
+from flexneedle.lab.study.grid import Study, StudyInsertion, recorded_study
+from flexneedle.lab.study.journal import Journal, read_rows
+from flexneedle.record.folder import STUDY_FILE, versions
+from flexneedle.record.plain import to_text
+from flexneedle.scenario.dotted import flatten
+from flexneedle.scenario.problems import printable, unexpected
+
+JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
+_FORMAT = 1
+_SOURCE = "versions.source"
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A study in its folder, finished or not. versions: those it was made with; own: digests of its own modules;
+    rows: those that are finished, by index.
+    """
+
+    folder: Path
+    study: Study
+    versions: Mapping[str, str]
+    own: Mapping[str, str]
+    rows: Mapping[int, Mapping[str, Any]]
+
+    def insertion(self, index: int) -> StudyInsertion:
+        """Return the insertion of a row. Raises InputError if this version does not accept its settings."""
+        try:
+            return self.study.insertion(index)
+        except InputError as error:
+            raise InputError(f"{self.folder}: row {index}: {one_line(error)}") from None
+
+
+def read_folder(path: Path) -> Recorded:
+    """Return the study in a folder, also while it runs.
+
+    Raises InputError if there is none, if it is damaged, or if a module of its own is missing.
+    """
+    stored = _stored(path)
+    if stored["format"] != _FORMAT:
+        raise InputError(f"{path}: not a study of this version of flexneedle: format must be {_FORMAT}")
+    try:
+        study = recorded_study(stored["study"])
+        made_by = dict(stored["versions"]), dict(stored["study"]["own"])
+    except InputError as error:
+        raise InputError(f"{path}: {one_line(error)}") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path / STUDY_FILE}: damaged: {unexpected(error)}") from None
+    return Recorded(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
+
+
+@contextmanager
+def study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
+    """Yield the folder `out`, or a new one in `runs/`, and whether it contains no study yet.
+
+    If the block fails, folders that are new and empty are removed.
+    """
+    outer = RUNS if out is None else out
+    missing = [path for path in (outer, *outer.parents) if not _exists(path)]
+    folder = new_folder("study", name) if out is None else out
+    try:
+        yield folder, not _exists(folder / STUDY_FILE)
+    except BaseException:
+        with suppress(OSError):  # until the first that is not empty
+            for path in missing if out else (folder, *missing):
+                path.rmdir()
+        raise
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # such as a name that is too long, which `open_folder` rejects
+        return False
+
+
+def remove_unused(path: Path) -> None:
+    """Remove the files of a study that has neither plans nor rows."""
+    for name in (STUDY_FILE, JOURNAL_FILE):
+        (path / name).unlink()
+
+
+def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Journal:
+    """Return the journal of a new study in the folder `path`, or with `resume` of the study in it.
+
+    An empty or missing folder starts a new study in either case. Raises InputError if the folder contains other
+    files, a study without `resume`, another study, or one of other package versions; or if another process is
+    writing to it.
+    """
+    try:
+        _check(path, study, resume)
+        path.mkdir(parents=True, exist_ok=True)
+        journal = Journal(path / JOURNAL_FILE, len(study))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    try:
+        _check(path, study, resume)  # again, now that no other process can create one here
+        if not (path / STUDY_FILE).exists():
+            replace_file(path / STUDY_FILE, to_text({**_identity(study), "command": command}).encode())
+    except BaseException:
+        journal.__exit__(None, None, None)
+        raise
+    return journal
+
+
+def _identity(study: Study) -> dict[str, Any]:
+    return {"format": _FORMAT, "versions": versions(), "study": study.definition}
+
+
+def _check(path: Path, study: Study, resume: bool) -> None:
+    if (path / STUDY_FILE).exists():
+        if not resume:
+            raise InputError(
+                f"{path}: already contains a study: add --resume to continue it, or set another --out"
+            )
+        _check_same(path, study)
+    elif path.exists() and not (path.is_dir() and {item.name for item in path.iterdir()} <= {JOURNAL_FILE}):
+        raise InputError(f"{path}: exists and is not an empty folder: set another with --out")
+
+
+def _check_same(path: Path, study: Study) -> None:
+    """Raise InputError, with the first difference, unless the folder contains this study with these versions."""
+    key = _first_difference(_stored(path), _identity(study))
+    if key is not None:
+        raise InputError(f"{path}: cannot resume: {key}")
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """What `_identity` has returned for the study in a folder."""
+    try:
+        values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
+        return {name: values[name] for name in ("format", "versions", "study")}
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: contains no study: {STUDY_FILE} is missing") from None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path / STUDY_FILE}: cannot be read: {error}") from None
+
+
+def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
+    there, here = flatten(stored), flatten(json.loads(json.dumps(current)))
+    for key in there | here:
+        if there.get(key) != here.get(key):
+            name = key.removeprefix("study.")
+            before, now = (_value_text(values, key) for values in (there, here))
+            edited = (
+                "the code of flexneedle has changed since the start of the study: " if key == _SOURCE else ""
+            )
+            return printable(f"{edited}{name} is {before} in the folder, {now} now")
+    return None
+
+
+def _value_text(values: Mapping[str, Any], key: str) -> str:
+    return str(values[key]) if key in values else "not recorded"

@@ -1,0 +1,385 @@
+"""The grid of a study: all its insertions in a fixed order, each with scenario and seed."""
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, checked
+from flexneedle.control.guide import check_guide
+from flexneedle.control.interface import Controller
+from flexneedle.errors import InputError, ScenarioError
+from flexneedle.lab.study.spec import (
+    ALL,
+    LARGEST_SEED,
+    SEED,
+    TARGET,
+    TARGET_KEYS,
+    WORLD,
+    WORLD_CASE,
+    WORLD_RIG,
+    Axis,
+    StudyFile,
+    base_of,
+    is_seed,
+    of_worlds,
+    read_study,
+    settings_of,
+)
+from flexneedle.loop.parts import (
+    SCENARIO_TRACKER,
+    controller_of,
+    digests,
+    own_controllers,
+    plant_of,
+    tracker_of,
+)
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
+from flexneedle.planning.planner import STRATEGIES
+from flexneedle.record.plain import plain
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.own import is_own
+from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.sections.settings import Target
+from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
+
+_DEFAULTS = {
+    "controller": DEFAULT,
+    "plant": DEFAULT_PLANT,
+    "tracker": SCENARIO_TRACKER,
+    "strategy": STRATEGIES[0],
+    "plan_seed": 0,
+}
+_CHOICES = {
+    "controller": tuple(CONTROLLERS),
+    "plant": tuple(PLANTS),
+    "tracker": (SCENARIO_TRACKER,),
+    "strategy": STRATEGIES,
+    WORLD_CASE: CASES,
+    WORLD_RIG: RIGS,
+}
+_DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
+_OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
+_MAX_INSERTIONS = 1_000_000
+_KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
+_FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {WORLD}"
+
+
+@dataclass(frozen=True)
+class GridPoint:
+    """A point of the grid: the settings shared by its insertions.
+
+    varied: values of the axes except target and world; target_number: index of the target in the study, or number of
+    the world; world: that number, None if the scenario is not a world; world_case, world_rig: case and rig of the
+    world; with_reach: whether the reach of its insertions is computed.
+    """
+
+    scenario: Scenario
+    case: str
+    controller: str
+    plant: str
+    tracker: str
+    strategy: str
+    plan_seed: int
+    target_number: int
+    varied: Mapping[str, Any]
+    world: int | None = None
+    world_case: str = ""
+    world_rig: str = ""
+    with_reach: bool = False
+
+
+@dataclass(frozen=True)
+class StudyInsertion:
+    """One insertion of a study: index of its row, grid point, number of the repeat, seed of the phantom."""
+
+    index: int
+    point: GridPoint
+    repeat: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Study:
+    """An expanded study. definition: all its settings as plain values; seeds: values of an axis of seeds, else ()."""
+
+    definition: Mapping[str, Any]
+    grid: "Grid"
+    repeats: int
+    first_seed: int
+    seeds: tuple[int, ...]
+
+    @cached_property
+    def points(self) -> tuple[GridPoint, ...]:
+        """All points in their order. Raises InputError for one that is not valid."""
+        return tuple(map(self.grid.point, range(len(self.grid))))
+
+    @property
+    def name(self) -> str:
+        """Name, used in the name of the folder."""
+        return str(self.definition["name"])
+
+    @property
+    def title(self) -> str:
+        """Title of tables and reports."""
+        return str(self.definition["title"])
+
+    @property
+    def axes(self) -> list[int]:
+        """Values of `setup.axes` in the study."""
+        return sorted({point.scenario.setup.axes for point in self.points})
+
+    def __len__(self) -> int:
+        return len(self.grid) * self.repeats
+
+    def insertion(self, index: int) -> StudyInsertion:
+        """Return the insertion of a row.
+
+        Without an axis of seeds, every target (or world) and repeat has its own phantom, which is the same at all
+        other settings of the study: comparisons are paired.
+        """
+        number, repeat = divmod(index, self.repeats)
+        point = self.grid.point(number)
+        own = self.first_seed + point.target_number * self.repeats + repeat
+        return StudyInsertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
+
+
+def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None) -> Study:
+    """Return the study of a shipped name or a TOML file; a Study is returned unchanged.
+
+    worlds: first number and count, in place of those of the axis of worlds.
+    Raises InputError with one line for each problem: file, key, value, rule.
+    """
+    if isinstance(source, Study):
+        return source
+    file, home, label = read_study(source)
+    try:
+        return _expanded(file if worlds is None else of_worlds(file, *worlds), base_of(file, home))
+    except InputError as error:
+        raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
+
+
+def recorded_study(definition: Mapping[str, Any]) -> Study:
+    """Return the study of a recorded `definition`; a point is made when it is needed, which may be one of thousands.
+
+    Raises InputError if this version makes another number of insertions of it, or for one of its parts that is missing;
+    KeyError, TypeError, ValueError or AttributeError for values that are no definition.
+    """
+    study = _study(definition, Scenario.from_record(definition["scenario"]))
+    if len(study) != definition["insertions"]:
+        rule = f"this version of flexneedle makes {len(study)} of it: its rows cannot be assigned"
+        raise InputError(to_line(Problem("insertions", definition["insertions"], rule)))
+    return study
+
+
+def _expanded(file: StudyFile, base: Scenario) -> Study:
+    axes = {axis.key: _axis_values(axis) for axis in file.axes}
+    seeds = tuple(axes.pop(SEED, ()))
+    repeats = len(seeds) or file.repeats
+    targets = {case.name: case.targets for case in file.cases if case.targets is not None}
+    of_cases = sum(len(targets.get(case.name, [None])) for case in file.cases) or 1
+    total = math.prod((of_cases, repeats, *map(len, axes.values())))
+    if total > _MAX_INSERTIONS:
+        raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
+    settings = {
+        "name": file.name,
+        "title": file.title,
+        "scenario": base.values(),
+        "without": list(file.without),
+        "values": _DEFAULTS | settings_of(file.values),
+        "cases": {case.name: settings_of(case.values) for case in file.cases},
+        "targets": targets,
+        "reach": [case.name for case in file.cases if case.reach],
+        "axes": axes,
+        "repeats": repeats,
+        "first_seed": file.first_seed,
+        "seeds": seeds,
+    }
+    study = _study(settings, base)
+    _ = study.points  # which are checked before anything runs
+    return study
+
+
+def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
+    """The study of a definition, which may lack what follows from the rest of it. base: its scenario."""
+    fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
+    names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
+    own = own_controllers(names["controller"])
+    base = checked(base, *own)
+    _check_without(settings["without"], base)
+    left_out, targets, reaching = (settings[key] for key in ("without", "targets", "reach"))
+    parts = _Parts(base, dict.fromkeys(left_out), fixed, cases or {"": {}}, targets, reaching, axes, own)
+    grid, repeats = Grid(parts), settings["repeats"]
+    definition = {
+        **settings,
+        "scenario": base.values(),
+        "insertions": len(grid) * repeats,
+        "own": digests(name for of_key in names.values() for name in of_key),
+    }
+    return Study(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
+
+
+def _values_of(
+    key: str,
+    fixed: Mapping[str, Any],
+    cases: Mapping[str, Mapping[str, Any]],
+    axes: Mapping[str, list[Any]],
+) -> list[Any]:
+    """All values of a key in a study."""
+    return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
+
+
+def _axis_values(axis: Axis) -> list[Any]:
+    if axis.key in _CHOICES and axis.values == ALL:
+        return list(_CHOICES[axis.key])
+    if isinstance(axis.values, dict):
+        first = axis.values["from"]
+        return list(range(first, first + axis.values["count"]))
+    return list(axis.values)
+
+
+def _check_without(keys: Sequence[str], base: Scenario) -> None:
+    for key in keys:
+        if key not in base.flat():
+            raise InputError(f"without = {json.dumps(key)}: not a key of the scenario")
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The parts of a grid: targets: those of a case by its name; reaching: cases with a reach."""
+
+    base: Scenario
+    left_out: Mapping[str, None]
+    fixed: Mapping[str, Any]
+    cases: Mapping[str, Mapping[str, Any]]
+    targets: Mapping[str, list[Any]]
+    reaching: Sequence[str]
+    axes: Mapping[str, list[Any]]
+    own: tuple[Controller, ...]
+
+    def choices(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Each case and its values: cases vary slowest, then their targets, then the axes in order."""
+        for case in self.cases:
+            own = {TARGET: self.targets[case]} if case in self.targets else {}
+            axes = {**own, **self.axes}
+            for values in itertools.product(*axes.values()):
+                yield case, dict(zip(axes, values, strict=True))
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Settings of a point, of which its scenario has not been made. chosen: values of the axes; kind: of a world."""
+
+    case: str
+    chosen: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    run: Mapping[str, Any]
+    world: int | None
+    kind: Mapping[str, str]
+    target_number: int
+
+
+class Grid:
+    """The points of a study by number. Each is made when it is first asked for, and is the same from then on."""
+
+    def __init__(self, parts: _Parts) -> None:
+        self._parts, self._worlds = parts, cache(world)  # the same worlds for every controller
+        self._choices = tuple(_choices(parts, self._worlds))
+        self._made = dict[int, GridPoint]()
+
+    def __len__(self) -> int:
+        return len(self._choices)
+
+    def point(self, number: int) -> GridPoint:
+        """Return a point. Raises InputError if its settings are not valid."""
+        if number not in self._made:
+            self._made[number] = _point(self._parts, self._choices[number], self._worlds)
+        return self._made[number]
+
+
+def _choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choice]:
+    """Yield the settings of the points; later settings override earlier ones."""
+    numbers: dict[Any, int] = {}
+    start = _DEFAULT_TARGET | {
+        key: value
+        for key, value in parts.base.flat().items()
+        if key in TARGET_KEYS and key not in parts.left_out
+    }
+    for case, chosen in parts.choices():
+        settings = {**parts.fixed, **parts.cases[case], **settings_of(chosen)}
+        run = {key: settings.pop(key) for key in _DEFAULTS}
+        number = settings.pop(WORLD, None)
+        kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}
+        _check_run(run | kind)
+        if number is not None and _is_skipped(worlds(number), run["controller"], *kind.values()):
+            continue
+        own = numbers.setdefault(_place(start | settings), len(numbers)) if number is None else number
+        yield _Choice(case, chosen, settings, run, number, kind, own)
+
+
+def _place(settings: Mapping[str, Any]) -> tuple[float | str, ...]:
+    """The target by which its number is found; one that is not valid is refused with its scenario."""
+    values = (settings[key] for key in TARGET_KEYS)
+    return tuple(value if isinstance(value, int | float) else repr(value) for value in values)
+
+
+def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> GridPoint:
+    case, chosen, kind = choice.case, choice.chosen, choice.kind
+    named = {"case": case, **chosen} if case else chosen
+    at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+    start = parts.base if choice.world is None else worlds(choice.world, *kind.values())
+    scenario = _varied(start, {**parts.left_out, **choice.settings}, parts.own, at)
+    _check_guide(choice.run, scenario, at)
+    of_world: dict[str, Any] = {} if choice.world is None else {WORLD: choice.world, **kind}
+    return GridPoint(
+        scenario,
+        case,
+        **choice.run,
+        target_number=choice.target_number,
+        varied={key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")},
+        **of_world,
+        with_reach=bool(of_world) or case in parts.reaching,
+    )
+
+
+def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
+    """Whether a world has another guide than the rig, or none that this case or the controller needs."""
+    return not has_rig(scenario, world_rig) or (
+        not scenario.setup.has_guide and (world_case == STRUCTURE or controller_of(controller)[1].needs_guide)
+    )
+
+
+def _check_guide(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
+    try:
+        check_guide(controller_of(run["controller"])[1], scenario.setup, run["strategy"])
+    except InputError as error:
+        raise InputError(f"{error}{_suffix(at)}") from None
+
+
+def _suffix(at: str) -> str:
+    return f" (at {at})" if at else ""
+
+
+def _check_run(run: Mapping[str, Any]) -> None:
+    for key, choices in _CHOICES.items():
+        if key in _OWN and is_own(run[key]):
+            _OWN[key](run[key])
+        elif run[key] not in choices:
+            more = ", or module:NAME for your own" if key in _OWN else ""
+            raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}{more}")))
+    if not is_seed(run["plan_seed"]):
+        rule = f"must be a whole number from 0 to {LARGEST_SEED}"
+        raise InputError(to_line(Problem("plan_seed", run["plan_seed"], rule)))
+
+
+def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Controller, ...], at: str) -> Scenario:
+    try:
+        return checked(base.with_values(settings), *own)
+    except ScenarioError as error:
+        further = (_FURTHER_KEYS if "unknown key" in problem else "" for problem in error.problems)
+        lines = (problem + more + _suffix(at) for problem, more in zip(error.problems, further, strict=True))
+        raise InputError("\n".join(lines)) from None

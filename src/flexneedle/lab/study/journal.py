@@ -1,0 +1,131 @@
+"""The journal of a study: one line per finished row, append-only, so that it survives any interruption."""
+
+import fcntl
+import json
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from flexneedle.errors import InputError
+from flexneedle.interrupts import uninterrupted
+from flexneedle.lab.study.rows import TIMES
+from flexneedle.record.results import RESULT_COLUMNS
+from flexneedle.scenario.problems import Problem, to_line
+
+_KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
+_READ = ("true_error_mm", "outcome", "reason")
+"""Columns that whoever reads rows needs; those of another version may lack others."""
+_LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # in a column
+
+
+class Journal:
+    """An open journal, locked against other processes; `rows`: finished rows by index.
+
+    Numbers keep all digits. An incomplete last line is dropped; its row is repeated. size: number of rows of the
+    study. Raises InputError if another process has the journal open, or if it is damaged. Use as a context manager.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.rows: dict[int, dict[str, Any]] = {}
+        self._path, self._size = path, size
+        self._file = path.open("a+b")
+        try:
+            self._lock()
+            self._read()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trail: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def add(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Add rows; returns once they are on disk."""
+        added = list(rows)
+        text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in added)
+        with uninterrupted():
+            self._file.write(text.encode())
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self.rows |= {row["index"]: row for row in added}
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"{self._path.parent}: another process is writing to this study") from None
+
+    def _read(self) -> None:
+        self._file.seek(0)
+        data = self._file.read()
+        self.rows = _rows_of(data, self._path, self._size, tuple(RESULT_COLUMNS))
+        self._file.truncate(_whole(data))
+
+
+def read_rows(path: Path, size: int) -> dict[int, dict[str, Any]]:
+    """Return the rows of a journal by index, also while a study writes to it. size: number of rows of the study.
+
+    Raises InputError if it cannot be read or is damaged.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    return _rows_of(data, path, size, _READ)
+
+
+def _rows_of(data: bytes, path: Path, size: int, needed: Sequence[str]) -> dict[int, dict[str, Any]]:
+    """The rows of the complete lines of a journal."""
+    rows = {}
+    for number, line in enumerate(data[: _whole(data)].splitlines(), 1):
+        row = _parsed(line)
+        fault = _fault(row, size, needed)
+        if fault is not None:
+            raise InputError(f"{path}: damaged at line {number}: {fault}")
+        rows[row["index"]] = row
+    return rows
+
+
+def _whole(data: bytes) -> int:
+    """Length of the complete lines."""
+    return data.rfind(b"\n") + 1
+
+
+def _parsed(line: bytes) -> Any:
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _fault(row: Any, size: int, needed: Sequence[str]) -> str | None:
+    """Return why a value is not a row with the needed columns of a study of this size, or None for a valid row."""
+    if not isinstance(row, dict):
+        return "not a row in JSON"
+    index = row.get("index")
+    if not (isinstance(index, int) and _fits(index, int) and 0 <= index < size):
+        return to_line(Problem("index", index, f"must be a whole number from 0 to {size - 1}"))
+    missing = next((name for name in needed if name not in row), None)
+    if missing is not None:
+        return f"{missing}: missing"
+    known = ((name, kind) for name, kind in _KINDS.items() if name in row)
+    wrong = next((name for name, kind in known if not _fits(row[name], kind)), None)
+    return None if wrong is None else to_line(Problem(wrong, row[wrong], "wrong type, or too large"))
+
+
+def _fits(value: Any, kind: type) -> bool:
+    """Whether a value fits a column of this kind; numbers may be None."""
+    if kind is str:
+        return isinstance(value, str)
+    if value is None:
+        return True
+    numbers = (int, float) if kind is float else (int,)
+    return isinstance(value, numbers) and not isinstance(value, bool) and abs(value) <= _LARGEST[kind]

@@ -1,0 +1,83 @@
+"""Executors of a study: local processes or a Dask cluster, both as `concurrent.futures.Executor`."""
+
+import multiprocessing
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any, cast
+
+from flexneedle.errors import InputError
+from flexneedle.lab.study.worker import set_up
+from flexneedle.scenario.problems import Problem, printable, to_line
+
+_CONNECT_S = 20
+_LAST_PORT = 65535
+_ADDRESS = re.compile(r"(tcp|tls|ws|wss)://(\[[0-9A-Fa-f:.]+\]|[^\s/:@?#\[\]]+):(?P<port>[0-9]{1,5})")
+
+
+def usable_cores() -> int:
+    """Return the number of cores available to this process, or of the machine if unknown."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def local(workers: int | None = None) -> Iterator[Executor]:
+    """Yield a pool of worker processes (default: one per usable core)."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers or usable_cores(), context, set_up) as pool:
+        with _without_ctrl_c():
+            pool.submit(int)  # starts the processes
+        yield pool
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Defer Ctrl-C, also in the processes that start in the meantime, until they are set up."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def check_address(address: str) -> None:
+    """Raise InputError unless this is a valid address of a Dask scheduler."""
+    found = _ADDRESS.fullmatch(address)
+    if found is None or not 1 <= int(found["port"]) <= _LAST_PORT:
+        rule = "must be protocol://host:port, such as tcp://host:8786; protocols: tcp, tls, ws, wss"
+        raise InputError(to_line(Problem("--scheduler", address, rule)))
+
+
+@contextmanager
+def cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
+    """Yield the workers of the Dask scheduler at `address` (`tcp://host:8786`) as an executor.
+
+    Tasks are submitted as impure, so that equal tasks are all executed. `on_no_workers` is called if there are no
+    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `cluster` is not
+    installed, or if no scheduler responds.
+    """
+    check_address(address)
+    with _client(address) as client:
+        if not client.nthreads():
+            on_no_workers()
+        yield client.get_executor(pure=False)
+
+
+def _client(address: str) -> Any:
+    try:
+        from distributed import Client, Security
+    except ImportError:
+        raise InputError("--scheduler needs Dask: pip install 'flexneedle[cluster]'") from None
+    connect, secure = cast("Any", Client), cast("Any", Security)  # not typed
+    security = secure()
+    # Checked here: a client that fails for this reason closes slowly and prints to stderr.
+    if address.startswith("tls:") and security.get_connection_args("client")["ssl_context"] is None:
+        raise InputError(f"{address}: needs a certificate: set distributed.comm.tls in Dask's configuration")
+    try:
+        return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
+    except Exception as error:  # noqa: BLE001  Dask raises many types for the response of another server
+        message = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(printable(f"{address}: no Dask scheduler responds: {message}")) from None

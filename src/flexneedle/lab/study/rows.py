@@ -1,0 +1,144 @@
+"""Jobs of a worker: plan, or run insertions and return a row for each. A failure is a row, too."""
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+from flexneedle.errors import RunError, ScenarioWarning
+from flexneedle.lab.study.grid import GridPoint
+from flexneedle.lab.study.reach import reach
+from flexneedle.loop.insert import insert
+from flexneedle.phantom.kernels import compile_kernels
+from flexneedle.planning.planner import plan
+from flexneedle.record.folder import versions
+from flexneedle.record.plain import plain, plan_values
+from flexneedle.record.results import RESULT_COLUMNS, insertion_row, plan_row
+from flexneedle.types import Insertion, Period, Plan
+
+TIMES = {"control_s": float, "plant_s": float, "total_s": float}
+"""Wall-clock times of an insertion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Insertions of one point: (index, seed) of each; refusal: reason for a missing plan.
+
+    with_reach: whether to compute their reach; needed for one of all points with the same truth.
+    """
+
+    point: GridPoint
+    plan: Plan | None
+    refusal: str
+    insertions: tuple[tuple[int, int], ...]
+    with_reach: bool = False
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """A plan as plain values and its planning time (s), or the reason why there is none."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    refusal: str = ""
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """Rows of a job, each with index, results and times, and the package versions of the worker."""
+
+    rows: list[dict[str, Any]]
+    versions: dict[str, str]
+
+
+def make_plan(point: GridPoint) -> PlanResult:
+    """Plan for a point, on one thread."""
+    _compile_once(point.scenario.setup.axes)
+    try:
+        made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
+    except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
+        return PlanResult(refusal=f"no plan: {_error_text(error)}")
+    return PlanResult(plan_values(made), made.seconds)
+
+
+def run_job(job: Job) -> JobResult:
+    """Run the insertions of a job, on one thread."""
+    _compile_once(job.point.scenario.setup.axes)
+    return JobResult([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
+
+
+def _row(job: Job, seed: int) -> dict[str, Any]:
+    begun = time.perf_counter()
+    results: dict[str, Any] = dict.fromkeys(RESULT_COLUMNS)
+    results |= {"warning": "", "outcome": "error", "reason": job.refusal}
+    times: dict[str, float] = {}
+    if job.plan is not None:
+        results |= plan_row(job.plan)
+        try:
+            insertion = insertion_at(job.point, job.plan, seed, threads=1)
+        except RunError as error:
+            results |= {"outcome": "refused", "reason": str(error)}
+        except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
+            results["reason"] = _error_text(error)
+        else:
+            results |= insertion_row(insertion)
+            times = _times(insertion)
+    times["total_s"] = time.perf_counter() - begun
+    if job.with_reach:
+        results["reach_mm"], failed = _reach(job.point, seed)
+        results["reason"] = "; ".join(filter(None, (results["reason"], failed)))
+    values: dict[str, Any] = plain(results | times)
+    return values
+
+
+def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
+    """The reach (mm), or the reason why it is unknown; the outcome of the insertion is not affected."""
+    try:
+        return reach(point.scenario, seed, point.plant, point.strategy), ""
+    except Exception as error:  # noqa: BLE001  recorded in the row
+        return None, f"no reach: {_error_text(error)}"
+
+
+def insertion_at(
+    point: GridPoint,
+    made: Plan,
+    seed: int,
+    *,
+    threads: int | None = None,
+    on_period: Callable[[Period], None] | None = None,
+) -> Insertion:
+    """Return an insertion of a point, as `flexneedle.insert` does; threads and on_period are as there."""
+    with warnings.catch_warnings():
+        # The study has checked all tables; a table of another of its controllers is not unused.
+        warnings.simplefilter("ignore", ScenarioWarning)
+        return insert(
+            point.scenario,
+            made,
+            seed,
+            controller=point.controller,
+            phantom=point.plant,
+            tracker=point.tracker,
+            threads=threads,
+            on_period=on_period,
+        )
+
+
+def _times(insertion: Insertion) -> dict[str, float]:
+    periods = insertion.periods
+    return {
+        "control_s": sum(period.durations["decide"] + period.durations["observe"] for period in periods),
+        "plant_s": sum(period.durations["apply"] for period in periods),
+    }
+
+
+def _error_text(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+@cache
+def _compile_once(axes: int) -> None:
+    """Compile the kernels once per process."""
+    versions()  # digest of the source, read now while the files are still those that were imported
+    compile_kernels(axes)

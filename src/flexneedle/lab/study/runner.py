@@ -1,0 +1,229 @@
+"""Run a study: submit plans and insertions, record the results; the tables are written however it ends."""
+
+import math
+from collections.abc import Callable, Container, Iterator, Mapping
+from concurrent.futures import Executor, Future
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from flexneedle.arguments import path, whole
+from flexneedle.errors import InputError, RunError
+from flexneedle.lab.study import pools
+from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder, remove_unused, study_folder
+from flexneedle.lab.study.grid import GridPoint, Study, load_study
+from flexneedle.lab.study.journal import Journal
+from flexneedle.lab.study.plans import Plans, plan_key, truth_key
+from flexneedle.lab.study.rows import Job, JobResult, PlanResult, make_plan, run_job
+from flexneedle.lab.study.tables import write_tables
+from flexneedle.phantom.kernels import compile_kernels
+from flexneedle.record.folder import versions
+
+_Pending = dict[str, list[tuple[GridPoint, tuple[tuple[int, int], ...]]]]
+_CLUSTER_JOBS = 1000  # at most: each job carries its plan, about 100 kB in the memory of the scheduler
+
+
+@dataclass(frozen=True)
+class Advance:
+    """Progress of a study: completed and total plans and insertions; insertions that did not finish."""
+
+    plans: int
+    all_plans: int
+    insertions: int
+    all_insertions: int
+    unfinished: int
+
+
+def run_study(
+    source: str | Path | Study,
+    out: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    resume: bool = False,
+    on_advance: Callable[[Advance], None] | None = None,
+    on_no_workers: Callable[[], None] = lambda: None,
+    command: str = "",
+) -> Path:
+    """Run a study, a shipped name or a TOML file, and return its folder (default: a new one in `runs/`).
+
+    It runs on `workers` processes (default: one per core), or on the Dask cluster at the address `scheduler`;
+    `on_no_workers` is called if the cluster has no workers yet, and the study waits for them. `resume` continues
+    the study in `out`. If the study ends early, the finished rows are kept; if it has no plan and no row yet, its files
+    are removed. `runs.parquet` is identical to the bit for any number of workers and interruptions. `command` is
+    recorded in `study.json`. A script that calls this needs an `if __name__ == "__main__"` guard, since workers import
+    it.
+
+    Raises InputError for an invalid study, folder or scheduler; RunError if a worker dies or has other package
+    versions than this process; KeyboardInterrupt, after the tables are written, if the user interrupts it.
+    """
+    if not isinstance(source, Study):
+        path("source", source)
+    study = load_study(source)
+    if workers is not None and scheduler is not None:
+        raise InputError(f"workers = {workers}: sets local processes: remove it, or remove the scheduler")
+    if workers is not None:
+        workers = whole("workers", workers, 1, "omit it for one per core")
+    given = None if out is None else path("out", out)
+    chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
+    # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
+    # script.
+    with (
+        _pool(workers, scheduler, on_no_workers) as pool,
+        study_folder(given, study.name) as (folder, is_new),
+        open_folder(folder, study, resume, command) as journal,
+    ):
+        engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
+        try:
+            if len(journal.rows) < len(study):
+                for axes in study.axes:
+                    compile_kernels(axes)  # before the workers, which would wait for each other
+                engine.run(pool, chunk)
+        finally:
+            if is_new and not journal.rows and not (folder / PLANS_FOLDER).exists():
+                remove_unused(folder)
+            else:
+                write_tables(folder, study, journal.rows, engine.plans)
+    return folder
+
+
+def _pool(
+    workers: int | None, scheduler: str | None, on_no_workers: Callable[[], None]
+) -> AbstractContextManager[Executor]:
+    return pools.local(workers) if scheduler is None else pools.cluster(scheduler, on_no_workers)
+
+
+class _Engine:
+    """Submits jobs and writes all results; the only writer of the study."""
+
+    def __init__(
+        self, study: Study, folder: Path, journal: Journal, on_advance: Callable[[Advance], None]
+    ) -> None:
+        self.plans = Plans(folder / PLANS_FOLDER)
+        self._study, self._journal, self._on_advance = study, journal, on_advance
+        self._versions = versions()
+        self._pending = _pending(study, journal.rows)
+        self._reach_points = _reach_points(study)
+        self._all_plans = len(self._pending)
+        self._unfinished = sum(map(_is_unfinished, journal.rows.values()))
+
+    def run(self, executor: Executor, chunk: int) -> None:
+        """Run the missing insertions, `chunk` insertions of a point in a job."""
+        calls = _PendingCalls(executor)
+        self._report_progress()
+        try:
+            for key, points in self._pending.items():
+                if self.plans.plan(key) is None:
+                    calls.submit(make_plan, points[0][0], partial(self._planned, calls, chunk, key))
+                else:
+                    self._submit(calls, chunk, key)
+            calls.finish()
+        except BaseException:
+            calls.abandon()
+            raise
+
+    def _planned(self, calls: "_PendingCalls", chunk: int, key: str, planned: PlanResult) -> None:
+        self.plans.keep(key, planned)
+        self._submit(calls, chunk, key)
+        self._report_progress()
+
+    def _submit(self, calls: "_PendingCalls", chunk: int, key: str) -> None:
+        made, refusal = self.plans.plan(key), self.plans.refusals.get(key, "")
+        for point, insertions in self._pending[key]:
+            for first in range(0, len(insertions), chunk):
+                chosen = insertions[first : first + chunk]
+                job = Job(point, made, refusal, chosen, id(point) in self._reach_points)
+                calls.submit(run_job, job, self._keep)
+
+    def _keep(self, done: JobResult) -> None:
+        if done.versions != self._versions:
+            raise RunError(
+                f"package versions of a worker differ from this process: {done.versions}, {self._versions}"
+            )
+        self._journal.add(done.rows)
+        self._unfinished += sum(map(_is_unfinished, done.rows))
+        self._report_progress()
+
+    def _report_progress(self) -> None:
+        missing = sum(
+            self.plans.plan(key) is None and key not in self.plans.refusals for key in self._pending
+        )
+        made, rows = self._all_plans - missing, len(self._journal.rows)
+        self._on_advance(Advance(made, self._all_plans, rows, len(self._study), self._unfinished))
+
+
+def _pending(study: Study, done: Container[int]) -> _Pending:
+    """Return the missing insertions by plan: points, each with (index, seed) of its insertions."""
+    pending: _Pending = {}
+    for number, point in enumerate(study.points):
+        first = number * study.repeats
+        indices = [index for index in range(first, first + study.repeats) if index not in done]
+        if indices:
+            insertions = tuple((index, study.insertion(index).seed) for index in indices)
+            pending.setdefault(plan_key(point), []).append((point, insertions))
+    return pending
+
+
+def _reach_points(study: Study) -> set[int]:
+    """Return the points, by id, whose insertions also compute the reach: the first with each truth."""
+    first: dict[str, int] = {}
+    for point in study.points:
+        if point.with_reach:
+            first.setdefault(truth_key(point), id(point))
+    return set(first.values())
+
+
+def _is_unfinished(row: Mapping[str, Any]) -> bool:
+    return bool(row["outcome"] != "done")
+
+
+class _PendingCalls:
+    """Pending calls on an executor, each with the function that handles its result."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+        self._open: dict[Future[Any], Callable[[Any], None]] = {}
+        self._done: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._abandoned = False
+
+    def submit(self, function: Callable[[Any], Any], argument: object, then: Callable[[Any], None]) -> None:
+        """Submit `function(argument)`; `then` is called with its result. Ignored after `abandon`."""
+        if self._abandoned:
+            return
+        with _worker_loss_reported():
+            future = self._executor.submit(function, argument)
+        self._open[future] = then
+        future.add_done_callback(self._done.put)
+
+    def finish(self) -> None:
+        """Wait for all calls, including those submitted in the meantime."""
+        while self._open:
+            future = self._done.get()
+            with _worker_loss_reported():
+                result = future.result()
+            self._open.pop(future)(result)
+
+    def abandon(self) -> None:
+        """Cancel calls that have not started, wait for the others, and handle their results."""
+        self._abandoned = True
+        for future in self._open:
+            future.cancel()
+        for future, then in list(self._open.items()):
+            if not future.cancelled() and future.exception() is None:
+                then(future.result())
+
+
+@contextmanager
+def _worker_loss_reported() -> Iterator[None]:
+    """Convert exceptions to RunError: jobs catch errors of an insertion, so others come from a lost worker."""
+    try:
+        yield
+    except Exception as error:
+        message = " ".join(f"{type(error).__name__} {error}".split())
+        raise RunError(
+            f"workers were lost ({message}); finished rows are kept; resume with --resume; "
+            "a script needs the guard `if __name__ == '__main__':`"
+        ) from error

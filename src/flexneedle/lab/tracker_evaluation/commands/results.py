@@ -1,0 +1,140 @@
+"""Tables of an evaluation for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from flexneedle.lab.tracker_evaluation.commands.tables import number, print_notes, print_rows, span
+from flexneedle.lab.tracker_evaluation.evaluation import published
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, Result
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import SingleSamples, Summary
+from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation
+from flexneedle.phantom.tracking.table import REFERENCE
+
+_PER_TABLE = 4
+_ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
+_INDICATOR = ("mean", "sd", "max", "min", "p95")
+
+
+def print_evaluation(evaluation: Evaluation, folder: Path) -> None:
+    """Print the tables, the notes and the output folder."""
+    _print_tables(evaluation)
+    print_notes(evaluation.notes)
+    print(f"Results and figures: {folder}")
+
+
+def _print_tables(evaluation: Evaluation) -> None:
+    frame = " after rigid registration of each sensor and environment" if evaluation.options.register else ""
+    heads = ("", "rmse", "95 %", "max", "jitter", "points", "samples")
+    results = evaluation.results
+    print_rows(f"Errors (mm){frame}", heads, [row for result in results for row in _error_rows(result)])
+    shown = [row for result in results for row in _indicator_rows(result)]
+    if shown:
+        print_rows(
+            "Indicator (means at grid points)", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
+        )
+    pair = evaluation.options.pair
+    fits = [row for found in evaluation.separations for row in _separation_rows(found, *pair)]
+    if fits:
+        print_rows("Error by indicator", ("", "", "95 % interval", "paper"), fits)
+    for start in range(0, len(results), _PER_TABLE):
+        some = results[start : start + _PER_TABLE]
+        print_rows("Details (mm)", ("", *(result.grid.title for result in some)), _details(some))
+
+
+def _error_rows(result: Result) -> Iterator[tuple[str, ...]]:
+    found, values = result.accuracy, result.values()
+    counts = f"{found.n_points}", f"{found.n_samples}"
+    yield (result.grid.title, *(number(values[key]) for key in _ERRORS), *counts)
+    if any(found.intervals.values()):
+        intervals = (span(found.intervals.get(key)) for key in _ERRORS)
+        yield (" 95 % interval", *intervals, "", "")
+    for name, key in (("paper", "paper"), ("manufacturer", "official")):
+        if values[key]:
+            yield (f" {name}", *(number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
+
+
+def _indicator_rows(result: Result) -> Iterator[tuple[str, ...]]:
+    found = result.summary
+    if found is None:
+        return
+    yield (result.grid.title, *_levels(found), f"{found.n_points}")
+    yield (" single samples", *_levels(found.samples), f"{found.samples.n_samples}")
+    paper = published.INDICATOR.get(result.grid.environment)
+    if paper and published.paper_sensor(result.grid.sensor) == REFERENCE:
+        yield (" paper", *(number(paper.get(key), ".4f") for key in _INDICATOR), "")
+
+
+def _levels(found: Summary | SingleSamples) -> list[str]:
+    return [number(getattr(found, key, None), ".4f") for key in _INDICATOR]
+
+
+def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
+    """Rows with the paper's values where sensor and environments are those of the paper."""
+    as_in_paper = published.paper_sensor(found.sensor) == REFERENCE
+    as_in_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
+    fits = published.FITS
+    papers = {
+        f"{ideal}: error (mm)": f"{fits['mean_mm']} ± {fits['sd_mm']}",
+        f"{noisy}: slope (mm)": str(fits["slope_mm"]),
+        f"{noisy}: intercept (mm)": str(fits["intercept_mm"]),
+        "threshold": str(published.THRESHOLD),
+    }
+    for row in _found_rows(found, ideal, noisy):
+        quantity = row[0].removeprefix(found.sensor).lstrip(", :")
+        yield (*row, papers.get(quantity, "") if as_in_paper else "")
+
+
+def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, str, str]]:
+    name = found.sensor
+    if found.ideal:
+        constant, intervals = found.ideal, found.ideal.intervals
+        yield (
+            f"{name}, {ideal}: error (mm)",
+            f"{number(constant.mean_mm)} ± {number(constant.sd_mm)}",
+            span(intervals["mean_mm"]),
+        )
+    if found.noisy:
+        line, intervals = found.noisy, found.noisy.intervals
+        yield f"{name}, {noisy}: slope (mm)", number(line.slope_mm), span(intervals["slope_mm"])
+        yield f"{name}, {noisy}: intercept (mm)", number(line.intercept_mm), span(intervals["intercept_mm"])
+        yield f"{name}, {noisy}: residual sd of the line (mm)", number(line.scatter_mm), ""
+    if found.threshold is not None:
+        yield f"{name}: threshold", number(found.threshold, ".4f"), span(found.threshold_interval, ".4f")
+        yield f"{name}: threshold of single samples", number(found.samples_threshold, ".4f"), ""
+    if found.confusion and found.auc is not None:
+        c = found.confusion
+        yield f"{name}, {ideal}: points below, above", f"{c.ideal_below}, {c.ideal_above}", ""
+        yield f"{name}, {noisy}: points below, above", f"{c.noisy_below}, {c.noisy_above}", ""
+        yield f"{name}: area under the ROC", number(found.auc, ".4f"), span(found.auc_interval, ".4f")
+
+
+def _details(results: list[Result]) -> Iterator[tuple[str, ...]]:
+    def row(name: str, text: Callable[[Result], str]) -> tuple[str, ...]:
+        return (name, *map(text, results))
+
+    yield row("mean error ± sd", lambda r: f"{number(r.accuracy.mean_mm)} ± {number(r.accuracy.sd_mm)}")
+    yield row("distance error, rms", lambda r: number(r.relative_distance.rms_mm))
+    yield row(
+        " 95 %, max", lambda r: f"{number(r.relative_distance.p95_mm)}, {number(r.relative_distance.max_mm)}"
+    )
+    yield row(" rms, closest neighbours", lambda r: number(r.relative_distance.neighbours_rms_mm))
+    yield row("repeatability, sd", lambda r: number(r.repeatability.sd_mm))
+    yield row(" at the worst point", lambda r: number(r.repeatability.worst_mm))
+    if any(r.orientation for r in results):
+        yield row("orientation jitter, rms (°)", lambda r: _part(r.orientation, "jitter_deg"))
+        yield row(" of the sensor axis (°)", lambda r: _part(r.orientation, "axis_jitter_deg"))
+    if any(r.distances for r in results):
+        yield row("limit of the rmse", lambda r: _part(r.distances, "limit_mm", "g"))
+        yield row(" met", lambda r: r.distances.limit_met if r.distances else "–")
+    if any(r.registration for r in results):
+        yield row("registration residual, rms", lambda r: _part(r.registration, "residual_mm"))
+        yield row(" rotation angle (°)", lambda r: _part(r.registration, "angle_deg"))
+        for k, axis in enumerate("xyz"):
+            shifts = [r.registration.translation_mm[k] if r.registration else None for r in results]
+            yield (f" translation {axis}", *map(number, shifts))
+
+
+def _part(found: object, name: str, form: str = ".3f") -> str:
+    return number(getattr(found, name, None), form)

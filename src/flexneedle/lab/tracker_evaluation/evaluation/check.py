@@ -1,0 +1,155 @@
+"""`flexneedle em check`: does the rig's own power distort the field (paper, section IV-B)?
+
+Compares the indicator with power off and on, from two environments of one table.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.lab.tracker_evaluation.evaluation import published
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, read_table
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import means
+from flexneedle.lab.tracker_evaluation.evaluation.intervals import Interval, bootstrap
+from flexneedle.lab.tracker_evaluation.evaluation.notes import differing_points, missing_sensors
+from flexneedle.lab.tracker_evaluation.table.grid import Grid
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Level:
+    """The indicator with power off or on: over means at grid points, and of single samples.
+
+    samples_max: largest single sample; samples_above: share of single samples above the threshold.
+    """
+
+    n_points: int
+    n_samples: int
+    mean: float
+    p95: float
+    max: float
+    samples_max: float
+    samples_above: float
+
+
+@dataclass(frozen=True)
+class PowerComparison:
+    """Indicator of one sensor with power off and on. difference: mean on minus mean off, with a bootstrap interval.
+
+    paired: both were measured at the same grid points, which are then resampled in pairs. above: the mean with power on
+    exceeds the threshold; points_above: number of grid points where it does.
+    """
+
+    sensor: str
+    threshold: float
+    off: Level
+    on: Level
+    difference: float
+    difference_interval: Interval
+    paired: bool
+    above: bool
+    points_above: int
+
+
+@dataclass(frozen=True, eq=False)
+class PowerCheck:
+    """Comparison of each sensor with an indicator in both environments; notes: what could not be compared."""
+
+    sensors: list[PowerComparison]
+    notes: list[str]
+
+    @property
+    def above(self) -> bool:
+        """Whether the indicator of any sensor is above the threshold with power on."""
+        return any(found.above for found in self.sensors)
+
+    @property
+    def paper(self) -> float:
+        """The indicator of the paper's rig with power on."""
+        return published.POWERED
+
+    def values(self) -> dict[str, Any]:
+        """Return the result as plain values."""
+        return {
+            "above": self.above,
+            "paper_powered": self.paper,
+            "notes": self.notes,
+            "results": [asdict(s) for s in self.sensors],
+        }
+
+
+def check(data: Path, off: str, on: str, threshold: float, options: Options) -> PowerCheck:
+    """Return the comparison of the environments `off` and `on` of a table.
+
+    Raises InputError for an invalid table, or if no sensor has an indicator in both environments.
+    """
+    grids, _ = read_table(data, options)
+    before, after = (_grids_of(data, grids, name) for name in (off, on))
+    both = [name for name in before if name in after]
+    if not both:
+        raise InputError(
+            f"{data}: no sensor has an indicator both with power off ({', '.join(before) or 'none'}) "
+            f"and on ({', '.join(after) or 'none'})"
+        )
+    powered = [
+        replace(grid, environment=f"power {power}")
+        for power, own in (("off", before), ("on", after))
+        for grid in own.values()
+    ]
+    notes = [*missing_sensors(powered, "no indicator in"), *differing_points(powered)]
+    return PowerCheck([compare(before[name], after[name], threshold) for name in both], notes)
+
+
+def compare(off: Grid, on: Grid, threshold: float) -> PowerComparison:
+    """Return the comparison of two grids of one sensor, both with an indicator."""
+    low, high = means(off)[0], means(on)[0]
+    paired = _names(off) == _names(on)
+    return PowerComparison(
+        sensor=on.sensor,
+        threshold=threshold,
+        off=_level(off, threshold),
+        on=_level(on, threshold),
+        difference=float(high.mean() - low.mean()),
+        difference_interval=bootstrap(_difference, low, high, paired=paired),
+        paired=paired,
+        above=bool(high.mean() > threshold),
+        points_above=int((high > threshold).sum()),
+    )
+
+
+def _grids_of(data: Path, grids: Sequence[Grid], environment: str) -> dict[str, Grid]:
+    present = list(dict.fromkeys(grid.environment for grid in grids))
+    if environment not in present:
+        raise InputError(
+            f"{data}: no environment {environment!r}: choose with --off and --on from {', '.join(present)}"
+        )
+    return {grid.sensor: grid for grid in grids if grid.environment == environment and grid.histogram.count}
+
+
+def _names(grid: Grid) -> list[str]:
+    return [grid.names[number] for number in np.flatnonzero(grid.points.indicators)]
+
+
+def _difference(low: Floats, high: Floats, axis: int) -> Floats:
+    difference: Floats = high.mean(axis=axis) - low.mean(axis=axis)
+    return difference
+
+
+def _level(grid: Grid, threshold: float) -> Level:
+    values = means(grid)[0]
+    return Level(
+        n_points=len(values),
+        n_samples=grid.histogram.count,
+        mean=float(values.mean()),
+        p95=float(np.quantile(values, P95)),
+        max=float(values.max()),
+        samples_max=grid.histogram.maximum,
+        samples_above=grid.histogram.above(threshold),
+    )

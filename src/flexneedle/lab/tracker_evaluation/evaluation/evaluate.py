@@ -1,0 +1,217 @@
+"""`flexneedle em evaluate`: errors and indicator of a table of measurements, and the files of results."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import InputError
+from flexneedle.files import replace_file
+from flexneedle.lab.tracker_evaluation.evaluation import published
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import Accuracy, RigidFit, accuracy, register_grid
+from flexneedle.lab.tracker_evaluation.evaluation.distance import DistanceErrors, distances
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import Summary, summary
+from flexneedle.lab.tracker_evaluation.evaluation.notes import notes
+from flexneedle.lab.tracker_evaluation.evaluation.points import POINTS_FILE, points_text
+from flexneedle.lab.tracker_evaluation.evaluation.repeatability import (
+    Orientation,
+    RelativeDistance,
+    Repeatability,
+    orientation,
+    relative_distance,
+    repeatability,
+)
+from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation, separation
+from flexneedle.lab.tracker_evaluation.evaluation.units import refuse_metres
+from flexneedle.lab.tracker_evaluation.table.columns import column_map
+from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.table.grids import read_grids
+from flexneedle.lab.tracker_evaluation.table.source import open_table
+from flexneedle.phantom.tracking.table import OPTIONAL, REFERENCE, REQUIRED
+from flexneedle.record.plain import to_text
+
+_RESULT_FILE = "evaluation.json"
+RESULT_FILES = (_RESULT_FILE, POINTS_FILE)
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of reading and evaluating a table.
+
+    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm", "m", or None for millimetres with a
+    check that they are not metres; limit_mm: limit of the RMSE over distance (None: the manufacturer's RMSE for the
+    paper's sensors); ideal, noisy: names of the environments to be separated by the indicator (None: the paper's);
+    sensor, environment: of all rows, for a table without such a column.
+    """
+
+    columns: tuple[str, ...] = ()
+    register: bool = False
+    unit: str | None = None
+    bin_mm: float = 50.0
+    limit_mm: float | None = None
+    ideal: str | None = None
+    noisy: str | None = None
+    sensor: str | None = None
+    environment: str | None = None
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the environments to be separated by the indicator."""
+        return self.ideal or published.IDEAL, self.noisy or published.NOISY
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Results of one sensor in one environment."""
+
+    grid: Grid
+    accuracy: Accuracy
+    registration: RigidFit | None
+    summary: Summary | None
+    relative_distance: RelativeDistance
+    repeatability: Repeatability
+    orientation: Orientation | None
+    distances: DistanceErrors | None
+
+    def values(self) -> dict[str, Any]:
+        """Return the result as plain values; lengths in mm, full precision."""
+        sensor = published.paper_sensor(self.grid.sensor) or ""
+        return {
+            "sensor": self.grid.sensor,
+            "environment": self.grid.environment,
+            **asdict(self.accuracy),
+            "official": published.OFFICIAL.get(sensor),
+            "paper": published.MEASURED.get((sensor, self.grid.environment)),
+            "registration": _values(self.registration),
+            "relative_distance": asdict(self.relative_distance),
+            "repeatability": asdict(self.repeatability),
+            "orientation": _values(self.orientation),
+            "distance": _values(self.distances),
+            "indicator": _values(self.summary),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The evaluation of a table. notes: one line on each unusual property of the data."""
+
+    data: Path
+    options: Options
+    rows: int
+    results: list[Result]
+    separations: list[Separation]
+    notes: list[str]
+
+    def values(self) -> dict[str, Any]:
+        """Return the evaluation as plain values, without the figures."""
+        return {
+            "format": _FORMAT,
+            "data": str(self.data),
+            "rows": self.rows,
+            "registered": self.options.register,
+            "unit": self.options.unit or "mm",
+            "notes": self.notes,
+            "results": [result.values() for result in self.results],
+            "indicator": [_separation_values(found, self.options) for found in self.separations],
+        }
+
+
+def evaluate(data: Path, options: Options) -> Evaluation:
+    """Return the evaluation of a table. Raises InputError for an invalid table."""
+    grids, rows = read_table(data, options)
+    try:
+        _check_names(grids, options)
+        results = [_result(grid, options) for grid in grids]
+    except InputError as error:
+        raise InputError(f"{data}: {error}") from None
+    registered = [result.grid for result in results]
+    separations = [
+        found
+        for sensor in dict.fromkeys(grid.sensor for grid in registered)
+        if (found := separation(sensor, *_environments(registered, sensor, options))) is not None
+    ]
+    found_notes = notes(registered, options.pair, suggest_registration=not options.register)
+    return Evaluation(data, options, rows, results, separations, found_notes)
+
+
+def read_table(data: Path, options: Options) -> tuple[list[Grid], int]:
+    """Return the grids of a table and its number of rows. Raises InputError for an invalid table."""
+    mapping = column_map(options.columns)
+    labels = {"sensor": options.sensor, "environment": options.environment}
+    names = {column: name for column, name in labels.items() if name is not None}
+    optional = (*OPTIONAL, "indicator", *names)
+    required = [column for column in REQUIRED if column not in optional]
+    with open_table(data, mapping, required, optional, names, options.unit or "mm") as table:
+        grids, rows = read_grids(table, options.bin_mm)
+        if options.unit is None:
+            refuse_metres(grids)
+    return grids, rows
+
+
+def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
+    """Write `points.csv` and `evaluation.json` and return the values of the latter."""
+    points = folder / POINTS_FILE
+    replace_file(points, points_text([result.grid for result in evaluation.results]).encode())
+    files = {"folder": str(folder), "points": str(points), "figures": [str(path) for path in figures]}
+    values = {**evaluation.values(), **files}
+    replace_file(folder / _RESULT_FILE, to_text(values).encode())
+    return values
+
+
+def _check_names(grids: Sequence[Grid], options: Options) -> None:
+    present = list(dict.fromkeys(grid.environment for grid in grids))
+    for option in ("ideal", "noisy"):
+        name = getattr(options, option)
+        if name is not None and name not in present:
+            raise InputError(f"--{option}: no environment {name!r}: choose from {', '.join(present)}")
+
+
+def _result(grid: Grid, options: Options) -> Result:
+    grid, registration = register_grid(grid) if options.register else (grid, None)
+    official = published.OFFICIAL.get(published.paper_sensor(grid.sensor) or "", {})
+    limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
+    return Result(
+        grid,
+        accuracy(grid),
+        registration,
+        summary(grid),
+        relative_distance(grid),
+        repeatability(grid),
+        orientation(grid),
+        distances(grid, options.bin_mm, limit),
+    )
+
+
+def _environments(grids: Sequence[Grid], sensor: str, options: Options) -> tuple[Grid | None, Grid | None]:
+    own = {grid.environment: grid for grid in grids if grid.sensor == sensor}
+    ideal, noisy = options.pair
+    return own.get(ideal), own.get(noisy)
+
+
+def _values(part: Any) -> dict[str, Any] | None:
+    return None if part is None else asdict(part)
+
+
+def _separation_values(found: Separation, options: Options) -> dict[str, Any]:
+    confusion = found.confusion
+    ideal, noisy = options.pair
+    return {
+        "sensor": found.sensor,
+        "ideal_environment": ideal,
+        "noisy_environment": noisy,
+        "ideal": _values(found.ideal),
+        "noisy": _values(found.noisy),
+        "threshold": found.threshold,
+        "threshold_interval": found.threshold_interval,
+        "samples_threshold": found.samples_threshold,
+        "samples_above": dict(zip(("ideal", "noisy"), found.samples_above, strict=True)),
+        "confusion": confusion
+        and {**asdict(confusion), "false_alarms": confusion.false_alarms, "detected": confusion.detected},
+        "auc": found.auc,
+        "auc_interval": found.auc_interval,
+        "roc": {"false_alarms": found.false_alarms, "detected": found.detected},
+        "paper": {"threshold": published.THRESHOLD, **published.FITS, "indicator": published.INDICATOR}
+        if published.paper_sensor(found.sensor) == REFERENCE
+        else None,
+    }

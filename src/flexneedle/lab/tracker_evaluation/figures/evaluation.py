@@ -1,0 +1,104 @@
+"""The figures of an evaluation."""
+
+from pathlib import Path
+
+import numpy as np
+
+from flexneedle.figures.style import save, signed
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import error_vectors
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, Result
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import LineFit, means
+from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation
+from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, distance_figure
+from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, field_figure
+from flexneedle.lab.tracker_evaluation.figures.indicator import (
+    IndicatorPanel,
+    PlottedPoints,
+    indicator_figure,
+)
+from flexneedle.lab.tracker_evaluation.figures.roc import RocLine, roc_figure
+from flexneedle.lab.tracker_evaluation.table.grid import Grid
+
+MOST_PANELS = 3
+
+
+def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
+    """Draw `field`, `indicator`, `roc` and `distance` as PNG and SVG, omitting those without data."""
+    paths = save(field_figure([_field(result) for result in evaluation.results]), folder, "field")
+    panels = [_indicator(evaluation, found) for found in evaluation.separations[:MOST_PANELS]]
+    if panels:
+        paths += save(
+            indicator_figure(panels, len(evaluation.separations) - len(panels)), folder, "indicator"
+        )
+    lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
+    if lines:
+        paths += save(roc_figure(lines), folder, "roc")
+    binned = [
+        _distance(result)
+        for result in evaluation.results
+        if result.distances and len(result.distances.bins) > 1
+    ]
+    return paths + (save(distance_figure(binned), folder, "distance") if binned else [])
+
+
+def _field(result: Result) -> FieldRow:
+    measured = result.grid.measured()
+    return FieldRow(result.grid.title, measured.true, error_vectors(measured))
+
+
+def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
+    own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
+    ideal, noisy = (own.get(name) for name in evaluation.options.pair)
+    constant, line = found.ideal, found.noisy
+    return IndicatorPanel(
+        found.sensor,
+        _points(ideal, f"{constant.mean_mm:.3f} ± {constant.sd_mm:.3f} mm") if ideal and constant else None,
+        _points(noisy, _line_text(line)) if noisy and line else None,
+        (constant.mean_mm, constant.sd_mm) if constant else None,
+        (line.slope_mm, line.intercept_mm) if line else None,
+        found.threshold,
+    )
+
+
+def _line_text(line: LineFit) -> str:
+    sign = "+" if line.intercept_mm >= 0.0 else "−"
+    return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
+
+
+def _is_of(result: Result, found: Separation) -> bool:
+    return result.grid.sensor == found.sensor and result.summary is not None
+
+
+def _points(grid: Grid, fit: str) -> PlottedPoints:
+    return PlottedPoints(grid.environment, *means(grid), fit)
+
+
+def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
+    confusion, threshold = found.confusion, found.threshold
+    if confusion is None or threshold is None:
+        raise ValueError("a ROC curve needs both environments")
+    own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
+    names = evaluation.options.pair
+    values = [means(own[name])[0] for name in names]
+    chosen = confusion.false_alarms, confusion.detected
+    shares = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
+    note = f"area {found.auc:.4f}\nat {threshold:.4f}: {shares}"
+    return RocLine(
+        found.sensor,
+        names,
+        found.false_alarms,
+        found.detected,
+        (values[0], values[1]),
+        threshold,
+        chosen,
+        note,
+    )
+
+
+def _distance(result: Result) -> DistanceLine:
+    found = result.distances
+    if found is None:
+        raise ValueError("the result has no distances")
+    distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
+    note = found.limit_met if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.limit_met}"
+    return DistanceLine(result.grid.title, distance, rmse, found.limit_mm, note)

@@ -1,0 +1,74 @@
+"""Trackers named on the command line."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from math import isfinite
+from pathlib import Path
+
+from flexneedle.errors import InputError, RigError, one_line
+from flexneedle.lab.rig.devices import trackers
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.ports import Clock, Tracker
+
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording or a run folder)"
+"""Syntax of a tracker on the command line."""
+
+
+def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    """Return the tracker given by `spec`, started; leaving the context stops it.
+
+    `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip` names
+    those at ports 1 and 2. `replay:FILE` plays back a recording or the readings in a run folder, at the speed of the
+    clock (`clock_for`). Raises InputError for any other `spec`, RunError if the tracker does not respond.
+    """
+    kind, _, rest = spec.partition(":")
+    if not rest or kind not in ("aurora", "replay"):
+        raise InputError(f"tracker {spec}: must be {FORMS}")
+    return _opened(spec, _aurora if kind == "aurora" else _replay, rest, clock)
+
+
+def clock_for(spec: str) -> WallClock:
+    """Return the clock for the tracker given by `spec`; for `replay:FILE@2` it runs at twice the speed.
+
+    Raises InputError for an invalid speed.
+    """
+    kind, _, rest = spec.partition(":")
+    return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
+
+
+def _opened(
+    spec: str, make: Callable[[str, Clock], AbstractContextManager[Tracker]], rest: str, clock: Clock
+) -> AbstractContextManager[Tracker]:
+    try:
+        return make(rest, clock)
+    except RigError as error:
+        raise InputError(f"tracker {spec}: {one_line(error)}") from error
+
+
+def _aurora(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    port, equals, names = rest.partition("=")
+    sensors = {"sensors": names.split(",")} if equals and names else {}
+    return trackers.aurora({"port": port, **sensors}, clock)
+
+
+def _replay(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    return trackers.replay({"file": _file_and_speed(rest)[0]}, clock)
+
+
+def _file_and_speed(rest: str) -> tuple[str, float]:
+    """Return file and speed of FILE@SPEED; the name of an existing file may contain @.
+
+    Raises InputError for an invalid speed.
+    """
+    if "@" not in rest or Path(rest).exists():
+        return rest, 1.0
+    file, _, text = rest.rpartition("@")
+    try:
+        speed = float(text)
+    except ValueError:
+        raise InputError(
+            f"tracker replay:{rest}: {text} is not a speed, and the file {rest} does not exist"
+        ) from None
+    if not (isfinite(speed) and speed > 0.0):
+        raise InputError(f"tracker replay:{rest}: the speed must be finite and above 0")
+    return file, speed

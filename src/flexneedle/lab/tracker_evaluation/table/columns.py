@@ -1,0 +1,89 @@
+"""Columns of a table: the names of flexneedle, or other names mapped to them."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from flexneedle.errors import InputError
+from flexneedle.phantom.tracking.table import COLUMNS
+from flexneedle.scenario.library import Library
+
+_MAPS = Library("a column map")
+_OPTION = "--columns NAME=COLUMN"
+
+
+def column_map(given: Iterable[str]) -> dict[str, str]:
+    """Return the names in the table by column, from pairs "NAME=COLUMN" and paths of TOML files with such pairs.
+
+    Raises InputError for invalid pairs and files, and for a column that is unknown or given twice.
+    """
+    names: dict[str, str] = {}
+    for text in given:
+        for name, column in [_pair(text)] if "=" in text else _from_file(Path(text)):
+            if column not in COLUMNS:
+                raise InputError(f"{_OPTION}: unknown COLUMN {column!r}: choose from {', '.join(COLUMNS)}")
+            if column in names:
+                raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
+            names[column] = name
+    return names
+
+
+def chosen_columns(
+    header: Sequence[str],
+    mapping: Mapping[str, str],
+    required: Iterable[str],
+    optional: Iterable[str],
+) -> dict[str, str]:
+    """Return the columns to read with their names in the header; all others are ignored.
+
+    mapping: names in the header by column, see `column_map`. Raises InputError if a column that is required or mapped
+    is not in the header, or occurs twice.
+    """
+    names = {column: mapping.get(column, column) for column in (*required, *optional)}
+    needed = {*required, *mapping}
+    missing = [
+        _described(column, name) for column, name in names.items() if column in needed and name not in header
+    ]
+    if missing:
+        raise InputError(
+            f"no column {', '.join(missing)} (found: {_listed(header)}): map other names with {_OPTION}"
+            + _label_options(missing)
+        )
+    found = {column: name for column, name in names.items() if name in header}
+    duplicates = [name for name in found.values() if header.count(name) > 1]
+    if duplicates:
+        raise InputError(f"two columns have the name {duplicates[0]!r}: names must differ")
+    for name in found.values():
+        shared = [column for column, other in found.items() if other == name]
+        if len(shared) > 1:
+            raise InputError(f"{_OPTION}: {name!r} would be both {' and '.join(shared)}: map both columns")
+    return found
+
+
+def _label_options(missing: Iterable[str]) -> str:
+    labels = [name for name in ("sensor", "environment") if name in missing]
+    options = " ".join(f"--{name} NAME" for name in labels)
+    return f"; for a table of one {' and '.join(labels)}, use {options}" if labels else ""
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, _, column = text.rpartition("=")
+    return name.strip(), column.strip()
+
+
+def _from_file(path: Path) -> list[tuple[str, str]]:
+    if not path.is_file():
+        raise InputError(f"{_OPTION}: {path}: must be a pair NAME=COLUMN or an existing file")
+    values = _MAPS.read(path)
+    invalid = [name for name, column in values.items() if not isinstance(column, str)]
+    if invalid:
+        raise InputError(f'{path}: {invalid[0]}: must be a line such as {invalid[0]} = "x_mm"')
+    return list(values.items())
+
+
+def _described(column: str, name: str) -> str:
+    return column if column == name else f"{name!r} (for {column})"
+
+
+def _listed(header: Sequence[str], most: int = 20) -> str:
+    shown = ", ".join(header[:most])
+    return f"{shown} and {len(header) - most} more" if len(header) > most else shown or "none"

@@ -1,0 +1,1 @@
+"""The closed loop of an insertion: ports, monitor, guard and periods."""

@@ -1,0 +1,263 @@
+"""Closed-loop insertion with a driver and a tracker, by default those of the virtual phantom."""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexneedle.arguments import instance, whole
+from flexneedle.control import tables
+from flexneedle.control.controllers import DEFAULT, used
+from flexneedle.control.forecast import missed, warning
+from flexneedle.control.guide import check_guide
+from flexneedle.control.interface import Controller, Decision, at_depth
+from flexneedle.errors import CommandError, DriverError, RefusedError, RunError, StoppedError, one_line
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.task import Task
+from flexneedle.loop.guard import Guard
+from flexneedle.loop.measuring import Observation, observe, observe_before_start
+from flexneedle.loop.monitor.monitor import Monitor
+from flexneedle.loop.parts import controller_of
+from flexneedle.loop.progress import Progress, hold_after
+from flexneedle.loop.record import record
+from flexneedle.loop.step import OnDecision, Steering, Step
+from flexneedle.loop.virtual import Rig
+from flexneedle.planning.origin import check_origin, placed
+from flexneedle.ports import Driver
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.pace import ROUNDING_S, travel_time
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import (
+    STILL,
+    Action,
+    Insertion,
+    Motion,
+    Outcome,
+    Period,
+    Plan,
+    X,
+)
+
+_MOST_MOVES = 4  # times the planned steps; then the insertion fails
+_Ending = tuple[Outcome, str]
+
+
+def run(
+    scenario: str | Path | Scenario,
+    plan: Plan,
+    rig: Rig,
+    rng: np.random.Generator,
+    seed: int = 0,
+    *,
+    controller: str | Controller = DEFAULT,
+    force: bool = False,
+    threads: int | None = None,
+    on_period: Callable[[Period], None] | None = None,
+    on_decision: OnDecision | None = None,
+) -> Insertion:
+    """Execute `plan` in closed loop on any rig; return the complete record.
+
+    scenario, controller, force, threads, on_period, on_decision: as for `insert`. rng: randomness of the controller;
+    seed: only recorded.
+
+    The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
+    exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
+    stopped at the rig, with the outcome "interrupted", and one with a command that the rig refuses, with the outcome
+    "held". A DriverError is raised only if the driver cannot be stopped after another error or an interrupt.
+    """
+    scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
+    rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.ports")
+    rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
+    scenario = placed(scenario, plan)
+    check_origin(plan, scenario)
+    name, chosen = controller_of(controller)
+    check_guide(chosen, scenario.setup, plan.strategy)
+    if not (plan.reached or force or chosen.predicts):
+        raise RunError(
+            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
+            "to insert anyway: flexneedle insert --force (force=True)"
+        )
+    scenario = used(scenario, chosen)
+    task = tables.task(chosen, Simulator(scenario, threads), plan)
+    steering = Steering(task, chosen, Guard.of(scenario, plan), rng, force, on_decision)
+    periods, ending = _run_to_end(steering, rig, on_period)
+    insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
+    if insertion.outcome is Outcome.DONE:
+        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
+        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
+    return insertion
+
+
+def _run_to_end(
+    steering: Steering, rig: Rig, on_period: Callable[[Period], None] | None
+) -> tuple[list[Period], _Ending]:
+    """All periods, and (outcome, reason), once the driver is stopped.
+
+    Raises DriverError if the driver cannot be stopped after another error or an interrupt.
+    """
+    periods: list[Period] = []
+    ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
+    try:
+        for period, ended in _periods(steering, rig):
+            periods.append(period)
+            ending = ended or ending
+            if on_period is not None:
+                on_period(period)
+    except DriverError as error:
+        ending = Outcome.FAILED, one_line(error)
+    except RefusedError as error:
+        ending = Outcome.HELD, one_line(error)
+    except StoppedError as error:
+        ending = Outcome.INTERRUPTED, one_line(error)
+    except BaseException as error:  # also after an interrupt or another error no motor goes on
+        _, still_on = _stopped(rig.driver, (Outcome.INTERRUPTED, ""))
+        if still_on:
+            raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error
+        raise
+    return periods, _stopped(rig.driver, ending)
+
+
+def _stopped(driver: Driver, ending: _Ending) -> _Ending:
+    """The ending once the driver is stopped: failed if it cannot be."""
+    try:
+        driver.stop()
+    except DriverError as error:
+        return Outcome.FAILED, "; ".join(
+            filter(None, (ending[1], f"the driver was not stopped: {one_line(error)}"))
+        )
+    return ending
+
+
+def planned(plan: object) -> Plan:
+    return instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)")
+
+
+def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | None]]:
+    """Yield each period with (outcome, reason) of the insertion, None while it continues.
+
+    After the last move the needle rests until the tracker has measured it at rest, since readings are delayed.
+    """
+    task = steering.task
+    start, indices = time.perf_counter(), itertools.count()
+    memory, estimate = steering.method.begin(task), steering.method.observer.begin(task)
+    progress = _before_start(task.scenario, memory, estimate, rig)
+    if (first := _first_step(progress)) is not None:
+        clocks, observation = [start, start, start, time.perf_counter()], progress.observation
+        yield record(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks), None
+    for index in indices:
+        if progress.moves == _MOST_MOVES * len(task.plan.controls):
+            return
+        clocks, begun = [time.perf_counter()], rig.clock.now()
+        step, decided = steering.next_step(progress, rig, begun)
+        clocks.append(time.perf_counter())
+        if rig.expect is not None:
+            rig.expect(progress.observation.estimate, step.decision.command)
+        motion = _carry_out(task.scenario, rig, step, begun)
+        clocks.append(time.perf_counter())
+        observation = _observed(progress.observation, task.scenario, rig, motion, begun)
+        clocks.append(time.perf_counter())
+        now = rig.clock.now()
+        if motion.held:
+            decided, step = decided.withheld(motion.held, progress), step.withheld(motion.held)
+        progress = _progress_after(decided, step, observation, steering, begun, now)
+        ending = _ending(task, progress)
+        period = record(index, now, task.plan, rig, step, motion.control, observation, clocks)
+        yield replace(period, warning=warning(step.decision, progress.in_a_row)), ending
+        if ending is not None:
+            return
+
+
+def _before_start(scenario: Scenario, memory: Any, estimate: Estimate, rig: Rig) -> Progress:
+    """The progress after the measurement before the first motion."""
+    monitor = Monitor(scenario.monitor, scenario.setup.axes)
+    observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
+    return Progress(observation, memory, hold_after(None, observation, rig.clock.now()))
+
+
+def _first_step(progress: Progress) -> Step | None:
+    """The step of the measurement before the first motion; None for a good reading of a tip alone: not recorded."""
+    if progress.hold is None and progress.observation.measurement.frame is None:
+        return None
+    return Step(Action.MEASURE, Decision(STILL, "measurement before the first motion"))
+
+
+def _observed(before: Observation, scenario: Scenario, rig: Rig, motion: Motion, begun: float) -> Observation:
+    """The observation after the motion of a period that began at `begun` (s)."""
+    predicted = before.estimate.move(motion)
+    return observe(scenario, predicted, before.monitor, begun, rig.clock.now(), rig.tracker)
+
+
+def _progress_after(
+    decided: Progress, step: Step, observation: Observation, steering: Steering, begun: float, now: float
+) -> Progress:
+    """The progress after a period from `begun` to `now` (s)."""
+    arrived_at, arrived = decided.arrived_at, steering.method.arrived
+    if (
+        arrived_at is None
+        and observation.verdict.ok
+        and arrived(steering.task, decided.memory, observation.estimate)
+    ):
+        arrived_at = now
+    return replace(
+        decided,
+        observation=observation,
+        hold=hold_after(decided.hold, observation, now),
+        refused=decided.refused.extended(now - begun) if decided.decides else decided.refused,
+        arrived_at=arrived_at,
+        held_in_all=decided.held_in_all + (now - begun if step.action is Action.HOLD else 0.0),
+    )
+
+
+def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion:
+    """Move, the travel in the time of its slowest axis, rounded up to whole tracker periods; or wait.
+
+    begun: start of the period (s), from which a needle that does not move is at rest.
+    """
+    command = step.decision.command
+    if step.wait is not None:
+        if step.wait > 0.0:
+            rig.clock.wait(step.wait)
+        return Motion(command, begun, rig.clock.now())
+    reading = scenario.tracker.period
+    readings = math.ceil((travel_time(scenario.setup, command) - ROUNDING_S) / reading)
+    try:
+        motion = rig.driver.apply(command, max(1, readings) * reading)
+    except CommandError as error:  # of a controller: refused, with a record of all before
+        raise RefusedError(one_line(error)) from error
+    motion = instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
+    if (
+        motion.held
+    ):  # a decision that the rig does not carry out takes no time: the next one shall have a reading
+        rig.clock.wait(reading)
+    return motion
+
+
+def _ending(task: Task, progress: Progress) -> _Ending | None:
+    """Outcome and reason if the insertion ends with this period."""
+    estimate = progress.observation.estimate
+    if not estimate.state.converged:
+        return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
+    if not progress.measured_at_rest:
+        return _held_too_long(task.scenario, progress)
+    short = task.plan.target[0] - float(estimate.tip[X])
+    if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
+        return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
+    return Outcome.DONE, ""
+
+
+def _held_too_long(scenario: Scenario, progress: Progress) -> _Ending | None:
+    """Outcome and reason if the needle has been held for as long as it may be, at once or in all."""
+    observation, held, refused = progress.observation, progress.held, progress.refused
+    limit, total = observation.hold_limit(scenario), scenario.control.hold_total_s
+    if held is not None and held > limit - 1e-9:
+        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
+    if progress.held_in_all > total - 1e-9 and (held is not None or progress.asked or refused.reason):
+        why = progress.asked or refused.reason if held is None else observation.verdict
+        return Outcome.HELD, f"held for {progress.held_in_all:.2f} s in all (limit {total:g} s): {why}"
+    return refused.ending(scenario.control.hold_limit_s)

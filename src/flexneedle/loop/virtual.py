@@ -1,0 +1,249 @@
+"""A rig: clock, driver and tracker of the closed loop; and the virtual one of a scenario and its seeds."""
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexneedle.arguments import refusal
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.geometry.quaternion import to_matrix
+from flexneedle.geometry.registration import Rigid, fit_rigid, identity
+from flexneedle.loop.parts import TrackerFactory
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.phantom import Condition, Phantom
+from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
+from flexneedle.phantom.tracking.field.room import Room
+from flexneedle.phantom.tracking.field.tracker import FieldTracker
+from flexneedle.phantom.tracking.placement import placed_references
+from flexneedle.phantom.tracking.simulated import NoisyTracker
+from flexneedle.phantom.tracking.stage import OnStage, tilt_of
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.registration import Registration
+from flexneedle.types import Control, Lateral, Point
+
+_CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
+
+
+def never() -> str:
+    """No reason to hold the needle: ""."""
+    return ""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Ports of the closed loop; `truth` is only recorded, None on hardware.
+
+    expect: called with the estimate and the command before each motion, so that readings during it can be checked; None
+    where they are not. deadline: time (s) of a decision after which it counts as late; the tracker is then read again
+    before it is used. None: no decision is late. hold: asked before each decision and each move why the needle is to be
+    held, "" if it is not.
+
+    Raises InputError if one has not the functions of its port, and for a deadline that is not above 0.
+    """
+
+    clock: Clock
+    driver: Driver
+    tracker: TipTracker
+    truth: Callable[[], Condition] | None = None
+    expect: Callable[[Estimate, Control], None] | None = None
+    deadline: float | None = None
+    hold: Callable[[], str] = never
+
+    def __post_init__(self) -> None:
+        _check_port("clock", self.clock, Clock, ("now", "wait"))
+        _check_port("driver", self.driver, Driver, ("apply", "stop"))
+        _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
+        if not (self.truth is None or callable(self.truth)):
+            raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+        if not (self.deadline is None or 0.0 < self.deadline < math.inf):
+            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
+
+
+def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:
+    """Raise InputError unless an object has the parts of a port; a class has them, but no object that they act on."""
+    missing = [part for part in parts if isinstance(given, type) or not hasattr(given, part)]
+    if missing:
+        wanted = f"must be an object with {', '.join(parts)}"
+        raise refusal(name, given, wanted, f"see flexneedle.ports.{port.__name__}")
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Seeds of a virtual rig: of the phantom, the tracker's noise, and the tracker's room."""
+
+    phantom: np.random.SeedSequence
+    tracker: np.random.SeedSequence
+    room: np.random.SeedSequence
+
+    @classmethod
+    def of(cls, seed: int) -> "Seeds":
+        """Return the seeds of the virtual rig of `insert` with a seed, whose third part is the controller's."""
+        phantom, tracker, _, room = _spawned(seed)
+        return cls(phantom, tracker, room)
+
+    @staticmethod
+    def controller(seed: int) -> np.random.Generator:
+        """Return the randomness of the controller in `insert` with a seed."""
+        return np.random.default_rng(_spawned(seed)[2])
+
+
+def _spawned(seed: int) -> list[np.random.SeedSequence]:
+    """Seeds of phantom, tracker, controller and room."""
+    return np.random.SeedSequence(seed).spawn(4)
+
+
+def virtual_rig(
+    scenario: Scenario,
+    roll: float,
+    seeds: Seeds,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
+    *,
+    tracker: TrackerFactory | None = None,
+    plate_distance_at: Callable[[float], float | None] | None = None,
+) -> Rig:
+    """Return a virtual phantom with the ports of a rig.
+
+    tracker: factory of the tracker (default: the tracker described by the scenario). plate_distance_at(time): distance
+    (mm) of a moving metal plate from the center of the tracker's workspace (default, and None: the environment's).
+    Raises InputError if the factory returns no tracker.
+    """
+    truth = draw(scenario, np.random.default_rng(seeds.phantom))
+    tank = Phantom(truth, roll, phantom)
+    if tracker is not None:
+        own = tracker(scenario, tank, np.random.default_rng(seeds.tracker))
+        return Rig(tank, tank, own, tank.condition)
+    errors = _Errors(truth.bias, registration_error(scenario.tracker.registration, seeds.room))
+    rng, around = (
+        np.random.default_rng(seeds.tracker),
+        virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
+    )
+    if around is None:
+        described: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
+    else:
+        described = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
+    return Rig(tank, tank, described, tank.condition)
+
+
+def virtual_room(
+    scenario: Scenario, seed: np.random.SeedSequence, plate_distance: float | None = None
+) -> tuple[Room, Mapping[str, SensorPose]] | None:
+    """Return the tracker's room in a virtual rig of this seed, and the reference sensors in the stage's frame.
+
+    None for a scenario without an environment. plate_distance: distance (mm) of the plate while the references are
+    placed (default: the environment's).
+    """
+    settings = scenario.tracker
+    if settings.environment is None:
+        return None
+    rng = np.random.default_rng(seed)
+    drawn = int(rng.integers(2**62))
+    room = Room(settings.environment, drawn if settings.field_seed is None else settings.field_seed)
+    limit = _CLEAN * scenario.monitor.indicator_limit
+    return room, placed_references(room, settings.workspace_center_mm, limit, rng, plate_distance)
+
+
+def to_stage(registration: Registration | None) -> Rigid:
+    """Return the map from the tracker's frame to the stage's; the identity without a registration."""
+    if registration is None:
+        return identity()
+    return Rigid(to_matrix(np.array(registration.rotation)), np.array(registration.translation_mm))
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Constant errors: bias x, y, z in mm, and the registration error as a map."""
+
+    bias: Point
+    registration: Rigid
+
+
+def _noisy_tracker(
+    scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
+) -> NoisyTracker:
+    """The tracker with white noise only."""
+
+    def tip_at(time: float) -> Point:
+        tip = tank.tip_at(time)
+        if scenario.tracker.registration is None:
+            return tip
+        x, y, z = errors.registration.apply(np.array(tip)).tolist()
+        return x, y, z
+
+    def direction_at(time: float) -> Lateral:
+        pose = tank.pose_at(time)
+        if scenario.tracker.registration is None:
+            return pose.theta, pose.psi
+        return tilt_of(errors.registration.rotation @ np.array(pose.axis))
+
+    jitter = scenario.tracker.direction_jitter
+    return NoisyTracker(
+        tip_at,
+        tank,
+        scenario.tracker.period,
+        scenario.tracker.jitter_per_axis,
+        rng,
+        delay=_delay(scenario),
+        missing=scenario.phantom.missing_fraction,
+        bias=errors.bias,
+        axes=scenario.setup.axes,
+        direction_at=None if jitter is None else direction_at,
+        direction_jitter=jitter or 0.0,
+    )
+
+
+def _field_tracker(
+    scenario: Scenario,
+    around: tuple[Room, Mapping[str, SensorPose]],
+    tank: Phantom,
+    errors: _Errors,
+    rng: np.random.Generator,
+    plate_distance_at: Callable[[float], float | None] | None,
+) -> OnStage:
+    """The tracker in its environment; around: room and references."""
+    (room, references), settings = around, scenario.tracker
+    center, offset = settings.workspace_center_mm, settings.tip_offset_mm
+    registered = to_stage(settings.registration)
+
+    def poses_at(time: float) -> Mapping[str, SensorPose]:
+        pose = tank.pose_at(time)
+        x, y, z = (value + off for value, off in zip(pose.point, errors.bias, strict=True))
+        return {
+            TIP: tip_sensor_pose((x, y, z), pose.axis, offset),
+            **references,
+        }
+
+    tracker = FieldTracker(
+        room,
+        poses_at,
+        tank,
+        settings.period,
+        rng,
+        center=center,
+        delay=_delay(scenario),
+        ahead=scenario.monitor.indicator_window_s,  # so that the field is known at the start
+        missing=scenario.phantom.missing_fraction,
+        to_tracker=registered.inverse().after(errors.registration),
+        plate_distance_at=plate_distance_at,
+    )
+    return OnStage(tracker, registered, offset)
+
+
+def _delay(scenario: Scenario) -> float:
+    """Age (s) of a reading on arrival: `delay_periods` control periods at full step and speed."""
+    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+    return scenario.phantom.delay_periods * step
+
+
+def registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
+    """Error of a registration, drawn from its fiducials and their localisation error."""
+    if registration is None or registration.localisation_mm == 0.0:
+        return identity()
+    rng = np.random.default_rng(seed).spawn(1)[0]
+    fiducials = np.array(registration.fiducials_mm)
+    noise = rng.normal(0.0, registration.localisation_mm / math.sqrt(3.0), fiducials.shape)
+    return fit_rigid(fiducials + noise, fiducials)

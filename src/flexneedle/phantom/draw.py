@@ -1,0 +1,185 @@
+"""The true phantom, drawn with a seed from the ranges of `[phantom]`."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexneedle.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Point
+
+_THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true scenario, pose of the clamped base (mm, rad), and imperfections with their sign (mm).
+
+    bend: tip deflection of the free needle, towards the bevel and turned from it by bend_angle (rad); run_out: offset
+    of the tip from the needle's axis, in the same way; both roll with the needle. load: constant force y, z on the tip
+    (N). bias x, y, z of the tracker (mm); variation: factor on μ in cells of `cell_mm` from the skin down. split: true
+    tops of layers (mm) where a hidden layer splits them, else empty.
+    """
+
+    scenario: Scenario
+    base_y: float = 0.0
+    base_turn: float = 0.0
+    bend: float = 0.0
+    run_out: float = 0.0
+    bias: Point = (0.0, 0.0, 0.0)
+    variation: tuple[float, ...] = (1.0,)
+    cell_mm: float = 0.25
+    base_z: float = 0.0
+    base_psi: float = 0.0
+    bend_angle: float = 0.0
+    run_out_angle: float = 0.0
+    load: tuple[float, float] = (0.0, 0.0)
+    split: tuple[float, ...] = ()
+
+    @property
+    def layer_tops(self) -> tuple[float, ...]:
+        """True depths (mm) at which the layers of the scenario begin from which it was drawn."""
+        return self.split or self.scenario.layer_tops
+
+    def __repr__(self) -> str:
+        base = f"base {self.base_y:.3f} mm, {1e3 * self.base_turn:.2f} mrad"
+        if self.base_z or self.base_psi:
+            base += f", out of the plane {self.base_z:.3f} mm, {1e3 * self.base_psi:.2f} mrad"
+        off = f"bend {self.bend:.3f} mm, run-out {self.run_out:.3f} mm"
+        return f"<Truth {base}, {off}, {self.scenario!r}>"
+
+
+def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
+    """Draw a phantom: tissue, bevel, start, needle and tracker; with finer contacts than the scenario's.
+
+    New quantities are drawn last, so that they do not change the other draws of a seed.
+    """
+    settings = scenario.phantom
+    factors = rng.uniform(*settings.shear_modulus_factor, len(scenario.tissue))
+    values: dict[str, Any] = structure_values(scenario) | {
+        f"tissue.{k}.shear_modulus_kpa": layer.shear_modulus_kpa * float(factor)
+        for k, (layer, factor) in enumerate(zip(scenario.tissue, factors, strict=True))
+    }
+    values["needle.bevel.offset_mm"] = scenario.needle.bevel.offset_mm * _bevel_factor(scenario, rng)
+    values["contact.spacing_mm"] = settings.contact_spacing_mm
+    base_y = float(rng.normal(0.0, settings.start_offset_sd_mm))
+    base_turn = float(rng.normal(0.0, settings.start_angle_sd))
+    values |= _displaced(scenario, rng)
+    bend_side, run_out_side = rng.choice([-1.0, 1.0], 2).tolist()
+    angle = float(rng.uniform(0.0, 2.0 * math.pi))
+    cell = 0.5 * settings.contact_spacing_mm
+    variation = _variation(scenario, cell, rng)
+    values |= _start(scenario, rng) | _modulus(scenario, rng)
+    base_z, base_psi, bend_angle, run_out_angle = _out_of_plane(scenario, rng)
+    layered = scenario.with_values(values)
+    truth = with_hidden_layer(layered, scenario)
+    return Truth(
+        truth,
+        base_y,
+        base_turn,
+        bend_side * settings.initial_bend_mm,
+        0.5 * run_out_side * settings.run_out_mm,
+        _bias(scenario, angle, rng),
+        variation,
+        cell,
+        base_z,
+        base_psi,
+        bend_angle,
+        run_out_angle,
+        split=() if truth is layered else layered.layer_tops,
+    )
+
+
+def _bias(scenario: Scenario, angle: float, rng: np.random.Generator) -> Point:
+    """The tracker's constant error (mm), at an angle (rad) from x in the plane.
+
+    In space it is raised from that at random, so that every direction is as likely.
+    """
+    size = scenario.phantom.tracker_bias_mm
+    z = float(rng.uniform(-1.0, 1.0)) if scenario.setup.axes == 2 else 0.0
+    flat = size * math.sqrt(1.0 - z**2)
+    return flat * math.cos(angle), flat * math.sin(angle), size * z
+
+
+def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
+    """Draw the factor on the bevel offset, from the part of its range that is valid for a bevel."""
+    low, high = scenario.phantom.bevel_factor
+    offset = scenario.needle.bevel.offset_mm
+    held = min(layer.most_bevel_mm for layer in scenario.tissue)
+    held *= scenario.phantom.structure.compression_length_factor
+    most = min(high, held / offset) if offset > 0.0 else high
+    return float(rng.uniform(min(low, most), most))
+
+
+def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Thicknesses (mm) after an independent displacement of each boundary; no layer vanishes."""
+    tops = np.array(scenario.layer_tops[1:])
+    bottoms = tops + rng.normal(0.0, scenario.phantom.layer_shift_sd_mm, tops.size)
+    values, top = {}, 0.0
+    for k, bottom in enumerate(bottoms.tolist()):
+        thickness = max(bottom - top, _THINNEST_MM)
+        values[f"tissue.{k}.thickness_mm"] = thickness
+        top += thickness
+    return values
+
+
+def _variation(scenario: Scenario, cell: float, rng: np.random.Generator) -> tuple[float, ...]:
+    """Factor on μ in cells down to the end of the stroke: log-normal of mean 1, exponentially correlated."""
+    settings = scenario.phantom
+    cells = math.ceil(max(scenario.setup.max_depth, 0.0) / cell) + 8
+    share = math.exp(-cell / settings.variation_length_mm)
+    level = rng.normal(0.0, 1.0, cells)
+    for k in range(1, cells):  # an Ornstein–Uhlenbeck process, sampled
+        level[k] = share * level[k - 1] + math.sqrt(1.0 - share**2) * level[k]
+    variance = math.log1p(settings.shear_modulus_variation**2)
+    return tuple(np.exp(math.sqrt(variance) * level - 0.5 * variance).tolist())
+
+
+def _start(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the gap from tip to skin (mm): an axial start error of base and tip.
+
+    A target that is then beyond the stroke is set to the largest depth in reach, so that the true scenario is valid.
+    """
+    setup = scenario.setup
+    low, high = _start_range(scenario)
+    error = min(max(float(rng.normal(0.0, scenario.phantom.start_axial_sd_mm)), low), high)
+    gap = setup.tip_to_skin_mm - error
+    depth = min(scenario.target.depth_mm, setup.stroke_mm - gap)
+    return {"setup.tip_to_skin_mm": gap, "target.depth_mm": depth}
+
+
+def _start_range(scenario: Scenario) -> tuple[float, float]:
+    """Range of the axial start error (mm): half of the distances to skin and guide, and of the base's margin at full
+    stroke. An operator would notice a tip in the tissue or behind the guide, and correct it before the insertion.
+    """
+    setup = scenario.setup
+    gap, guide = setup.tip_to_skin_mm, guide_to_skin(scenario)
+    left = scenario.needle.length_mm + gap - (guide or 0.0) - setup.stroke_mm
+    behind = math.inf if guide is None else guide - gap
+    return -0.5 * min(behind, setup.max_depth), 0.5 * min(gap, left)
+
+
+def _modulus(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the needle's modulus, uniform around the scenario's."""
+    factor = 1.0 + scenario.phantom.youngs_modulus_variation * float(rng.uniform(-1.0, 1.0))
+    return {"needle.youngs_modulus_gpa": factor * scenario.needle.youngs_modulus_gpa}
+
+
+def _out_of_plane(scenario: Scenario, rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """Draw base z (mm) and ψ (rad), and the angles (rad) of bend and run-out from the plane of the bevel.
+
+    The sides of bend and run-out are drawn before, so that ± a right angle is any direction.
+    """
+    settings, axes = scenario.phantom, scenario.setup.axes
+
+    def range_of(given: float | None, with_two_axes: float) -> float:
+        return (with_two_axes if axes == 2 else 0.0) if given is None else given
+
+    z, psi = rng.normal(0.0, 1.0, 2).tolist()
+    bend, run_out = rng.uniform(-1.0, 1.0, 2).tolist()
+    spread = math.radians(range_of(settings.direction_spread_deg, 90.0))
+    offset = range_of(settings.start_offset_z_sd_mm, settings.start_offset_sd_mm)
+    angle = 1e-3 * range_of(settings.start_angle_z_sd_mrad, settings.start_angle_sd_mrad)
+    return z * offset, psi * angle, bend * spread, run_out * spread

@@ -1,0 +1,50 @@
+"""Compiled kernels of the closed loop: those of the model and of the virtual phantoms, in the plane or in space."""
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flexneedle import phantom
+from flexneedle.mechanics.compile import cache_folder
+from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.phantom.plants import PLANTS
+from flexneedle.scenario.files import load_scenario
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import STILL
+
+_SCENARIOS = {1: "phantom", 2: "phantom3d"}
+"""Lateral positions are real numbers in the plane and complex ones in space: the kernels are others, and in each the
+same for every scenario."""
+
+
+def all_compiled(axes: int) -> bool:
+    """Whether the kernels for scenarios with `setup.axes` are in the cache, so that no compilation is needed."""
+    return _mark(axes).exists()
+
+
+def compile_kernels(axes: int) -> None:
+    """Compile all kernels for scenarios with `setup.axes`, or load them from the cache, ahead of their first call.
+
+    One process at a time: compiling in many at once is slow, and has crashed. The others load what it has compiled.
+    """
+    scenario, mark = load_scenario(_SCENARIOS[axes]), _mark(axes)
+    with _alone(mark.with_name("lock")):
+        Simulator(scenario, threads=1).compile()
+        for kind in PLANTS:
+            Phantom(Truth(scenario), 0.0, kind).apply(STILL, 0.0)
+        mark.touch()
+
+
+def _mark(axes: int) -> Path:
+    """A file beside the kernels of the phantoms, whose folder has the name of the sources of all kernels."""
+    return Path(cache_folder(Path(str(phantom.__file__)).parent)) / f"axes-{axes}"
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,59 @@
+"""Map from a tracker's frames to the tip of the needle in the frame of the stage."""
+
+import math
+
+import numpy as np
+
+from flexneedle.geometry.quaternion import z_axis
+from flexneedle.geometry.registration import Rigid
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.ports import Tracker
+from flexneedle.types import VISIBLE, Floats, Frame, Lateral, Measurement
+
+
+def tip_on_stage(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Measurement:
+    """Return the tip in the stage's frame: the sensor's position plus `tip_offset` mm along the measured z axis.
+
+    With the direction of that axis, if the sensor has an orientation. No coordinates if the tip sensor is not measured,
+    or has no orientation and the offset is not 0.
+    """
+    reading = frame.readings.get(TIP)
+    if reading is None or reading.status != VISIBLE or reading.position is None:
+        return Measurement(frame.time, None, None, None, frame)
+    position, direction = np.array(reading.position), None
+    if reading.orientation is not None:
+        axis = z_axis(np.array(reading.orientation))
+        position, direction = position + tip_offset * axis, tilt_of(to_stage.rotation @ axis)
+    elif tip_offset != 0.0:
+        return Measurement(frame.time, None, None, None, frame)
+    x, y, z = to_stage.apply(position).tolist()
+    return Measurement(frame.time, x, y, z, frame, direction)
+
+
+def tilt_of(axis: Floats) -> Lateral:
+    """Slopes θ, ψ (rad) of a needle along a vector (3,): the angle by which it is tilted from x, in the direction y,
+    z.
+    """
+    x, y, z = axis.tolist()
+    across = math.hypot(y, z)
+    if across == 0.0:
+        return 0.0, 0.0
+    angle = math.atan2(across, x)
+    return angle * y / across, angle * z / across
+
+
+class OnStage:
+    """A `TipTracker` that reads the frames of a tracker; to_stage: map from the tracker's frame to the stage's."""
+
+    def __init__(self, tracker: Tracker, to_stage: Rigid, tip_offset: float = 0.0) -> None:
+        self._tracker, self._to_stage, self._tip_offset = tracker, to_stage, tip_offset
+
+    def read(self) -> tuple[Measurement, ...]:
+        """Return the tip in each frame since the last call, oldest first."""
+        frames = self._tracker.read()
+        return tuple(tip_on_stage(frame, self._to_stage, self._tip_offset) for frame in frames)
+
+    @property
+    def status(self) -> str:
+        """The tracker's status."""
+        return self._tracker.status

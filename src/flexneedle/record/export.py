@@ -1,0 +1,54 @@
+"""A run as CSV: a header with units, one line per period or reading, numbers with all digits."""
+
+import csv
+from collections.abc import Iterable
+from typing import IO, Any
+
+from flexneedle.record.columns import COLUMNS, to_row
+from flexneedle.record.readings import OPTIONAL, to_values
+from flexneedle.types import Insertion, Period
+
+_READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
+_SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
+
+
+def marks(insertion: Insertion) -> dict[str, Any]:
+    """Return the columns that mark every row of a dry run or a disturbed insertion; none for another."""
+    found = {"dry_run": insertion.dry_run, "disturbed": bool(insertion.disturbed)}
+    return {name: True for name, marked in found.items() if marked}
+
+
+def write_csv(file: IO[str], insertion: Insertion) -> None:
+    """Write periods to a text file opened with newline="". Wall-clock durations are only in the trace."""
+    marked = marks(insertion)
+    writer = csv.DictWriter(file, [*COLUMNS, *marked], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(to_row(period) | marked for period in insertion.periods)
+
+
+def write_readings(file: IO[str], insertion: Insertion) -> None:
+    """Write all readings of an insertion, one line per reading, to a text file opened with newline="".
+
+    The tip of the needle in the stage's frame, with the direction, points and covariances that any reading has, is
+    followed by each sensor in the tracker's frame, as reported: columns `NAME.x_mm` and so on, for all sensors of all
+    frames. Missing values are empty.
+    """
+    periods, marked = insertion.periods, marks(insertion)
+    rows = [
+        {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked) | marked
+        for period in periods
+        for checked in period.readings
+    ]
+    measured = [key for key in OPTIONAL if any(key in row for row in rows)]
+    sensors = (f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)
+    columns = [*_READING, *measured, *sensors, *marked]
+    writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(rows)
+
+
+def _sensors(periods: Iterable[Period]) -> list[str]:
+    """Return the names of all sensors in the order of their first reading."""
+    measurements = (checked.measurement for period in periods for checked in period.readings)
+    frames = (one.frame for one in measurements if one.frame is not None)
+    return list(dict.fromkeys(name for frame in frames for name in frame.readings))

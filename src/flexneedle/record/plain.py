@@ -1,0 +1,75 @@
+"""Conversion of records to plain JSON values and back, and readable JSON text.
+
+Numbers keep all digits. NaN and infinity, which JSON does not have, become null.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from flexneedle.record.planar import plan_in_space
+from flexneedle.types import COLUMNS, Plan
+
+_ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
+_STORED_ELSEWHERE = ("seconds", "scenario")
+
+
+def plain(value: Any) -> Any:
+    """Return a value in JSON types: dicts, lists, text, numbers, booleans, null."""
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not isfinite(value):
+        return None
+    return value
+
+
+def plan_values(plan: Plan) -> dict[str, Any]:
+    """Return a plan as plain values, without its scenario and wall-clock time; arrays (mm, rad, mJ) come last."""
+    names = [field.name for field in fields(plan) if field.name not in _STORED_ELSEWHERE]
+    ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
+    return {name: plain(getattr(plan, name)) for name in ordered}
+
+
+def plan_from_values(values: Mapping[str, Any]) -> Plan:
+    """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError for other values."""
+    values = values if "roll" in values else plan_in_space(values)
+    given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
+    given["controls"] = given["controls"].reshape(-1, len(COLUMNS))
+    x, y, z = values["target"]
+    return Plan(**{**given, "target": (x, y, z), "history": tuple(values["history"])})
+
+
+def to_text(values: Mapping[str, Any]) -> str:
+    """Return JSON with one line per key and per row of an array."""
+    return "".join(_lines(plain(values), "")) + "\n"
+
+
+def _lines(value: Any, indent: str) -> Iterator[str]:
+    deeper = indent + " "
+    if isinstance(value, dict) and value:
+        opened = [(f"{_dump(key)}: ", item) for key, item in value.items()]
+        yield from _wrapped("{}", opened, indent, deeper)
+    elif isinstance(value, list) and any(isinstance(item, list | dict) for item in value) and len(indent) < 4:
+        yield from _wrapped("[]", [("", item) for item in value], indent, deeper)
+    else:
+        yield _dump(value)
+
+
+def _wrapped(brackets: str, items: list[tuple[str, Any]], indent: str, deeper: str) -> Iterator[str]:
+    yield brackets[0]
+    for number, (opening, item) in enumerate(items):
+        yield f"{',' if number else ''}\n{deeper}{opening}"
+        yield from _lines(item, deeper)
+    yield f"\n{indent}{brackets[1]}"
+
+
+def _dump(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)

@@ -1,0 +1,103 @@
+"""Write plans and insertions to the folder of a run, step by step or at once."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from flexneedle.arguments import path
+from flexneedle.control.controllers import used
+from flexneedle.errors import RecordError
+from flexneedle.record.figures import draw_run
+from flexneedle.record.folder import TRACE_FILE, Folder, versions
+from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
+from flexneedle.record.writer import TraceWriter
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.problems import unexpected
+from flexneedle.types import Insertion, Plan, scenario_of
+
+PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
+"""What an insertion was made with, in `run.json` and `trace.mcap`: fields of `Insertion`."""
+
+
+def save(record: Plan | Insertion, folder: str | Path) -> Path:
+    """Write a plan or an insertion to a folder, as the commands do, and return the folder.
+
+    The folder is created; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder
+    that already contains a run or cannot be created, and for a record without its scenario; RecordError if a file
+    cannot be written.
+    """
+    scenario, out = scenario_of(record), path("folder", folder)
+    if isinstance(record, Plan):
+        claimed = Folder.claim(out, "", "plan", used(scenario), record.seed)
+        keep_plan(claimed, record)
+        finish_plans(claimed)
+    else:
+        claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
+        parts = {name: getattr(record, name) for name in PARTS}
+        claimed.values |= parts
+        keep_plan(claimed, record.plan)
+        with open_trace(claimed, scenario, record.plan, record.seed, parts) as trace:
+            for period in record.periods:
+                trace.add(period)
+        finish_insertion(claimed, record)
+    if problems := [*claimed.problems, *claimed.undrawn]:
+        raise RecordError("; ".join(problems))
+    return claimed.path
+
+
+def keep_plan(folder: Folder, plan: Plan) -> None:
+    """Write a plan and its planning time to `run.json`."""
+    folder.plans[plan.strategy] = plan
+    folder.timing[plan.strategy] = plan_timing(plan)
+    folder.write()
+
+
+def finish_plans(folder: Folder) -> None:
+    """Record that all plans are complete, and draw them."""
+    folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
+    folder.end("done")
+    _draw(folder)
+
+
+def open_trace(
+    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, Any]
+) -> TraceWriter:
+    """Return the writer of `trace.mcap`; parts: by the names of `PARTS`."""
+    named = {name: str(part) for name, part in parts.items()}
+    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **named, **versions()}
+    return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
+
+
+def note_result(folder: Folder, insertion: Insertion) -> None:
+    """Add result and times of an insertion to the next write of `run.json`."""
+    folder.values["result"] = insertion_result(insertion)
+    folder.timing |= insertion_timing(insertion)
+
+
+def finish_insertion(folder: Folder, insertion: Insertion) -> None:
+    """Write the outcome of an insertion to `run.json`, and draw it; `folder.problems` has what cannot be written."""
+    note_result(folder, insertion)
+    finish(folder, insertion.outcome, insertion.reason)
+
+
+def finish(folder: Folder, status: str, reason: str) -> None:
+    """Write the final status, and draw plans and insertion; `folder.problems` has what cannot be written."""
+    steps: list[Callable[[], object]] = [partial(folder.end, status, reason)]
+    if folder.plans:
+        steps.append(partial(_draw, folder))
+    for step in steps:
+        try:
+            step()
+        except RecordError as problem:
+            folder.problems.append(str(problem))
+
+
+def _draw(folder: Folder) -> None:
+    """Draw the figures; `folder.undrawn` has why one cannot be. Raises RecordError if one cannot be written."""
+    try:
+        draw_run(folder.path)
+    except RecordError:
+        raise
+    except Exception as error:  # noqa: BLE001 - whatever drawing raises, the record and the result stay
+        folder.undrawn.append(f"figures cannot be drawn: {unexpected(error)}")

@@ -1,1 +1,0 @@
-"""Files on disk: run folders, traces, tables."""

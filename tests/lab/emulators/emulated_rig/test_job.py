@@ -1,0 +1,237 @@
+"""What can be emulated, and what a job is after its way through a line."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexneedle.cli.main import main
+from flexneedle.errors import InputError, RigError, RunError
+from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, checked_job
+from flexneedle.lab.emulators.emulated_rig.motors import address_of, device_of
+from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle
+from flexneedle.lab.emulators.emulated_rig.phantom import drawn, sensor_of
+from flexneedle.lab.emulators.emulated_rig.rig import split_fault
+from flexneedle.lab.emulators.emulated_rig.stream import Sink, Source, StreamEnded
+from flexneedle.lab.emulators.emulated_rig.tracker import noise_of, port_of
+from flexneedle.lab.rig.rig_file import RIGS, RigFile, load_rig
+from flexneedle.loop.virtual import Seeds, registration_error, virtual_rig
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.sections.registration import Registration
+
+RIG = load_rig("emulated")
+PHANTOM = load_scenario("phantom")
+
+
+def rig_with(**parts):
+    """The emulated rig of the package with other tables."""
+    return RigFile.model_validate(RIGS.shipped("emulated") | parts)
+
+
+def test_the_rig_of_the_package_fits_both_presets():
+    assert RIGS.names() == ["emulated"]
+    for name in ("phantom", "phantom3d"):
+        setup, axes = load_scenario(name).setup, RIG.axes
+        checked_job(RIG, load_scenario(name), None, 0, None, ())
+        assert axes.insertion.limits == (0.0, setup.stroke_mm)
+        assert axes.insertion.speed >= setup.insertion_speed_mm_s
+        step = setup.max_advance_mm / setup.insertion_speed_mm_s
+        for guide in (axes.guide_y, axes.guide_z):
+            assert guide.limits == (-setup.max_guide_travel_mm, setup.max_guide_travel_mm)
+            assert guide.speed >= setup.max_guide_step_mm / step
+    assert (address_of(RIG), port_of(RIG)) == (("127.0.0.1", 2323), "/tmp/aurora")
+
+
+def test_a_job_is_the_same_after_its_way_through_a_line(tmp_path):
+    job = Job(RIG, load_scenario("world:100012"), 7, tmp_path / "truth.csv", (("galil", "stall=A@5"),))
+    assert Job.of_line(job.to_line()) == job
+    assert "\n" not in job.to_line()
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"driver": {"kind": "own:NAME"}}, "driver.kind = 'own:NAME': must be 'galil'"),
+        ({"tracker": {"kind": "replay"}}, "tracker.kind = 'replay': must be 'aurora'"),
+    ],
+)
+def test_other_devices_are_refused(parts, message):
+    with pytest.raises(RigError, match=message):
+        checked_job(rig_with(**parts), PHANTOM, None, 0, None, ())
+
+
+@pytest.mark.parametrize("address", [None, 2323, "", ":23", "host:", "host:x", "host:65536"])
+def test_an_invalid_address_is_refused_in_one_line(address):
+    given = {} if address is None else {"address": address}
+    with pytest.raises(RigError, match=r"driver\.address = .*: must be \"HOST:PORT\"") as refusal:
+        address_of(rig_with(driver={"kind": "galil"} | given))
+    assert "\n" not in str(refusal.value)
+
+
+def test_the_port_of_a_controller_is_23_where_none_is_given():
+    assert address_of(rig_with(driver={"kind": "galil", "address": "10.0.0.2"})) == ("10.0.0.2", 23)
+
+
+@pytest.mark.parametrize("port", [None, 5, ""])
+def test_a_tracker_without_a_path_is_refused(port):
+    given = {} if port is None else {"port": port}
+    with pytest.raises(RigError, match=r"tracker\.port = .*: must be a path"):
+        port_of(rig_with(tracker={"kind": "aurora"} | given))
+
+
+def test_a_tracker_in_an_environment_is_refused():
+    with pytest.raises(InputError, match="white noise only"):
+        checked_job(RIG, PHANTOM.with_values({"tracker.environment": "noisy"}), None, 0, None, ())
+
+
+def test_a_free_entry_needs_the_plan(quick_plan):
+    free = PHANTOM.with_values({"entry.free_slope_mrad": 50.0})
+    with pytest.raises(InputError, match="give the plan with --plan"):
+        checked_job(RIG, free, None, 0, None, ())
+    plan = replace(quick_plan, scenario=PHANTOM.with_values({"entry.slope_mrad": 12.0}))
+    assert checked_job(RIG, free, plan, 0, None, ()).scenario.entry.slope_mrad == 12.0
+
+
+def test_a_plan_of_another_scenario_is_refused(quick_plan):
+    with pytest.raises(InputError, match="the plan was made with"):
+        checked_job(RIG, PHANTOM.with_values({"needle.length_mm": 149.0}), quick_plan, 0, None, ())
+    with pytest.raises(InputError, match="several plans"):
+        checked_job(RIG, PHANTOM, {"manipulation": quick_plan}, 0, None, ())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("stall=A@5", "must be DEVICE:KIND"),
+        ("galil:", "must be DEVICE:KIND"),
+        ("motor:stall=A@5", "must be DEVICE:KIND"),
+        ("galil:missing@5", "unknown kind; kinds: stall"),
+        ("aurora:missing", "must be KIND"),
+    ],
+)
+def test_an_invalid_fault_is_refused_in_one_line(given, message):
+    with pytest.raises(InputError, match=message):
+        split_fault(given)
+    assert split_fault("galil:stall=A@5:1") == ("galil", "stall=A@5:1")
+
+
+def test_the_phantom_is_that_of_the_virtual_rig_of_the_same_seed():
+    """Also its start: the tip before the first motion."""
+    for seed in (0, 5):
+        needle = DrivenNeedle(drawn(Job(RIG, PHANTOM, seed)), np.zeros(6))
+        virtual = virtual_rig(PHANTOM, 0.0, Seeds.of(seed))
+        np.testing.assert_array_equal(needle.tip, virtual.truth().tip)
+
+
+def test_the_sensor_has_the_errors_of_the_draw():
+    """Bias, and the error of the rig's registration in place of the scenario's."""
+    registration = RIG.registration.model_copy(update={"localisation_mm": 0.5})
+    scenario = PHANTOM.with_values({"phantom.tracker_bias_mm": 0.4, "tracker.tip_offset_mm": 9.0})
+    job = Job(rig_with(registration=registration.model_dump()), scenario, 3)
+    sensor = sensor_of(job, truth := drawn(job))
+    assert np.linalg.norm(sensor.bias) == pytest.approx(0.4)
+    assert (sensor.bias, sensor.offset) == (truth.bias, 9.0)
+    error = registration_error(registration, Seeds.of(3).room)
+    point = np.array([30.0, 1.0, -2.0])
+    mapped = sensor.to_tracker.apply(point)
+    registered = np.array([mapped[2] + 220.0, mapped[0], mapped[1]])
+    np.testing.assert_allclose(registered, error.apply(point))
+    assert 0.05 < np.linalg.norm(registered - point) < 2.0
+
+
+def test_without_a_registration_the_frames_are_the_same():
+    values = {key: value for key, value in RIGS.shipped("emulated").items() if key != "registration"}
+    job = Job(RigFile.model_validate(values), PHANTOM)
+    x, y, z, *axis = sensor_of(job, drawn(job)).at(np.array([1.0, 2.0, 3.0, 0.0, 0.0]))
+    assert ((x, y, z), axis) == ((1.0, 2.0, 3.0), [1.0, 0.0, 0.0])
+    own = Registration.model_validate(RIGS.shipped("emulated")["registration"])
+    of_scenario = PHANTOM.with_values({"tracker.registration": own.model_dump(mode="json")})
+    mapped = sensor_of(replace(job, scenario=of_scenario), drawn(job)).at(
+        np.array([20.0, 2.0, 3.0, 0.0, 0.0])
+    )
+    np.testing.assert_allclose(mapped[:3], (2.0, 3.0, -200.0))
+
+
+def test_noise_and_missing_frames_are_those_of_the_scenario():
+    values = {
+        "tracker.jitter_mm": 0.2,
+        "tracker.direction_jitter_mrad": 5.0,
+        "phantom.missing_fraction": 0.05,
+    }
+    noise = noise_of(PHANTOM.with_values(values))
+    assert (noise.position, noise.direction, noise.missing) == (0.2, 0.005, 0.05)
+
+
+def test_the_controller_has_the_switches_of_its_axes():
+    device = device_of(Job(rig_with(), PHANTOM))
+    assert device.axes[0].switches == (-2000.0, 222_000.0)
+    assert device.axes[2].switches == (-32_000.0, 32_000.0)
+
+
+def test_records_pass_a_pipe_whole_and_in_order():
+    source, sink = os.pipe()
+    reading, writing = Source(source, 2), Sink(sink, 2, "reader")
+    assert reading.read() == []
+    for k in range(3):
+        writing.write(k, (k + 0.5, -k), k == 1)
+    assert [tuple(record) for record in reading.read()] == [
+        (0.0, (0.5, 0.0), False),
+        (1.0, (1.5, -1.0), True),
+        (2.0, (2.5, -2.0), False),
+    ]
+    os.write(sink, b"half a")
+    assert reading.read() == []
+    os.close(sink)
+    with pytest.raises(StreamEnded):
+        reading.read()
+    os.close(source)
+
+
+def test_a_reader_that_does_not_keep_up_is_an_error_and_one_that_is_gone_the_end():
+    source, sink = os.pipe()
+    writing = Sink(sink, 4, "phantom")
+
+    def fill():
+        for k in range(10_000):
+            writing.write(k, (0.0,) * 4, True)
+
+    with pytest.raises(RunError, match="the phantom does not keep up"):
+        fill()
+    os.close(source)
+    with pytest.raises(StreamEnded):
+        writing.write(0.0, (0.0,) * 4, True)
+    os.close(sink)
+
+
+def test_a_lifeline_ends_with_the_process_at_its_other_end():
+    source, sink = os.pipe()
+    lifeline = Lifeline(source)
+    os.write(sink, b"clear\nfau")
+    assert lifeline.read(lifeline.sources) == ["clear"]
+    os.close(sink)
+    with pytest.raises(StreamEnded):
+        lifeline.read(lifeline.sources)
+    os.close(source)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.toml", "phantom"], "none.toml: no such file, and no such rig (choices: emulated)"),
+        (["emulated", "none"], "none: no such file"),
+        (["emulated", "phantom", "--fault", "stall@1"], "--fault stall@1: must be DEVICE:KIND"),
+        (["emulated", "phantom", "--plan", "none"], "none"),
+    ],
+)
+def test_the_command_refuses_in_one_line(arguments, message, capsys):
+    assert main(["emulate", "rig", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_job_is_plain_json():
+    assert json.loads(Job(RIG, PHANTOM).to_line())["rig"]["driver"]["address"] == "127.0.0.1:2323"

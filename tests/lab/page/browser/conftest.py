@@ -1,0 +1,136 @@
+"""A browser for the tests of the page, Debian's Chromium; a fake server and a page for each test."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from chromium import ARGUMENTS, CHROMIUM
+
+TOUR_SEEN = "if (origin !== 'null') localStorage.setItem('flexneedle tour', 'seen')"
+# In software each drawing of the view in space takes as long as the rest of a test.
+DRAWS_NOTHING = """for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
+  WebGL2RenderingContext.prototype[name] = () => {};
+}"""
+
+
+@pytest.fixture(scope="session")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium on the path: apt-get install chromium")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def kept_server():
+    from fake_page import FakePage
+    from flexneedle.lab.page.server.catalog import SCHEMA
+
+    with FakePage(SCHEMA) as server:
+        yield server
+
+
+@pytest.fixture
+def server(kept_server):
+    """A server of the page's files; a test that has one before its tabs ends with nobody connected.
+
+    A request that the page's server would refuse as no request fails the test.
+    """
+    yield kept_server
+    assert kept_server.begin_anew() == []
+
+
+@pytest.fixture
+def pictures():
+    """A function that keeps a picture of a page or of a part of it where SCREENSHOTS names a folder."""
+
+    def kept(shown, name):
+        if folder := os.environ.get("SCREENSHOTS"):
+            shown.screenshot(path=Path(folder) / f"{name}.png")
+
+    return kept
+
+
+@pytest.fixture(scope="session")
+def kept_tabs():
+    """Tabs that one test leaves to the next, by whether WebGL draws: to start one takes longer than most tests."""
+    return {}
+
+
+@pytest.fixture
+def tab(browser, kept_tabs):
+    """A function that opens an empty tab. Errors on its pages, in `errors`, fail the test at its end.
+
+    before: a script that runs before those of a page; tour: whether the tour is shown, as on a first visit; draws:
+    whether WebGL draws; touch: whether it is touched.
+    """
+    kept, fresh, errors = [], [], []
+
+    def failed(error):
+        errors.append(str(error))
+
+    def printed(message):
+        if message.type == "error":
+            errors.append(message.text)
+
+    def made(before, tour, draws, touch=False):
+        page = browser.new_context(has_touch=touch).new_page()
+        page.set_default_timeout(20_000)
+        for script in ("" if tour else TOUR_SEEN, "" if draws else DRAWS_NOTHING, before):
+            if script:
+                page.add_init_script(script)
+        return page
+
+    def opened(
+        width, height, scheme, before=None, tour=False, draws="SCREENSHOTS" in os.environ, touch=False
+    ):
+        if before or tour or touch or any(draws == as_kept for as_kept, _ in kept):
+            page = made(before, tour, draws, touch)
+            fresh.append(page)
+        else:
+            page = kept_tabs.pop(draws, None) or made(None, tour, draws)
+            kept.append((draws, page))
+        page.on("pageerror", failed)
+        page.on("console", printed)
+        page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=scheme)
+        return page
+
+    opened.errors = errors
+    yield opened
+    for page in fresh:
+        page.context.close()
+    for draws, page in kept:
+        page.evaluate("localStorage.clear()")
+        page.goto("about:blank")
+        page.mouse.move(0, 0)
+        page.remove_listener("pageerror", failed)
+        page.remove_listener("console", printed)
+        kept_tabs[draws] = page
+    assert not errors
+
+
+@pytest.fixture
+def visit(server, tab):
+    """A function that opens the page and returns it; before: a script that runs first, tour: as on a first visit."""
+
+    def opened(
+        width=1280,
+        height=800,
+        scheme="light",
+        before=None,
+        tour=False,
+        ready="[data-panel=status] .connection",
+        **how,
+    ):
+        page = tab(width, height, scheme, before, tour, **how)
+        page.goto(server.url)
+        page.wait_for_selector(ready)
+        return page
+
+    opened.errors = tab.errors
+    return opened

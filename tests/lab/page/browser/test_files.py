@@ -1,0 +1,488 @@
+"""Presets, scenario files, links, recorded runs, rows of studies."""
+
+from base64 import b64decode, b64encode
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from browser_layout import too_wide
+from chromium import NO_WEBGL
+from fake_page import until
+from flexneedle.lab.page.frames import Source
+from flexneedle.lab.page.messages import Job, Runs, StudyRow, StudyRows
+from recorded_page import insertion, people, period_frames, rows, session
+
+pytestmark = pytest.mark.page
+
+FILES, SECTION = "[data-panel=files]", "[data-panel=section] canvas"
+TEXT = 'name = "mine"\n[target]\ndepth_mm = 33.0\n'
+
+
+@pytest.fixture
+def files(visit, server):
+    server.files["/scenario.toml"] = TEXT
+
+    def opened(**how):
+        page = visit(ready=f"{FILES} li", **how)
+        page.wait_for_selector("text=nobody is in control")
+        return page
+
+    return opened
+
+
+def test_a_preset_and_a_random_world_are_begun(files, server):
+    page = files()
+    page.select_option("#files-preset", "phantom")
+    page.click("[aria-label='Begin with the preset']")
+    page.fill("[aria-label='Number of a random world']", "7")
+    page.click("text=Random world")
+    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "world:7"]
+
+
+def test_a_file_is_loaded(files, server):
+    page = files()
+    payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
+    page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector("text=you are in control")
+    assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
+
+
+ASKS = {
+    "preset": "To begin with phantom drops the changes that were made here.",
+    "world": "To begin with world:7 drops the changes",
+    "file": "To load my.toml drops the changes",
+}
+
+
+@pytest.mark.parametrize("opened", [True, False])
+@pytest.mark.parametrize("way", ASKS)
+def test_it_asks_before_changes_are_lost(files, server, way, opened):
+    page = files()
+    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
+    until(page, "flexneedle.store.get('session').changed.length")
+    if way == "preset":
+        page.select_option("#files-preset", "phantom")
+        page.click("[aria-label='Begin with the preset']")
+    elif way == "world":
+        page.fill("[aria-label='Number of a random world']", "7")
+        page.click("text=Random world")
+    else:
+        payload = {"name": "my.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
+        page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector(f"{FILES} >> text={ASKS[way]}")
+    assert not server.asked("preset")
+    assert not server.asked("load")
+    status = page.locator(f"{FILES} [role=status]", has_text="drops the changes")
+    if opened:
+        status.get_by_role("button", name="Load" if way == "file" else "Begin", exact=True).click()
+        server.wait_for("load" if way == "file" else "preset")
+    else:
+        status.get_by_role("button", name="Keep this scenario").click()
+    until(page, f"!document.querySelector('{FILES}').textContent.includes('drops the changes')")
+    assert opened or not (server.asked("preset") or server.asked("load"))
+
+
+def test_a_file_that_is_too_large_is_not_sent(files, server):
+    page = files()
+    payload = {"name": "large.toml", "mimeType": "application/toml", "buffer": b"x" * 200_001}
+    page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector("text=must have at most 200000")
+    assert not server.asked("load")
+
+
+DROPPED = """(element, text) => {
+  const dataTransfer = new DataTransfer();
+  dataTransfer.items.add(new File([text], "dropped.toml"));
+  const drop = (type) => element.dispatchEvent(new DragEvent(type, { bubbles: true, cancelable: true, dataTransfer }));
+  return ["dragover", "drop"].map((type) => !drop(type));
+}"""
+"""Drop a file on an element; whether the page takes it, as otherwise the browser opens it in the place of the page."""
+
+
+def test_a_file_that_is_dropped_on_the_panel_is_loaded(files, server):
+    page = files()
+    assert page.eval_on_selector(f"{FILES} .runs", DROPPED, TEXT) == [True, True]
+    assert server.wait_for("load") == [{"type": "load", "name": "dropped.toml", "text": TEXT}]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_it_fits_its_width(files, server, pictures, size, scheme):
+    page = files(width=size[0], height=size[1], scheme=scheme, before=NO_CLIPBOARD)
+    server.send(insertion("done", of="first", name="mine"), rows(0, 3, "first"))
+    page.click("summary:has-text('Download')")
+    page.click("text=Copy a link")
+    page.wait_for_selector("[aria-label='Link to copy']")
+    assert too_wide(page) == []
+    pictures(page.locator(FILES), f"files-{size[0]}-{scheme}")
+
+
+CLIPBOARD = """
+  const writeText = async (text) => { window.copied = text; };
+  Object.defineProperty(navigator, "clipboard", { value: { writeText } });
+"""
+NO_CLIPBOARD = "Object.defineProperty(navigator, 'clipboard', { value: undefined });"
+
+
+def test_a_link_reproduces_scenario_and_options(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    address = page.evaluate("window.copied")
+    assert address.startswith(f"{server.url}#state=")
+    page.goto("about:blank")
+    page.goto(address)
+    page.wait_for_selector("text=you are in control")
+    until(page, "!location.hash")
+    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    assert server.asked("options") == [
+        {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
+    ]
+
+
+def test_copying_a_link_leaves_the_address_so_a_reload_keeps_later_changes(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    assert page.url == server.url
+    page.reload()
+    page.wait_for_selector("text=nobody is in control")
+    page.wait_for_timeout(200)
+    assert not server.asked("load")
+
+
+def test_without_a_clipboard_the_link_is_shown_to_be_copied(files, server):
+    page = files(before=NO_CLIPBOARD)
+    assert not page.is_visible("[aria-label='Link to copy']")
+    page.click("text=Copy a link")
+    page.wait_for_selector("text=The clipboard is not available")
+    assert page.input_value("[aria-label='Link to copy']").startswith(f"{server.url}#state=")
+    selected = "(({ value, selectionStart, selectionEnd }) => value.slice(selectionStart, selectionEnd))"
+    assert page.evaluate(f"{selected}(document.activeElement)").startswith(f"{server.url}#state=")
+    assert page.url == server.url
+
+
+def test_a_link_that_is_followed_while_another_is_in_control_is_opened_afterwards(files, server):
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    link = page.evaluate("window.copied").partition("#")[2]
+    server.send(people(2, steering=2))
+    page.wait_for_selector("text=person 2 is in control")
+    page.evaluate("link => { location.hash = link; }", link)
+    page.wait_for_selector("text=The link is opened when you are in control")
+    server.send(people(2))  # who was in control may be back in a moment
+    page.wait_for_selector("text=nobody is in control")
+    page.evaluate(PAINTED)
+    assert not server.asked("steer")
+    assert not server.asked("load")
+    page.click("text=Take control")
+    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    until(page, "!location.hash")
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_a_link_asks_before_changes_are_lost(files, server, opened):
+    """Any web site can send a browser to one."""
+    page = files(before=CLIPBOARD)
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    link = page.evaluate("window.copied").partition("#")[2]
+    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
+    until(page, "flexneedle.store.get('session').changed.length")
+    page.evaluate("link => { location.hash = link; }", link)
+    page.wait_for_selector(
+        f"{FILES} >> text=The link has the scenario phantom3d. To open it drops the changes"
+    )
+    assert not server.asked("load")
+    page.click("text=Open the link" if opened else "text=Keep this scenario")
+    page.wait_for_selector(f"{FILES} >> text=The link has the scenario", state="detached")
+    if opened:
+        assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    page.evaluate(PAINTED)
+    assert len(server.asked("load")) == opened
+
+
+@pytest.mark.parametrize("damaged", ["x", "xyz", "A" * 3000])
+def test_a_damaged_link_is_reported(files, server, damaged):
+    page = files()
+    page.evaluate("damaged => { location.hash = `#state=${damaged}`; }", damaged)
+    page.wait_for_selector("text=The link is damaged")
+    assert not server.asked("load")
+
+
+def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
+    page = files()
+    page.click("[aria-label='Open first']")
+    page.click("[aria-label='Compare with first']")
+    page.click("summary:has-text('Download')")
+    links = page.locator(".run a").evaluate_all("all => all.map((one) => one.getAttribute('href'))")
+    assert links == [f"/runs/first/{file}" for file in ("figure.png", "trace.csv", "run.zip", "replay.html")]
+    server.send(insertion("done", of="first"), rows(0, 3, "first"), *period_frames(2, Source.FIRST))
+    page.click("[aria-label='Close phantom3d']")
+    assert server.wait_for("open", 3) == [
+        {"type": "open", "name": "first", "second": False},
+        {"type": "open", "name": "first", "second": True},
+        {"type": "open", "name": None, "second": False},
+    ]
+
+
+def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
+    page, held = files(), []
+    page.route("**/runs/first/*", lambda route, _request: held.append(route))
+
+    def requested():
+        while not held:
+            page.wait_for_timeout(20)
+        return held.pop()
+
+    page.click("summary:has-text('Download')")
+    page.click("[aria-label='CSV of first']")
+    page.wait_for_selector("text=CSV of first is being made…")
+    requested().fulfill(status=404, body="the run has no trace\n")
+    page.wait_for_selector("text=CSV of first: the run has no trace")
+    page.click("[aria-label='Run folder of first']")
+    page.wait_for_selector("text=Run folder of first is being made…")
+    assert not page.is_visible("text=the run has no trace")
+    with page.expect_download() as download:
+        requested().fulfill(body=b"PK")
+    assert download.value.suggested_filename == "first-run.zip"
+    page.wait_for_selector("text=is being made…", state="detached")
+    assert len(visit.errors) == 1  # the browser's own line of the refusal
+    visit.errors.clear()
+
+
+def test_news_of_runs_leave_open_what_is_open_and_the_focus(files, server):
+    page = files()
+    page.click("summary:has-text('Download')")
+    page.focus("[aria-label='CSV of first']")
+    first = {"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}
+    server.send(Runs(runs=[MANY, first | {"summary": "changed"}]))
+    page.wait_for_selector("text=changed")
+    names = page.locator(".run strong").all_inner_texts()
+    assert names == ["many", "first"]
+    assert page.is_visible("[aria-label='CSV of first']")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
+    server.send(Runs(runs=[MANY]))
+    page.wait_for_selector("text=changed", state="detached")
+
+
+MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
+
+
+def study_row(index, **changes):
+    given = {
+        "settings": "base", "controller": "adaptive-mpc", "target": (40.0, 5.0, 0.0), "error_mm": 0.2214,
+        "outcome": "done", "reason": "", "opens": True, **changes,
+    }  # fmt: skip
+    return StudyRow(index=index, **given)
+
+
+REFUSED = study_row(
+    9, target=(40.0, 5.0, 3.0), error_mm=None, outcome="refused", reason="plan misses", opens=False
+)
+
+
+def listing(request):
+    """What the server sends of the rows of a study."""
+    index = request.get("index")
+    found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
+    about = {"title": "Many targets", "insertions": 150, "finished": 149}
+    return [StudyRows(name=request["name"], index=index, rows=found, **about)]
+
+
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
+)
+def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width, scheme):
+    server.news[-1] = Runs(runs=[MANY])
+    server.answers["study"] = listing
+    page = files(width=width, scheme=scheme)
+    assert not page.is_visible("text=Worst first")
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=many: Many targets, 149 of 150 rows")
+    entries = page.locator("[aria-label='Rows of the study'] li").all_inner_texts()
+    assert entries[0].split("\n")[:2] == ["Row 17", "done, 0.221 mm off: base, adaptive-mpc, target 40, 5 mm"]
+    refused = ["Row 9", "refused: base, adaptive-mpc, target 40, 5, 3 mm", "plan misses"]
+    assert entries[2].split("\n") == refused
+    assert entries[3] == "3 of 149 finished rows: choose the first row for others"
+    assert page.locator("[aria-label='Open row 9']").count() == 0
+    pictures(page.locator(FILES), f"study-{width}-{scheme}")
+    page.click("[aria-label='Open row 17']")
+    page.click("[aria-label='Compare with row 3']")
+    page.fill("[aria-label='First row']", "120")
+    page.click("text=From this row")
+    page.wait_for_selector("text=Row 120")
+    page.click("text=Worst first")
+    page.wait_for_selector("text=Row 17")
+    assert server.asked("open") == [
+        {"type": "open", "name": "many", "row": 17, "second": False},
+        {"type": "open", "name": "many", "row": 3, "second": True},
+    ]
+    assert server.asked("study") == [
+        {"type": "study", "name": "many"},
+        {"type": "study", "name": "many", "index": 120},
+        {"type": "study", "name": "many", "index": None},
+    ]
+    assert too_wide(page) == []
+
+
+def test_a_study_without_finished_rows_is_named_so(files, server):
+    server.news[-1] = Runs(runs=[MANY])
+    about = {"title": "Many", "insertions": 150, "finished": 0}
+    server.answers["study"] = lambda _: [StudyRows(name="many", index=None, rows=[], **about)]
+    page = files()
+    page.click("[aria-label='Rows of many']")
+    page.wait_for_selector("text=No row is finished yet")
+
+
+def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
+    page = files()
+    server.send(Job(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
+    page.wait_for_selector("text=Computing again: many, row 17")
+    page.click("[aria-label='Cancel: Computing again']")
+    assert server.wait_for("cancel") == [{"type": "cancel", "job": 7}]
+
+
+def test_an_insertion_that_has_ended_is_saved(files, server):
+    page = files()
+    assert not page.is_visible("[aria-label='Name of the run to save']")
+    server.send(insertion("done"))
+    page.fill("[aria-label='Name of the run to save']", "../x")
+    page.click("text=Save the insertion")
+    page.wait_for_selector("text=The name must begin with a letter or digit")
+    page.fill("[aria-label='Name of the run to save']", "my run")
+    page.click("text=Save the insertion")
+    assert server.wait_for("save") == [{"type": "save", "name": "my run", "of": "live"}]
+
+
+def test_a_row_that_is_shown_is_saved_as_a_run(files, server):
+    page = files()
+    server.send(
+        insertion("done", of="first", name="mine"),
+        insertion("done", of="second", name="many, row 17", row=17),
+    )
+    page.wait_for_selector("text=Compared with: many, row 17")
+    assert page.locator("text=Save as a run").count() == 1
+    name = page.locator("[aria-label='Name to save many row 17 as']")
+    assert name.input_value() == "many row 17"
+    name.fill("worst")
+    page.click("text=Save as a run")
+    until(page, "!document.querySelector('.opened form input').value")
+    assert server.asked("save") == [{"type": "save", "name": "worst", "of": "second"}]
+
+
+def test_the_scenario_is_saved(files, tmp_path):
+    page = files()
+    with page.expect_download() as download:
+        page.click("text=Save the scenario")
+    assert download.value.suggested_filename == "scenario.toml"
+    download.value.save_as(tmp_path / "saved.toml")
+    assert (tmp_path / "saved.toml").read_text() == TEXT
+
+
+def test_a_picture_of_the_scene_is_saved(files, tmp_path):
+    page = files(draws=True)
+    page.wait_for_selector("[data-panel=space] .legend li")
+    with page.expect_download() as download:
+        page.click("text=Picture")
+    assert download.value.suggested_filename == "flexneedle.png"
+    download.value.save_as(tmp_path / "made.png")
+    picture = imread(tmp_path / "made.png")
+    shape = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
+    assert list(picture.shape[:2]) == shape
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+
+
+PAINTED = """async () => {
+  for (let frame = 0; frame < 4; frame++) await new Promise(requestAnimationFrame);
+}"""
+
+# Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.
+CODED = """
+const coded = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+"""
+DECODED = f"""
+async (gif) => {{
+  {CODED}
+  const decoder = new ImageDecoder({{ data: decoded(gif).buffer, type: "image/gif" }});
+  await decoder.tracks.ready;
+  const frames = [];
+  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {{
+    const {{ image }} = await decoder.decode({{ frameIndex: at }});
+    const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    image.close();
+    frames.push(coded(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data));
+  }}
+  return frames;
+}}
+"""
+MADE = f"""
+async ([width, height, frames]) => {{
+  {CODED}
+  const {{ Gif }} = await import("/static/files/gif.js");
+  const gif = new Gif(width, height, 0.1);
+  for (const frame of frames) gif.add(decoded(frame));
+  return coded(gif.bytes());
+}}
+"""
+
+
+@pytest.mark.parametrize("size", [(1, 1), (37, 20), (120, 90)])
+def test_a_gif_has_the_pixels_of_its_frames(files, size):
+    """Also where the codes of a frame need 12 bits and begin anew, and end at any of their lengths."""
+    page = files()
+    rng = np.random.default_rng(3)
+    frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
+    frames[..., 3] = 255
+    frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs
+    made = page.evaluate(MADE, [*size, [b64encode(frame.tobytes()).decode() for frame in frames]])
+    shown = np.array([np.frombuffer(b64decode(frame), np.uint8) for frame in page.evaluate(DECODED, made)])
+    assert np.max(np.abs(shown.reshape(frames.shape).astype(int) - frames)) <= 26
+
+
+def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
+    page = files(draws=True)
+    page.click("text=GIF")
+    page.wait_for_selector("text=A GIF needs an insertion")
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
+    with page.expect_download() as download:
+        page.click("text=GIF")
+    download.value.save_as(tmp_path / "made.gif")
+    frames = page.evaluate(DECODED, b64encode((tmp_path / "made.gif").read_bytes()).decode())
+    assert len(frames) == 4
+    assert frames[0] != frames[-1]
+    assert page.evaluate("flexneedle.store.get('view period')") is None
+
+
+def test_pictures_without_webgl_are_of_the_section_though_it_is_off_the_screen(files, server, tmp_path):
+    page = files(width=390, before=NO_WEBGL)
+
+    def saved(button):
+        with page.expect_download() as download:
+            page.click(f"text={button}")
+        download.value.save_as(tmp_path / "made")
+        return (tmp_path / "made").read_bytes()
+
+    page.locator("text=Picture").scroll_into_view_if_needed()
+    page.evaluate(PAINTED)
+    box = page.locator(SECTION).bounding_box()
+    assert box["y"] + box["height"] < -100.0
+    before = saved("Picture")
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
+    frames = page.evaluate(DECODED, b64encode(saved("GIF")).decode())
+    assert len(set(frames)) == 4
+    picture = saved("Picture")
+    assert picture != before
+    page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn by itself
+    page.evaluate(PAINTED)
+    assert saved("Picture") == picture
+
+
+def frames_of(count):
+    return [frame for period in range(count) for frame in period_frames(period, Source.FIRST)]

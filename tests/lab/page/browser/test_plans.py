@@ -1,0 +1,233 @@
+"""Plans: started, watched and cancelled; both strategies side by side with the terms of their cost."""
+
+import numpy as np
+import pytest
+
+from browser_blends import BLENDS, arrived
+from browser_layout import too_wide
+from fake_page import until
+from flexneedle.lab.page.frames import Kind, Source
+from flexneedle.lab.page.messages import Estimate, Job
+from recorded_page import (
+    insertion,
+    iteration,
+    opening,
+    people,
+    period_frames,
+    plan,
+    plan_frames,
+    planned,
+    rows,
+    samples,
+    scene,
+    session,
+    shape,
+)
+
+pytestmark = pytest.mark.page
+
+PLANS = "[data-panel=plans]"
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+
+@pytest.fixture
+def plans(visit, server):
+    def opened(news=None, **how):
+        server.news = news or server.news
+        page = visit(ready=f"{PLANS} button:visible", **how)
+        page.wait_for_selector("text=in control")
+        return page
+
+    return opened
+
+
+def table(page):
+    """Cells by the name of their row."""
+    rows = page.locator(f"{PLANS} tbody tr").all()
+    return {row.locator("th").inner_text(): row.locator("td").all_inner_texts() for row in rows}
+
+
+def test_work_is_started_and_cancelled(plans, server):
+    page = plans()
+    for work in ("plan", "compare", "reach"):
+        page.click(f"{PLANS} [data-work={work}]")
+    assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
+    server.send(Job(job=4, kind="compare", state="running", share=0.25))
+    page.click(f"{PLANS} button:has-text('Cancel')")
+    assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
+    server.send(Job(job=4, kind="compare", state="cancelled"))
+    page.wait_for_selector(f"{PLANS} progress", state="hidden")
+    assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
+
+
+COST = """async ([tone, shares]) => {
+  const { color } = await import("/static/theme.js");
+  const wanted = color(tone).match(/[0-9]+/g).slice(0, 3).map(Number);
+  const [canvas, over] = [".cost canvas", ".cost .u-over"].map((each) => document.querySelector(each));
+  const scale = canvas.width / canvas.clientWidth;
+  const is = (data, at) => data[at + 3] > 60 && wanted.every((value, part) => Math.abs(data[at + part] - value) < 40);
+  const columns = shares.map((share) => {
+    const x = Math.round((over.offsetLeft + share * over.clientWidth) * scale) - (share === 1 ? 1 : 0);
+    const { data } = canvas.getContext("2d").getImageData(x, 0, 1, canvas.height);
+    const found = Array.from({ length: canvas.height }, (_, y) => y).filter((y) => is(data, 4 * y));
+    return found.map((y) => 1 - (y / scale - over.offsetTop) / over.clientHeight);
+  });
+  return [columns, over.clientHeight];
+}"""
+"""Where a tone is at shares of the width of the plot of the cost, from 0 at its foot to 1; its height in pixels."""
+DECADES = (-1, 1)
+"""Of the plot's axis, which ends at powers of ten, for costs from 0.125 to 4."""
+
+
+def share_of(cost):
+    """Where a cost is in the plot, from 0 at its foot to 1."""
+    low, high = DECADES
+    return (np.log10(cost) - low) / (high - low)
+
+
+def test_cost_falls_with_each_iteration(plans, server):
+    """The lowest line is the best cost so far, on an axis that is logarithmic; the others are above it."""
+    page = plans()
+    for number in range(4):
+        server.send(iteration(number), samples(number))
+        until(page, f"flexneedle.store.get('iteration manipulation')?.iteration === {number}")
+    page.wait_for_selector(f"{PLANS} .cost canvas")
+    assert page.locator(f"{PLANS} .cost .legend > *").all_inner_texts() == [
+        "manipulation, best",
+        "manipulation, elite",
+        "manipulation, median",
+    ]
+    page.locator(f"{PLANS} .cost").scroll_into_view_if_needed()
+    page.evaluate(PAINTED)
+    shares = [*np.linspace(0.0, 1.0, 4), *np.linspace(0.0, 0.03, 24)]
+    columns, height = page.evaluate(COST, ["--manipulation", shares])
+    lowest = [min(column) for column in columns[:4]]
+    highest = max(max(column) for column in columns[4:])  # of dots, near the first iteration
+    np.testing.assert_allclose(lowest, [share_of(cost) for cost in iteration(3).best], atol=3.0 / height)
+    assert highest == pytest.approx(share_of(iteration(3).median[0]), abs=4.0 / height)
+
+
+def test_strategies_are_side_by_side_with_their_terms(plans):
+    page = plans(planned())
+    page.wait_for_selector(f"{PLANS} table")
+    cells = table(page)
+    assert cells["Cost: accuracy"] == ["0.020", "4.000"]
+    assert cells["Cost: energy"] == ["0.120", "–"]
+    assert cells["Cost"] == ["0.190", "4.200"]
+    assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
+    page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
+    page.wait_for_timeout(200)
+    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    captions = page.locator(f"{PLANS} .sweeps figcaption").all_inner_texts()
+    assert [caption.partition(" ×")[0] for caption in captions] == [
+        "manipulation, lateral",
+        "steering, lateral",
+    ]
+
+
+BANDS = f"""async ([selector, tone, x]) => {{
+  {BLENDS}
+  const {{ boxOf }} = await import("/static/box.js");
+  const {{ mappingOf }} = await import("/static/flat/plane.js");
+  const canvas = document.querySelector(selector);
+  const [{{ width, height }}, scene] = [canvas, flexneedle.store.get("scene")];
+  const across = Math.round(mappingOf(boxOf(scene, scene.target), width, height, 3).toX(x));
+  const picture = composed(canvas);
+  const at = (y) => 4 * (y * width + across);
+  const ground = [0, 1, 2].map((part) => picture[at(1) + part]);
+  const bands = [];
+  let before = 0;
+  for (let y = 0; y < height; y++) {{
+    const pixel = picture.slice(at(y), at(y) + 4);
+    const share = shareOf(ground, pixel, 0, toneOf(tone));
+    if (share && !before) bands.push(0);
+    if (share) bands[bands.length - 1] = Math.max(bands.at(-1), share);
+    before = share;
+  }}
+  return bands;
+}}"""
+"""Share of a tone in each of the lines that cross a column of a canvas at x (mm), from above."""
+
+
+@pytest.mark.parametrize("strategy", ["manipulation", "steering"])
+def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans, strategy):
+    """At the first step, the last, and evenly between them."""
+    x = np.linspace(-60.0, 45.0, 12)
+    needles = [np.column_stack([x, np.full(12, 8.0 - 0.5 * step), np.zeros(12)]) for step in range(33)]
+    flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0))]
+    sweep = shape(Kind.SWEEP, Source[strategy.upper()], 0, *needles)
+    page = plans([*opening(), *flat, plan(strategy), sweep])
+    canvas = f"{PLANS} .sweeps figure:not([hidden]) canvas"
+    page.locator(canvas).scroll_into_view_if_needed()
+    arrived(page)
+    shares = page.evaluate(BANDS, [canvas, f"--{strategy}", -11.0])
+    assert len(shares) == 9
+    assert np.all(np.diff(shares) > 0.04)
+    assert shares[-1] > 0.8
+
+
+def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
+    page = plans([*opening(), plan(), *plan_frames()])
+    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
+    server.send(session(2), Estimate(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
+    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
+    page.wait_for_selector(f"{PLANS} .sweeps .stale")
+
+
+def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server):
+    page = plans([*opening(), plan(), *plan_frames()])
+    page.wait_for_selector(f"{PLANS} table")
+    page.evaluate(
+        """() => {
+          window.changes = 0;
+          const count = (records) => { window.changes += records.length; };
+          new MutationObserver(count).observe(document.querySelector(".words"), { childList: true, subtree: true });
+          window.table = document.querySelector(".plans table");
+        }"""
+    )
+    live = [frame for period in range(3) for frame in period_frames(period)]
+    server.send(insertion("running", periods=3), rows(0, 3), *live, iteration(2), samples(2), session(seed=8))
+    until(
+        page, "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('session').seed === 8"
+    )
+    page.evaluate(PAINTED)
+    assert page.evaluate("window.changes") == 0
+    assert page.evaluate("window.table === document.querySelector('.plans table')")
+    server.send(plan("steering"))
+    page.wait_for_selector(f"{PLANS} >> text=Steering: ends 0.001 mm off.")
+    assert page.evaluate("window.changes") > 0
+
+
+def test_nothing_is_started_while_another_steers(plans):
+    page = plans([*opening(), people(2, steering=2)])
+    until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
+    assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 1000), (390, 844)])
+def test_it_is_drawn_at_each_size(plans, pictures, size, scheme):
+    page = plans(planned(), width=size[0], height=size[1], scheme=scheme)
+    page.evaluate("document.querySelector('.panel.plans').scrollIntoView()")
+    page.wait_for_timeout(300)
+    assert too_wide(page) == []
+    pictures(page, f"plans-{size[0]}-{scheme}")
+
+
+SAMPLED = """async () => {
+  const { sampledPaths } = await import("/static/planned.js");
+  return sampledPaths(flexneedle.store)?.number ?? null;
+}"""
+
+
+def test_in_a_comparison_the_paths_of_the_strategy_that_is_searched_are_shown(plans, server):
+    page = plans()
+    server.send(iteration(2), samples(2))
+    server.send(Job(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
+    server.send(samples(3, source=Source.STEERING))
+    until(page, "flexneedle.store.get('shape samples steering')")
+    assert page.evaluate(SAMPLED) == 3
+    server.send(Job(job=4, kind="compare", state="done"))
+    until(page, "flexneedle.store.get('job compare').state === 'done'")
+    assert page.evaluate(SAMPLED) == 2

@@ -1,0 +1,176 @@
+"""The file of `flexneedle view --html` in a browser, opened from the disk without a network."""
+
+import pytest
+
+from browser_layout import too_wide
+from chromium import NO_WEBGL
+from fake_page import until
+from flexneedle.lab.page.frames import Source, unpacked
+from flexneedle.lab.page.replay.document import document
+from recorded_page import PERIODS, insertion, period_frames, row, rows
+
+pytestmark = pytest.mark.page
+
+SPACE, SECTION, AXIAL = (f"[data-panel={name}] canvas" for name in ("space", "section", "axial"))
+SCRUB, PLOTS = "[data-panel=player] input[type=range]", "[data-panel=plots]"
+WORDS, DRAWN = "[data-panel=insertion]", "[data-panel=space] .legend li"
+HOSTILE = "</script><script>window.hit = 1</script><!-- <script><img src=x onerror='window.hit = 1'>"
+NO_STORAGE = "Object.defineProperty(window, 'localStorage', { get() { throw new Error('refused'); } });"
+
+
+def record(of="first", **changes):
+    """An insertion in space with the shapes of all periods, as a worker reports a recorded one."""
+    source = Source[of.upper()]
+    shapes = [unpacked(frame) for period in range(PERIODS) for frame in period_frames(period, source)]
+    return [insertion("done", of=of, pace=0.0, **changes), *shapes, rows(0, PERIODS, of)]
+
+
+@pytest.fixture
+def replay(tab, tmp_path):
+    """A function that opens a replay from the disk; what it asks the network for, and errors, fail the test."""
+    pages, asked = [], []
+
+    def note(request):
+        asked.append(request.url)
+
+    def opened(records=None, width=1280, height=900, scheme="light", before=None, ready=DRAWN, **how):
+        path = tmp_path / "replay.html"
+        path.write_text(document("mine", records or record()), encoding="utf-8")
+        page = tab(width, height, scheme, before, **how)
+        page.context.set_offline(True)
+        page.on("request", note)
+        pages.append(page)
+        page.goto(path.as_uri())
+        page.wait_for_selector(f"{SCRUB}:visible")
+        page.wait_for_selector(ready)
+        return page
+
+    yield opened
+    for page in pages:
+        page.remove_listener("request", note)
+        page.context.set_offline(False)
+    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+    assert len([url for url in asked if url.startswith("file:")]) == len(pages)
+
+
+def at(page, period):
+    """Show a period; wait until everything is drawn."""
+    page.evaluate(f"flexneedle.store.set('view period', {period})")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def pictures_at(page, period):
+    at(page, period)
+    found = []
+    for canvas in (SPACE, SECTION, AXIAL):
+        page.locator(canvas).scroll_into_view_if_needed()
+        at(page, period)
+        found.append(page.locator(canvas).screenshot())
+    return found
+
+
+def test_it_begins_at_the_end_of_the_run_with_what_happened_in_words(replay):
+    page = replay()
+    assert page.title() == "mine – flexneedle"
+    assert page.get_attribute(SCRUB, "aria-valuetext").startswith(f"period {PERIODS} of {PERIODS}")
+    assert f"Ended: adaptive-mpc, seed 0, {PERIODS} periods." in page.inner_text(WORDS)
+    assert "advance as planned" in page.inner_text(WORDS)
+    assert page.locator("[data-panel=player] [role=group]").is_hidden()
+    assert page.locator("main .panel").count() == 6
+    assert page.locator("main .panel:visible").count() == 6
+
+
+def test_scrubbing_by_keys_shows_another_period_in_all_views(replay):
+    page = replay(draws=True)
+    last = pictures_at(page, PERIODS - 1)
+    page.focus(SCRUB)
+    page.keyboard.press("Home")
+    until(page, "flexneedle.store.get('view period') === 0")
+    for before, after in zip(last, pictures_at(page, 0), strict=True):
+        assert before != after
+    for before, after in zip(last, pictures_at(page, PERIODS - 1), strict=True):
+        assert before == after
+
+
+def test_plots_follow_and_choose_the_period(replay):
+    page = replay()
+    page.locator(PLOTS).scroll_into_view_if_needed()
+    page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
+    at(page, 20)
+    page.wait_for_selector(f"{PLOTS} [aria-label^='Error from the planned path (mm) at 4.0 s']")
+    label = page.get_attribute(f"{PLOTS} [aria-label^='Error']", "aria-label")
+    assert label == f"Error from the planned path (mm) at 4.0 s: true tip {row(20).error_mm:.3f}"
+    plot = page.locator(f"{PLOTS} .u-over").first
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2 - 3, box["y"] + 20)
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
+    until(page, f"Math.abs(flexneedle.store.get('view period') - {PERIODS // 2}) <= 3")
+
+
+def test_it_plays(replay):
+    page = replay()
+    page.focus(SCRUB)
+    for _ in range(4):
+        page.keyboard.press(">")
+    page.keyboard.press("Home")
+    until(page, "flexneedle.store.get('view period') === 0")
+    page.keyboard.press(" ")
+    until(page, f"flexneedle.store.get('view period') === {PERIODS - 1}")
+    until(page, "!flexneedle.store.get('view playing')")
+    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period {PERIODS} of {PERIODS}']")
+    assert page.input_value(SCRUB) == str(PERIODS - 1)
+
+
+def test_nothing_can_be_moved_or_asked_for(replay):
+    page = replay()
+    page.locator(SECTION).scroll_into_view_if_needed()
+    at(page, 3)
+    assert page.locator(".handle").count() == 0
+
+
+def test_two_runs_are_beside_each_other(replay, pictures):
+    second = record("second", name="other", controller="ce-mpc", seed=7)
+    page = replay([*record(), *second])
+    for panel in ("space", "section", "axial"):
+        page.locator(f"[data-panel={panel}]").scroll_into_view_if_needed()
+        page.wait_for_selector(f"[data-panel={panel}] .legend >> text=second run")
+    assert "Compared with other. Ended: ce-mpc, seed 7" in page.inner_text(WORDS)
+    page.locator(PLOTS).scroll_into_view_if_needed()
+    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
+    pictures(page, "replay-compared")
+
+
+def test_names_and_reasons_are_text(replay):
+    page = replay(record(name=HOSTILE, summary=HOSTILE))
+    assert page.inner_text(WORDS).count(HOSTILE) == 2
+    assert page.evaluate("window.hit") is None
+
+
+def test_a_browser_that_keeps_nothing_shows_it_in_both_themes(replay):
+    page = replay(before=NO_STORAGE)
+    ground = "getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(ground)
+    page.click("#theme")
+    assert page.evaluate(ground) != light
+    assert page.inner_text("#theme") == "Light"
+
+
+def test_without_webgl_the_other_views_show_it(replay):
+    page = replay(before=NO_WEBGL, ready="[data-panel=section] .legend li")
+    page.wait_for_selector("text=This browser has no WebGL")
+    at(page, 3)
+    assert page.get_attribute(SCRUB, "aria-valuetext").startswith("period 4 of")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_it_fits_its_width(replay, pictures, size, scheme):
+    page = replay(width=size[0], height=size[1], scheme=scheme)
+    at(page, 45)
+    pictures(page, f"replay-{size[0]}-{scheme}")
+    for name in ("section", "plots", "insertion"):
+        page.locator(f"[data-panel={name}]").scroll_into_view_if_needed()
+        page.wait_for_timeout(300)
+        pictures(page, f"replay-{size[0]}-{scheme}-{name}")
+    assert too_wide(page) == []

@@ -1,0 +1,148 @@
+"""The page in a browser with its server and workers behind it, as `flexneedle serve` runs them."""
+
+import csv
+import sys
+import zipfile
+from dataclasses import replace
+
+import pytest
+
+import page_clients
+import small_study
+from fake_page import until
+from flexneedle.lab.page.server.limits import Limits
+from page_clients import served
+
+pytestmark = pytest.mark.page
+
+PLANS, INSERTION, PLAYER, FILES = (
+    f"[data-panel={name}]" for name in ("plans", "insertion", "player", "files")
+)
+WORKER = (sys.executable, "-m", "flexneedle.lab.page.worker")
+LIMITS = replace(
+    Limits(), rest_s=60.0, runs_s=0.2
+)  # a changed scenario keeps its estimate until it is planned
+PATIENCE_MS = 100_000
+"""Workers take their time to start where many run."""
+
+
+@pytest.fixture
+def address(tmp_path, monkeypatch):
+    monkeypatch.setattr(page_clients, "PATIENCE_S", PATIENCE_MS / 1000)
+    with served(
+        tmp_path / "runs", limits=LIMITS, workers=((*WORKER, "plans"), (*WORKER, "insertion"))
+    ) as server:
+        yield server.address
+
+
+def see(page, selector):
+    """Wait for what a worker has computed."""
+    page.wait_for_selector(selector, timeout=PATIENCE_MS)
+
+
+def downloaded(page, name, path):
+    """What a link downloads."""
+    with page.expect_download(timeout=PATIENCE_MS) as download:
+        page.click(f"[aria-label='{name}']")
+    download.value.save_as(path)
+    return path
+
+
+def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
+    page = tab(1280, 800, "light")
+    page.goto(address)
+    see(page, f"{PLANS} >> text=Manipulation:")
+    depth = page.evaluate("flexneedle.store.get('scene').target[0]")
+
+    page.focus("[data-panel=section] [data-handle=target]")
+    page.keyboard.press("ArrowRight")
+    see(page, f"{PLANS} >> text=First estimate: error at the target")
+    until(page, f"flexneedle.store.get('scene').target[0] === {depth + 0.5}")
+    page.click(f"{PLANS} [data-work=plan]")
+    see(page, f"{PLANS} .words:not(:has-text('earlier state')) >> text=Manipulation:")
+
+    page.locator(INSERTION).get_by_role("button", name="Insert", exact=True).click()
+    see(page, f"{INSERTION} .decisions .now:has-text('Period')")
+    page.select_option("[aria-label=Pace]", "2")
+    page.locator(INSERTION).get_by_role("button", name="Push", exact=True).click()
+    page.wait_for_selector(f"{INSERTION} >> text=Active: push of 0.02 N at 0°")
+    page.select_option("[aria-label=Pace]", "20")
+    see(page, f"{INSERTION} >> text=Ended: adaptive-mpc, seed 0,")
+    periods = page.evaluate("flexneedle.store.get('insertion live').periods")
+    assert periods > 30
+    assert page.evaluate("flexneedle.store.get('rows live').map(({ index }) => index)") == list(
+        range(periods)
+    )
+
+    page.fill("[aria-label='Name of the run to save']", "mine")
+    page.click("text=Save the insertion")
+    page.click("[aria-label='Open mine']")
+    see(
+        page,
+        f"{PLAYER}:has([aria-pressed=true][data-of=first]) [aria-valuetext^='period {periods} of {periods},']",
+    )
+
+    page.click("summary:has-text('Download')")
+    with downloaded(page, "CSV of mine", tmp_path / "trace.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == periods
+    with zipfile.ZipFile(downloaded(page, "Run folder of mine", tmp_path / "run.zip")) as archive:
+        assert {"mine/run.json", "mine/trace.mcap"} <= set(archive.namelist())
+        assert archive.testzip() is None
+
+
+CLIPBOARD = """Object.defineProperty(navigator, "clipboard", {
+  value: { writeText: async (text) => { window.copied = text; } },
+});"""
+
+LOST = "((rows) => rows.some((_, at) => at > 2 && rows.slice(at - 3, at + 1).every(({ measured }) => !measured)))"
+"""Whether the tip was not measured in four periods one after the other."""
+
+
+@pytest.mark.slow
+def test_searches_a_stopped_insertion_a_link_and_a_row_of_a_study(address, tab, tmp_path):
+    page = tab(1280, 800, "light", before=CLIPBOARD)
+    page.goto(address)
+    see(page, f"{PLANS} >> text=Manipulation:")
+
+    page.click(f"{PLANS} [data-work=reach]")
+    page.click(f"{PLANS} button:has-text('Cancel')")
+    until(page, "flexneedle.store.get('job reach').state === 'cancelled'")
+    assert not page.evaluate("flexneedle.store.get('reach')")
+    page.click(f"{PLANS} [data-work=compare]")
+    see(page, f"{PLANS} >> text=Steering:")
+    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    costs = page.locator(f"{PLANS} tr:has(th:text-is('Cost')) td").all_inner_texts()
+    assert 0.0 < float(costs[0]) < float(costs[1])  # out of reach by the bevel alone
+    page.click(f"{PLANS} [data-work=reach]")
+    see(page, "[data-panel=section] .legend >> text=reach")
+
+    page.locator(INSERTION).get_by_role("button", name="Insert", exact=True).click()
+    see(page, f"{INSERTION} .decisions .now:has-text('Period')")
+    page.locator(INSERTION).get_by_role("button", name="Drop", exact=True).click()
+    page.wait_for_selector(f"{INSERTION} >> text=Active: tip not measured for 1 s")
+    until(page, f"{LOST}(flexneedle.store.get('rows live'))")
+    page.locator(INSERTION).get_by_role("button", name="Stop", exact=True).click()
+    see(page, f"{INSERTION} >> text=Stopped: adaptive-mpc, seed 0")
+
+    state = "(({ seed, values }) => [seed, values['target.depth_mm']])(flexneedle.store.get('session'))"
+    page.evaluate("flexneedle.link.edit({ 'target.depth_mm': 33 })")
+    page.evaluate("flexneedle.link.ask({ type: 'options', seed: 7 })")
+    until(page, f"{state}.join() === '7,33'")
+    page.click("text=Copy a link")
+    page.wait_for_selector(f"{FILES} >> text=Copied")
+    page.click("[aria-label='Begin with the preset']")
+    page.locator(FILES).get_by_role("button", name="Begin", exact=True).click()
+    page.evaluate("flexneedle.link.ask({ type: 'options', seed: 1 })")
+    until(page, f"{state}[0] === 1 && {state}[1] !== 33")
+    page.evaluate("location.hash = new URL(window.copied).hash")
+    until(page, f"{state}.join() === '7,33'")
+
+    (tmp_path / "runs").mkdir(exist_ok=True)
+    small_study.run(tmp_path).rename(tmp_path / "runs" / "small")
+    see(page, "[aria-label='Rows of small']")
+    page.click("[aria-label='Rows of small']")
+    page.click("[aria-label='Open row 3']")
+    see(page, f"{PLAYER} [aria-pressed=true][data-of=first]:visible")
+    again = page.evaluate("flexneedle.store.get('insertion first').error_mm")
+    rows = page.evaluate("flexneedle.store.get('study').rows")
+    assert again == pytest.approx(next(row["error_mm"] for row in rows if row["index"] == 3), abs=1e-9)

@@ -1,0 +1,112 @@
+"""Messages in place of a link's: what is not new, or not in order, ends the link and gives no frame."""
+
+import json
+
+import pytest
+
+from flexneedle.lab.rig.devices.aurora.incoming import Incoming
+from flexneedle.lab.rig.devices.aurora.messages import LONGEST_LINE
+from flexneedle.lab.rig.devices.aurora.readings import NAMES
+from flexneedle.types import VISIBLE
+
+POSE = (1.0, 0.0, 0.0, 0.0, 10.0, -20.0, -200.0, 0.024)
+READY = ["ready", {"10": ["01", "00"]}]
+NOW = 100.0
+
+
+def incoming(*messages, now=NOW):
+    """An adapter that received these messages from one link since 90 s."""
+    clock = [90.0]
+    found = Incoming(NAMES, 0.0, lambda: clock[0])
+    clock[0] = now
+    for message in messages:
+        found.feed(line(message))
+    return found
+
+
+def line(message):
+    return json.dumps(message).encode() + b"\n"
+
+
+def frame(number, requested=NOW, handles=("10",)):
+    return ["frame", number, requested, {handle: [0, 0x31, number, POSE] for handle in handles}]
+
+
+def test_frames_after_ready_are_delivered_once():
+    found = incoming(READY, frame(7, 99.9), frame(8, 99.925))
+    assert [(one.number, one.readings["tip"].position) for one in found.read()] == [
+        (7, (10.0, -20.0, -200.0)),
+        (8, (10.0, -20.0, -200.0)),
+    ]
+    assert found.read() == ()
+    assert found.counts.missed == 0
+
+
+@pytest.mark.parametrize(
+    ("sent", "wrong", "text"),
+    [
+        ([], frame(7), "out of order"),
+        ([], ["error", "garbled", ""], "out of order"),
+        ([READY], READY, "out of order"),
+        ([READY, ["end", "no reply"]], frame(7), "out of order"),
+        ([READY, ["end", "no reply"]], ["end", ""], "out of order"),
+        ([READY, frame(7)], frame(7), "frame 7 after frame 7"),
+        ([READY, frame(7)], frame(6), "frame 6 after frame 7"),
+        ([READY, frame(7, 99.9)], frame(8, 99.8), "requested"),
+        ([READY], frame(7, 89.9), "requested"),
+        ([READY], frame(7, 100.1), "requested"),
+        ([READY], frame(7, handles=("11",)), "has sensors 11, not 10"),
+        ([READY], frame(7, handles=("10", "11")), "has sensors 10, 11, not 10"),
+        ([], ["ready", {"10": ["01", "00"], "11": ["01", "00"]}], "two sensors of one name"),
+    ],
+)
+def test_a_message_out_of_order_or_a_frame_that_is_not_new_is_refused(sent, wrong, text):
+    found = incoming(*sent)
+    before = len(found.read())
+    with pytest.raises(ValueError, match=text):
+        found.feed(line(wrong))
+    assert found.read() == ()
+    assert before == sum(one[0] == "frame" for one in sent)
+
+
+def test_the_names_of_an_earlier_link_are_not_used_for_the_next():
+    found = incoming(READY, frame(7, 99.9))
+    found.begin()
+    with pytest.raises(ValueError, match="out of order"):
+        found.feed(line(frame(8)))
+
+
+def test_a_line_without_end_does_not_grow_without_bound():
+    found = incoming(READY)
+    for _ in range(LONGEST_LINE // 1000):
+        assert not found.feed(b"x" * 1000)
+    with pytest.raises(ValueError, match="without the end of a line"):
+        found.feed(b"x" * 1000)
+
+
+def test_a_link_that_ends_in_the_middle_of_a_message_is_refused():
+    found = incoming(READY)
+    found.feed(line(frame(7))[:-1])
+    with pytest.raises(ValueError, match="incomplete message"):
+        found.finish()
+    assert found.read() == ()
+
+
+def test_a_reason_is_one_printable_line():
+    found = incoming(READY, ["end", "no\nreply\x1b[2J" + "x" * 1000])
+    assert found.status == ("no reply?[2J" + "x" * 1000)[:200]
+
+
+def test_the_status_is_that_of_the_newest_message():
+    found = incoming(READY, frame(7))
+    assert found.status == VISIBLE
+    found.feed(line(["error", "garbled", "replies are garbled"]))
+    assert found.status == "replies are garbled"
+    assert found.counts.errors == {"garbled": 1}
+    found.crashed("the link failed: x")
+    assert found.counts.errors == {"garbled": 1, "crash": 1}
+
+
+def test_no_time_is_after_the_request_of_its_frame_though_numbers_are_huge():
+    found = incoming(READY, frame(5, 99.9), frame(2**32 - 1, 99.921))
+    assert [one.time for one in found.read()] == [99.9, 99.921]

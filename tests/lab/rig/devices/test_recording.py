@@ -1,0 +1,96 @@
+"""Conversion of frames to rows and back."""
+
+import csv
+
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.lab.rig.devices.recording import COLUMNS, read_frames, rows_of
+from flexneedle.types import Frame, SensorReading
+
+MEASURED = SensorReading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
+FRAMES = (
+    Frame(0.1, 4, {"tip": MEASURED, "ref1": SensorReading(None, status="out of volume")}),
+    Frame(0.125, 5, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": MEASURED}),
+)
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Return a function that writes rows as CSV or Parquet."""
+
+    def write(rows, suffix=".csv", columns=COLUMNS):
+        path = tmp_path / f"recorded{suffix}"
+        if suffix == ".parquet":
+            import pyarrow as pa
+            from pyarrow import parquet
+
+            parquet.write_table(pa.Table.from_pylist(rows), path)
+            return path
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
+        return path
+
+    return write
+
+
+ROWS = [row for frame in FRAMES for row in rows_of(frame)]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_frames_are_restored_to_the_last_digit(table, suffix):
+    assert read_frames(table(ROWS, suffix)) == FRAMES
+
+
+def test_a_table_of_measurements_without_status_can_be_read(table):
+    columns = ("sensor", "x_mm", "y_mm", "z_mm", "time_s", "frame_number", "point_id")
+    frames = read_frames(table([{"point_id": 1, **row} for row in ROWS], columns=columns))
+    assert frames[0].readings["tip"].position == MEASURED.position
+    assert frames[0].readings["ref1"].status == "missing"
+
+
+def test_a_position_with_a_bad_status_is_not_used(table):
+    (frame,) = read_frames(table([{**ROWS[0], "status": "out of volume"}]))
+    assert frame.readings["tip"].position is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x_mm": "nan"}, "line 3: x_mm = nan: must be finite"),
+        ({"x_mm": "0,5"}, "line 3: x_mm = 0,5: must be a number, with a decimal point"),
+        ({"time_s": ""}, "line 3: time_s is empty"),
+        ({"sensor": ""}, "line 3: sensor is empty"),
+        ({"sensor": "tip"}, "line 3: duplicate sensor tip in frame 4"),
+        ({"time_s": 0.01}, "frame 4: time_s must not decrease"),
+    ],
+)
+def test_a_damaged_recording_is_rejected_in_one_line(table, change, message):
+    rows = [ROWS[0], {**ROWS[1], **change}, *ROWS[2:]]
+    with pytest.raises(InputError, match=message) as refusal:
+        read_frames(table(rows))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_duplicate_rows_are_rejected(table, suffix):
+    """An identical row, and another one of the same sensor in the same frame."""
+    for again in (ROWS[0], {**ROWS[0], "x_mm": 9.0}):
+        with pytest.raises(InputError, match="line 4: duplicate sensor tip in frame 4"):
+            read_frames(table([*ROWS[:2], again, *ROWS[2:]], suffix))
+
+
+def test_a_file_that_is_not_a_recording_is_rejected(table, tmp_path):
+    with pytest.raises(InputError, match="no column frame_number"):
+        read_frames(table(ROWS, columns=("time_s", "sensor", "x_mm", "y_mm", "z_mm")))
+    with pytest.raises(InputError, match="contains no frames"):
+        read_frames(table([]))
+    for name in ("nothing.csv", "nothing.parquet"):
+        with pytest.raises(InputError) as refusal:
+            read_frames(tmp_path / name)
+        assert str(refusal.value) == f"{tmp_path / name}: cannot be read: No such file or directory"
+    (tmp_path / "no.parquet").write_text("no parquet")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_frames(tmp_path / "no.parquet")

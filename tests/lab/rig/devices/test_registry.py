@@ -1,0 +1,338 @@
+"""Drivers and trackers of a rig file are found by name or as `module:NAME`, made, and checked."""
+
+import sys
+import tomllib
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bench_rig import Clock, Motors, Tracker, rig
+from flexneedle.errors import DriverError, InputError, RigError, RunError
+from flexneedle.lab.rig.devices.registry import DRIVERS, TRACKERS, open_motors, open_tracker
+from flexneedle.ports import MotorPaces
+from flexneedle.scenario.own import resolved
+from galil_peer import peer
+
+PROJECT = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())["project"]
+
+
+class Halves:
+    """A tracker without status."""
+
+    closed = False
+
+    def read(self):
+        return ()
+
+    def close(self):
+        type(self).closed = True
+
+
+def keeps_what_it_gets(settings, channels):
+    motors = Motors(channels)
+    motors.settings = settings
+    return motors
+
+
+def refuses(settings, _about):
+    raise RigError(f"port = {settings['port']}: must be text", "speed = 0: must be above 0")
+
+
+def refuses_in_one_line(_settings, _about):
+    raise InputError("/dev/tty9: no such port")
+
+
+def does_not_reply(_settings, _clock):
+    raise RunError("/dev/tty9: no tracker: no reply")
+
+
+@contextmanager
+def managed(_settings, clock):
+    tracker = Tracker(clock)
+    yield tracker
+    tracker.close()
+
+
+def halves(_settings, _clock):
+    return Halves()
+
+
+def paced(_settings, channels):
+    paced.made = motors = Motors(channels)
+    motors.paces = MotorPaces((500.0, 10_000.0), (1024.0, 200_000.0))
+    return motors
+
+
+def lists(_settings, _about):
+    return []
+
+
+def takes_one(_settings):
+    return None
+
+
+@contextmanager
+def managed_lists(_settings, _clock):
+    yield []
+    Halves.closed = True
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch):
+    """This module is importable as `parts`."""
+    monkeypatch.setitem(sys.modules, "parts", sys.modules[__name__])
+    Halves.closed = False
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Return a function that installs a package with entry points of a group, without its code."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def install(name, group, **points):
+        folder = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        lines = "".join(f"{point} = {value}\n" for point, value in points.items())
+        (folder / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+        monkeypatch.syspath_prepend(tmp_path)  # the finder of packages reads the folder again
+
+    return install
+
+
+def message(call, *arguments):
+    with pytest.raises(RigError) as caught:
+        call(*arguments)
+    lines = caught.value.problems
+    assert all(line.isprintable() for line in lines)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("group", [DRIVERS, TRACKERS])
+def test_what_the_package_registers_exists(group):
+    points = PROJECT["entry-points"].get(group, {})
+    assert all(callable(resolved(value, ())) for value in points.values())
+    assert group != TRACKERS or {"aurora", "replay"} <= set(points)
+
+
+def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
+    motors = open_motors(rig(driver={"kind": "parts:keeps_what_it_gets", "port": 7, "deep": {"a": [1]}}))
+    assert motors.settings == {"port": 7, "deep": {"a": [1]}}
+    assert tuple(motors.states) == ("A", "B", "C")
+
+
+def test_an_installed_package_has_drivers_and_trackers_by_name(package):
+    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
+    package("acme-camera", TRACKERS, acme="bench_rig:trackers")
+    found = rig(driver={"kind": "acme"}, tracker={"kind": "acme", "rate": 20.0})
+    clock = Clock()
+    assert tuple(open_motors(found).read()) == ("A", "B", "C")
+    tracker = open_tracker(found, clock)
+    assert (tracker.rate, tracker.clock) == (20.0, clock)
+
+
+def test_a_tracker_with_close_is_closed_by_it():
+    tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), Clock())
+    tracker.close()
+    assert tracker.closed
+
+
+def test_a_tracker_may_be_a_context_manager():
+    clock = Clock()
+    tracker = open_tracker(rig(tracker={"kind": "parts:managed"}), clock)
+    clock.wait(0.1)
+    assert (len(tracker.read()), tracker.status) == (4, "ok")
+    assert not tracker.tracker.closed
+    tracker.close()
+    assert tracker.tracker.closed
+
+
+class Faulty(Motors):
+    """Motors of a user, whose code has an error in one of its parts."""
+
+    @property
+    def identity(self):
+        raise OSError("no such port")
+
+    def read(self):
+        return {"A": int("bad\nbyte")}
+
+
+def faulty(_settings, channels):
+    return Faulty(channels)
+
+
+def does_not_open(settings, _about):
+    return settings["nothing"]
+
+
+class Refusing(Motors):
+    """Motors of a user that call functions of this package, whose errors they do not know."""
+
+    def read(self):
+        raise RigError("a = 1: no such key", "b = 2: no such key")
+
+    def follow(self, _positions):
+        raise DriverError("no reply within 100 ms")
+
+
+def refusing(_settings, channels):
+    return Refusing(channels)
+
+
+def test_any_other_error_of_the_package_in_a_call_is_one_of_the_driver():
+    motors = open_motors(rig(driver={"kind": "parts:refusing"}))
+    line = "^driver parts:refusing: read: a = 1: no such key; b = 2: no such key$"
+    with pytest.raises(DriverError, match=line):
+        motors.read()
+    with pytest.raises(DriverError, match=r"^no reply within 100 ms$"):
+        motors.follow({})
+
+
+def test_any_error_in_a_device_of_your_own_names_it_the_call_and_the_line():
+    motors = open_motors(rig(driver={"kind": "parts:faulty"}))
+    with pytest.raises(
+        DriverError, match=r"^driver parts:faulty: read: ValueError: invalid literal .* line \d+\)$"
+    ):
+        motors.read()
+    with pytest.raises(DriverError, match=r"^driver parts:faulty: identity: OSError: no such port \("):
+        _ = motors.identity
+    motors.stop()
+    assert not hasattr(motors, "describe")
+    with pytest.raises(
+        DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_registry\.py, "
+    ):
+        open_motors(rig(driver={"kind": "parts:does_not_open"}))
+    with pytest.raises(DriverError, match=r"^tracker parts:does_not_open: KeyError: 'nothing' "):
+        open_tracker(rig(tracker={"kind": "parts:does_not_open"}), Clock())
+
+
+def test_an_unknown_name_is_refused_with_the_names_that_are_installed(package):
+    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
+    line = message(open_motors, rig(driver={"kind": "acmee"}))
+    assert line.startswith('driver.kind = "acmee": must be one of ')
+    assert "acme" in line.split("one of ")[1].split(" or ")[0].replace(",", "").split()
+    assert line.endswith("or module:NAME of your own")
+
+
+def test_two_packages_with_the_same_name_are_refused(package):
+    """Which of them would move the needle?"""
+    package("acme-stage", DRIVERS, stage="bench_rig:drivers")
+    package("other-stage", DRIVERS, stage="other:drivers")
+    line = message(open_motors, rig(driver={"kind": "stage"}))
+    assert line.startswith('driver.kind = "stage": several packages have one of this name: ')
+    assert "acme-stage (bench_rig:drivers)" in line
+    assert "other-stage (other:drivers)" in line
+
+
+def test_a_package_that_is_broken_is_named(package):
+    package("acme-stage", DRIVERS, gone="acme_gone:drivers", less="bench_rig:Nothing")
+    gone = message(open_motors, rig(driver={"kind": "gone"}))
+    assert gone.startswith('driver.kind = "gone": no module acme_gone in ')
+    assert gone.endswith("(entry point of acme-stage)")
+    less = message(open_motors, rig(driver={"kind": "less"}))
+    names = less.removeprefix('driver.kind = "less": bench_rig has no Nothing; public names: ').split(", ")
+    assert {"Motors", "Tracker", "drivers", "values"} <= set(names)
+    assert not {"copy", "tomllib", "replace", "MotorState"} & set(names), "imported there"
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("nothing_such:NAME", "no module nothing_such in "),
+        ("parts:Nothing", "parts has no Nothing; public names: "),
+        ("not a name:x", "must be module:NAME, such as mymodule:MINE"),
+        ("parts:PROJECT", "is a dict, not a function of (settings, "),
+        ("parts:takes_one", "must be a function of (settings, "),
+        ("parts:lists", "made a list "),
+    ],
+)
+def test_an_unsuitable_part_of_your_own_is_refused(kind, line):
+    found = rig(driver={"kind": kind}, tracker={"kind": kind})
+    assert message(open_motors, found).startswith(f'driver.kind = "{kind}": {line}')
+    assert message(open_tracker, found, Clock()).startswith(f'tracker.kind = "{kind}": {line}')
+
+
+def test_a_device_has_all_parts_of_its_port():
+    missing = "without read, set_speed, follow, stop, define, power, reconnect, close"
+    assert message(open_motors, rig(driver={"kind": "parts:lists"})).endswith(f"made a list {missing}")
+    line = message(open_tracker, rig(tracker={"kind": "parts:lists"}), Clock())
+    assert line.endswith("made a list that cannot be closed: it needs close(), or to be a context manager")
+
+
+def test_a_device_that_is_refused_is_closed():
+    line = message(open_tracker, rig(tracker={"kind": "parts:halves"}), Clock())
+    assert line == 'tracker.kind = "parts:halves": made a Halves without status'
+    assert Halves.closed
+    Halves.closed = False
+    line = message(open_tracker, rig(tracker={"kind": "parts:managed_lists"}), Clock())
+    assert line == 'tracker.kind = "parts:managed_lists": made a list without read, status'
+    assert Halves.closed
+
+
+def test_settings_that_a_device_refuses_are_reported_with_its_kind():
+    found = rig(driver={"kind": "parts:refuses", "port": 3}, tracker={"kind": "parts:refuses_in_one_line"})
+    assert message(open_motors, found) == (
+        "driver parts:refuses: port = 3: must be text\ndriver parts:refuses: speed = 0: must be above 0"
+    )
+    line = message(open_tracker, found, Clock())
+    assert line == "tracker parts:refuses_in_one_line: /dev/tty9: no such port"
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (
+            {"axes__insertion__counts_per_mm": 300.0},  # 30,000 counts/s², and 3000 counts/s
+            None,
+        ),
+        (
+            {"axes__insertion__acceleration_mm_s2": 1.02},
+            "axes.insertion.acceleration_mm_s2 = 1.02: must be at least 1.024: the controller takes 1024 counts/s² "
+            "and more",
+        ),
+        (
+            {"axes__guide_y__counts_per_mm": 3.0, "axes__guide_y__acceleration_mm_s2": 341.0},
+            "axes.guide_y.speed_mm_s = 5.0: must be at least 166.666667: the controller takes 500 counts/s and more\n"
+            "axes.guide_y.acceleration_mm_s2 = 341.0: must be at least 341.333334: the controller takes 1024 "
+            "counts/s² and more",
+        ),
+        (
+            {"axes__insertion__speed_mm_s": 10.5},
+            "axes.insertion.speed_mm_s = 10.5: must be at most 10: the controller takes 10000 counts/s and less",
+        ),
+        (
+            {"axes__rotation__acceleration_deg_s2": 2400.0, "axes__rotation__speed_deg_s": 50.0},
+            "axes.rotation.acceleration_deg_s2 = 2400.0: must be at most 2000: the controller takes 200000 "
+            "counts/s² and less",
+        ),
+    ],
+    ids=str,
+)
+def test_speeds_and_accelerations_that_the_controller_does_not_take_are_refused(changes, line):
+    slower = {"axes__rotation__speed_deg_s": 90.0, "axes__guide_y__counts_per_mm": 500.0}
+    found = rig(driver={"kind": "parts:paced"}, **(slower | changes))
+    if line is None:
+        open_motors(found)
+        return
+    assert message(open_motors, found) == line
+    assert paced.made.closed
+    assert paced.made.calls == []
+
+
+def test_an_acceleration_below_the_least_of_a_galil_is_refused_when_it_is_opened():
+    with peer() as device:
+        galil = {"kind": "galil", "address": f"127.0.0.1:{device.port}", "reply_timeout_ms": 1000}
+        open_motors(rig(driver=galil, axes__insertion__acceleration_mm_s2=1.024)).close()
+        line = message(open_motors, rig(driver=galil, axes__insertion__acceleration_mm_s2=1.023))
+        assert not [one for one in device.lines if one.startswith(("AC", "DC", "SP", "SH"))]
+    assert line == (
+        "axes.insertion.acceleration_mm_s2 = 1.023: must be at least 1.024: the controller takes 1024 counts/s² "
+        "and more"
+    )
+
+
+def test_a_device_that_does_not_reply_is_no_error_of_the_file():
+    with pytest.raises(RunError, match="no reply"):
+        open_tracker(rig(tracker={"kind": "parts:does_not_reply"}), Clock())

@@ -1,0 +1,121 @@
+"""Replies of a controller: split, refused if they are not what was asked for, and read as numbers or text."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexneedle.lab.emulators.galil.controller import Device, advanced, reply
+from flexneedle.lab.rig.devices.galil.replies import (
+    LONGEST_LINE,
+    GarbledError,
+    Reply,
+    lines,
+    numbers,
+    parse,
+    text,
+)
+
+TRANSCRIPTS = {
+    path.stem: tomllib.loads(path.read_text())
+    for path in sorted((Path(__file__).parent / "transcripts").glob("*.toml"))
+}
+EXCHANGES = [(name, exchange) for name, found in TRANSCRIPTS.items() for exchange in found["exchange"]]
+
+
+@pytest.mark.parametrize(("name", "exchange"), EXCHANGES)
+def test_the_makers_examples_are_read(name, exchange):
+    (found,) = parse(exchange["reply"].encode(), 1)
+    assert found.accepted == (exchange["reply"] != "?")
+    if "text" in exchange:
+        assert text(found.data) == exchange["text"]
+    elif exchange.get("numbers"):
+        assert numbers(found.data, len(exchange["numbers"])) == tuple(exchange["numbers"])
+    elif name == "hexadecimal":
+        with pytest.raises(GarbledError, match="numbers"):
+            numbers(found.data, 4)
+    else:
+        assert found.data == ""
+
+
+@pytest.mark.parametrize("name", TRANSCRIPTS)
+def test_the_emulated_controller_answers_like_the_makers_examples(name):
+    """But for spaces, which the documents print in several ways."""
+    device = Device()
+    for exchange in TRANSCRIPTS[name]["exchange"]:
+        device, answer = reply(advanced(device, exchange.get("after_ms", 0)), exchange["command"])
+        if exchange.get("emulated", True):
+            assert "".join(answer.split()) == "".join(exchange["reply"].split()), exchange["command"]
+
+
+def test_replies_are_one_for_each_command():
+    assert parse(b" 1, 2\r\n: 3\r\n:?:", 4) == (
+        Reply(True, " 1, 2\r\n"),
+        Reply(True, " 3\r\n"),
+        Reply(False),
+        Reply(True),
+    )
+
+
+@pytest.mark.parametrize("received", [b"", b" 1", b" 1\r\n", b":", b" 1\r\n: 2\r\n"])
+def test_replies_that_are_not_complete_are_waited_for(received):
+    assert parse(received, 2) is None
+
+
+@pytest.mark.parametrize(
+    "received",
+    [b"\xb1\xb7\r\n: 1\r\n:", b"\x00:", b"::\x07", b": 1\r\n::", b":::", b":: 1\r\n", b" 1\r\n?:", b"\xff"],
+)
+def test_what_is_no_reply_to_two_commands_is_refused(received):
+    with pytest.raises(GarbledError):
+        parse(received, 2)
+
+
+@pytest.mark.parametrize(
+    "data",
+    ["", " 1", " 1\r\n 2\r\n", " 1\r\n\r\n", " x\r\n", " nan\r\n", " 1e5\r\n", " 1,\r\n", " 1, 2\r\n", " --1\r\n",
+     " $0000C8\r\n", " 12345678901\r\n", " 1.\r\n", "17.0000\r\n 1\r\n", " +1\r\n", " ١\r\n"],
+)  # fmt: skip
+def test_what_is_not_one_number_is_refused(data):
+    with pytest.raises(GarbledError):
+        numbers(data, 1)
+
+
+@pytest.mark.parametrize("data", ["", "\r\n", "a\r\nb\r\n", "abc"])
+def test_what_is_not_a_line_of_text_is_refused(data):
+    with pytest.raises(GarbledError):
+        text(data)
+
+
+def test_commands_are_distributed_over_lines_in_their_order():
+    commands = tuple(f"PA{'ABCD'[k % 4]}={'1' * (5 * k + 1)}" for k in range(12))
+    found = lines(commands)
+    assert tuple(command for line in found for command in line) == commands
+    assert all(len(";".join(line)) <= LONGEST_LINE for line in found)
+    assert len(lines(("TPABCD", "RPABCD", "TSABCD", "SCABCD"))) == 1
+    with pytest.raises(ValueError, match="longer than 80"):
+        lines(("X" * 81,))
+
+
+@settings(max_examples=500)
+@given(st.binary(max_size=40), st.integers(1, 5))
+def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
+    try:
+        found = parse(received, count)
+    except GarbledError:
+        return
+    assert found is None or len(found) == count
+    if found is not None:
+        assert "".join(each.data + "?:"[each.accepted] for each in found).encode() == received
+
+
+@settings(max_examples=300)
+@given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=8), st.data())
+def test_a_reply_arrives_in_any_pieces(values, data):
+    whole = f" {', '.join(map(str, values))}\r\n:".encode()
+    at = data.draw(st.integers(0, len(whole) - 1))
+    assert parse(whole[:at], 1) is None
+    (found,) = parse(whole, 1)
+    assert numbers(found.data, len(values)) == tuple(values)

@@ -1,0 +1,142 @@
+"""The emulated controller on TCP: a process of its own, as a client meets it, and its faults over time."""
+
+import re
+import socket
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from emulated import DEADLINE_S, emulator, until
+from flexneedle.errors import InputError
+from flexneedle.lab.emulators.faults import parse_fault
+from flexneedle.lab.emulators.galil.controller import Device, reply
+from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp
+
+PAGE = (Path(__file__).parents[4] / "docs" / "rig" / "galil.md").read_text()
+
+
+@contextmanager
+def connected(*arguments):
+    """A client of an emulated controller; gives a function that sends a line and returns the reply."""
+    with emulator(*arguments, device="galil") as (address, _):
+        host, port = address.rsplit(":", 1)
+        with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as line:
+
+            def ask(command):
+                line.sendall(f"{command}\r".encode())
+                answer = b""
+                while answer.count(b":") + answer.count(b"?") <= command.count(";"):
+                    got = line.recv(4096)
+                    if not got:
+                        raise ConnectionResetError
+                    answer += got
+                return answer.decode()
+
+            ask.line, ask.address = line, (host, int(port))
+            yield ask
+
+
+def test_a_client_moves_a_motor_in_real_time_and_stops_it():
+    with connected() as ask:
+        assert ask("SHA;SPA=2000;PRA=100;BGA") == "::::"
+        until(lambda: float(ask("MG _BGA").strip(" \r\n:")) == 0.0)
+        assert ask("TPA") == " 100\r\n:"
+        assert ask("JGA=500;BGA") == "::"
+        until(lambda: int(ask("TPA").strip(" \r\n:")) > 150)
+        assert ask("STA") == ":"
+        until(lambda: float(ask("MG _BGA").strip(" \r\n:")) == 0.0)
+        assert ask("SCA") == " 4\r\n:"
+        assert ask("BGX") == "?"
+        assert ask("TC1") == " 4 Operand error\r\n:"
+
+
+def test_an_unplugged_controller_loses_its_connections_and_can_be_reached_again():
+    with connected("--fault", "unplug@0:0.3") as ask:
+        ask("SHA;PRA=2000000;BGA")
+
+        lost, reachable = _holds_for(OSError, lambda: ask("TPA")), _works(ask.address)
+        until(lost)
+        until(reachable)
+        with socket.create_connection(ask.address, timeout=DEADLINE_S) as line:
+            line.sendall(b"EO 0\r")
+            assert line.recv(16) == b":"
+
+
+def _holds_for(error, action):
+    """Whether an action fails with an error."""
+
+    def fails():
+        try:
+            action()
+        except error:
+            return True
+        return False
+
+    return fails
+
+
+def _works(address):
+    """Whether a connection to an address is possible."""
+    refused = _holds_for(OSError, lambda: socket.create_connection(address, timeout=DEADLINE_S).close())
+    return lambda: not refused()
+
+
+def test_a_port_in_use_is_said_in_one_line():
+    with (
+        Tcp("127.0.0.1", 0) as tcp,
+        pytest.raises(InputError, match="cannot be listened on: Address already"),
+    ):
+        Tcp(*tcp.address).plug()
+
+
+def session(*faults):
+    """A session whose axis A has moved from 0 s on, with other motors on."""
+    made = GalilSession(Device(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
+    for line in ("SH", "SP 1000,1000", "PR 100000,100000", "BGAB"):
+        made.reply(line, 0.0)
+    made.advance(0.0)
+    assert made.moved_since == 0.0
+    return made
+
+
+def position(made, axis):
+    return reply(made.device, f"TP{axis}")[1]
+
+
+def test_it_moves_on_while_its_process_is_not_scheduled():
+    often, once = session(), session()
+    for k in range(1, 1001):
+        often.advance(k * 1e-3)
+    once.advance(1.0)
+    assert position(often, "A") == position(once, "A") != " 0\r\n:"
+
+
+@pytest.mark.parametrize("kind", ["stall", "lag", "overshoot", "reversed", "off", "reset", "limit"])
+def test_a_fault_of_a_motor_is_of_its_axis_and_time(kind):
+    good, bad = session(), session(f"{kind}=A@0.5:0.2")
+    for now in (0.1, 0.4):
+        good.advance(now)
+        bad.advance(now)
+        assert position(good, "A") == position(bad, "A")
+    for k in range(10):
+        good.advance(0.5 + 0.02 * k)
+        bad.advance(0.5 + 0.02 * k)
+    good.advance(0.75)
+    bad.advance(0.75)
+    assert position(good, "A") != position(bad, "A")
+    assert position(good, "B") == position(bad, "B")
+
+
+def test_faults_of_the_line_change_replies():
+    assert session("refuse@0").reply("TPA", 1.0) == (1.0, b"?")
+    assert session("silence@0").reply("TPA", 1.0)[1] == b""
+    assert session("delay=0.3@0").reply("EO 0", 1.0) == (1.3, b":")
+    assert session("delay=0.3@5").reply("EO 0", 1.0) == (1.0, b":")
+
+
+def test_the_page_has_every_fault():
+    listed = re.findall(
+        r"`([a-z-]+)`", "".join(line.split("|")[1] for line in PAGE.splitlines() if "|" in line)
+    )
+    assert set(FAULTS) <= set(listed)

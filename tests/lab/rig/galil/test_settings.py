@@ -1,0 +1,82 @@
+"""Settings of the driver in a rig file."""
+
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from flexneedle.errors import RigError
+from flexneedle.lab.rig.devices.galil.motors import factory
+from flexneedle.lab.rig.devices.galil.settings import checked
+
+GOOD = {"address": "192.168.1.10"}
+
+
+def test_defaults():
+    found = checked(GOOD, ["A", "B"])
+    assert (found.host, found.port, found.mode, found.reply_timeout_ms) == (
+        "192.168.1.10",
+        23,
+        "tracking",
+        100.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("address", "host", "port"),
+    [("galil.lab:2323", "galil.lab", 2323), ("[fe80::1%eth0]:23", "fe80::1%eth0", 23), ("[::1]", "::1", 23)],
+)
+def test_an_address_has_a_host_and_perhaps_a_port(address, host, port):
+    found = checked({"address": address}, ["A"])
+    assert (found.host, found.port) == (host, port)
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({}, "driver.address: missing"),
+        ({"address": 23}, "driver.address = 23: must be text in quotes"),
+        (
+            {"address": "a b"},
+            'driver.address = "a b": must be HOST or HOST:PORT, such as 192.168.1.10:23',
+        ),
+        ({"address": "a:0"}, 'driver.address = "a:0": must be HOST or HOST:PORT, such as 192.168.1.10:23'),
+        (
+            {"address": "a:65536"},
+            'driver.address = "a:65536": must be HOST or HOST:PORT, such as 192.168.1.10:23',
+        ),
+        ({**GOOD, "mode": "jog"}, 'driver.mode = "jog": must be one of tracking, moves'),
+        ({**GOOD, "reply_timeout_ms": 0}, "driver.reply_timeout_ms = 0: must be at least 1"),
+        ({**GOOD, "reply_timeout_ms": 2e3}, "driver.reply_timeout_ms = 2000.0: must be at most 1000"),
+        (
+            {**GOOD, "adress": "a"},
+            'driver.adress = "a": unknown key; did you mean address? valid keys: address, mode, reply_timeout_ms',
+        ),
+    ],
+)
+def test_a_setting_that_is_not_valid_is_refused_in_one_line(settings, line):
+    with pytest.raises(RigError) as error:
+        factory(settings, ["A"])
+    assert str(error.value) == line
+
+
+@pytest.mark.parametrize(
+    ("channels", "line"),
+    [
+        (["A", "Q"], 'channel = "Q": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
+        (["AB"], 'channel = "AB": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
+        (["A", "A"], 'channel = "A": each axis once'),
+        ([], "channel: at least one"),
+    ],
+)
+def test_channels_are_axes_of_the_controller(channels, line):
+    with pytest.raises(RigError) as error:
+        factory(GOOD, channels)
+    assert line in error.value.problems
+
+
+def test_the_package_offers_the_driver():
+    pyproject = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())
+    module, name = pyproject["project"]["entry-points"]["flexneedle.drivers"]["galil"].split(":")
+    assert getattr(import_module(module), name) is factory

@@ -1,0 +1,136 @@
+"""The client waits for what its requests have changed, and takes no earlier report for it."""
+
+import os
+import threading
+from multiprocessing.connection import Connection
+from threading import Thread
+
+import pytest
+
+from flexneedle.errors import RefusedError
+from flexneedle.geometry.registration import identity
+from flexneedle.lab.rig.supervisor import client
+from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor.client import Supervisor
+from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from stages import rig_file
+
+
+class Scripted:
+    """The supervisor's process in a thread. The rig was stopped long ago; another stop is acted on, and motors
+    rest, heartbeats of a waiting client later.
+    """
+
+    pid = 0
+
+    def __init__(self, _command, pass_fds, **_options):
+        self._line = Connection(os.dup(pass_fds[0]))
+        self._requests, self._next = 0, []
+        self._thread = Thread(target=self._serve)
+        self._thread.start()
+
+    def wait(self, _seconds):
+        self._thread.join()
+
+    def _report(self, requests, *, rests):
+        self._line.send(say.Report(0.0, State.STOPPED, "the test", requests=requests, at_rest=rests))
+
+    def _take(self):
+        request = self._line.recv()
+        self._requests += 1
+        return request
+
+    def _serve(self):
+        self._line.recv()
+        self._report(0, rests=True)
+        with self._line:
+            while not isinstance(request := self._take(), say.Close):
+                self._answer(request)
+            self._line.send(say.Ended())
+
+    def _answer(self, request):
+        match request:
+            case say.Stop():
+                self._report(self._requests - 1, rests=True)  # an earlier one, that was under way
+                self._next = [(self._requests, rests) for rests in (False, False, True)]
+            case say.Heartbeat() if self._next:
+                requests, rests = self._next.pop(0)
+                self._report(requests, rests=rests)
+            case say.Reset() if self._next:
+                self._line.send(say.Refused(0, "motors have not come to rest yet", State.STOPPED))
+                self._report(self._requests, rests=False)
+                # As the supervisor's own, its number of requests never falls, also if a late client sends heartbeats.
+                self._next = [(self._requests, rests) for _, rests in self._next]
+            case say.Reset():
+                self._line.send(say.Report(0.0, State.IDLE, requests=self._requests))
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    monkeypatch.setattr(client.subprocess, "Popen", Scripted)
+    monkeypatch.setattr(client, "_SILENT_S", 60.0)  # it reports only when it is asked
+
+
+@pytest.fixture
+def supervisor(scripted):  # noqa: ARG001  it has to be there first
+    with Supervisor.of_operator(rig_file()) as made:
+        yield made
+
+
+@pytest.mark.usefixtures("scripted")
+@pytest.mark.parametrize("error", [OSError("no space left"), ValueError("a bug")])
+def test_what_a_follower_raises_is_raised_where_the_client_waits_and_the_rig_can_still_be_stopped(error):
+    seen = []
+
+    def fails(report):
+        seen.append(report)
+        raise error
+
+    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
+    with Supervisor(task, fails) as made:
+        with pytest.raises(type(error), match=str(error)):
+            made.wait(5.0)
+        assert made.ended is None
+        made.stop()
+        sent = made._sent
+        for move in (made.arm, lambda: made.move_to("insertion", 1.0)):
+            with pytest.raises(type(error), match=str(error)):
+                move()
+        assert made._sent == sent  # nothing was asked for
+        made.stop()
+    assert len(seen) > 1  # it goes on getting reports, as the others do
+    assert made.ended == ""
+
+
+@pytest.mark.usefixtures("scripted")
+@pytest.mark.parametrize("waits", [True, False])
+def test_what_a_follower_raises_after_the_last_wait_is_printed(monkeypatch, waits):
+    """By the hook for errors of threads; once, also if it was raised before."""
+    printed, fails = [], []
+    monkeypatch.setattr(threading, "excepthook", printed.append)
+
+    def follower(_report):
+        if fails:
+            raise OSError("no space left")
+
+    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
+    with Supervisor(task, follower) as made:
+        fails.append(True)
+        made.stop()
+        if waits:
+            with pytest.raises(OSError, match="no space left"):
+                made.wait(5.0)
+    assert [str(one.exc_value) for one in printed] == ([] if waits else ["no space left"])
+
+
+def test_after_a_stop_a_reset_is_accepted(supervisor):
+    supervisor.stop()
+    supervisor.reset()
+    assert supervisor.report.state is State.IDLE
+
+
+def test_a_request_that_is_refused_has_the_reason(supervisor):
+    supervisor.request_stop("another thread")
+    with pytest.raises(RefusedError, match="motors have not come to rest yet"):
+        supervisor.reset()

@@ -1,0 +1,57 @@
+"""The tick's check before the first step: nothing is expected, but a step does not begin on a reading that is none."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from flexneedle.lab.rig.supervisor.messages import Expectation
+from flexneedle.lab.rig.supervisor.watch import Watch
+from flexneedle.loop.monitor.monitor import Monitor
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, VerdictKind
+
+NOW = 10.0
+AT_TIP = Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 3.0)
+
+
+def measured(number, time=NOW, x=0.0):
+    frame = Frame(time, number, {"tip": SensorReading((x, 0.0, 0.0))})
+    return Measurement(time, x, 0.0, 0.0, frame)
+
+
+def watched(*readings):
+    """The verdict at the begin of the first step after these readings, each of one tick."""
+    watch = Watch(Monitor(MonitorSettings(references=0)), 0.25, 0.0)
+    for reading in readings:
+        watch = watch.after([reading], NOW, VISIBLE)
+    return watch.expecting(AT_TIP, NOW, NOW + 1.0).verdict
+
+
+@pytest.mark.parametrize(
+    ("newest", "kind"),
+    [
+        (measured(3), VerdictKind.OK),
+        (measured(3, x=math.nan), VerdictKind.NOT_A_NUMBER),
+        (measured(2), VerdictKind.STALE),
+        (measured(1), VerdictKind.STALE),
+        (measured(3, NOW - 0.3), VerdictKind.STALE),
+        (measured(3, NOW + 0.3), VerdictKind.STALE),
+    ],
+)
+def test_a_first_step_does_not_begin_on_a_reading_that_is_none_old_or_repeated(newest, kind):
+    assert watched(measured(1), measured(2), newest).kind is kind
+
+
+def test_a_good_reading_ends_the_rejection():
+    assert watched(measured(1), measured(1), measured(2)).ok
+
+
+def test_while_a_motion_waits_for_its_motors_so_does_what_is_expected_of_the_tip():
+    watch = Watch(Monitor(MonitorSettings(references=0)), 0.25, 0.0).expecting(AT_TIP, NOW, NOW + 1.0)
+    assert watch.waiting(NOW + 0.5, 1.0).ended == NOW + 2.0
+    assert watch.waiting(NOW + 1.5, 1.0).ended == NOW + 1.0
+    halfway = replace(
+        watch.waiting(NOW + 0.5, 1.0), expected=Expectation((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1)
+    )
+    assert halfway.after([measured(4, NOW + 1.0, 4.5)], NOW + 1.0, VISIBLE).verdict.ok

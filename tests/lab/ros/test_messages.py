@@ -1,0 +1,243 @@
+"""Messages of the records of an insertion: those of the trace, and those of SmartNeedle."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+import flexneedle
+from flexneedle.geometry.quaternion import to_matrix
+from flexneedle.lab.ros.messages import UNKNOWN_TURN, Composer, length_of, rolled, spaced
+from flexneedle.lab.ros.profile import PUBLISHED, load_profile
+from flexneedle.lab.ros.records import JointTargets, RigState, Target
+from flexneedle.record.messages import STORE, pose
+from flexneedle.record.writer import TraceWriter
+from flexneedle.types import Measurement, Pose, Shape
+from synthetic import blind, make_periods, make_plan
+
+PLAN = replace(make_plan(), scenario=flexneedle.load_scenario("phantom"))
+PERIODS = [
+    replace(one, predicted=Shape(one.shape + 0.1, one.shape[:, 1:3] ** 2))
+    for one in list(make_periods(PLAN))[40:44]
+]
+PERIOD = PERIODS[-1]
+SAME = {  # key of `publish`: topic of the trace
+    "shape": "/needle/shape",
+    "predicted_shape": "/needle/predicted_shape",
+    "tip": "/tip/estimate",
+    "plan": "/plan/path",
+    "joint_states": "/joint_states",
+}
+
+
+def circle(s, curvature=2e-3):
+    """Poses (n, 5) of a needle bent to a circle, at arc lengths (n,)."""
+    slope = curvature * s
+    return np.column_stack([np.sin(slope) / curvature, (1 - np.cos(slope)) / curvature, 0 * s, slope, 0 * s])
+
+
+BENT = replace(PERIOD, shape=circle(np.linspace(0.0, 150.0, 61)))
+
+
+def composed(*records, profile="neutral", epoch=0.0):
+    """Messages by key, the last of each, decoded from the bytes that are sent."""
+    composer = Composer(load_profile(profile), epoch)
+    found = [one for record in records for one in composer.messages(record)]
+    return {
+        one.key: STORE.deserialize_cdr(
+            STORE.serialize_cdr(one.message, PUBLISHED[one.key]), PUBLISHED[one.key]
+        )
+        for one in found
+    }
+
+
+def xyz(at):
+    return np.array([at.x, at.y, at.z])
+
+
+def positions(message):
+    return np.array([xyz(one.position) for one in message.poses])
+
+
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory):
+    """Messages of `trace.mcap` by topic, of the plan and of the last period."""
+    path = tmp_path_factory.mktemp("trace") / "trace.mcap"
+    with TraceWriter(path, PLAN, about={}, scenario={}) as writer:
+        for period in PERIODS:
+            writer.add(period)
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(log_time_order=False)
+        return {c.topic: STORE.deserialize_cdr(m.data, s.name) for s, c, m in found}
+
+
+@pytest.mark.parametrize(("key", "topic"), SAME.items())
+def test_topics_have_what_the_trace_has(traced, key, topic):
+    sent, kept = composed(PLAN, *PERIODS)[key], traced[topic]
+    assert sent.header.stamp == kept.header.stamp
+    match key:
+        case "shape" | "predicted_shape":
+            assert sent.poses == [stamped.pose for stamped in kept.poses]
+            assert sent.header == kept.header
+        case "joint_states":
+            assert sent.name == kept.name
+            np.testing.assert_array_equal(sent.position, kept.position)
+        case _:
+            assert sent == kept
+
+
+def test_diagnostics_have_the_scalars_readings_and_durations_of_the_trace(traced):
+    sent = composed(PERIOD)["diagnostics"]
+    kept = [s for topic in ("/control/status", "/tracker/readings", "/timing") for s in traced[topic].status]
+    assert [(s.name, s.level, s.message, s.values) for s in sent.status] == [
+        (f"flexneedle: {s.name}", s.level, s.message, s.values) for s in kept
+    ]
+
+
+def test_stamps_are_moved_by_the_epoch():
+    at, moved = composed(PERIOD)["tip"].header.stamp, composed(PERIOD, epoch=1.7e9)["tip"].header.stamp
+    assert moved.sec - at.sec == 1_700_000_000
+    assert moved.nanosec == at.nanosec
+
+
+def test_shapes_of_smartneedle_are_half_a_millimetre_apart_and_end_at_the_tip():
+    sent = composed(BENT, profile="smartneedle")["shape"]
+    steps = np.linalg.norm(np.diff(positions(sent), axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.5, rtol=1e-5)
+    x, y, z = BENT.shape[-1, :3]
+    np.testing.assert_allclose(positions(sent)[-1], (-z, y, x))
+    assert len(sent.poses) == 300
+    assert sent.header.frame_id == "needle"
+
+
+def test_poses_of_smartneedle_have_their_z_along_the_needle():
+    sent = composed(BENT, profile="smartneedle")["shape"]
+    turns = [one.orientation for one in sent.poses]
+    axes = np.array([to_matrix(np.array([q.w, q.x, q.y, q.z]))[:, 2] for q in turns])
+    chords = np.gradient(positions(sent), axis=0)
+    np.testing.assert_allclose(axes, chords / np.linalg.norm(chords, axis=1)[:, None], atol=1e-3)
+
+
+@given(st.floats(0.1, 5.0), st.floats(1e-3, 8e-3))
+def test_poses_are_on_the_needle_at_equal_distances_from_the_tip(spacing, curvature):
+    """A circle: positions and slopes are known everywhere."""
+    nodes = circle(np.linspace(0.0, 100.0, 41), curvature)
+    found, length = spaced(nodes, spacing), length_of(nodes)
+    expected = circle((length - spacing * np.arange(len(found))[::-1]) * 100.0 / length, curvature)
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+    assert 0.0 <= length - spacing * (len(found) - 1) < spacing
+
+
+def test_the_needle_pose_is_the_inserted_length_and_the_roll():
+    straight = np.zeros((61, 5))
+    straight[:, 0] = np.linspace(-110.0, 40.0, 61)
+    period = replace(
+        PERIOD, shape=straight, base=Pose(-110.0, 0.0, 0.0, 0.0, 0.0), roll=math.pi / 2, guide=(3.0, -1.0)
+    )
+    sent = composed(period, profile="smartneedle")
+    np.testing.assert_allclose(xyz(sent["needle_pose"].pose.position), (0.0, 0.0, 40.0), atol=1e-12)
+    turn = sent["needle_pose"].pose.orientation
+    np.testing.assert_allclose((turn.w, turn.x, turn.y, turn.z), (0.5**0.5, 0, 0, 0.5**0.5), atol=1e-12)
+    np.testing.assert_allclose(xyz(sent["guide_pose"].point), (-1.0, 40.0, 3.0), atol=1e-12)
+    assert sent["guide_pose"].header.frame_id == "stage"
+
+
+def test_a_roll_turns_about_the_needles_own_axis():
+    at = pose(0.0, Pose(1.0, 2.0, 3.0, 0.3, -0.2)).pose
+    before, after = (
+        to_matrix(np.array([q.w, q.x, q.y, q.z])) for q in (at.orientation, rolled(at, 0.7).orientation)
+    )
+    np.testing.assert_allclose(after[:, 0], before[:, 0])
+    np.testing.assert_allclose(after[:, 1] @ before[:, 1], math.cos(0.7))
+    np.testing.assert_allclose(after[:, 1] @ before[:, 2], math.sin(0.7))
+
+
+def test_a_measured_tip_has_its_covariance():
+    matrix = ((1e-2, 2e-3, 0.0), (2e-3, 4e-2, 0.0), (0.0, 0.0, 9e-2))
+    slopes = ((1e-4, 5e-5), (5e-5, 4e-4))
+    measured = Measurement(
+        1.5, 1.0, 2.0, 3.0, direction=(0.1, 0.2), covariance=matrix, direction_covariance=slopes
+    )
+    period = replace(PERIOD, measurement=measured)
+    sent = composed(period)["measured_tip"]
+    found = sent.pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(found[:3, :3], 1e-6 * np.array(matrix))
+    turns = [[UNKNOWN_TURN, 0.0, 0.0], [0.0, 4e-4, -5e-5], [0.0, -5e-5, 1e-4]]  # ψ turns about −y, θ about z
+    np.testing.assert_allclose(found[3:, 3:], turns)
+    assert sent.pose.pose == pose(1.5, Pose(1.0, 2.0, 3.0, 0.1, 0.2)).pose
+    assert sent.header.stamp.sec == 1
+
+
+def test_an_angle_that_is_not_measured_may_be_any():
+    measured = Measurement(1.5, 1.0, 2.0, covariance=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    found = composed(replace(PERIOD, measurement=measured))["measured_tip"].pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(found[3:, 3:], UNKNOWN_TURN * np.eye(3))
+
+
+def test_without_a_covariance_or_an_accepted_reading_there_is_no_measured_tip():
+    assert "measured_tip" not in composed(PERIOD)
+    assert "measured_tip" not in composed(blind(PERIOD))
+
+
+def test_what_was_not_predicted_is_not_published():
+    assert "predicted_shape" not in composed(replace(PERIOD, predicted=None))
+
+
+def test_markers_are_the_layers_and_the_target():
+    sent = composed(PLAN)["markers"].markers
+    assert [(m.ns, m.text) for m in sent] == [
+        ("tissue", "superficial"),
+        ("tissue", "deep"),
+        ("target", "target"),
+    ]
+    first, second, ball = sent
+    assert first.pose.position.x + first.scale.x / 2 == pytest.approx(0.020)
+    assert first.pose.position.x - first.scale.x / 2 == pytest.approx(0.0)
+    assert second.pose.position.x - second.scale.x / 2 == pytest.approx(0.020)
+    assert second.pose.position.x + second.scale.x / 2 > PLAN.target[0] * 1e-3
+    np.testing.assert_allclose(xyz(ball.pose.position), 1e-3 * np.array(PLAN.target))
+    assert ball.scale.x == pytest.approx(0.002)
+
+
+def test_a_new_target_keeps_the_layers():
+    sent = composed(PLAN, Target(3.0, (35.0, -4.0, 1.0)))["markers"].markers
+    assert [m.ns for m in sent] == ["tissue", "tissue", "target"]
+    np.testing.assert_allclose(xyz(sent[-1].pose.position), (0.035, -0.004, 0.001))
+
+
+def test_a_plan_without_a_scenario_has_no_layers():
+    assert [m.ns for m in composed(replace(PLAN, scenario=None))["markers"].markers] == ["target"]
+
+
+def test_the_state_is_a_word_and_a_diagnostic():
+    sent = composed(RigState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
+    assert sent["state"].data == "fault"
+    (status,) = sent["diagnostics"].status
+    assert (status.level, status.name, status.message) == (
+        b"\x01"[0],
+        "flexneedle: rig",
+        "fault: motor A is off",
+    )
+    assert [(pair.key, pair.value) for pair in status.values] == [("axis", "A")]
+
+
+def test_joint_targets():
+    sent = composed(JointTargets(1.0, {"insertion": 0.01, "roll": 3.0}))["joint_targets"]
+    assert sent.name == ["insertion", "roll"]
+    assert sent.position.tolist() == [0.01, 3.0]
+    assert len(sent.velocity) == len(sent.effort) == 0
+
+
+def test_only_what_the_profile_lists_is_made():
+    assert set(composed(PLAN, PERIOD, profile="smartneedle-fbg")) == {
+        "predicted_shape",
+        "tip",
+        "plan",
+        "markers",
+        "joint_states",
+        "diagnostics",
+    }

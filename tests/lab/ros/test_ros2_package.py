@@ -1,0 +1,269 @@
+"""ros2/flexneedle_ros: it agrees with the neutral profile, and its node runs with (a stand-in of) rclpy only."""
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from threading import Thread
+from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
+from xml.etree import ElementTree
+
+import pytest
+from ruamel.yaml import YAML
+
+from emulated import until
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, load_profile
+
+FOLDER = Path(__file__).parents[3] / "ros2" / "flexneedle_ros"
+NEUTRAL = load_profile("neutral")
+DISPLAYS = {
+    "MarkerArray": "visualization_msgs/msg/MarkerArray",
+    "Path": "nav_msgs/msg/Path",
+    "Pose": "geometry_msgs/msg/PoseStamped",
+    "PoseArray": "geometry_msgs/msg/PoseArray",
+    "PoseWithCovariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+}
+
+
+@pytest.fixture
+def operator(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    sys.modules.pop("flexneedle_ros.operator", None)
+    import flexneedle_ros.operator
+
+    return flexneedle_ros.operator
+
+
+@pytest.fixture
+def stand_ins(monkeypatch):
+    """Modules that stand in for those of ROS, by name."""
+
+    def stand_in(*names):
+        modules = {name: MagicMock(name=name) for name in names}
+        for name, module in modules.items():
+            monkeypatch.setitem(sys.modules, name, module)
+        return modules
+
+    return stand_in
+
+
+def parameters():
+    text = (FOLDER / "config" / "operator.yaml").read_text()
+    return YAML(typ="safe").load(text)["flexneedle_operator"]["ros__parameters"]
+
+
+def test_without_ros_the_node_reports_what_it_needs():
+    script = "import sys; from flexneedle_ros.operator import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env={"PYTHONPATH": str(FOLDER)}, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "flexneedle_ros needs ROS 2 (no module rclpy): source /opt/ros/DISTRIBUTION/setup.bash first\n"
+    )
+
+
+def test_topics_are_those_of_the_neutral_profile(operator):
+    topics = {
+        "stop_topic": NEUTRAL.subscribe.stop.topic,
+        "arm_topic": NEUTRAL.subscribe.arm.topic,
+        "state_topic": NEUTRAL.publish.state.topic,
+    }
+    assert {key: parameters()[key] for key in topics} == topics
+    assert parameters() == operator.DEFAULTS
+
+
+def test_rviz_shows_topics_of_the_neutral_profile_as_what_they_are():
+    config = YAML(typ="safe").load((FOLDER / "config" / "flexneedle.rviz").read_text())[
+        "Visualization Manager"
+    ]
+    assert config["Global Options"]["Fixed Frame"] == NEUTRAL.frames["skin"].id
+    keys = {topic.topic: key.removeprefix("publish.") for key, topic in NEUTRAL.topics()}
+    shown = [display for display in config["Displays"] if "Topic" in display]
+    assert len(shown) == 6
+    for display in shown:
+        key = keys[display["Topic"]["Value"]]
+        assert PUBLISHED[key] == DISPLAYS[display["Class"].rpartition("/")[2]]
+        assert (display["Topic"]["Durability Policy"] == "Transient Local") is (key in LATCHED)
+
+
+def test_what_is_installed_exists_and_the_launch_file_starts_it(stand_ins):
+    setup = stand_ins("setuptools")["setuptools"].setup
+    runpy.run_path(str(FOLDER / "setup.py"))
+    given = setup.call_args.kwargs
+    files = [FOLDER / file for _, files in given["data_files"] for file in files]
+    assert [file for file in files if not file.is_file()] == []
+    assert given["entry_points"]["console_scripts"] == ["operator = flexneedle_ros.operator:main"]
+
+    modules = stand_ins(
+        "ament_index_python", "ament_index_python.packages", "launch", "launch.actions", "launch.conditions",
+        "launch.substitutions", "launch_ros", "launch_ros.actions",
+    )  # fmt: skip
+    modules["ament_index_python.packages"].get_package_share_directory.return_value = str(FOLDER)
+    runpy.run_path(str(FOLDER / "launch" / "flexneedle.launch.py"))["generate_launch_description"]()
+    operator, rviz = (call.kwargs for call in modules["launch_ros.actions"].Node.call_args_list)
+    assert (operator["package"], operator["executable"], operator["name"]) == (
+        "flexneedle_ros",
+        "operator",
+        "flexneedle_operator",
+    )
+    assert Path(rviz["arguments"][1]).is_file()
+    defaults = [
+        c.kwargs["default_value"] for c in modules["launch.actions"].DeclareLaunchArgument.call_args_list
+    ]
+    assert Path(defaults[1]).is_file()
+
+
+def test_the_manifest_names_what_is_imported():
+    manifest = ElementTree.parse(FOLDER / "package.xml").getroot()
+    assert manifest.findtext("name") == "flexneedle_ros"
+    assert manifest.findtext("export/build_type") == "ament_python"
+    needed = {entry.text for entry in manifest.findall("exec_depend")}
+    assert needed >= {"rclpy", "std_msgs", "std_srvs", "launch", "launch_ros", "rviz2"}
+
+
+class Rclpy:
+    """Stands in for rclpy: keeps what the node makes, and spins until the test ends it."""
+
+    def __init__(self, monkeypatch):
+        self.sent, self.services, self.publishers, self.spinning = [], {}, 1, True
+        self.node = SimpleNamespace(
+            declare_parameter=lambda _name, default: SimpleNamespace(value=default),
+            create_subscription=lambda _kind, topic, call, _qos, **_: setattr(self, "state", (topic, call)),
+            create_publisher=lambda _kind, topic, _depth: SimpleNamespace(
+                publish=lambda message: self.sent.append((topic, message.data))
+            ),
+            create_service=lambda _kind, name, call, **_: self.services.update({name: call}),
+            count_publishers=lambda _topic: self.publishers,
+            destroy_node=lambda: None,
+        )
+        executor = SimpleNamespace(
+            MultiThreadedExecutor=lambda: SimpleNamespace(add_node=lambda _node: None, spin=self.spin),
+            ExternalShutdownException=type("ExternalShutdownException", (Exception,), {}),
+        )
+        parts = {
+            "rclpy": {
+                "init": lambda **_: None,
+                "create_node": lambda _name: self.node,
+                "try_shutdown": lambda: None,
+            },
+            "rclpy.callback_groups": {"ReentrantCallbackGroup": object},
+            "rclpy.executors": vars(executor),
+            "rclpy.qos": {
+                "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1),
+                "QoSProfile": lambda **given: given,
+            },
+            "std_msgs": {},
+            "std_msgs.msg": {"Bool": SimpleNamespace, "String": SimpleNamespace},
+            "std_srvs": {},
+            "std_srvs.srv": {"Trigger": SimpleNamespace},
+        }
+        for name, values in parts.items():
+            module = ModuleType(name)
+            vars(module).update(values)
+            monkeypatch.setitem(sys.modules, name, module)
+
+    def spin(self):
+        until(lambda: not self.spinning)
+
+    def call(self, name):
+        return self.services[name](None, SimpleNamespace())
+
+
+@pytest.fixture
+def running(operator, monkeypatch):
+    rclpy = Rclpy(monkeypatch)
+    thread = Thread(target=operator.main)
+    thread.start()
+    until(lambda: "~/arm" in rclpy.services)
+    yield rclpy
+    rclpy.spinning = False
+    thread.join()
+
+
+def test_a_stop_is_repeated_until_the_rig_reports_it(running):
+    topic, report = running.state
+    assert topic == "/flexneedle/state"
+    report(SimpleNamespace(data="inserting"))
+    answers = []
+    caller = Thread(target=lambda: answers.append(running.call("~/stop")))
+    caller.start()
+    until(lambda: len(running.sent) >= 3)
+    report(SimpleNamespace(data="stopped"))
+    caller.join()
+    assert set(running.sent) == {("/flexneedle/stop", True)}
+    assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
+
+
+def test_an_idle_rig_is_asked_until_it_reports_the_stop(running):
+    """What it last reported may be older than the stop, and an arm may be on its way."""
+    report = running.state[1]
+    report(SimpleNamespace(data="idle"))
+    answers = []
+    caller = Thread(target=lambda: answers.append(running.call("~/stop")))
+    caller.start()
+    until(lambda: len(running.sent) >= 3)
+    report(SimpleNamespace(data="idle"))  # once a second
+    report(SimpleNamespace(data="stopped"))
+    caller.join()
+    assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
+
+
+@pytest.mark.parametrize(("name", "state"), [("stop", "stopped"), ("arm", "armed")])
+def test_a_state_that_was_reported_before_the_call_is_no_answer(running, name, state):
+    """It may be that of a rig that has ended, while another one begins."""
+    report, answers = running.state[1], []
+    report(SimpleNamespace(data=state))
+    caller = Thread(target=lambda: answers.append(running.call(f"~/{name}")))
+    caller.start()
+    until(lambda: len(running.sent) >= (3 if name == "stop" else 1))
+    assert answers == []
+    report(SimpleNamespace(data=state))
+    caller.join()
+    assert answers[0].success
+
+
+def test_a_stop_that_an_idle_rig_does_not_report_fails(running):
+    running.state[1](SimpleNamespace(data="idle"))
+    answered = running.call("~/stop")
+    assert (answered.success, answered.message) == (False, "not done within 2 s: the rig reports 'idle'")
+
+
+def test_an_arm_is_asked_for_once_and_may_fail(running):
+    running.state[1](SimpleNamespace(data="idle"))
+    answered = running.call("~/arm")
+    assert running.sent == [("/flexneedle/arm", True)]
+    assert not answered.success
+    assert answered.message == "not done within 2 s: the rig reports 'idle'"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "done"),
+    [
+        ("idle", ("armed", "inserting"), True),
+        ("idle", ("inserting",), True),  # the topic keeps one state, so that "armed" may never come
+        ("inserting", ("inserting",), False),
+        ("inserting", ("armed", "inserting"), True),
+    ],
+)
+def test_an_arm_is_done_also_where_the_rig_has_gone_on(running, before, after, done):
+    running.state[1](SimpleNamespace(data=before))
+    answers = []
+    caller = Thread(target=lambda: answers.append(running.call("~/arm")))
+    caller.start()
+    until(lambda: running.sent)
+    for state in after:
+        running.state[1](SimpleNamespace(data=state))
+    caller.join()
+    assert answers[0].success is done
+
+
+def test_without_a_rig_a_service_fails_and_a_stop_is_sent_all_the_same(running):
+    running.publishers = 0
+    running.state[1](SimpleNamespace(data="stopped"))  # of a rig that has ended
+    answered = running.call("~/stop")
+    assert (answered.success, answered.message) == (False, "no rig publishes /flexneedle/state")
+    assert running.sent == [("/flexneedle/stop", True)]
+    assert not running.call("~/arm").success
+    assert len(running.sent) == 1

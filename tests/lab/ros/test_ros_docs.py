@@ -1,0 +1,105 @@
+"""docs/rig/ros.md: its tables are those of the profiles and of a node, and its rig file is one."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import Policy
+
+from emulated import until
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.ros.client import NodeClient
+from flexneedle.lab.ros.dds import participant
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, load_profile
+from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings, checked
+from ros_topics_rig import rig_of_page
+
+PAGE = (Path(__file__).parents[3] / "docs" / "rig" / "ros.md").read_text(encoding="utf-8")
+
+
+def row(key, topic, frames):
+    section, _, name = key.partition(".")
+    kind = {"publish": PUBLISHED, "subscribe": SUBSCRIBED}[section][name]
+    verb = {"publish": "publishes", "subscribe": "reads"}[section]
+    latched = ", latched" if section == "publish" and name in LATCHED else ""
+    placed = f"{frames[topic.frame].id} | {topic.unit}" if hasattr(topic, "unit") else "| "
+    return f"| {verb} `{name}`{latched} | `{topic.topic}` | {kind} | {placed} |".replace("|  |", "| |")
+
+
+@pytest.mark.parametrize("name", ["neutral", "smartneedle"])
+def test_tables_are_those_of_the_profiles(name):
+    profile = load_profile(name)
+    expected = [row(key, topic, profile.frames) for key, topic in profile.topics()]
+    table = re.search(rf"<!-- table: {name} -->\n\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
+    assert table.splitlines()[2:] == expected
+
+
+def announced(domain, kind, counts):
+    """Qualities of service of the endpoints of topics, as DDS announces them; counts: how many, by topic."""
+    reader, found = BuiltinDataReader(domain, kind), {topic: {} for topic in counts}
+
+    def complete():
+        for one in reader.take(N=100):
+            topic = (getattr(one, "topic_name", None) or "").removeprefix("rt")
+            if topic in found:
+                found[topic][one.key] = quality(one.qos)
+        return all(len(found[topic]) >= count for topic, count in counts.items())
+
+    until(complete)
+    return {topic: sorted(qualities.values()) for topic, qualities in found.items()}
+
+
+def quality(qos):
+    """Reliability, durability and history in the words of the page."""
+    reliable = isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable)
+    latched = qos[Policy.Durability] == Policy.Durability.TransientLocal
+    return (
+        "reliable" if reliable else "best effort",
+        "transient local" if latched else "volatile",
+        f"last {qos[Policy.History].depth}",
+    )
+
+
+def table_of_qualities():
+    """The table of the page: qualities by its first column; those of several readers are separated by `;`."""
+    table = re.search(r"<!-- table: quality -->\n\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    columns = {name: [cell.split("; ") for cell in cells] for name, *cells in rows}
+    return {
+        name: sorted(zip(reliable, durable, history * len(reliable), strict=True))
+        for name, (reliable, durable, history) in columns.items()
+    }
+
+
+def first_column(key):
+    """The row of the table of qualities for a key such as `publish.tip`."""
+    section, _, name = key.partition(".")
+    if section == "publish":
+        return "published, latched" if name in LATCHED else "published"
+    rows = ("reads `stop`: three readers", "reads `target`, `arm`", "reads `tip`, `shape`, `joint_states`")
+    return next(row for row in rows if f"`{name}`" in row)
+
+
+@pytest.mark.parametrize(
+    ("section", "kind"),
+    [("publish", BuiltinTopicDcpsPublication), ("subscribe", BuiltinTopicDcpsSubscription)],
+)
+def test_qualities_of_service_are_those_of_a_node(section, kind):
+    profile, page, domain = load_profile("neutral"), table_of_qualities(), participant()
+    wanted = {
+        topic.topic: page[first_column(key)] for key, topic in profile.topics() if key.startswith(section)
+    }
+    with NodeClient(profile):
+        found = announced(domain, kind, {topic: len(qualities) for topic, qualities in wanted.items()})
+    assert found == wanted
+
+
+def test_the_rig_file_is_one():
+    rig = RigFile.model_validate(tomllib.loads(rig_of_page()))
+    assert (rig.driver.kind, rig.tracker.kind) == ("ros", "ros")
+    checked(rig.driver.settings, DriverSettings)
+    checked(rig.tracker.settings, TrackerSettings)
+    assert rig.axes.insertion.scale == 0.001
+    assert rig.axes.rotation.scale == pytest.approx(1.0)

@@ -1,0 +1,220 @@
+"""Factors of a study according to `study.json`, with the level of each row."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexneedle.lab.study.findings.design import column_label, design_of
+from flexneedle.lab.study.findings.reading import read_study_folder
+from flexneedle.scenario.files import load_scenario
+from study_rows import BASE, OURS, make_rows, write_study
+
+TARGETS = ((25.0, 0.0), (40.0, 5.0))
+DISTANCE = "tracker.environment.plate.distance_mm"
+
+
+@pytest.fixture
+def design(tmp_path):
+    """Return a function from rows (dicts) and changes of study.json to the design, through its files."""
+
+    def read(rows, **asked):
+        study = read_study_folder(write_study(tmp_path / "study", rows, **asked))
+        return design_of(study.rows, study.definition)
+
+    return read
+
+
+@pytest.fixture
+def along(design):
+    """Return a function from axes to the design of a study with them."""
+    return lambda axes: design(make_rows(axes=axes, targets=TARGETS, repeats=1), axes=axes)
+
+
+@pytest.fixture
+def in_cases(design):
+    """Return a function from cases to the design of a study with them."""
+    return lambda cases: design(make_rows(cases=cases, targets=TARGETS, repeats=1), cases=cases)
+
+
+def doubled(*names):
+    """Return cases: the base, and each entry of [phantom] doubled."""
+    cases = {f"{name} doubled": {f"phantom.{name}": 2 * BASE[f"phantom.{name}"]} for name in names}
+    return {"as shipped": {}} | cases
+
+
+def described(found):
+    return {factor.key: factor.names for factor in found.factors}
+
+
+def test_a_study_of_one_setting_varies_nothing(design):
+    assert described(design(make_rows(targets=TARGETS, repeats=2))) == {"controller": (OURS,)}
+
+
+def test_a_setting_not_varied_in_study_json_is_not_a_factor(design):
+    """Rows that differ in it for another reason, for example a random draw, are one group."""
+    rows = make_rows(targets=TARGETS, repeats=2)
+    for row in rows:
+        row["phantom.run_out_mm"] = 0.01 * row["index"]
+    assert described(design(rows)) == {"controller": (OURS,)}
+
+
+def test_the_default_controller_comes_first(design):
+    rows = make_rows(("ce-mpc", "open-loop", OURS), targets=TARGETS, repeats=2)
+    assert design(rows).controller.names == (OURS, "ce-mpc", "open-loop")
+
+
+def test_a_number_that_varies_is_an_axis_in_ascending_order(along):
+    (axis,) = along({"contact.spacing_mm": [2.0, 0.5, 1.0]}).axes
+    assert (axis.key, axis.label) == ("contact.spacing_mm", "contact: spacing (mm)")
+    assert axis.names == ("0.5", "1", "2")
+    assert axis.titles[0] == "contact: spacing = 0.5 mm"
+    assert_allclose(axis.positions, [0.5, 1.0, 2.0])
+    assert axis.codes.tolist() == [2, 2, 0, 0, 1, 1]
+
+
+def test_levels_without_rows_are_omitted(design):
+    axes = {"contact.spacing_mm": [2.0, 0.5, 1.0]}
+    rows = make_rows(axes=axes, targets=TARGETS, repeats=1)[:4]
+    assert design(rows, axes=axes).axes[0].names == ("0.5", "2")
+
+
+def test_gauges_are_ordered_from_thick_to_thin(along):
+    (axis,) = along({"needle.gauge": ["25G", "18G", "21G"]}).axes
+    assert axis.names == axis.titles == ("18G", "21G", "25G")
+    assert_allclose(axis.positions, [0, 1, 2])
+
+
+def test_booleans_are_names(along):
+    (axis,) = along({"monitor.enabled": [True, False]}).axes
+    assert axis.names == axis.titles == ("True", "False")
+
+
+def test_plants_and_strategies_are_axes_too(design):
+    rows = make_rows(targets=TARGETS, repeats=2)
+    for row in rows[::2]:
+        row["plant"] = "model"
+    assert described(design(rows, axes={"plant": ["model", "exact"]}))["plant"] == ("model", "exact")
+
+
+@pytest.mark.parametrize("key", ["seed", "plan_seed", "target.depth_mm"])
+def test_axes_of_seeds_and_targets_are_not_factors(design, key):
+    rows = make_rows(targets=TARGETS, repeats=2)
+    for row in rows:
+        row["plan_seed"] = row["seed"]
+    assert described(design(rows, axes={key: [0, 1]})) == {"controller": (OURS,)}
+
+
+def test_two_axes_are_two_factors(along):
+    axes = {"contact.spacing_mm": [0.5, 1.0], "tracker.jitter_mm": [0.0, 0.07, 0.14]}
+    assert [axis.key for axis in along(axes).axes] == list(axes)
+
+
+def test_lists_are_levels_too(along):
+    (axis,) = along({"phantom.bevel_factor": [[0.5, 1.5], [0.0, 2.0]]}).axes
+    assert axis.names == ("0.5 to 1.5", "0 to 2")
+
+
+def test_cases_that_change_one_setting_each_are_cases(in_cases):
+    assert described(in_cases(doubled("run_out_mm", "initial_bend_mm"))) == {
+        "controller": (OURS,),
+        "case": ("as shipped", "run_out_mm doubled", "initial_bend_mm doubled"),
+    }
+
+
+def test_the_base_case_is_the_first_without_settings(in_cases):
+    cases = dict(reversed(doubled("run_out_mm", "initial_bend_mm").items()))
+    assert in_cases(cases).cases.names == ("as shipped", "initial_bend_mm doubled", "run_out_mm doubled")
+
+
+def test_cases_named_by_a_number_are_points_of_an_axis(in_cases):
+    """As in the study `mismatch`: a case scales many values of the phantom at once."""
+    cases = {
+        f"s = {scale:g}": {
+            "phantom.start_offset_sd_mm": 0.5 * scale,
+            "phantom.start_angle_sd_mrad": 3.0 * scale,
+            "phantom.bevel_factor": [1 - 0.5 * scale, 1 + 0.5 * scale],
+        }
+        for scale in (1.0, 0.0, 2.0, 0.5)
+    }
+    found = in_cases(cases)
+    (axis,) = found.axes
+    assert (axis.key, axis.label, axis.names) == ("case", "s", ("0", "0.5", "1", "2"))
+    assert axis.titles == ("s = 0", "s = 0.5", "s = 1", "s = 2")
+    assert axis.codes.tolist() == [2, 2, 0, 0, 3, 3, 1, 1]
+    assert axis.covaried == tuple(cases["s = 0"])
+    assert not found.cases.varies
+
+
+def test_cases_named_by_a_setting_are_points_of_its_axis(in_cases):
+    """As in the study `guide-distance`: the tip is moved with the guide."""
+    cases = {
+        f"G = {g:g} mm": {"setup.guide_to_skin_mm": g, "setup.tip_to_skin_mm": g - 12.5} for g in (41.0, 20.0)
+    }
+    (axis,) = in_cases(cases).axes
+    assert (axis.key, axis.label) == ("setup.guide_to_skin_mm", "setup: guide to skin (mm)")
+    assert (axis.names, axis.titles) == (("20", "41"), ("G = 20 mm", "G = 41 mm"))
+    assert axis.covaried == ("setup.tip_to_skin_mm",)
+
+
+@pytest.mark.parametrize("names", [("base", "s = 1"), ("s = 1", "t = 2"), ("1 mm", "2 mN")])
+def test_names_that_differ_in_more_than_a_number_are_cases(in_cases, names):
+    found = in_cases({name: {"phantom.run_out_mm": float(k)} for k, name in enumerate(names)})
+    assert (found.cases.names, found.axes) == (names, ())
+
+
+@pytest.mark.parametrize(
+    ("key", "label"),
+    [
+        ("tissue.0.shear_modulus_kpa", "tissue 0: shear modulus (kPa)"),
+        ("phantom.friction_mn_per_mm", "phantom: friction (mN/mm)"),
+        ("setup.insertion_speed_mm_s", "setup: insertion speed (mm/s)"),
+        ("phantom.delay_periods", "phantom: delay periods"),
+        ("needle.gauge", "needle gauge"),
+        ("plant", "plant"),
+    ],
+)
+def test_labels_have_units(key, label):
+    assert column_label(key) == label
+
+
+def environment(name):
+    """Values that an environment adds to the scenario."""
+    flat = load_scenario("phantom").with_values({"tracker.environment": name}).flat()
+    return {key: value for key, value in flat.items() if key not in BASE}
+
+
+@pytest.mark.parametrize("names", [("none", "ideal", "noisy"), ("ideal", "noisy"), ("none", "noisy")])
+def test_environments_are_one_axis_by_their_names(design, names):
+    """Not one factor for each of their values."""
+    rows = make_rows(cases={name: environment(name) for name in names}, targets=TARGETS, repeats=1)
+    rows = [row | {"case": ""} for row in rows]
+    (axis,) = design(rows, axes={"tracker.environment": list(names)}).axes
+    assert (axis.label, axis.names) == ("tracker environment", names)
+
+
+def test_a_table_without_a_name_is_an_axis_as_well(design):
+    plates = [{"phantom.plate.x_mm": 1.0, "phantom.plate.y_mm": y} for y in (2.0, 3.0)]
+    rows = make_rows(cases=dict(zip("ab", plates, strict=True)), targets=TARGETS, repeats=1)
+    (axis,) = design([row | {"case": ""} for row in rows], axes={"phantom.plate": [{}, {}]}).axes
+    assert axis.names == ("1 to 2", "1 to 3")
+
+
+def test_a_value_within_an_environment_is_an_axis_beside_it(design):
+    axes = {DISTANCE: [100.0, 80.0]}
+    cases = {name: environment("noisy") | {"tracker.environment.name": name} for name in ("noisy", "mine")}
+    rows = make_rows(cases=cases, axes=axes, targets=TARGETS, repeats=1)
+    rows = [row | {"case": ""} for row in rows]
+    found = design(rows, axes={"tracker.environment": ["noisy", "mine"]} | axes)
+    assert described(found) | {"controller": ()} == {
+        "controller": (),
+        "tracker.environment": ("noisy", "mine"),
+        DISTANCE: ("80", "100"),
+    }
+    assert found.axes[1].label == "tracker environment plate: distance (mm)"
+
+
+def test_levels_of_rows_in_any_order_are_those_of_the_rows(along):
+    """Each row has the level of its own value."""
+    values = [0.3, 0.1, 0.2]
+    axis = along({"tracker.jitter_mm": values}).axes[0]
+    assert_allclose(axis.positions[axis.codes], np.repeat(values, len(TARGETS)))

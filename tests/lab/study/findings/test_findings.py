@@ -1,0 +1,211 @@
+"""Findings in the rows of a study: groups, paired differences, endings, the worst."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from flexneedle.lab.study.findings.design import design_of
+from flexneedle.lab.study.findings.reading import read_study_folder
+from flexneedle.lab.study.findings.summary import (
+    case_differences,
+    controller_differences,
+    endings,
+    groups_of,
+    worst,
+)
+from study_rows import BASE, OURS, make_rows, unfinished, write_study
+
+TARGETS = ((25.0, 0.0), (40.0, 5.0))
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Return a function from rows (dicts) and changes of study.json to the study record, through its files."""
+    return lambda rows, **more: read_study_folder(write_study(tmp_path / "study", rows, **more))
+
+
+def designed(study):
+    return design_of(study.rows, study.definition)
+
+
+def doubled(*names):
+    """Return cases: the base, and each entry of [phantom] doubled."""
+    cases = {f"{name} doubled": {f"phantom.{name}": 2 * BASE[f"phantom.{name}"]} for name in names}
+    return {"as shipped": {}} | cases
+
+
+def test_the_statistics_of_a_group_agree_with_hand_values(read):
+    rows = make_rows(targets=TARGETS[:1], repeats=5)
+    for row, error in zip(rows, (0.1, 0.2, 0.3, 0.4, 2.0), strict=True):
+        row |= {"true_error_mm": error, "strain_energy_mj": 3.0, "planned_strain_energy_mj": 2.0}
+        row |= {
+            "periods": 60,
+            "planned_periods": 50,
+            "flips": 2,
+            "planned_flips": 1,
+            "residual_mm": error + 0.1,
+        }
+    rows[0]["periods"], rows[1]["unconverged_periods"] = 75, 3
+    found = read(rows)
+    (group,) = groups_of(found.rows, designed(found).factors)
+    value = {name: estimate.value for name, estimate in group.estimates.items()}
+    assert (group.name, group.count, group.finished, group.known, group.missed) == (OURS, 5, 5, 5, 1)
+    assert (group.unconverged, group.largest_mm, group.largest_period_ratio) == (1, 2.0, 1.5)
+    expected = {
+        "mean_mm": 0.6, "sd_mm": np.std([0.1, 0.2, 0.3, 0.4, 2.0], ddof=1), "median_mm": 0.3, "p95_mm": 1.68,
+        "residual_mm": 0.7, "flips": 2.0, "planned_flips": 1.0, "energy_mj": 3.0, "planned_energy_mj": 2.0,
+        "energy_ratio": 1.5, "period_ratio": 63 / 50,
+    }  # fmt: skip
+    assert value == pytest.approx(expected, rel=1e-12)
+
+
+def test_unfinished_insertions_are_counted_and_not_averaged(read):
+    rows = make_rows(targets=TARGETS[:1], repeats=4)
+    for row, error in zip(rows, (0.1, 0.2, 0.3, 50.0), strict=True):
+        row["true_error_mm"] = error
+    rows[3] = unfinished(rows[3])
+    rows.append(unfinished({**rows[0], "index": 4, "seed": 99, "repeat": 4}, "error", "ValueError: x"))
+    rows[3]["unconverged_periods"] = 7
+    found = read(rows)
+    (group,) = groups_of(found.rows, designed(found).factors)
+    assert (group.count, group.finished, group.missed, group.unconverged) == (5, 3, 0, 1)
+    assert group.estimates["mean_mm"].value == pytest.approx(0.2)
+    assert group.largest_mm == 0.3
+
+
+def test_a_finished_insertion_with_unknown_error_is_counted(read):
+    rows = make_rows(targets=TARGETS[:1], repeats=3)
+    rows[0]["true_error_mm"] = None
+    rows[1]["true_error_mm"] = float("nan")
+    found = read(rows)
+    (group,) = groups_of(found.rows, designed(found).factors)
+    assert (group.finished, group.known) == (3, 1)
+
+
+def test_groups_are_every_level_of_every_factor(read):
+    axes = {"contact.spacing_mm": [1.0, 0.5]}
+    rows = make_rows((OURS, "open-loop"), axes=axes, targets=TARGETS, repeats=2)
+    found = read(rows, axes=axes)
+    groups = groups_of(found.rows, designed(found).factors)
+    assert [group.levels for group in groups] == [
+        {"controller": name, "contact.spacing_mm": spacing}
+        for name in (OURS, "open-loop")
+        for spacing in ("0.5", "1")
+    ]
+    assert sum(group.count for group in groups) == len(rows)
+
+
+def compared(rows, read, **more):
+    found = read(rows, **more)
+    return controller_differences(found.rows, designed(found))
+
+
+def test_controllers_are_compared_pair_by_pair(read):
+    """The other controller is 0.05 mm worse in each pair: the differences have no spread."""
+    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=5)
+    own = {(row["seed"], row["repeat"]): row["true_error_mm"] for row in rows if row["controller"] == OURS}
+    for row in rows:
+        if row["controller"] == "open-loop":
+            row["true_error_mm"] = own[row["seed"], row["repeat"]] + 0.05
+    (found,) = compared(rows, read)
+    assert (found.name, found.against, found.pairs, found.left_out) == (OURS, "open-loop", 10, 0)
+    assert_allclose([found.mean_mm.value, found.mean_mm.low, found.mean_mm.high], -0.05, atol=1e-12)
+    assert found.verdict == "better"
+
+
+def test_a_worse_default_is_called_worse(read):
+    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=20)
+    for row in rows:
+        row["true_error_mm"] *= 100.0 if row["controller"] == OURS else 1.0
+    assert compared(rows, read)[0].verdict == "worse"
+
+
+def test_equal_controllers_are_not_separable(read):
+    rows = make_rows(("ce-mpc", OURS), targets=TARGETS, repeats=10)
+    rng = np.random.default_rng(3)
+    for row in rows:
+        row["true_error_mm"] = float(rng.lognormal(-2.0, 0.5))
+    assert compared(rows, read)[0].verdict == "not separable"
+
+
+def test_a_pair_with_one_unfinished_is_left_out_and_counted(read):
+    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=5)
+    rows[2], rows[13] = unfinished(rows[2]), unfinished(rows[13], "error", "?")
+    (found,) = compared(rows, read)
+    assert (found.pairs, found.left_out) == (8, 2)
+
+
+def test_too_few_pairs_give_no_verdict(read):
+    rows = make_rows(("open-loop", OURS), targets=TARGETS[:1], repeats=1)
+    (found,) = compared(rows, read)
+    assert (found.pairs, found.verdict) == (1, None)
+
+
+def test_pairs_never_cross_settings(read):
+    """Errors that depend on the axis alone, the same for both controllers, differ in no pair."""
+    axes = {"tracker.jitter_mm": [0.01 * k for k in range(30)]}
+    rows = make_rows(("open-loop", OURS), axes=axes, targets=TARGETS, repeats=5)
+    shuffled = np.random.default_rng(0).permutation(len(rows)).tolist()
+    for row, index in zip(rows, shuffled, strict=True):
+        row |= {"true_error_mm": 0.1 + row["tracker.jitter_mm"], "index": index}
+    (found,) = compared(rows, read, axes=axes)
+    assert (found.pairs, found.mean_mm.low, found.mean_mm.high) == (300, 0.0, 0.0)
+
+
+def test_cases_are_compared_with_the_base_for_each_controller(read):
+    rows = make_rows((OURS, "open-loop"), cases=doubled("run_out_mm", "initial_bend_mm"), repeats=2)
+    for row in rows:
+        more = {"as shipped": 0.0, "run_out_mm doubled": 0.02, "initial_bend_mm doubled": -0.01}[row["case"]]
+        row["true_error_mm"] += more * (3 if row["controller"] == "open-loop" else 1)
+    found = read(rows)
+    differences = case_differences(found.rows, designed(found))
+    assert [(d.controller, d.name, d.pairs, d.verdict) for d in differences] == [
+        (controller, case, 30, verdict)
+        for controller in (OURS, "open-loop")
+        for case, verdict in (("run_out_mm doubled", "worse"), ("initial_bend_mm doubled", "better"))
+    ]
+    assert_allclose([d.mean_mm.value for d in differences], [0.02, -0.01, 0.06, -0.03], atol=1e-12)
+    assert {d.against for d in differences} == {"as shipped"}
+
+
+def test_endings_that_differ_only_in_numbers_are_grouped(read):
+    rows = make_rows(targets=TARGETS, repeats=5)
+    for k, seconds in ((1, 1.03), (4, 1.2), (7, 12.0)):
+        rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1 s)")
+    rows[5] = unfinished(rows[5], "error", "ValueError: x")
+    rows[8]["reason"] = "missed the target by 1.20 mm"
+    found = endings(read(rows).rows)
+    assert [(kind.outcome, kind.count, kind.first, kind.reason) for kind in found] == [
+        ("held", 3, 1, "held for 1.03 s (limit 1 s)"),
+        ("error", 1, 5, "ValueError: x"),
+        ("done", 1, 8, "missed the target by 1.20 mm"),
+    ]
+
+
+def test_the_worst_are_the_largest_errors_finished_or_not(read):
+    rows = make_rows(targets=TARGETS, repeats=3)
+    for row, error in zip(rows, (0.1, 0.5, 0.3, None, 0.5, 0.2), strict=True):
+        row["true_error_mm"] = error
+    rows[4] = unfinished(rows[4])
+    assert worst(read(rows).rows, 4) == [1, 4, 2, 5]
+
+
+@settings(max_examples=25)
+@given(st.data())
+def test_no_insertion_is_dropped_for_any_outcomes(tmp_path_factory, data):
+    """Every insertion is in one group, and each that did not finish is in one ending."""
+    rows = make_rows((OURS, "open-loop"), targets=TARGETS, repeats=2)
+    outcomes = data.draw(
+        st.lists(st.sampled_from(("done", "held", "failed", "refused", "error")), min_size=8, max_size=8)
+    )
+    rows = [
+        row if outcome == "done" else unfinished(row, outcome, "why")
+        for row, outcome in zip(rows, outcomes, strict=True)
+    ]
+    found = read_study_folder(write_study(tmp_path_factory.mktemp("study"), rows))
+    groups = groups_of(found.rows, designed(found).factors)
+    assert sum(group.count for group in groups) == 8
+    assert sum(group.finished for group in groups) == outcomes.count("done")
+    assert sum(kind.count for kind in endings(found.rows)) == 8 - outcomes.count("done")

@@ -1,0 +1,257 @@
+"""Reports on random worlds: errors relative to open loop and reach, the worst with the commands to reproduce them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexneedle.control.controllers import DEFAULT
+from flexneedle.lab.study.grid import load_study
+from flexneedle.lab.study.plans import Plans
+from flexneedle.lab.study.report.report import write_report
+from flexneedle.lab.study.runner import _reach_points
+from flexneedle.lab.study.tables import write_tables
+from flexneedle.record.results import RESULT_COLUMNS
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.worlds import world
+from report_page import Page, save_nothing
+
+FREE, GUIDED = (15, 16, 31), (1, 2, 3, 4)
+STUDY = f"""
+name = "few"
+title = "A few worlds"
+[[cases]]
+name = "perfect"
+values = {{ world_case = "perfect", plant = "model" }}
+[[cases]]
+name = "structure"
+values = {{ world_case = "structure" }}
+[[axes]]
+key = "world"
+values = {[*FREE, *GUIDED]}
+[[axes]]
+key = "controller"
+values = ["{DEFAULT}", "open-loop"]
+"""
+ERRORS = {  # of the perfect case, by controller and world (mm)
+    DEFAULT: {1: 0.02, 2: 0.5, 3: 1.6, 4: None, 15: 0.1, 16: 4.4, 31: None},
+    "open-loop": {1: 0.01, 2: 0.2, 3: 1.5, 4: 0.1, 15: 0.3, 16: None, 31: 2.0},
+}
+REACH = {1: 0.0, 2: 0.0, 3: 0.0, 4: 0.0, 15: 0.0, 16: 4.0, 31: 3.0}
+
+
+SIGMAS = {
+    1: (0.5, 1.0, 1.9),
+    2: (1.0, -2.1, 1.0),
+    3: (3.0, -3.0, 2.0),
+    15: (None, None, 0.0),
+}  # of the default
+WARNED = (2, 15)  # worlds of the default's perfect case with a warning
+
+
+def row_of(study, index, bounded):
+    insertion = study.insertion(index)
+    point = insertion.point
+    error = ERRORS[point.controller][point.world] if point.case == "perfect" else 0.05
+    depth, lateral, _ = point.scenario.target.position
+    return dict.fromkeys(RESULT_COLUMNS) | {
+        "index": index,
+        "true_error_mm": error,
+        "tip_x_mm": depth,
+        "tip_y_mm": lateral + (error or 0.0),
+        **predicted(point, error),
+        "strain_energy_mj": 2.0 ** (point.world % 3),
+        "planned_strain_energy_mj": 1.0,
+        "unconverged_periods": 0,
+        "reach_mm": REACH[point.world] if bounded else None,
+        "outcome": "done" if error is not None else "held",
+        "reason": "" if error is not None else "held for 1.00 s",
+    }
+
+
+def predicted(point, error):
+    """Deviations of the tip from its predictions, half as large in the middle; y alone, as in the plane."""
+    if (point.controller, point.case) != (DEFAULT, "perfect"):
+        return {}
+    places = zip(("quarter", "half", "three_quarters"), SIGMAS.get(point.world, [None] * 3), strict=True)
+    found = {"warning": "predicted miss" if point.world in WARNED else ""}
+    for place, off in places:
+        if off is not None:
+            found |= {f"predicted_{place}_y_mm": error + 0.1 * off, f"predicted_{place}_sd_mm": 0.1}
+            found |= {f"predicted_{place}_tip_y_sds": off, f"predicted_{place}_middle_y_sds": 0.75 * off}
+    return found
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("worlds")
+    (folder / "few.toml").write_text(STUDY)
+    study = load_study(folder / "few.toml")
+    bounding = _reach_points(study)
+    rows = {k: row_of(study, k, id(study.insertion(k).point) in bounding) for k in range(len(study))}
+    write_tables(folder, study, rows, Plans(folder / "plans"))
+    (folder / "study.json").write_text(json.dumps({"study": study.definition}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("flexneedle.lab.study.report.figures.save", save_nothing)
+        return write_report(folder)
+
+
+def group(report, controller, case, guide):
+    levels = {"controller": controller, "case": case, "guide": guide}
+    (found,) = [group for group in report.findings.worlds if group.levels == levels]
+    return found
+
+
+def test_groups_are_controllers_cases_and_whether_there_is_a_guide(report):
+    """Not the hundred values that differ between worlds, and not the plant, which follows from the case."""
+    assert [list(group.levels.values()) for group in report.findings.worlds] == [
+        [controller, case, guide]
+        for controller in (DEFAULT, "open-loop")
+        for case, guide in (
+            ("perfect", "with a guide"),
+            ("perfect", "no guide"),
+            ("structure", "with a guide"),
+        )
+    ]
+    assert report.findings.planned == len(report.findings.study.rows) == 22
+
+
+def test_errors_are_those_of_the_finished_insertions(report):
+    found = group(report, DEFAULT, "perfect", "with a guide")
+    errors = [0.02, 0.5, 1.6]
+    assert (found.count, found.finished) == (4, 3)
+    expected = [np.median(errors), np.mean(errors), *np.quantile(errors, (0.95, 0.99)), 1.6, 1 / 3]
+    measured = (found.median_mm, found.mean_mm, found.p95_mm, found.p99_mm, found.max_mm, found.above)
+    assert_allclose(measured, expected)
+
+
+def test_shares_are_relative_to_open_loop_and_reach_in_each_world(report):
+    guided = group(report, DEFAULT, "perfect", "with a guide")
+    assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
+    assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
+    assert_allclose(guided.within_reach, 2 / 3)  # 0.02 and 0.5 ≤ 0.5, 1.6 above
+    free = group(report, DEFAULT, "perfect", "no guide")
+    assert (
+        free.within_twice_open_loop == free.within_open_loop == 1.0
+    )  # of world 15; in 16 open loop did not finish
+    assert free.within_reach == 1.0  # 4.4 ≤ 4.0 + 0.5
+    assert group(report, "open-loop", "perfect", "with a guide").within_open_loop == 1.0
+
+
+def test_an_unfinished_insertion_is_a_failure_only_within_reach(report):
+    assert group(report, DEFAULT, "perfect", "with a guide").failures == 1
+    assert group(report, DEFAULT, "perfect", "no guide").failures == 0  # world 31 is 3 mm out of reach
+    assert group(report, "open-loop", "perfect", "no guide").failures == 0
+
+
+def test_energy_is_a_geometric_mean(report):
+    """2, 4 and 1 times the planned energy in worlds 1, 2, 3."""
+    assert_allclose(group(report, DEFAULT, "perfect", "with a guide").energy_ratio, 2.0)
+
+
+def test_predictions_are_reported_for_groups_that_have_any(report):
+    """Only the default in the perfect case; coverage is over insertions with a prediction at that depth."""
+    guided, free = report.findings.predictions
+    assert guided.levels == {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
+    assert (guided.count, free.count) == (3, 1)
+    assert_allclose(guided.tip_covered, (2 / 3, 1 / 3, 2 / 3))
+    assert_allclose(guided.middle_covered, (2 / 3, 2 / 3, 1.0))
+    assert_allclose(free.tip_covered, (np.nan, np.nan, 1.0))
+
+
+def test_false_warnings_and_misses_without_warning_are_counted(report):
+    """World 1 ends at 0.02 mm, 2 at 0.5, which is not below 0.5, 3 at 1.6 without a warning, 15 at 0.1 with one."""
+    guided, free = report.findings.predictions
+    assert (guided.in_vain, guided.unwarned) == (0.0, 1)
+    assert (free.in_vain, free.unwarned) == (1.0, 0)
+
+
+def test_page_and_summary_have_the_predictions(report):
+    page = report.page.read_text(encoding="utf-8")
+    assert "tip covered at ¼ of the depth" in page
+    assert "middle covered at ¼ of the depth" in page
+    assert [group["unwarned"] for group in report.values()["predictions"]] == [1, 0]
+
+
+def test_the_worst_have_the_largest_error_beyond_reach_of_the_default_controller(report):
+    rows = report.findings.study.rows
+    worst = [(rows.value("controller", row), rows.value("world", row)) for row in report.findings.worst]
+    assert {name for name, _ in worst} == {DEFAULT}
+    assert [number for _, number in worst[:3]] == [3, 2, 16]
+
+
+def test_a_command_names_the_world_and_its_case(report):
+    """The command in the report is sufficient; no scenario file is written."""
+    rows = report.findings.study.rows
+    for row, command in report.commands.items():
+        name = re.match(r"flexneedle insert (world:\S+) --target", command)[1]
+        number, case = int(rows.value("world", row)), rows.value("case", row)
+        assert load_scenario(name) == world(number, case)
+        assert f"--seed {number} " in command
+        plant = "model" if case == "perfect" else "exact"
+        assert f"--controller {rows.value('controller', row)} --phantom {plant}" in command
+    assert not list(report.page.parent.glob("*.toml"))
+
+
+def test_the_page_has_the_table_and_the_figure(report):
+    text = report.page.read_text(encoding="utf-8")
+    assert "within reach + 0.5 mm" in text
+    assert report.figures[0].name == "shares"
+    assert "targeting" not in {drawn.name for drawn in report.figures}
+    assert "perfect: 7 worlds; structure: 4 worlds" in report.figures[0].alt
+    levels = "</th><th [^>]*>".join((DEFAULT, "perfect", "with a guide"))
+    row = re.search(rf"{levels}</th>(.*?)</tr>", text, re.S)
+    cells = re.findall(r"<td [^>]*>(.*?)</td>", row[1])
+    assert cells[:4] == ["4", "3", "1", "0.500"]
+    assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT
+
+
+def test_each_cell_of_the_tables_of_worlds_has_its_heading_as_label(report):
+    tables = Page(report.page).tables
+    for start in ("Errors, shares and energy", "Finished insertions. Covered"):
+        (found,) = (table for caption, table in tables.items() if caption.startswith(start))
+        assert len(found.labels) > 0
+        assert all(labels == found.headings for labels in found.labels)
+
+
+def test_worlds_in_space_are_grouped_by_their_rigs_and_named_in_the_commands(tmp_path, monkeypatch):
+    monkeypatch.setattr("flexneedle.lab.study.report.figures.save", save_nothing)
+    (tmp_path / "few.toml").write_text(
+        'name = "few"\n[[axes]]\nkey = "world"\nvalues = [3, 15]\n'
+        '[[axes]]\nkey = "world_rig"\nvalues = ["two-axes", "one-axis", "no-guide"]\n'
+    )
+    study = load_study(tmp_path / "few.toml")
+    rows = {k: done_row(study, k) for k in range(len(study))}
+    write_tables(tmp_path, study, rows, Plans(tmp_path / "plans"))
+    (tmp_path / "study.json").write_text(json.dumps({"study": study.definition}))
+    report = write_report(tmp_path)
+    assert [list(found.levels.values()) for found in report.findings.worlds] == [
+        [DEFAULT, "two-axes"],
+        [DEFAULT, "one-axis"],
+        [DEFAULT, "no-guide"],
+    ]
+    names = {
+        re.match(r"flexneedle insert (\S+) --target", command)[1] for command in report.commands.values()
+    }
+    assert names == {"world:3:two-axes", "world:3:one-axis", "world:15:no-guide"}
+    assert "targeting-across" in {drawn.name for drawn in report.figures}
+
+
+def done_row(study, index):
+    """An insertion that ends 0.1 mm beyond its target along z."""
+    depth, lateral, z = study.insertion(index).point.scenario.target.position
+    tip = {"tip_x_mm": depth, "tip_y_mm": lateral, "tip_z_mm": z + 0.1}
+    return (
+        dict.fromkeys(RESULT_COLUMNS)
+        | tip
+        | {
+            "index": index,
+            "true_error_mm": 0.1,
+            "reach_mm": 0.0,
+            "unconverged_periods": 0,
+            "outcome": "done",
+            "reason": "",
+        }
+    )

@@ -1,0 +1,147 @@
+"""A study on a real Dask scheduler with two workers, one of which is killed during the study."""
+
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from threading import Timer
+
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.lab.study import pools
+from flexneedle.lab.study.runner import run_study
+
+distributed = pytest.importorskip("distributed")
+
+
+@contextmanager
+def process(part, *argv):
+    """Run a Dask scheduler or worker in a separate process, with its log on stderr."""
+    command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *argv, "--no-dashboard"]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.communicate()
+
+
+@contextmanager
+def scheduler():
+    """Run a scheduler and yield its address. It is killed after two minutes, which ends all waiting clients."""
+    with process("scheduler", "--host", "127.0.0.1", "--port", "0") as running:
+        watchdog = Timer(120, running.kill)
+        watchdog.start()
+        try:
+            yield next(line for line in running.stderr if "Scheduler at:" in line).split("at:")[1].strip()
+        finally:
+            watchdog.cancel()
+
+
+def worker(address):
+    """Run a worker with one thread that is not restarted."""
+    return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp_path):
+    counts = []
+    with scheduler() as address, worker(address) as first, worker(address) as second:
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+
+        def kill_one(advance):
+            counts.append(advance.insertions)
+            if advance.insertions == 3 and first.poll() is None:
+                first.kill()
+
+        out = run_study(quick, tmp_path / "a", scheduler=address, on_advance=kill_one)
+        assert first.wait(timeout=30) == -signal.SIGKILL
+        assert second.poll() is None
+    assert counts[-1] == 16
+    assert (out / "runs.parquet").read_bytes() == (uninterrupted / "runs.parquet").read_bytes()
+    assert len((out / "journal.jsonl").read_text().splitlines()) == 16
+    assert len(pq.read_table(out / "timing.parquet")) == 16
+
+
+def test_a_scheduler_that_does_not_respond_creates_no_folder(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(pools, "_CONNECT_S", 0.2)
+    with pytest.raises(InputError, match=r"^tcp://127\.0\.0\.1:9: no Dask scheduler responds: "):
+        run_study(quick, tmp_path / "a", scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "a").exists()
+
+
+def test_only_a_scheduler_without_workers_is_reported():
+    calls = []
+    with scheduler() as address:
+        with pools.cluster(address, lambda: calls.append("none")):
+            assert calls == ["none"]
+        with worker(address), distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=30)
+            with pools.cluster(address, lambda: calls.append("none")):
+                assert calls == ["none"]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("", "foo", "foo:bar", "tcp://", "tcp://host", "tcp://:8786", "tcp://host:", "tcp://host:0"),
+        *("tcp://host:65536", "tcp://host:8786/x", "tcp://a b:1", "tcp://host:1\n", "tcp://host:٣"),
+        *("http://localhost:1", "inproc://x", "127.0.0.1:8786", "TCP://host:1", "tcp://user@[::1:1"),
+    ],
+)
+def test_an_invalid_address_is_rejected_immediately(quick, tmp_path, address, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        InputError, match=r"^--scheduler = \".*\": must be protocol://host:port, such as "
+    ) as caught:
+        run_study(quick, tmp_path / "a", scheduler=address)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "tls://login-1.cluster:8786", "ws://[::1]:65535", "wss://h_1:80"]
+)
+def test_a_valid_address_is_tried(quick, tmp_path, address, monkeypatch):
+    def refuses(tried):
+        raise InputError(f"tried {tried}")
+
+    monkeypatch.setattr(pools, "_client", refuses)
+    with pytest.raises(InputError, match="^tried " + re.escape(address) + "$"):
+        run_study(quick, tmp_path / "a", scheduler=address)
+
+
+def test_tls_without_a_certificate_is_one_line(quick, tmp_path):
+    with pytest.raises(
+        InputError, match=r"^tls://127\.0\.0\.1:9: needs a certificate: set distributed\.comm\.tls"
+    ):
+        run_study(quick, tmp_path / "a", scheduler="tls://127.0.0.1:9")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError(), "OSError"),
+        (ImportError("versions\ndiffer"), "versions differ"),
+        (TypeError("TLS\nexpects"), "TLS expects"),
+        (ValueError("a\x1bb"), r"a\x1bb"),
+    ],
+)
+def test_any_connection_error_is_one_line(quick, tmp_path, monkeypatch, error, message):
+    def fail(*_args, **_options):
+        raise error
+
+    monkeypatch.setattr(distributed, "Client", fail)
+    with pytest.raises(InputError) as caught:
+        run_study(quick, tmp_path / "a", scheduler="tcp://host:1")
+    assert str(caught.value) == f"tcp://host:1: no Dask scheduler responds: {message}"
+
+
+def test_without_dask_the_extra_is_named(quick, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'flexneedle\[cluster\]'"):
+        run_study(quick, tmp_path / "a", scheduler="tcp://127.0.0.1:9")

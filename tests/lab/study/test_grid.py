@@ -1,0 +1,494 @@
+"""Study files: the grid, its order and seeds; and one line for each violated rule."""
+
+import importlib.util
+import itertools
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from flexneedle.control.controllers import CONTROLLERS, checked
+from flexneedle.errors import InputError, ScenarioWarning
+from flexneedle.lab.study.grid import load_study
+from flexneedle.lab.study.spec import LARGEST_SEED, STUDIES
+from flexneedle.planning.planner import bevel_reach
+from flexneedle.scenario.files import dump_scenario, load_scenario
+
+PHANTOM = checked(load_scenario("phantom"))
+CONTROLLERS = tuple(CONTROLLERS)[:2]
+CHOICES = "must be one of " + ", ".join(CONTROLLERS)
+SEEDS = f"from 0 to {LARGEST_SEED}"
+DEPTHS, LATERALS = (25, 30, 35, 40, 45), (-5, 0, 5)
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Return a function that loads a study from the text of its file, after a line with its name."""
+
+    def load(text):
+        path = tmp_path / "my.toml"
+        path.write_text(f'name = "my"\n{text}')
+        return load_study(path)
+
+    return load
+
+
+def insertions(study):
+    return [study.insertion(index) for index in range(len(study))]
+
+
+def refusal(study, text):
+    """Return the message about a study file, without the file name."""
+    with pytest.raises(InputError) as caught:
+        study(text)
+    lines = [line.split("my.toml: ", 1) for line in str(caught.value).splitlines()]
+    assert all(len(line) == 2 for line in lines)
+    return [line[1] for line in lines]
+
+
+TWO_BY_TWO = """
+repeats = 2
+first_seed = 50
+[[cases]]
+name = "base"
+[[cases]]
+name = "rough"
+values = { phantom.run_out_mm = 0.4 }
+[[axes]]
+key = "target"
+values = [[30, 0], [40, 5]]
+[[axes]]
+key = "controller"
+values = ["CONTROLLERS"]
+""".replace("CONTROLLERS", '", "'.join(CONTROLLERS))
+
+
+def test_cases_vary_slowest_then_axes_in_their_order_and_repeats_fastest(study):
+    got = [
+        (i.point.case, i.point.scenario.target.position, i.point.controller, i.repeat)
+        for i in insertions(study(TWO_BY_TWO))
+    ]
+    targets, controllers = [(30.0, 0.0, 0.0), (40.0, 5.0, 0.0)], list(CONTROLLERS)
+    assert got == list(itertools.product(["base", "rough"], targets, controllers, [0, 1]))
+
+
+def test_a_case_sets_its_values_and_nothing_else(study):
+    base, rough = (study(TWO_BY_TWO).points[k].scenario for k in (0, 4))
+    assert base == PHANTOM.with_values({"target.depth_mm": 30, "target.lateral_mm": 0})
+    assert rough == base.with_values({"phantom.run_out_mm": 0.4})
+
+
+def test_each_target_and_repeat_has_its_own_seed_at_all_other_settings(study):
+    seeds = {}
+    for insertion in insertions(study(TWO_BY_TWO)):
+        key = insertion.point.scenario.target.position, insertion.repeat
+        seeds.setdefault(key, set()).add(insertion.seed)
+    assert [min(own) for own in seeds.values()] == [50, 51, 52, 53]
+    assert all(len(own) == 1 for own in seeds.values())
+
+
+@pytest.mark.parametrize("values", ["[3, 5, 9]", "{ from = 3, count = 3 }"])
+def test_an_axis_of_seeds_gives_all_targets_the_same_seeds(study, values):
+    text = f'[[axes]]\nkey = "seed"\nvalues = {values}\n[[axes]]\nkey = "target.depth_mm"\nvalues = [30, 40]'
+    expected = [3, 5, 9] if values.startswith("[") else [3, 4, 5]
+    assert [(i.repeat, i.seed) for i in insertions(study(text))] == 2 * list(enumerate(expected))
+
+
+def test_values_apply_to_all_points_and_axes_and_cases_override_them(study):
+    text = "[values]\nplant = 'model'\nphantom.run_out_mm = 1.0\nplan_seed = 4\n" + TWO_BY_TWO.split("50")[1]
+    points = study(text).points
+    assert {(point.plant, point.plan_seed) for point in points} == {("model", 4)}
+    assert [point.scenario.phantom.run_out_mm for point in points] == [1.0] * 4 + [0.4] * 4
+
+
+OWN_TARGETS = """
+repeats = 2
+first_seed = 50
+[values]
+setup.axes = 2
+[[axes]]
+key = "controller"
+values = ["CONTROLLERS"]
+[[cases]]
+name = "any"
+targets = [[30, 1, 2], [40, 5]]
+[[cases]]
+name = "one axis"
+values = { setup.guide_axes = 1 }
+reach = true
+targets = [[30, 1, 2], [35, 0, -1]]
+[[cases]]
+name = "as in the scenario"
+""".replace("CONTROLLERS", '", "'.join(CONTROLLERS))
+
+
+def test_a_case_may_have_its_own_targets(study):
+    """They vary after the cases and before the axes; without z they are in the plane; without any, the scenario's."""
+    points = study(OWN_TARGETS).points
+    targets = [(point.case, point.scenario.target.position) for point in points[::2]]
+    assert targets == [
+        ("any", (30.0, 1.0, 2.0)),
+        ("any", (40.0, 5.0, 0.0)),
+        ("one axis", (30.0, 1.0, 2.0)),
+        ("one axis", (35.0, 0.0, -1.0)),
+        ("as in the scenario", PHANTOM.target.position),
+    ]
+    assert [point.controller for point in points] == 5 * list(CONTROLLERS)
+    assert {point.scenario.setup.guide_axes for point in points if point.case == "one axis"} == {1}
+    assert all(set(point.varied) == {"controller"} for point in points)
+
+
+def test_equal_targets_of_two_cases_have_the_same_seeds(study):
+    seeds = {}
+    for insertion in insertions(study(OWN_TARGETS)):
+        seeds.setdefault(insertion.point.scenario.target.position, set()).add(insertion.seed)
+    expected = {(30.0, 1.0, 2.0): {50, 51}, (40.0, 5.0, 0.0): {52, 53}, (35.0, 0.0, -1.0): {54, 55}}
+    assert seeds == expected  # the target of the scenario is that of the first case, too
+
+
+def test_a_case_may_have_its_reach_computed(study):
+    assert [point.with_reach for point in study(OWN_TARGETS).points] == [False] * 4 + [True] * 4 + [False] * 2
+
+
+def test_targets_and_reach_of_cases_are_part_of_the_definition(study):
+    definition = study(OWN_TARGETS).definition
+    assert definition["targets"] == {"any": [[30, 1, 2], [40, 5]], "one axis": [[30, 1, 2], [35, 0, -1]]}
+    assert definition["reach"] == ["one axis"]
+    assert definition["insertions"] == 5 * len(CONTROLLERS) * 2
+
+
+def test_a_target_of_two_numbers_is_in_the_plane(study):
+    """Whatever the scenario's own target."""
+    points = study('scenario = "phantom3d"\n[[axes]]\nkey = "target"\nvalues = [[30, 1, 2], [30, 1]]').points
+    assert [point.scenario.target.position for point in points] == [(30.0, 1.0, 2.0), (30.0, 1.0, 0.0)]
+
+
+def test_the_targets_of_space_are_those_that_were_drawn(capsys):
+    """`studies/space_targets.py` prints them."""
+    path = Path(__file__).parents[3] / "studies" / "space_targets.py"
+    spec = importlib.util.spec_from_file_location("space_targets", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.main([])
+    lists = capsys.readouterr().out.split("targets = ")[1:]
+    drawn = [tomllib.loads(f"targets = {text}")["targets"] for text in lists]
+    found = load_study("space").definition["targets"]
+    assert drawn == list(found.values())
+    two, one, half = (np.array(found[name]) for name in ("two axes", "one axis", "half turns"))
+    most = np.minimum(8.0, 0.2 * two[:, 0])
+    assert len(two) == len(one) == len(half) == 30
+    assert two[:, 0].min() >= 25.0
+    assert two[:, 0].max() <= 80.0
+    assert (np.hypot(two[:, 1], two[:, 2]) <= most + 0.01).all()
+    assert len(set(np.sign(two[:, 1]) + 3 * np.sign(two[:, 2]))) == 4  # in all quadrants
+    reach = [bevel_reach(load_scenario("phantom3d"), depth)[1] for depth in one[:, 0]]
+    assert (np.abs(one[:, 2]) <= 0.5 * np.array(reach) + 0.01).all()
+    assert (half[:, 2] == 0.0).all()
+
+
+def test_all_means_every_controller(study):
+    points = study('[[axes]]\nkey = "controller"\nvalues = "all"').points
+    assert [point.controller for point in points] == list(CONTROLLERS)
+
+
+def test_keys_of_the_base_can_be_removed(study):
+    text = (
+        'without = ["needle.outer_diameter_mm", "needle.inner_diameter_mm"]\n[values]\nneedle.gauge = "19G"'
+    )
+    needle = study(text).points[0].scenario.needle
+    assert (needle.gauge, needle.outer_diameter_mm, needle.outer_diameter) == ("19G", None, 1.067)
+
+
+def test_renamed_keys_are_accepted_in_values_cases_and_axes(study):
+    axis = '[[axes]]\nkey = "control.horizon"\nvalues = [3, 4]\n'
+    rest = '[values]\ncontrol.samples = 9\n[[cases]]\nname = "a"\nvalues = { control.iterations = 2 }\n'
+    with pytest.warns(ScenarioWarning) as caught:
+        points = study(rest + axis).points
+    assert {str(warning.message).split()[0] for warning in caught} == {
+        "control.horizon",
+        "control.samples",
+        "control.iterations",
+    }
+    tables = [point.scenario.control.tables["ce_mpc"] for point in points]
+    assert [(t["horizon"], t["samples"], t["iterations"]) for t in tables] == [(3, 9, 2), (4, 9, 2)]
+    assert [dict(point.varied) for point in points] == [{"control.ce_mpc.horizon": k} for k in (3, 4)]
+    twice = axis + '[[cases]]\nname = "a"\nvalues = { control.ce_mpc.horizon = 2 }\n'
+    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="also set by an axis"):
+        study(twice)
+
+
+def test_an_unknown_controller_table_is_rejected(study):
+    with pytest.raises(InputError, match=r"control.ce_mcp: unknown table; did you mean ce_mpc\? tables: "):
+        study("[values]\ncontrol.ce_mcp.horizon = 3\n")
+
+
+def test_a_scenario_path_is_relative_to_the_study_file(study, tmp_path):
+    scenario = PHANTOM.with_values({"name": "Beside", "setup.stroke_mm": 100})
+    (tmp_path / "beside.toml").write_text(dump_scenario(scenario))
+    assert study('scenario = "beside.toml"').points[0].scenario == scenario
+
+
+def test_a_study_with_only_a_name_is_one_insertion_of_the_preset(study):
+    (only,) = insertions(study(""))
+    assert (only.point.scenario, only.point.case, only.seed, only.point.plan_seed) == (PHANTOM, "", 0, 0)
+
+
+def test_the_largest_seeds_fit_into_a_table(study):
+    longest = f"first_seed = {LARGEST_SEED}\nrepeats = 100_000\n" + axis("target.depth_mm", "[30, 40]")
+    axes = axis("seed", f"{{from = {LARGEST_SEED}, count = 2}}") + axis("plan_seed", f"[0, {LARGEST_SEED}]")
+    for text in (longest, axes):
+        whole = study(text)
+        last = whole.insertion(len(whole) - 1)
+        seeds = pa.array([last.seed, last.point.plan_seed], pa.int64()).to_pylist()
+        assert seeds == [last.seed, last.point.plan_seed]
+        assert last.seed > LARGEST_SEED
+
+
+def test_true_is_not_a_duplicate_of_one(study):
+    assert "twice" not in refusal(study, axis("plan.samples", "[16, 1, true]"))[0]
+
+
+def in_space(case):
+    """A study in space with one case."""
+    return f'[values]\nsetup.axes = 2\n[[cases]]\nname = "a"\n{case}\n'
+
+
+def axis(key, values):
+    return f"[[axes]]\nkey = '{key}'\nvalues = {values}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("repeat = 3", "repeat = 3: unknown key; did you mean repeats?"),
+        ("repeats = 0", "repeats = 0: must be at least 1"),
+        ("first_seed = -1", f"first_seed = -1: must be from 0 to {LARGEST_SEED}"),
+        (
+            f"first_seed = {LARGEST_SEED + 1}",
+            f"first_seed = {LARGEST_SEED + 1}: must be from 0 to {LARGEST_SEED}",
+        ),
+        ("first_seed = true", "first_seed = true: must be a whole number"),
+        ("scenario = 'no.toml'", "/no.toml: no such file"),
+        ("x = ", "not TOML: "),
+        ("without = ['needle.gauge']", 'without = "needle.gauge": not a key of the scenario'),
+        ("[values]\ncontroller = 'pid'", f'controller = "pid": {CHOICES}'),
+        ("[values]\nplant = 'real'", 'plant = "real": must be one of exact, model'),
+        ("[values]\nstrategy = 'x'", 'strategy = "x": must be one of manipulation, steering'),
+        ("[values]\nplan_seed = 1.5", f"plan_seed = 1.5: must be a whole number {SEEDS}"),
+        (axis("plan_seed", f"[1, {2**63}]"), f"plan_seed = {2**63}: must be a whole number {SEEDS}"),
+        (
+            "[values]\nseed = 3",
+            "values.seed = 3: not allowed here: set seeds with first_seed and repeats, or with an axis",
+        ),
+        (
+            "[values]\ntarget = 3",
+            "values.target = 3: must be two or three numbers, [depth, y] or [depth, y, z] in mm",
+        ),
+        ("[values]\nphantom.runout_mm = 3", "phantom.runout_mm = 3: unknown key; did you mean run_out_mm?"),
+        ("[values]\nsetup.stroke_mm = 'a'", 'setup.stroke_mm = "a": must be a number'),
+        (axis("setup.stroke_mm", "[100, 140]"), "setup.stroke_mm = 140.0: the base would reach the guide"),
+        (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
+        (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, world_rig, as an axis also seed, world"),
+        (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
+        (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
+        (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: contains 8 twice"),
+        (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: contains 100 twice"),
+        (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: contains [30, 0] twice"),
+        (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), f'controller = "x": {CHOICES}'),
+        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: must be two or three numbers"),
+        (axis("target", "[[30, 0], [400, 0]]"), "target.depth_mm = 400.0: beyond the stroke"),
+        (in_space("targets = 3"), "cases[0].targets = 3: must be a list of at least one value"),
+        (in_space("targets = []"), "cases[0].targets = []: must be a list of at least one value"),
+        (in_space("targets = [[30]]"), "cases[0].targets = [30]: must be two or three numbers, [depth, y]"),
+        (in_space("targets = [[30, 1], [30, 1]]"), "[[30, 1], [30, 1]]: contains [30, 1] twice"),
+        (
+            in_space("targets = [[30, 1]]\nvalues = { target.depth_mm = 30 }"),
+            "cases[0].values.target.depth_mm: also set by targets",
+        ),
+        (
+            in_space("targets = [[30, 1]]") + axis("target.lateral_z_mm", "[0, 1]"),
+            "cases[0].targets: also set by an axis",
+        ),
+        (in_space("targets = [[30, 1]]") + axis("world", "[3]"), "cases[0].targets: also set by an axis"),
+        (in_space("targets = [[30, 1, 99]]"), "target.lateral_z_mm = 99.0: must be at most 15 in size"),
+        (axis("target", "[[30, 0, 1]]"), "target.lateral_z_mm = 1.0: must be 0 with setup.axes = 1"),
+        (axis("seed", "[1, -2]"), f"axes[0].values = [1, -2]: must be whole numbers {SEEDS}"),
+        (axis("seed", f"[1, {LARGEST_SEED + 1}]"), f"{LARGEST_SEED + 1}]: must be whole numbers {SEEDS}"),
+        (
+            axis("seed", f"{{from = {2**62 + 1}, count = 2}}"),
+            f"from a whole number, 0 to {LARGEST_SEED}, count 1",
+        ),
+        (axis("seed", "{from = 1}"), "axes[0].values = {…}: must be a list, or {from, count}"),
+        ("repeats = 2\n" + axis("seed", "[1]"), "repeats = 2: remove it: an axis sets the seeds"),
+        (2 * axis("plan.samples", "[16]"), 'axes = "plan.samples": set by two axes'),
+        (
+            axis("target", "[[30, 0]]") + axis("target.depth_mm", "[30]"),
+            'axes = "target.depth_mm": set by two axes',
+        ),
+        (
+            axis("plan.samples", "[16]") + "[[cases]]\nname = 'a'\nvalues = {plan.samples = 8}",
+            'cases[0].values = "plan.samples": also set by an axis',
+        ),
+        ("[[cases]]\nname = 'a'\n[[cases]]\nname = 'a'", 'cases = "a": names must be unique'),
+        (
+            "[[cases]]\nname = 'a'\nvalues = {seed = 1}",
+            "cases[0].values.seed = 1: not allowed here: set seeds with",
+        ),
+        ("[[axes]]\nvalues = [1]", "axes[0].key: missing"),
+        (
+            "repeats = 100_000\n" + axis("plan.samples", str(list(range(16, 28)))),
+            "insertions = 1200000: must be at most",
+        ),
+    ],
+)
+def test_a_bad_study_file_is_rejected_in_one_line_with_the_problem(study, text, line):
+    (message,) = refusal(study, text)
+    assert line in message
+
+
+def test_an_invalid_setting_is_reported_with_its_grid_point(study):
+    (message,) = refusal(study, axis("plan.samples", "[16, 32]") + axis("setup.stroke_mm", "[100, 140]"))
+    assert message.endswith("(at plan.samples = 16, setup.stroke_mm = 140)")
+
+
+def test_an_unknown_study_is_rejected_with_the_valid_names():
+    with pytest.raises(InputError, match=r"^nope: no such file, and no such study \(choices: controllers, "):
+        load_study("nope")
+
+
+@pytest.mark.slow
+def test_the_shipped_studies_load():
+    """Loading checks every scenario of the grid against all rules, including targets within the stroke."""
+    sizes = {name: len(load_study(name)) for name in STUDIES.names()}
+    assert sizes == {
+        "phantom": 150,
+        "phantom-published": 150,
+        "odd-targets": 150,
+        "controllers": 150 * len(CONTROLLERS),
+        "mismatch": 5 * 150,
+        "mismatch-doubled": 10_005,
+        "imperfections": 18 * 150,
+        "guide-distance": 7 * 150,
+        "gauges": 8 * 150,
+        "tracker": 5 * 150,
+        "worlds": 2202,
+        "space": 3 * 4 * 300,
+        "worlds-space": 5740,
+    }
+
+
+def test_the_phantom_study_has_the_papers_targets_and_its_own_seeds():
+    all_of_it = insertions(load_study("phantom"))
+    targets = [insertion.point.scenario.target.position[:2] for insertion in all_of_it]
+    assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]
+    assert [insertion.seed for insertion in all_of_it] == list(range(100000, 100150))
+
+
+def test_the_published_phantoms_are_those_of_the_phantom_study_without_later_imperfections():
+    """The later imperfections are drawn last and change no other draw."""
+    old, new = (insertions(load_study(name)) for name in ("phantom-published", "phantom"))
+    assert [insertion.seed for insertion in old] == [insertion.seed for insertion in new]
+    assert {insertion.point.scenario.phantom.start_axial_sd_mm for insertion in old} == {0.0}
+    assert {insertion.point.scenario.phantom.youngs_modulus_variation for insertion in old} == {0.0}
+
+
+def test_odd_targets_are_off_the_papers_grid():
+    all_of_it = insertions(load_study("odd-targets"))
+    targets = {insertion.point.scenario.target.position[:2] for insertion in all_of_it}
+    assert not targets & set(itertools.product(DEPTHS, LATERALS))
+    assert {insertion.seed for insertion in all_of_it} == set(range(300000, 300150))
+
+
+def test_the_controllers_study_has_the_phantoms_of_the_phantom_study():
+    seeds = {}
+    for insertion in insertions(load_study("controllers")):
+        seeds.setdefault(insertion.point.controller, []).append(insertion.seed)
+    assert list(seeds) == list(CONTROLLERS)
+    assert all(own == list(range(100000, 100150)) for own in seeds.values())
+
+
+def settings(study, case):
+    return next(point.scenario for point in study.points if point.case == case)
+
+
+def test_mismatch_grows_from_none_through_the_preset_to_the_doubled():
+    study = load_study("mismatch")
+    at = {float(case[4:]): settings(study, case).phantom for case in study.definition["cases"]}
+    assert list(at) == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert at[1.0] == PHANTOM.phantom
+    assert (at[0.0].shear_modulus_factor, at[0.0].bevel_factor) == ((1.0, 1.0), (1.0, 1.0))
+    assert (at[2.0].shear_modulus_factor, at[2.0].bevel_factor) == ((0.3, 2.5), (0.0, 2.0))
+    for s, low, high in ((0.5, 0.0, 1.0), (1.5, 1.0, 2.0)):
+        ends = zip(at[low].shear_modulus_factor, at[high].shear_modulus_factor, strict=True)
+        assert at[s].shear_modulus_factor == pytest.approx([(a * b) ** 0.5 for a, b in ends], rel=1e-3)
+    for s, phantom in at.items():
+        assert phantom.bevel_factor == (1 - s / 2, 1 + s / 2)
+        assert (phantom.start_offset_sd_mm, phantom.start_angle_sd_mrad) == (0.5 * s, 3 * s)
+
+
+def test_the_long_study_has_the_doubled_mismatch_and_its_own_seeds():
+    study = load_study("mismatch-doubled")
+    (phantom,) = {point.scenario.phantom for point in study.points}
+    published = {"start_axial_sd_mm": 0.0, "youngs_modulus_variation": 0.0}
+    assert phantom == settings(load_study("mismatch"), "s = 2").phantom.model_copy(update=published)
+    assert len({insertion.seed for insertion in insertions(study)}) == len(study) >= 10_000
+    assert min(insertion.seed for insertion in insertions(study)) == 200_000
+
+
+def test_each_imperfection_is_changed_alone():
+    study = load_study("imperfections")
+    base = settings(study, "base").flat()
+    changed = {}
+    for case in list(study.definition["cases"])[1:]:
+        values = settings(study, case).flat()
+        ((key, value),) = [(key, value) for key, value in values.items() if base[key] != value]
+        changed[key] = (base[key], value)
+    own = {f"phantom.{name}" for name in type(PHANTOM.phantom).model_fields}
+    sizes = {f"phantom.{name}_mm" for name in ("contact_spacing", "element", "step")}
+    out_of_plane = (
+        "start_offset_z_sd_mm",
+        "start_angle_z_sd_mrad",
+        "direction_spread_deg",
+        "rotation_friction_mn",
+    )
+    none_in_the_plane = {f"phantom.{name}" for name in out_of_plane}
+    assert own - set(changed) == {*sizes, *none_in_the_plane, "phantom.structure"}
+    assert changed.pop("phantom.tracker_bias_mm") == (0.0, 0.3)
+    assert changed.pop("phantom.shear_modulus_factor") == ([0.6, 1.6], [0.3, 2.5])
+    assert changed.pop("phantom.bevel_factor") == ([0.5, 1.5], [0.0, 2.0])
+    assert all(after == 2 * before for before, after in changed.values())
+
+
+def test_no_imperfection_makes_all_readings_stale():
+    study = load_study("imperfections")
+    for case in study.definition["cases"]:
+        scenario = settings(study, case)
+        period = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+        late = scenario.phantom.delay_periods * period
+        assert late + 2 * scenario.tracker.period < scenario.control.stale_after_s
+
+
+def test_the_tip_starts_at_the_same_distance_from_the_guide_in_every_case():
+    setups = [point.scenario.setup for point in load_study("guide-distance").points]
+    assert {setup.guide_to_skin_mm - setup.tip_to_skin_mm for setup in setups} == {12.5}
+    assert sorted({setup.guide_to_skin_mm for setup in setups}) == [20, 30, 40, 50, 60, 70, 80]
+
+
+def test_the_gauges_are_solid_needles_of_growing_number():
+    needles = [point.scenario.needle for point in load_study("gauges").points]
+    assert list(dict.fromkeys(needle.gauge for needle in needles)) == [
+        f"{number}G" for number in range(18, 26)
+    ]
+    assert {needle.inner_diameter for needle in needles} == {0.0}
+    assert {needle.outer_diameter for needle in needles if needle.gauge == "21G"} == {
+        PHANTOM.needle.outer_diameter
+    }
+
+
+def test_shipped_study_files_begin_with_a_comment():
+    for name in STUDIES.names():
+        text = (Path(load_study.__code__.co_filename).parent / "studies" / f"{name}.toml").read_text()
+        assert text.startswith("# ")
+        assert f'name = "{name}"' in text

@@ -1,0 +1,348 @@
+"""Rows of a study computed again: the same to the last digit, or how they differ, or why they cannot be."""
+
+import json
+import re
+import shutil
+import sys
+
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.lab.study import recompute as module
+from flexneedle.lab.study import rows
+from flexneedle.lab.study.folder import read_folder
+from flexneedle.lab.study.grid import load_study, recorded_study
+from flexneedle.lab.study.recompute import recompute, row_folder
+from flexneedle.lab.study.runner import run_study
+from flexneedle.record.folder import versions
+from flexneedle.record.plain import plain
+from flexneedle.record.results import insertion_row
+
+SIZE = 16
+
+
+def journalled(folder):
+    """Rows by index."""
+    lines = (folder / "journal.jsonl").read_text().splitlines()
+    return {row["index"]: row for row in map(json.loads, lines)}
+
+
+def agrees(insertion, row):
+    """Whether an insertion has the values of a row, to the last digit."""
+    values = json.loads(json.dumps(plain(insertion_row(insertion))))
+    return values == {name: row[name] for name in values}
+
+
+@pytest.fixture
+def copied(uninterrupted, tmp_path):
+    """A copy of the folder of the quick study, for a test that changes it."""
+    return shutil.copytree(uninterrupted, tmp_path / "copied")
+
+
+@pytest.fixture
+def ran(tmp_path, in_threads):  # noqa: ARG001
+    """Return a function that runs a study of a text, and returns its folder."""
+
+    def run(text):
+        (tmp_path / "my.toml").write_text(text)
+        return run_study(tmp_path / "my.toml", tmp_path / "study", workers=1)
+
+    return run
+
+
+def change(folder, name, **values):
+    """Change what is recorded in `study.json`, in one of its tables."""
+    stored = json.loads((folder / "study.json").read_text())
+    stored[name] |= values
+    (folder / "study.json").write_text(json.dumps(stored))
+
+
+def change_row(folder, index, **values):
+    found = journalled(folder)
+    found[index] |= values
+    (folder / "journal.jsonl").write_text("".join(json.dumps(row) + "\n" for row in found.values()))
+
+
+@pytest.mark.parametrize("index", [0, 6, 15])
+def test_a_row_is_the_same_to_the_last_digit(uninterrupted, index):
+    """Of another case, target, plant and repeat; on all cores, where the study had one for each insertion."""
+    again, shares = recompute(uninterrupted, index), []
+    assert agrees(again.insertion, journalled(uninterrupted)[index])
+    assert again.note == ""
+    recompute(uninterrupted, index, shares.append)
+    assert len(shares) == len(again.insertion.periods)
+    assert 0.0 <= shares[0] < 0.3
+    assert shares[-1] > 0.97
+
+
+QUICK_PARTS = """
+[values]
+plan = { samples = 16, iterations = 2 }
+setup.tip_to_skin_mm = 4.0
+phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
+target = [8, 0.5]
+"""
+HELD = f"""
+name = "held"
+{QUICK_PARTS.replace("step_mm = 1.0", "step_mm = 1.0, missing_fraction = 0.99")}
+control.hold_limit_s = 0.4
+"""
+
+
+def test_a_held_insertion_is_the_same(ran):
+    folder = ran(HELD)
+    assert journalled(folder)[0]["outcome"] == "held"
+    again = recompute(folder, 0)
+    assert (again.insertion.outcome, again.note) == ("held", "")
+    assert agrees(again.insertion, journalled(folder)[0])
+
+
+OWN = """
+from dataclasses import replace
+from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.errors import DriverError
+
+PLAIN = CONTROLLERS["open-loop"]
+
+
+def decide(task, done, estimate, rng):
+    if done == 5:
+        raise DriverError("the motor is off")
+    return PLAIN.decide(task, done, estimate, rng)
+
+
+BREAKS = replace(PLAIN, name="breaks", decide=decide)
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """A module `breaking` beside the study, which the current directory is."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "breaking.py").write_text(OWN)
+    yield tmp_path / "breaking.py"
+    sys.modules.pop("breaking", None)
+
+
+def test_a_failed_insertion_of_an_own_controller_is_the_same(ran, own_module):
+    folder = ran(f'name = "own"\n{QUICK_PARTS}controller = "breaking:BREAKS"')
+    assert (journalled(folder)[0]["outcome"], journalled(folder)[0]["periods"]) == ("failed", 5)
+    again = recompute(folder, 0)
+    assert agrees(again.insertion, journalled(folder)[0])
+    assert (again.insertion.controller, again.note) == ("breaking:BREAKS", "")
+    own_module.write_text(f"{OWN}# edited\n")
+    assert recompute(folder, 0).note == "recomputed with other code than the study's: the same result"
+
+
+def test_an_own_module_that_is_missing_is_an_error(ran, own_module):
+    folder = ran(f'name = "own"\n{QUICK_PARTS}controller = "breaking:BREAKS"')
+    own_module.unlink()
+    del sys.modules["breaking"]
+    missing = f"{folder}: controller = 'breaking:BREAKS': no module breaking in "
+    with pytest.raises(InputError, match=re.escape(missing)):
+        recompute(folder, 0)
+
+
+WORLDS = """
+name = "few"
+repeats = 2
+[values]
+plan = { samples = 48, iterations = 6, max_iterations = 6 }
+plant = "model"
+[[cases]]
+name = "perfect"
+values = { world_case = "perfect" }
+[[cases]]
+name = "real"
+[[axes]]
+key = "world"
+values = [15, 3]
+[[axes]]
+key = "controller"
+values = ["resolved-rate"]
+"""
+
+
+def test_a_world_is_the_same_also_after_one_that_is_left_out(ran, monkeypatch):
+    """Without a guide, in world 15, this controller has no row."""
+    monkeypatch.setattr(rows, "reach", lambda *_: 1 / 0)
+    folder = ran(WORLDS)
+    found = journalled(folder)
+    assert len(found) == 4
+    assert found[3]["reason"].endswith("no reach: ZeroDivisionError: division by zero")
+    again = recompute(folder, 3)
+    assert agrees(again.insertion, found[3] | {"reason": again.insertion.reason})
+    assert (again.insertion.seed, again.note) == (7, "")
+
+
+@pytest.mark.parametrize("source", ["phantom", "gauges", "quick", "worlds"])
+def test_a_recorded_study_has_the_insertions_of_the_study(source, quick, tmp_path):
+    """Also those that are made alone, and not after all before them."""
+    (tmp_path / "worlds.toml").write_text(WORLDS)
+    files = {"quick": quick, "worlds": tmp_path / "worlds.toml"}
+    study = load_study(files.get(source, source))
+    definition = json.loads(json.dumps(study.definition))
+    for index in range(0, len(study), 1 + len(study) // 20):
+        assert recorded_study(definition).insertion(index) == study.insertion(index)
+    assert recorded_study(definition).definition == study.definition
+
+
+def test_a_study_that_runs_has_the_rows_that_are_finished(copied):
+    """With a last line that is being written."""
+    lines = (copied / "journal.jsonl").read_text().splitlines(keepends=True)
+    first = [json.loads(line)["index"] for line in lines[:3]]
+    (copied / "journal.jsonl").write_text("".join(lines[:3]) + lines[3][:40])
+    for name in ("runs.parquet", "timing.parquet"):
+        (copied / name).unlink()
+    assert sorted(read_folder(copied).rows) == sorted(first)
+    assert recompute(copied, first[-1]).note == ""
+    other = next(index for index in range(SIZE) if index not in first)
+    with pytest.raises(InputError, match=f"copied: row {other} is not finished: 3 of 16 are"):
+        recompute(copied, other)
+
+
+def test_a_study_that_another_process_writes_to_is_read(copied, quick):
+    from flexneedle.lab.study.folder import open_folder
+
+    with open_folder(copied, load_study(quick), resume=True):
+        assert len(read_folder(copied).rows) == SIZE
+
+
+@pytest.mark.parametrize("index", [-1, SIZE, 10**9])
+def test_a_row_that_is_none_is_an_error_with_the_range(uninterrupted, index):
+    with pytest.raises(InputError, match=rf"study: row = {index}: must be from 0 to 15"):
+        recompute(uninterrupted, index)
+
+
+@pytest.mark.parametrize("outcome", ["refused", "error"])
+def test_a_row_without_an_insertion_is_an_error_with_its_reason(copied, outcome):
+    change_row(copied, 4, outcome=outcome, reason="no plan: FloatingPointError: overflow")
+    message = f"copied: row 4 has no insertion: {outcome}: no plan: FloatingPointError: overflow"
+    with pytest.raises(InputError, match=message):
+        recompute(copied, 4)
+
+
+def test_a_plan_that_is_missing_is_an_error_with_its_name(copied):
+    shutil.rmtree(copied / "plans")
+    with pytest.raises(InputError, match=r"copied: row 4: its plan plans/[0-9a-f]{16}\.json is missing$"):
+        recompute(copied, 4)
+    change(copied, "versions", source="0")
+    with pytest.raises(InputError, match=r"is missing; the study was made by other code$"):
+        recompute(copied, 4)
+
+
+def damage_definition(folder):
+    change(folder, "study", axes=3)
+
+
+def other_settings(folder):
+    values = json.loads((folder / "study.json").read_text())["study"]["values"]
+    change(folder, "study", values=values | {"plan.samples": -1})
+
+
+def other_size(folder):
+    change(folder, "study", insertions=3)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda folder: (folder / "study.json").unlink(),
+            r"copied: contains no study: study\.json is missing",
+        ),
+        (lambda folder: (folder / "study.json").write_text("{"), r"copied/study\.json: cannot be read: "),
+        (lambda folder: (folder / "study.json").write_text("[]"), r"copied/study\.json: cannot be read: "),
+        (damage_definition, r"copied/study\.json: damaged: "),
+        (other_settings, r"copied: row 0: plan\.samples = -1: must be "),
+        (other_size, "copied: insertions = 3: this version of flexneedle makes 16 of it: its rows cannot be"),
+        (
+            lambda folder: (folder / "journal.jsonl").unlink(),
+            r"journal\.jsonl: cannot be read: No such file or directory",
+        ),
+        (
+            lambda folder: (folder / "journal.jsonl").write_text("3\n"),
+            r"journal\.jsonl: damaged at line 1: not a ",
+        ),
+        (
+            lambda folder: change_row(folder, 0, true_error_mm="x"),
+            r"journal\.jsonl: damaged at line \d+: true_error",
+        ),
+    ],
+)
+def test_a_damaged_folder_is_an_error(copied, damage, message):
+    damage(copied)
+    with pytest.raises(InputError, match=message):
+        recompute(copied, 0)
+
+
+def test_a_folder_that_does_not_exist_is_an_error(tmp_path):
+    with pytest.raises(InputError, match=r"none: contains no study: study\.json is missing"):
+        recompute(tmp_path / "none", 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "recorded", "note"),
+    [
+        ({}, {}, ""),
+        ({"source": "0"}, {}, "recomputed with other code than the study's: the same result"),
+        ({"numpy": "1.0"}, {}, "recomputed with other versions (numpy) than the study's: the same result"),
+        (
+            {"source": "0"},
+            {"true_error_mm": 7.25},
+            r"recomputed with other code than the study's: error 0.\d{3} mm, recorded 7.250 mm",
+        ),
+        (
+            {},
+            {"flips": 99},
+            r"recomputed with the study's code, and not the same: flips \d, recorded 99",
+        ),
+        (
+            {},
+            {"outcome": "held"},
+            "recomputed with the study's code, and not the same: outcome done, recorded held",
+        ),
+        ({}, {"reason": "no reach: x", "reach_mm": 3.0}, ""),
+        ({}, {"of_an_earlier_version": 3.0}, ""),
+    ],
+)
+def test_what_differs_from_the_recorded_row_is_noted(copied, changed, recorded, note):
+    change(copied, "versions", **changed)
+    change_row(copied, 2, **recorded)
+    assert re.fullmatch(note if "\\" in note else re.escape(note), recompute(copied, 2).note)
+
+
+def test_a_row_of_an_earlier_version_may_lack_columns(copied):
+    found = journalled(copied)
+    kept = {name: found[2][name] for name in ("index", "true_error_mm", "outcome", "reason")}
+    (copied / "journal.jsonl").write_text(json.dumps(kept) + "\n")
+    assert recompute(copied, 2).note == ""
+
+
+def test_a_difference_in_the_last_digit_is_shown_with_all_digits(copied):
+    error = journalled(copied)[2]["true_error_mm"]
+    change_row(copied, 2, true_error_mm=error * (1 + 1e-12))
+    assert recompute(copied, 2).note.endswith(f": error {error} mm, recorded {error * (1 + 1e-12)} mm")
+
+
+def test_it_ends_with_what_is_raised_at_a_share(uninterrupted):
+    """So it is cancelled."""
+
+    class CancelledError(Exception):
+        pass
+
+    def cancel(share):
+        if share > 0.5:
+            raise CancelledError
+
+    with pytest.raises(CancelledError):
+        recompute(uninterrupted, 0, cancel)
+
+
+def test_present_versions_are_those_of_the_study(uninterrupted):
+    assert read_folder(uninterrupted).versions == versions() == module.versions()
+
+
+def test_a_row_has_a_folder_in_that_of_the_study(tmp_path):
+    assert row_folder(tmp_path, 17) == tmp_path / "rows" / "row-000017"

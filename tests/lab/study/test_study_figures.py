@@ -1,0 +1,452 @@
+"""Figures of studies hold what they must: judged by their artists, not by their pixels."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
+from numpy.testing import assert_allclose
+
+from flexneedle.figures.layout import Panel, look
+from flexneedle.figures.style import save
+from flexneedle.lab.study.figures.comparison import DifferenceRow, difference_figure
+from flexneedle.lab.study.figures.distributions import error_figure
+from flexneedle.lab.study.figures.energy import energy_figure
+from flexneedle.lab.study.figures.samples import Sample
+from flexneedle.lab.study.figures.shares import share_figure
+from flexneedle.lab.study.figures.sweeps import sweep_figure
+from flexneedle.lab.study.figures.targeting import ACROSS, Tips, targeting_figure
+
+TARGETS = np.array(
+    [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
+)
+NAMES = ("adaptive-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")
+
+
+def lognormal(middle, count=150, seed=0):
+    return middle * np.exp(0.5 * np.random.default_rng(seed).normal(size=count))
+
+
+def target_panel(number=0, spread=0.1, repeats=10, targets=TARGETS, unfinished=()):
+    rng = np.random.default_rng(number)
+    there = np.repeat(targets, repeats, axis=0)
+    tips = there + rng.normal(0.0, spread, there.shape)
+    done = ~np.isin(np.arange(len(there)), unfinished)
+    alarm = f"{len(unfinished)} not finished" if unfinished else ""
+    note = "mean 0.06, 95 % 0.13, max 0.16 mm"
+    return Panel(NAMES[number], note, look(number).color, Tips(there, tips, done), alarm)
+
+
+def samples(count=150):
+    return [
+        Sample(name, look(k), lognormal(0.05 * (k + 1), count, k), count + (k == 2))
+        for k, name in enumerate(NAMES)
+    ]
+
+
+def by_controller(rows):
+    return error_figure([Panel("", "", "#000000", rows)], "")
+
+
+def error_panels(number=7, count=30):
+    levels = ("all", "25", "30", "35", "40", "45")
+    note, alarm = "mean 0.06, 95 % 0.13, max 0.16 mm", "2 not finished"
+    return [
+        Panel(
+            NAMES[k],
+            note,
+            look(k).color,
+            [Sample(name, look(k), lognormal(0.05 * (k + 1), count, k), count) for name in levels],
+            alarm,
+        )
+        for k in range(number)
+    ]
+
+
+def sweeps(number, names=("0", "0.5", "1", "1.5", "2"), missing=0):
+    return [
+        Panel(
+            NAMES[k],
+            f"n = {40 * len(names)}",
+            look(k).color,
+            [
+                Sample(name, look(k), lognormal(0.05 * (k + 1) * (m + 1), 40, m), 40 + missing)
+                for m, name in enumerate(names)
+            ],
+            f"{missing * len(names)} not finished" if missing else "",
+        )
+        for k in range(number)
+    ]
+
+
+def energy_panels(number, count=150):
+    return [
+        Panel(
+            NAMES[k],
+            "medians 1.70 mJ, 0.060 mm",
+            look(k).color,
+            np.stack([lognormal(1.7, count, k), lognormal(0.1, count, 50 + k)], axis=1),
+        )
+        for k in range(number)
+    ]
+
+
+def difference_panels(number, rows=12):
+    rng = np.random.default_rng(0)
+    return [
+        Panel(
+            NAMES[k],
+            "base case: mean 0.060 mm",
+            look(k).color,
+            [
+                DifferenceRow(f"phantom entry {row} doubled", look(k), m, m - 0.02, m + 0.02)
+                for row, m in enumerate(rng.normal(0.0, 0.05, rows).tolist())
+            ],
+        )
+        for k in range(number)
+    ]
+
+
+def share_panels(number, controllers=7, count=150):
+    return [
+        Panel(
+            ("perfect", "real", "structure")[k],
+            f"{count} worlds",
+            "#000000",
+            [
+                Sample(NAMES[j], look(j), lognormal(0.05 * (j + 1), count, j), count + j)
+                for j in range(controllers)
+            ],
+        )
+        for k in range(number)
+    ]
+
+
+def far_apart():
+    """Differences of hundredths and of millimetres."""
+    ends = (
+        (-0.09, -0.05, -0.015),
+        (-3.6, -3.2, -2.6),
+        (-0.02, 0.01, 0.04),
+        (-0.01, 0, 0.005),
+        (0.1, 0.2, 0.3),
+    )
+    rows = [DifferenceRow(f"other {k}", look(k), m, low, high) for k, (low, m, high) in enumerate(ends)]
+    return Panel("default", "left of zero: smaller errors", "#000000", rows)
+
+
+PLACES = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+CLOSE = [f"{x:.3f}" for x in np.linspace(0, 1, 20)]
+FIGURES = {
+    "targeting, one": lambda: targeting_figure([target_panel(unfinished=(3,))]),
+    "targeting, all": lambda: targeting_figure(
+        [target_panel(k, 0.2 * k, unfinished=(3, 9)) for k in range(7)]
+    ),
+    "targeting, one target": lambda: targeting_figure([target_panel(targets=TARGETS[:1])]),
+    "errors": lambda: by_controller(samples()),
+    "errors, one": lambda: by_controller(samples()[:1]),
+    "depths, one": lambda: error_figure(error_panels(1), "depth of the target (mm)"),
+    "depths, two": lambda: error_figure(error_panels(2), "depth of the target (mm)"),
+    "depths, all": lambda: error_figure(error_panels(), "depth of the target (mm)"),
+    "sweep, one": lambda: sweep_figure(sweeps(1, missing=1), "G (mm)", PLACES),
+    "sweep, three": lambda: sweep_figure(sweeps(3), "mismatch", PLACES),
+    "sweep, all": lambda: sweep_figure(sweeps(7, missing=2), "mismatch", PLACES),
+    "sweep, close": lambda: sweep_figure(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
+    "sweep, close, all": lambda: sweep_figure(sweeps(7, CLOSE), "mismatch", np.linspace(0, 1, 20)),
+    "energy, one": lambda: energy_figure(energy_panels(1)),
+    "energy, two": lambda: energy_figure(energy_panels(2)),
+    "energy, all": lambda: energy_figure(energy_panels(7)),
+    "shares, one": lambda: share_figure(share_panels(1)),
+    "shares, three": lambda: share_figure(share_panels(3)),
+    "differences, one": lambda: difference_figure(difference_panels(1), "more error (mm)"),
+    "differences, far apart": lambda: difference_figure([far_apart()], "more error (mm)"),
+    "differences, all": lambda: difference_figure(difference_panels(7, 5), "more error (mm)"),
+}
+
+
+def shown_texts(figure):
+    """Return the visible texts with their boxes; labels of ticks beyond the ends of their axes are not drawn."""
+    renderer = figure.canvas.get_renderer()
+    figure.draw_without_rendering()
+    sides = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
+    ticks = [(tick, sorted(axis.get_view_interval())) for axis in sides for tick in axis.get_major_ticks()]
+    unseen = {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
+    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unseen]
+    return [(text.get_text(), Text.get_window_extent(text, renderer)) for text in texts]
+
+
+def overlapping(figure):
+    """Return pairs of texts that overlap, and texts that leave the figure."""
+    boxes, whole = shown_texts(figure), figure.bbox
+    cut = [
+        name
+        for name, box in boxes
+        if box.x0 < whole.x0 or box.x1 > whole.x1 or box.y0 < 0 or box.y1 > whole.y1
+    ]
+    return cut + [(a, b) for (a, one), (b, two) in combinations(boxes, 2) if one.overlaps(two)]
+
+
+def texts(figure):
+    return [name for name, _ in shown_texts(figure)]
+
+
+def lines(ax, label):
+    return [line for line in ax.get_lines() if line.get_label() == label]
+
+
+def dots(ax, label):
+    return [found for found in ax.collections if found.get_label() == label]
+
+
+TIP = "final true tip"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_no_labels_overlap(name):
+    assert overlapping(FIGURES[name]()) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["targeting, one", "errors", "sweep, three", "energy, two", "differences, one"]
+)
+def test_the_same_data_give_the_same_bytes(tmp_path, name):
+    for part in ("first", "second"):
+        (tmp_path / part).mkdir()
+        with matplotlib.rc_context({"font.size": 20.0 if part == "second" else 8.0}):
+            save(FIGURES[name](), tmp_path / part, "figure")
+    for kind in ("figure.png", "figure.svg"):
+        assert (tmp_path / "first" / kind).read_bytes() == (tmp_path / "second" / kind).read_bytes()
+
+
+def test_circles_have_a_radius_of_1_mm_to_scale():
+    figure = targeting_figure([target_panel(k) for k in range(3)])
+    shown_texts(figure)
+    for ax in figure.axes:
+        (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
+        boxes = [path.get_extents() for path in circles.get_paths()]
+        assert len(boxes) == 15
+        assert_allclose([(box.width, box.height) for box in boxes], 2.0, rtol=1e-6)
+        assert_allclose(sorted([(box.x0 + 1, box.y0 + 1) for box in boxes]), TARGETS.tolist(), atol=1e-9)
+        window, (left, right), (low, high) = ax.get_window_extent(), ax.get_xlim(), ax.get_ylim()
+        assert window.width / (right - left) == pytest.approx(window.height / (high - low), rel=1e-6)
+
+
+def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
+    panel = target_panel(unfinished=(0, 7))
+    ax = targeting_figure([panel]).axes[0]
+    (tips,) = dots(ax, TIP)
+    assert_allclose(tips.get_offsets(), panel.content.tips[panel.content.done])
+    (crosses,) = lines(ax, "final true tip, not finished")
+    assert_allclose(crosses.get_xydata(), panel.content.tips[[0, 7]])
+
+
+def test_tips_far_outside_are_counted():
+    panel = target_panel()
+    panel.content.tips[:2] += 30.0
+    figure = targeting_figure([panel, target_panel(1)])
+    assert texts(figure).count("2 tips outside") == 1
+    assert figure.axes[0].get_xlim()[1] == pytest.approx(45.0 + 6.0)
+
+
+def test_the_close_up_shows_where_tips_ended_from_their_targets():
+    panel = target_panel()
+    close = targeting_figure([panel]).axes[1]
+    assert_allclose(dots(close, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
+    farthest = np.hypot(*(panel.content.tips - panel.content.targets).T).max()
+    assert close.get_xlim()[1] == pytest.approx(1.15 * farthest)
+
+
+def test_the_view_along_the_axis_is_relative_to_the_target():
+    off = np.random.default_rng(0).normal(0.0, 0.1, (20, 2))
+    panel = replace(target_panel(), content=Tips(np.zeros_like(off), off, np.ones(20, dtype=bool), ACROSS))
+    for figure in (targeting_figure([panel]), targeting_figure([panel, panel])):
+        shown = texts(figure)
+        assert "y beyond the target (mm)" in shown
+        assert "z beyond the target (mm)" in shown
+        (circles,) = (found for found in figure.axes[0].collections if isinstance(found, PatchCollection))
+        assert len(circles.get_paths()) == 1
+        assert_allclose(dots(figure.axes[0], TIP)[0].get_offsets(), off)
+
+
+def test_targets_that_are_many_are_laid_on_one_another():
+    rng = np.random.default_rng(0)
+    targets = rng.uniform((25.0, -5.0), (45.0, 5.0), (200, 2))
+    panel = target_panel(targets=targets, repeats=1)
+    ax = targeting_figure([panel]).axes[0]
+    (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
+    assert len(circles.get_paths()) == 1
+    assert_allclose(dots(ax, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
+
+
+def test_unknown_tips_are_left_out():
+    panel = target_panel(unfinished=(0,))
+    panel.content.tips[0] = np.nan
+    drawn = [dot.get_offsets() for ax in targeting_figure([panel]).axes for dot in dots(ax, TIP)]
+    places = np.concatenate([np.ma.filled(offsets, np.nan) for offsets in drawn])
+    assert len(places) > 0
+    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(panel.content.tips) - 1)
+
+
+def test_rows_show_quartiles_median_mean_and_95_percent():
+    row = samples()[3]
+    ax = by_controller([row]).axes[0]
+    errors = row.errors
+    assert_allclose(sorted(dots(ax, "one insertion")[0].get_offsets()[:, 0]), np.sort(errors))
+    assert_allclose(lines(ax, "interquartile range")[0].get_xdata(), np.quantile(errors, (0.25, 0.75)))
+    assert_allclose(lines(ax, "median")[0].get_xdata(), [np.median(errors)])
+    assert_allclose(lines(ax, "mean")[0].get_xdata(), [errors.mean()])
+    assert_allclose(lines(ax, "95 %")[0].get_xdata(), [np.quantile(errors, 0.95)] * 2)
+
+
+def test_rows_say_how_many_did_not_finish():
+    found = texts(by_controller(samples()))
+    assert found.count("n = 150") == 6
+    assert "n = 151\n1 not finished" in found
+
+
+def test_a_controller_has_one_colour_in_all_figures():
+    color = to_hex(look(1).color)
+    figures = (
+        targeting_figure([target_panel(k) for k in range(2)]),
+        energy_figure(energy_panels(2)),
+    )
+    for figure in figures:
+        label = TIP if figure is figures[0] else "one insertion"
+        assert to_hex(dots(figure.axes[1], label)[0].get_facecolor()[0]) == color
+    _, median = lines(sweep_figure(sweeps(2), "x", PLACES).axes[0], "median")
+    assert median.get_color() == look(1).color
+
+
+def test_looks_differ_for_any_number_of_controllers():
+    assert len({(look(k).color, look(k).marker) for k in range(49)}) == 49
+
+
+def test_sweeps_show_median_quartiles_and_mean_at_each_level():
+    (sweep,) = sweeps(1)
+    errors = [row.errors for row in sweep.content]
+    ax = sweep_figure([sweep], "G (mm)", PLACES).axes[0]
+    assert_allclose(
+        lines(ax, "median")[0].get_xydata(), np.column_stack([PLACES, list(map(np.median, errors))])
+    )
+    assert_allclose(lines(ax, "mean")[0].get_ydata(), [own.mean() for own in errors])
+    (band,) = (found for found in ax.collections if isinstance(found, PolyCollection))
+    low, high = (np.quantile(errors[4], q) for q in (0.25, 0.75))
+    at_end = band.get_paths()[0].vertices
+    at_end = at_end[at_end[:, 0] == 2.0][:, 1]
+    assert_allclose([at_end.min(), at_end.max()], [low, high])
+    assert ax.get_xlabel() == "G (mm)"
+
+
+def test_a_level_without_a_finished_insertion_leaves_a_gap():
+    (sweep,) = sweeps(1)
+    last = replace(sweep.content[4], errors=np.empty(0))
+    empty = replace(sweep, content=[*sweep.content[:4], last])
+    ax = sweep_figure([empty], "G (mm)", PLACES).axes[0]
+    assert np.isnan(lines(ax, "median")[0].get_ydata()[4])
+    assert {"not finished:", "40"} <= set(texts(ax.figure))
+
+
+def test_a_share_is_that_of_the_insertions_that_end_nearer():
+    """Steps at the errors; short of 100 % by what did not finish."""
+    row = Sample("a", look(0), np.array([0.4, 0.1, 0.2]), 4)
+    (ax,) = share_figure([Panel("real", "4 worlds", "#000000", [row])]).axes
+    (line,) = lines(ax, "a")
+    assert_allclose(line.get_xdata()[:3], [0.1, 0.2, 0.4])
+    assert_allclose(line.get_ydata(), [25.0, 50.0, 75.0, 75.0])
+    assert line.get_drawstyle() == "steps-post"
+
+
+def test_where_nothing_finished_the_share_is_zero():
+    row = Sample("a", look(0), np.empty(0), 4)
+    (ax,) = share_figure([Panel("real", "4 worlds", "#000000", [row])]).axes
+    assert lines(ax, "a")[0].get_ydata().tolist() == [0.0]
+
+
+SURE, UNSURE = "mean with 95 % interval", "not separable from no difference"
+
+
+def test_differences_that_hold_zero_are_hollow():
+    rows = [
+        DifferenceRow("sure", look(0), 0.1, 0.05, 0.15),
+        DifferenceRow("sure, too", look(0), -0.1, -0.15, -0.05),
+        DifferenceRow("not", look(0), 0.1, -0.05, 0.25),
+        DifferenceRow("no interval", look(0), 0.1, np.nan, np.nan),
+    ]
+    ax = difference_figure([Panel("a", "b", "#000000", rows)], "x (mm)").axes[0]
+    faces = [line.get_markerfacecolor() for line in ax.get_lines() if line.get_label() in (SURE, UNSURE)]
+    assert faces == [look(0).color, look(0).color, "white", "white"]
+    ends = [line.get_xdata().tolist() for line in lines(ax, "interval")]
+    assert ends == [[row.low, row.high] for row in rows[:3]]
+
+
+def test_differences_of_different_size_can_all_be_read():
+    figure = difference_figure([far_apart()], "difference (mm)")
+    shown_texts(figure)
+    (ax,) = figure.axes
+    place = ax.transAxes.inverted().transform
+    ends = [ax.transData.transform([(x, 0) for x in line.get_xdata()]) for line in lines(ax, "interval")]
+    widths = [place(b)[0] - place(a)[0] for a, b in ends]
+    assert min(widths) > 0.02
+    assert [text for text in texts(figure) if text in ("−3", "−1", "−0.1", "0", "0.1")]
+    zero, near, nearer = (place(ax.transData.transform((x, 0)))[0] for x in (0.0, 0.04, 0.02))
+    assert near - zero == pytest.approx(2 * (nearer - zero))
+
+
+def test_differences_of_one_size_have_an_even_scale():
+    (ax,) = difference_figure(difference_panels(1), "difference (mm)").axes
+    assert ax.get_xscale() == "linear"
+
+
+def test_an_error_of_nothing_is_still_drawn():
+    row = Sample("perfect", look(0), np.array([0.0, 0.1]), 2)
+    ax = by_controller([row]).axes[0]
+    assert dots(ax, "one insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
+
+
+def test_ten_thousand_dots_make_a_small_drawing(tmp_path):
+    figure = energy_figure(energy_panels(1, 10_000))
+    _, svg = save(figure, tmp_path, "energy")
+    assert svg.stat().st_size < 1_000_000
+
+
+def test_names_are_no_mathematics_and_never_too_long():
+    name = "$5_phantom$ " + "long " * 30
+    named = replace(target_panel(), title=name)
+    figure = targeting_figure([named] * 3)
+    assert overlapping(figure) == []
+    assert any(text.startswith("$5_phantom$ long") and "…" in text for text in texts(figure))
+
+
+def legend_names(figure):
+    return [text.get_text() for found in figure.legends for text in found.get_texts()]
+
+
+def test_legends_name_what_is_drawn_and_nothing_else():
+    assert legend_names(targeting_figure([target_panel()])) == ["target, 1 mm radius", TIP]
+    assert legend_names(targeting_figure([target_panel(unfinished=(3,))])) == [
+        *("target, 1 mm radius", TIP, "final true tip, not finished"),
+    ]
+    row = Sample("near", look(0), lognormal(0.01), 150)
+    assert "1 mm" not in legend_names(by_controller([row]))
+    assert "1 mm" in legend_names(by_controller([replace(row, errors=lognormal(0.5))]))
+    assert legend_names(by_controller([replace(row, errors=np.empty(0))])) == ["1 mm"]
+    assert "other panels" in legend_names(energy_figure(energy_panels(2)))
+    assert "other panels" not in legend_names(energy_figure(energy_panels(1)))
+    assert legend_names(difference_figure(difference_panels(1, 1), "x"))[-1] in (SURE, UNSURE)
+    assert len(legend_names(difference_figure(difference_panels(1, 1), "x"))) == 1
+
+
+def test_one_millimetre_is_drawn_only_where_the_scale_reaches_it():
+    (near,), (far,) = (by_controller([Sample("a", look(0), lognormal(m), 150)]).axes for m in (0.01, 0.5))
+    assert lines(near, "1 mm") == []
+    assert lines(far, "1 mm")[0].get_xdata() == [1.0, 1.0]
+
+
+def test_panels_below_and_left_have_the_labels_of_their_axes():
+    axes = error_figure(error_panels(5), "depth of the target (mm)").axes
+    assert [bool(ax.get_xlabel()) for ax in axes] == [False, False, True, True, True]
+    assert [bool(ax.get_ylabel()) for ax in axes] == [True, False, False, True, False]

@@ -1,0 +1,265 @@
+"""Studies of worlds: an axis of numbers, each with its own scenario, target, phantom and reach."""
+
+from dataclasses import replace
+
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.control.controllers import checked
+from flexneedle.errors import InputError
+from flexneedle.lab.study import rows
+from flexneedle.lab.study.grid import load_study
+from flexneedle.lab.study.plans import Plans, plan_key, truth_key
+from flexneedle.lab.study.rows import Job, run_job
+from flexneedle.lab.study.runner import _reach_points
+from flexneedle.lab.study.summary import is_failure
+from flexneedle.lab.study.tables import write_tables
+from flexneedle.record.results import RESULT_COLUMNS
+from flexneedle.scenario.worlds import CASES, world
+from synthetic import make_insertion
+
+FREE, GUIDED = 15, 3  # worlds without and with a guide
+STUDY = f"""
+name = "few"
+[[cases]]
+name = "perfect"
+values = {{ world_case = "perfect", plant = "model" }}
+[[cases]]
+name = "real"
+values = {{ world_case = "real" }}
+[[cases]]
+name = "structure"
+values = {{ world_case = "structure" }}
+[[axes]]
+key = "world"
+values = [{FREE}, {GUIDED}]
+[[axes]]
+key = "controller"
+values = ["open-loop", "resolved-rate"]
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Return a function that loads a study from a text."""
+
+    def study(text=STUDY, worlds=None):
+        path = tmp_path / "few.toml"
+        path.write_text(text)
+        return load_study(path, worlds)
+
+    return study
+
+
+def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
+    study = load()
+    for point in study.points:
+        assert point.scenario == checked(world(point.world, point.case))
+        assert point.world_case == point.case
+        assert "world" not in point.varied
+
+
+def test_insertions_that_need_a_guide_are_omitted_in_worlds_without_one(load):
+    """They are not insertions, and therefore not failures."""
+    found = {(point.case, point.world, point.controller) for point in load().points}
+    assert found == {
+        *((case, GUIDED, name) for case in CASES for name in ("open-loop", "resolved-rate")),
+        *((case, FREE, "open-loop") for case in CASES[:2]),
+    }
+    assert load().definition["insertions"] == len(load()) == len(found)
+
+
+def test_a_world_has_the_phantom_of_its_number_in_every_case_and_with_every_controller(load):
+    study = load()
+    seeds = [(study.insertion(index).point.world, study.insertion(index).seed) for index in range(len(study))]
+    assert all(number == seed for number, seed in seeds)
+
+
+def test_repeats_have_their_own_phantoms(load):
+    study = load("repeats = 3\nfirst_seed = 7\n" + STUDY)
+    seeds = {study.insertion(index).seed for index in range(len(study))}
+    assert seeds == {7 + 3 * number + repeat for number in (FREE, GUIDED) for repeat in range(3)}
+
+
+def test_other_worlds_can_be_requested(load):
+    chosen = load(worlds=(100, 4))
+    assert {point.world for point in chosen.points} == {100, 101, 102, 103}
+    assert chosen.definition["axes"]["world"] == [100, 101, 102, 103]
+
+
+NAMED = 'name = "a"\n'
+ODD = STUDY.replace('"structure" }', '"odd" }')
+FRACTION = STUDY.replace(f"[{FREE}, {GUIDED}]", "[1.5]")
+FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
+
+
+@pytest.mark.parametrize(
+    ("text", "worlds", "message"),
+    [
+        (
+            STUDY,
+            (-1, 4),
+            "worlds = -1, 4: must be the first number, 0 to 1000000000, and a count, 1 to 100000",
+        ),
+        (STUDY, (0, 0), "worlds = 0, 0: must be the first number"),
+        (STUDY, (10**9, 2), "world = 1000000001: must be a whole number from 0 to 1000000000"),
+        (NAMED, (0, 2), "no axis of worlds: --worlds needs one"),
+        (FRACTION, None, "values = [1.5]: must be whole numbers from 0 to 1000000000"),
+        (
+            'scenario = "phantom"' + STUDY,
+            None,
+            'scenario = "phantom": remove it: an axis sets the worlds',
+        ),
+        (STUDY + FAR, None, "target.lateral_mm"),
+        (
+            NAMED + "values = { world = 3 }",
+            None,
+            "values.world = 3: not allowed here: set worlds with an axis",
+        ),
+        (NAMED + 'values = { world_case = "real" }', None, "world_case: needs an axis of worlds"),
+        (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
+    ],
+)
+def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message):
+    with pytest.raises(InputError) as caught:
+        load(text, worlds)
+    assert message in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_shipped_study_has_two_hundred_worlds_not_used_for_tuning():
+    study = load_study("worlds")
+    numbers = {point.world for point in study.points}
+    assert numbers == set(range(100_000, 100_200))
+    for case, plant in (("perfect", "model"), ("real", "exact"), ("structure", "exact")):
+        points = [point for point in study.points if point.case == case]
+        assert {point.plant for point in points} == {plant}
+        worlds = numbers if case != "structure" else {n for n in numbers if world(n).setup.has_guide}
+        assert {point.world for point in points if point.controller == "open-loop"} == worlds
+
+
+def test_the_reach_is_computed_once_for_all_controllers_of_a_world_and_case(load):
+    study = load()
+    chosen = [point for point in study.points if id(point) in _reach_points(study)]
+    assert [(point.case, point.world) for point in chosen] == [
+        *(("perfect", FREE), ("perfect", GUIDED), ("real", FREE), ("real", GUIDED), ("structure", GUIDED))
+    ]
+    assert len({truth_key(point) for point in study.points}) == 5
+    assert len({plan_key(point) for point in study.points}) == 2
+
+
+def test_a_job_computes_the_reach_if_requested(load, monkeypatch):
+    point = load().points[0]
+    monkeypatch.setattr(
+        rows,
+        "reach",
+        lambda scenario, seed, _plant, strategy: (
+            (point.scenario is scenario and strategy == "manipulation") * seed * 0.1
+        ),
+    )
+    for with_reach, expected in ((True, 0.5), (False, None)):
+        (row,) = run_job(Job(point, None, "no plan", ((0, 5),), with_reach)).rows
+        assert row["reach_mm"] == expected
+        assert row["outcome"] == "error"
+
+
+def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkeypatch):
+    done = make_insertion()
+
+    def reach(*_args):
+        raise ZeroDivisionError("nowhere")
+
+    monkeypatch.setattr(rows, "reach", reach)
+    monkeypatch.setattr(rows, "insertion_at", lambda *_args, **_options: done)
+    monkeypatch.setattr(rows, "_times", lambda _insertion: {})
+    (row,) = run_job(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
+    assert row["reach_mm"] is None
+
+
+def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
+    """From whichever controller's insertion; unknown if none has computed it yet."""
+    study = load()
+    empty = {**dict.fromkeys(RESULT_COLUMNS), "outcome": "done", "reason": ""}
+    found = {
+        index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _reach_rows(study) else None}
+        for index in range(len(study) - 2)
+    }
+    write_tables(tmp_path, study, found, Plans(tmp_path / "plans"))
+    table = pq.read_table(tmp_path / "runs.parquet").to_pylist()
+    of_truth = {
+        (row["case"], row["world"]): row["reach_mm"] for row in table if row["controller"] == "open-loop"
+    }
+    assert all(row["reach_mm"] == of_truth[row["case"], row["world"]] is not None for row in table)
+    assert {row["world_case"] for row in table} == {"perfect", "real"}
+
+
+def _reach_rows(study):
+    return [index for index in range(len(study)) if id(study.insertion(index).point) in _reach_points(study)]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reach", "failure"),
+    [("done", 0.0, False), ("held", 0.3, True), ("refused", 1.2, False), ("failed", None, True)],
+)
+def test_an_unfinished_insertion_is_a_failure_if_the_target_is_within_reach(outcome, reach, failure):
+    assert is_failure({"outcome": outcome, "reach_mm": reach}) == failure
+
+
+@pytest.mark.parametrize(("outcome", "failure"), [("held", True), ("refused", False), ("failed", False)])
+def test_a_hold_is_a_failure_up_to_the_miss_at_which_a_controller_may_hold(outcome, failure):
+    row = {"outcome": outcome, "reach_mm": 1.5, "control.miss_limit_mm": 2.0}
+    assert is_failure(row) is failure
+    assert not is_failure(row | {"reach_mm": 2.1})
+
+
+def test_points_with_another_needle_have_another_reach(load):
+    point = load().points[0]
+    other = replace(point, scenario=point.scenario.with_values({"phantom.run_out_mm": 0.1}))
+    assert truth_key(other) != truth_key(point)
+    assert plan_key(other) == plan_key(point)
+
+
+IN_SPACE = f"""
+name = "few"
+[[axes]]
+key = "world"
+values = [{FREE}, {GUIDED}]
+[[axes]]
+key = "world_rig"
+values = "all"
+[[axes]]
+key = "controller"
+values = ["open-loop", "resolved-rate"]
+"""
+
+
+def test_each_world_has_the_rigs_that_it_can_have(load):
+    """Of those with the guide of the world, and that in the plane."""
+    study = load(IN_SPACE)
+    found = {(point.world, point.world_rig, point.controller) for point in study.points}
+    guided = ("plane", "two-axes", "two-axes-half-turns", "one-axis", "one-axis-half-turns")
+    assert found == {
+        *((GUIDED, rig, name) for rig in guided for name in ("open-loop", "resolved-rate")),
+        *((FREE, rig, "open-loop") for rig in ("plane", "no-guide", "no-guide-half-turns")),
+    }
+    for point in study.points:
+        assert point.scenario == checked(world(point.world, "real", point.world_rig))
+        assert point.varied["world_rig"] == point.world_rig
+
+
+def test_a_rig_needs_an_axis_of_worlds(load):
+    with pytest.raises(InputError, match="world_rig: needs an axis of worlds"):
+        load('name = "a"\n[values]\nworld_rig = "two-axes"\n')
+    with pytest.raises(InputError, match='world_rig = "three": must be one of plane, two-axes'):
+        load(IN_SPACE.replace('"all"', '["three"]'))
+
+
+@pytest.mark.slow
+def test_the_shipped_worlds_in_space_have_every_rig_in_both_cases():
+    study = load_study("worlds-space")
+    guided = sum(world(number).setup.has_guide for number in range(100000, 100200))
+    with_guide, without = 4 * 4, 2 * 3  # drivers by controllers; resolved-rate needs a guide
+    assert len(study) == 2 * (with_guide * guided + without * (200 - guided))
+    assert {point.scenario.setup.axes for point in study.points} == {2}
+    assert all(study.insertion(k).seed == study.insertion(k).point.world for k in range(0, len(study), 97))

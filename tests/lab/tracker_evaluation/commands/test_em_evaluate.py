@@ -1,0 +1,261 @@
+"""`flexneedle em evaluate` and `em check`: output, files and exit status."""
+
+import json
+import re
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+
+import numpy as np
+import pytest
+
+from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.cli import main as cli
+
+
+@pytest.fixture(scope="module")
+def rows():
+    """A sensor in a clean field, and another over metal as well, with distances to the field generator."""
+    rng = np.random.default_rng(0)
+    rows = random_rows(1, samples=5)
+    for name, error, level in (("ideal", 0.5, 0.02), ("noisy", 2.0, 0.2)):
+        samples = GRID[:, None] + rng.normal(0.0, error, (27, 1, 3)) + rng.normal(0.0, 0.04, (27, 5, 3))
+        rows += rows_of(GRID, samples, "reference", name, (level * rng.uniform(0.5, 1.5, 27)).tolist())
+    return [{**row, "distance_mm": 700.0 + row["true_x_mm"]} for row in rows]
+
+
+@pytest.fixture
+def table(tmp_path, rows):
+    return write_csv(tmp_path / "mine.csv", rows)
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, rows):
+    """Two evaluations of one table, as tables and as JSON: folder, exit status, stdout and stderr of each."""
+    home = tmp_path_factory.mktemp("evaluated")
+    table = write_csv(home / "mine.csv", rows)
+    results = []
+    for name, options in (("tables", ()), ("objects", ("--json",))):
+        with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+            status = cli.main(["em", "evaluate", str(table), *options, "--out", str(home / name)])
+        results.append((home / name, status, out.getvalue(), err.getvalue()))
+    return results
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Draw nothing: figures take most of a command's time."""
+    monkeypatch.setattr("flexneedle.lab.tracker_evaluation.figures.evaluation.draw_evaluation", lambda *_: [])
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and stderr."""
+    status = cli.main(list(map(str, argv)))
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_tables_show_the_papers_and_the_manufacturers_values(evaluated):
+    folder, status, out, err = evaluated[0]
+    assert (status, err) == (0, "note: tip: not in noisy, only in ideal\n")
+    for text in (
+        "tip, ideal",
+        " paper",
+        "0.65",
+        " manufacturer",
+        "0.48",
+        "threshold",
+        "area under the ROC",
+        "reference, noisy: slope (mm)",
+        " met",
+    ):
+        assert text in out
+    assert str(folder) in out
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_with_a_registration_its_residual_is_shown(capsys, table, tmp_path):
+    status, out, _ = run(capsys, "em", "evaluate", table, "--register", "--out", tmp_path / "out")
+    assert status == 0
+    assert "registration residual" in out
+
+
+def test_json_is_one_object_in_full_precision_and_is_written_as_well(evaluated):
+    folder, status, out, _ = evaluated[1]
+    values = json.loads(out)
+    assert status == 0
+    assert json.loads((folder / "evaluation.json").read_text()) == values
+    tip = values["results"][0]
+    assert (tip["sensor"], tip["environment"]) == ("tip", "ideal")
+    for name, value in plain(random_rows(1, samples=5)).items():
+        assert tip[name] == pytest.approx(value, abs=1e-12)
+    assert values["indicator"][0]["sensor"] == "tip"
+    names = [path.rsplit("/", 1)[-1] for path in values["figures"]]
+    assert names == [
+        f"{name}.{kind}" for name in ("field", "indicator", "roc", "distance") for kind in ("png", "svg")
+    ]
+
+
+def test_the_same_table_gives_the_same_bytes(evaluated):
+    one, two = (folder for folder, *_ in evaluated)
+    assert sorted(path.name for path in one.iterdir()) == sorted(path.name for path in two.iterdir())
+    for path in one.iterdir():
+        if path.name != "evaluation.json":  # contains the name of its folder
+            assert path.read_bytes() == (two / path.name).read_bytes(), path.name
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_the_default_folder_is_new_and_results_are_not_overwritten(capsys, table, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(capsys, "em", "evaluate", table)
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.endswith("-em-mine")
+    status, _, err = run(capsys, "em", "evaluate", table, "--out", folder)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "already contains evaluation.json" in err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "check", "register"])
+def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, monkeypatch):
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    status, out, err = run(capsys, "em", command, table)
+    assert (status, out) == (2, "")
+    assert err == "flexneedle: tables of measurements need duckdb: pip install 'flexneedle[em]'\n"
+
+
+def test_an_invalid_table_gives_one_line_and_status_2(capsys, tmp_path):
+    path = write_csv(tmp_path / "t.csv", [{"a": 1.0}])
+    status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "out")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"flexneedle: {path}: no column point_id, true_x_mm")
+    assert not (tmp_path / "out").exists()
+
+
+def powered(mean, environment="on", points=27, sensor="reference"):
+    values = mean * np.linspace(0.5, 1.5, points)
+    return rows_of(GRID[:points], GRID[:points, None], sensor, environment, values.tolist())
+
+
+def test_check_compares_two_environments_with_status_1_above_the_threshold(capsys, tmp_path):
+    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.04))
+    status, out, _ = run(capsys, "em", "check", table)
+    assert status == 0
+    assert "power adds 0.0200 (95 % interval" in out
+    assert "mean 0.0400 with power on, not above the threshold of 0.0547 (" in out
+    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.06))
+    status, out, _ = run(capsys, "em", "check", table, "--json")
+    values = json.loads(out)
+    assert (status, values["above"], values["paper_powered"]) == (1, True, 0.04)
+    assert values["results"][0]["difference"] == pytest.approx(0.04)
+    assert values["results"][0]["paired"] is True
+    low, high = values["results"][0]["difference_interval"]
+    assert 0.03 < low <= 0.04 + 1e-12 <= high + 2e-12 < 0.05  # higher with power on
+    assert values["results"][0]["points_above"] == 16
+
+
+def test_the_interval_of_the_difference_resamples_points_in_pairs(capsys, tmp_path):
+    rng = np.random.default_rng(1)
+    off, on = rng.uniform(0.01, 0.03, 27), rng.uniform(0.02, 0.05, 27)
+    rows = [
+        row
+        for name, values in (("off", off), ("on", on))
+        for row in rows_of(GRID, GRID[:, None], "reference", name, values.tolist())
+    ]
+    _, out, _ = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows), "--json")
+    chosen = np.random.default_rng(0).integers(0, 27, (2000, 27))
+    ends = np.quantile((on - off)[chosen].mean(axis=1), (0.025, 0.975))
+    assert json.loads(out)["results"][0]["difference_interval"] == pytest.approx(ends, abs=1e-12)
+
+
+def test_check_finds_both_environments_by_name(capsys, tmp_path):
+    both = write_csv(tmp_path / "both.csv", powered(0.02, "quiet") + powered(0.03))
+    status, out, _ = run(capsys, "em", "check", both, "--off", "quiet", "--threshold", "0.025")
+    assert status == 1
+    assert "above the threshold of 0.025" in out
+    assert re.search(r"paper, power on +0\.0400", out)
+    status, _, err = run(capsys, "em", "check", both)
+    assert status == 2
+    assert "no environment 'off': choose with --off and --on from on, quiet" in err
+
+
+def test_check_reports_few_and_differing_points(capsys, tmp_path):
+    few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
+    assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
+    other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
+    note = (
+        "reference: grid points: 20 in power off, 27 in power on, 20 in common: the compared positions differ"
+    )
+    assert run(capsys, "em", "check", other)[2] == f"note: {note}\n"
+    values = json.loads(run(capsys, "em", "check", other, "--json")[1])
+    assert values["results"][0]["paired"] is False
+    low, high = values["results"][0]["difference_interval"]
+    assert low < 0.0 < high
+
+
+def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
+    rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
+    table = write_csv(tmp_path / "t.csv", rows)
+    status, _, err = run(capsys, "em", "check", table)
+    assert (status, err) == (0, "note: ref2: no indicator in power off, only in power on\n")
+    assert json.loads(run(capsys, "em", "check", table, "--json")[1])["notes"] == [err[6:-1]]
+    status, _, err = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows[:27] + rows[54:]))
+    assert status == 2
+    assert "no sensor has an indicator both with power off (reference) and on (ref2)" in err
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
+    table.write_text(table.read_text().replace(",ideal", ",lab empty").replace(",noisy", ",with table"))
+    argv = (
+        "em",
+        "evaluate",
+        table,
+        "--ideal",
+        "lab empty",
+        "--noisy",
+        "with table",
+        "--out",
+        tmp_path / "out",
+    )
+    _, out, _ = run(capsys, *argv)
+    for text in ("reference, lab empty: error", "reference, with table: slope", "lab empty: points below"):
+        assert text in out
+    assert " ideal" not in out
+    assert " noisy" not in out
+
+
+def test_a_misspelt_environment_is_refused_before_a_folder_is_made(capsys, table, tmp_path):
+    status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "--ideal: no environment 'idael': choose from ideal, noisy" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_points_is_not_overwritten(capsys, table, tmp_path):
+    (tmp_path / "points.csv").write_text("mine")
+    status, _, err = run(capsys, "em", "evaluate", table, "--out", tmp_path)
+    assert status == 2
+    assert "already contains points.csv" in err
+    assert (tmp_path / "points.csv").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
+    rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
+    path = write_csv(tmp_path / "t.csv", rows)
+    argv = ("em", "evaluate", path, "--sensor", "coil", "--environment", "lab", "--out", tmp_path / "out")
+    status, out, err = run(capsys, *argv)
+    assert (status, err) == (0, "")
+    assert " coil, lab" in out
+    with pytest.raises(SystemExit):
+        run(capsys, *argv[:3], "--sensor", " ")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "check"])
+def test_an_unknown_option_prints_the_usage_of_its_command(capsys, command):
+    with pytest.raises(SystemExit) as ended:
+        run(capsys, "em", command, "t.csv", "--registr")
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"usage: flexneedle em {command} ")
+    assert f"flexneedle em {command}: error: unrecognized arguments: --registr" in err

@@ -1,0 +1,140 @@
+"""`flexneedle em simulate` from the command line."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.cli.main import main
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.sections.environment import Environment
+
+DOCS = Path(__file__).resolve().parents[4] / "docs" / "tracking" / "simulate.md"
+
+FEW = ("--points", "2", "--samples", "2", "--repeats", "1")
+
+
+def simulate(*arguments):
+    return main(["em", "simulate", *map(str, arguments)])
+
+
+def test_by_default_both_environments_are_written_to_a_csv(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert simulate(*FEW) == 0
+    assert capsys.readouterr().out == "measurements.csv\n"
+    table = pyarrow.csv.read_csv(tmp_path / "measurements.csv")
+    assert table.num_rows == 2 * 2 * 8 * 2
+    assert set(table["environment"].to_pylist()) == {"ideal", "noisy"}
+
+
+def test_a_custom_environment_appears_by_its_name(tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text('name = "operating room"\nlength_mm = 80\n[plate]\nreference_mm = 2\n')
+    out = tmp_path / "out.parquet"
+    assert simulate(*FEW, "--environment", mine, "ideal", "--seed", 3, "--field-seed", 4, "--out", out) == 0
+    assert set(pq.read_table(out)["environment"].to_pylist()) == {"operating room", "ideal"}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("length_mm = 80\n", "mine.toml: name: missing"),
+        ('name = "a"\nlenght_mm = 80\n', "unknown key; did you mean length_mm?"),
+        ('name = "a"\nlength_mm = 0\n', "mine.toml: length_mm = 0: must be above 0"),
+        ("name = \n", "mine.toml: not TOML"),
+    ],
+)
+def test_an_invalid_environment_file_gives_one_line(tmp_path, capsys, content, message):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(content)
+    assert simulate(*FEW, "--environment", mine, "--out", tmp_path / "out.csv") == 2
+    complaint = capsys.readouterr().err
+    assert message in complaint
+    assert complaint.count("\n") == 1
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_an_unknown_environment_is_refused_with_the_choices(tmp_path, capsys):
+    assert simulate("--environment", "nosy", "--out", tmp_path / "out.csv") == 2
+    message = "nosy: no such file, and no such environment (choices: ideal, noisy)"
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_is_no_environment(tmp_path, capsys):
+    assert simulate("--environment", tmp_path, "--out", tmp_path / "out.csv") == 2
+    assert "is a directory, not an environment file" in capsys.readouterr().err
+
+
+def test_the_suffix_is_checked_before_the_work(tmp_path, capsys):
+    assert simulate("--out", tmp_path / "out.txt") == 2
+    assert "must end in .csv or .parquet" in capsys.readouterr().err
+
+
+def test_an_existing_table_is_not_overwritten(tmp_path, capsys):
+    out = tmp_path / "precious.csv"
+    out.write_text("mine")
+    assert simulate(*FEW, "--out", out) == 2
+    assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
+    assert out.read_text() == "mine"
+
+
+def test_a_missing_folder_is_bad_input(tmp_path, capsys):
+    out = tmp_path / "nodir" / "foo.csv"
+    assert simulate(*FEW, "--out", out) == 2
+    assert capsys.readouterr().err == f"flexneedle: {out}: the folder {out.parent} does not exist\n"
+
+
+@pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])
+def test_counts_out_of_bounds_are_refused(option, value, capsys):
+    with pytest.raises(SystemExit) as ended:
+        simulate(option, value)
+    assert ended.value.code == 2
+    assert "must be" in capsys.readouterr().err
+
+
+# ---- the documentation page
+
+
+def examples():
+    return re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
+
+
+def test_the_documented_environment_can_be_simulated(tmp_path):
+    _, room = examples()
+    (tmp_path / "room.toml").write_text(room)
+    out = tmp_path / "out.csv"
+    assert simulate(*FEW, "--environment", tmp_path / "room.toml", "ideal", "--out", out) == 0
+    assert "operating room" in out.read_text()
+
+
+def test_the_indicator_detects_the_documented_plate(tmp_path):
+    """The coils of the indicator are sensitive only along their axis; the plate is not beside them."""
+    (tmp_path / "room.toml").write_text(examples()[1])
+    arguments = ("--points", 4, "--samples", 10, "--repeats", 1, "--out", tmp_path / "out.csv")
+    assert simulate(*arguments, "--environment", tmp_path / "room.toml", "ideal") == 0
+    (found,) = evaluate(tmp_path / "out.csv", Options(noisy="operating room")).separations
+    assert found.auc > 0.9
+
+
+def test_the_documented_scenario_is_valid():
+    values = tomllib.loads(examples()[0])["tracker"]
+    scenario = load_scenario("phantom").with_values({f"tracker.{key}": values[key] for key in values})
+    assert scenario.tracker.tip_offset_mm == 6.0
+    assert scenario.tracker.environment.name == "noisy"
+
+
+def test_the_page_lists_every_setting_with_its_default():
+    """All keys of the tables, by name; defaults are those of an environment with only a name and a plate."""
+    page = DOCS.read_text()
+    settings = page.split("## Settings")[1].split("\n## ")[0]
+    flat = load_scenario("phantom").with_values({"tracker.environment": {"name": "a", "plate": {}}}).flat()
+    opening = "tracker.environment."
+    keys = [key.removeprefix(opening) for key in flat if key.startswith(opening)]
+    assert len(keys) > 20
+    message = set(re.findall(r"`([a-z0-9_.]+)`", settings))
+    assert [key for key in keys if key not in message and key.split(".")[-1] not in message] == []
+    assert Environment(name="a").length_mm == 60.0

@@ -1,0 +1,276 @@
+"""`em evaluate` against values computed by hand, a second implementation, and invariances."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.errors import InputError
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.lab.tracker_evaluation.table.columns import column_map
+
+LAWS = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+# Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
+# first, ±2 along y at the second.
+BY_HAND = rows_of(
+    [(0, 0, 0), (10, 0, 0)],
+    [[(2, 4, 0), (4, 4, 0)], [(10, 2, 1), (10, -2, 1)]],
+    indicator=[0.02, 0.04],
+)
+
+
+def results(path, **options):
+    return {
+        (r["sensor"], r["environment"]): r for r in evaluate(path, Options(**options)).values()["results"]
+    }
+
+
+def only(path, **options):
+    (result,) = results(path, **options).values()
+    return result
+
+
+def test_the_papers_equations_on_a_table_worked_out_by_hand(tmp_path):
+    found = only(write_csv(tmp_path / "t.csv", BY_HAND))
+    assert found["rmse_mm"] == pytest.approx(math.sqrt((25 + 1) / 2), rel=1e-15)
+    assert found["p95_mm"] == pytest.approx(1 + 0.95 * 4, rel=1e-15)  # between the ranks 0 and 1
+    assert found["max_mm"] == 5.0
+    assert found["max_at"] == "0"
+    assert found["jitter_mm"] == pytest.approx(math.sqrt((1 + 1 + 4 + 4) / 4), rel=1e-15)
+    assert (found["mean_mm"], found["sd_mm"]) == pytest.approx((3.0, math.sqrt(8.0)))
+    assert found["bias_mm"] == pytest.approx([1.5, 2.0, 0.5])
+    assert (found["n_points"], found["n_samples"], found["n_missing"]) == (2, 4, 0)
+    assert found["indicator"]["mean"] == pytest.approx(0.03)
+    assert found["official"] == {"rmse_mm": 0.70, "p95_mm": 1.40}
+
+
+def test_points_weigh_equally_in_the_errors_and_samples_in_the_jitter(tmp_path):
+    rows = rows_of([(0, 0, 0), (10, 0, 0)], [[(1, 0, 0)], [(12, 1, 0), (12, -1, 0), (12, 0, 0)]])
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    found = evaluation.values()["results"][0]
+    assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
+    assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
+    assert (found["n_single"], found["samples_least"], found["samples_most"]) == (1, 1, 3)
+    assert any("one sample at 1 grid point (used for the errors" in note for note in evaluation.notes)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1000.0, -2500.0])
+def test_a_second_implementation_agrees_far_from_the_origin(tmp_path, offset):
+    rows = random_rows(seed=3, samples=50, offset=offset)
+    np.random.default_rng(1).shuffle(rows)
+    found, other = only(write_csv(tmp_path / "t.csv", rows)), plain(rows)
+    for name, value in other.items():
+        assert found[name] == pytest.approx(value, abs=1e-11), name
+
+
+def test_parquet_and_csv_give_the_same_result_for_any_type_of_point_id(tmp_path):
+    rows = random_rows(seed=1)
+    table = pa.Table.from_pylist(rows)
+    as_csv = results(write_csv(tmp_path / "t.csv", rows))
+    pq.write_table(table, tmp_path / "t.parquet")
+    text = table.set_column(0, "point_id", table["point_id"].cast(pa.string()))
+    pq.write_table(text, tmp_path / "text.parquet", row_group_size=7)
+    for name in ("t.parquet", "text.parquet"):
+        (found,) = results(tmp_path / name).values()
+        assert_same(found, *as_csv.values())
+
+
+@pytest.mark.long
+@LAWS
+@given(st.randoms(use_true_random=False))
+def test_the_order_of_rows_does_not_matter(tmp_path, random):
+    rows = random_rows(seed=5, samples=4)
+    before = only(write_csv(tmp_path / "t.csv", rows))
+    random.shuffle(rows)
+    after = only(write_csv(tmp_path / "t.csv", rows))
+    assert_same(after, before)
+
+
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory):
+    """Rows of a table, and their evaluation after registration."""
+    rows = random_rows(seed=7, samples=4)
+    return rows, only(write_csv(tmp_path_factory.mktemp("registered") / "t.csv", rows), register=True)
+
+
+@LAWS
+@given(
+    rotation=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
+    shift=st.tuples(*[st.floats(-800, 800)] * 3),
+)
+def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(
+    tmp_path, registered, rotation, shift
+):
+    rows, before = registered
+    moved = [{**row, **rigid(row, rotation, shift)} for row in rows]
+    after = only(write_csv(tmp_path / "t.csv", moved), register=True)
+    for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm"):
+        assert after[name] == pytest.approx(before[name], abs=1e-9)
+    assert after["registration"]["residual_mm"] == pytest.approx(after["rmse_mm"], rel=1e-12)
+
+
+@pytest.mark.long
+@LAWS
+@given(shift=st.tuples(*[st.floats(-2000, 2000)] * 3))
+def test_a_translation_of_the_tracker_does_not_change_jitter_or_relative_distances(tmp_path, shift):
+    rows = random_rows(seed=8, samples=4)
+    before = only(write_csv(tmp_path / "t.csv", rows))
+    after = only(write_csv(tmp_path / "t.csv", [{**row, **rigid(row, (0, 0, 0), shift)} for row in rows]))
+    assert after["jitter_mm"] == pytest.approx(before["jitter_mm"], abs=1e-9)
+    assert after["relative_distance"]["rms_mm"] == pytest.approx(
+        before["relative_distance"]["rms_mm"], abs=1e-9
+    )
+
+
+def assert_same(one, other):
+    for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm", "mean_mm", "sd_mm"):
+        assert one[name] == pytest.approx(other[name], abs=1e-12)
+    assert_allclose(one["intervals"]["rmse_mm"], other["intervals"]["rmse_mm"], atol=1e-12)
+    assert one["indicator"]["samples"]["p95"] == other["indicator"]["samples"]["p95"]
+    assert one["max_at"] == other["max_at"]
+
+
+def rigid(row, rotation, shift):
+    x = Rotation.from_rotvec(rotation).apply([row[f"{axis}_mm"] for axis in "xyz"]) + shift
+    return dict(zip(("x_mm", "y_mm", "z_mm"), map(float, x), strict=True))
+
+
+def test_a_registration_removes_a_rigid_transform_and_reports_it(tmp_path):
+    rotated = Rotation.from_euler("z", 3, degrees=True).apply(GRID) + np.array([1.0, 2.0, 3.0])
+    samples = rotated[:, None]
+    found = only(write_csv(tmp_path / "t.csv", rows_of(GRID, samples)), register=True)
+    assert found["rmse_mm"] < 1e-12
+    assert found["registration"]["angle_deg"] == pytest.approx(3.0, rel=1e-10)
+    rotation, translation = (np.array(found["registration"][key]) for key in ("rotation", "translation_mm"))
+    assert_allclose(rotated @ rotation.T + translation, GRID, atol=1e-10)
+
+
+def test_points_on_a_line_cannot_be_registered(tmp_path):
+    path = write_csv(tmp_path / "t.csv", BY_HAND)
+    with pytest.raises(
+        InputError, match=r"t\.csv: --register: sensor 'tip', environment 'ideal'.*at least 3"
+    ):
+        evaluate(path, Options(register=True))
+
+
+def test_sensors_and_environments_are_evaluated_separately_in_the_papers_order(tmp_path):
+    rows = [
+        *random_rows(1, sensor="reference", environment="noisy", bias=2.0),
+        *random_rows(2, sensor="coil 7", environment="ideal"),
+        *random_rows(3, sensor="tip", environment="noisy"),
+        *random_rows(4, sensor="reference", environment="ideal"),
+    ]
+    found = results(write_csv(tmp_path / "t.csv", rows))
+    assert list(found) == [
+        ("tip", "noisy"),
+        ("reference", "ideal"),
+        ("reference", "noisy"),
+        ("coil 7", "ideal"),
+    ]
+    assert found["reference", "noisy"]["paper"]["max_mm"] == 8.16
+    assert found["coil 7", "ideal"]["official"] is None
+    for seed, key in ((1, ("reference", "noisy")), (4, ("reference", "ideal"))):
+        bias = 2.0 if seed == 1 else 0.5
+        assert found[key]["rmse_mm"] == pytest.approx(plain(random_rows(seed, bias=bias))["rmse_mm"])
+
+
+def test_errors_over_distance_are_those_after_registration(tmp_path):
+    rotation = Rotation.from_euler("xyz", (10, 20, 30), degrees=True)
+    rows = []
+    for row in random_rows(0):
+        position = rotation.apply([row[f"{axis}_mm"] for axis in "xyz"]) + 300.0
+        rows.append(
+            {**row, "distance_mm": 612.0}
+            | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, position), strict=True))
+        )
+    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), Options(register=True)).values()["results"]
+    (bin_,) = found["distance"]["bins"]
+    assert bin_["rmse_mm"] == pytest.approx(found["rmse_mm"])
+    assert bin_["rmse_mm"] < 1.5
+
+
+def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_path):
+    error = {400.0: 2.0, 500.0: 0.9, 610.0: 0.3, 700.0: 0.8, 805.0: 0.2}
+    rows = []
+    for distance, off in error.items():
+        around = np.array([(off, 0.01, 0.0), (off, -0.01, 0.0)])
+        own = rows_of(GRID, GRID[:, None] + around)
+        rows += [{**row, "distance_mm": distance} for row in own]
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    assert evaluation.notes[0].startswith("tip, ideal: points were measured at several distances")
+    found = evaluation.values()["results"][0]["distance"]
+    assert [b["distance_mm"] for b in found["bins"]] == pytest.approx(list(error))
+    assert [b["rmse_mm"] for b in found["bins"]] == pytest.approx(list(error.values()))
+    assert [b["jitter_mm"] for b in found["bins"]] == pytest.approx([0.01] * 5)
+    assert found["bins"][2]["from_mm"] == 600.0
+    assert (found["limit_mm"], found["smallest_mm"], found["exceeded_mm"]) == (
+        0.70,
+        610.0,
+        pytest.approx((700.0,)),
+    )
+    assert evaluation.results[0].distances.limit_met == "from 610 mm, not at 700 mm"
+    assert only(tmp_path / "t.csv", limit_mm=0.1)["distance"]["smallest_mm"] is None
+    wide = only(tmp_path / "t.csv", bin_mm=1000.0)
+    assert len(wide["distance"]["bins"]) == 1
+    pooled = np.mean(list(error.values()))
+    assert wide["rmse_mm"] == pytest.approx(pooled)  # the main figures pool by grid point alone
+    assert wide["jitter_mm"] == pytest.approx(np.sqrt(np.var(list(error.values())) + 0.01**2))
+
+
+def test_orientation_jitter_is_the_rms_angle_for_either_sign_of_the_quaternion(tmp_path):
+    angle = np.radians([0.5, -0.5, 0.5, -0.5])
+    rows = rows_of(GRID, [[p] * 4 for p in GRID])
+    for k, row in enumerate(rows):
+        sign = (-1.0) ** (k % 3)
+        rotated = np.cos(angle[k % 4] / 2), 0.0, np.sin(angle[k % 4] / 2), 0.0
+        row |= {name: sign * float(q) for name, q in zip(("qw", "qx", "qy", "qz"), rotated, strict=True)}
+    found = only(write_csv(tmp_path / "t.csv", rows))["orientation"]
+    assert found["jitter_deg"] == pytest.approx(0.5, rel=1e-9)
+    assert found["axis_jitter_deg"] == pytest.approx(0.5, rel=1e-6)
+    assert found["n_samples"] == len(rows)
+
+
+def test_a_roll_about_the_sensor_axis_is_no_jitter_of_the_axis(tmp_path):
+    rows = rows_of(GRID, [[p] * 2 for p in GRID])
+    for k, row in enumerate(rows):
+        half = (-1.0) ** k * np.radians(5.0)
+        row |= {"qw": float(np.cos(half)), "qx": 0.0, "qy": 0.0, "qz": float(np.sin(half))}
+    found = only(write_csv(tmp_path / "t.csv", rows))["orientation"]
+    assert found["jitter_deg"] == pytest.approx(10.0, rel=1e-9)
+    assert found["axis_jitter_deg"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_scale_error_gives_distance_errors_in_proportion_to_the_distance(tmp_path):
+    found = only(write_csv(tmp_path / "t.csv", rows_of(GRID, [[1.01 * p + 300.0] for p in GRID])))
+    distance = np.linalg.norm(GRID[:, None] - GRID[None], axis=2)[np.triu_indices(27, 1)]
+    assert found["relative_distance"]["n_pairs"] == 351
+    # A distance measured too long is a positive error.
+    assert found["relative_distance"]["mean_mm"] == pytest.approx(0.01 * distance.mean())
+    assert found["relative_distance"]["rms_mm"] == pytest.approx(0.01 * np.sqrt((distance**2).mean()))
+    assert found["relative_distance"]["max_mm"] == pytest.approx(0.01 * np.sqrt(3) * 50)
+    assert found["relative_distance"]["neighbours"] == 54
+    assert found["relative_distance"]["neighbours_rms_mm"] == pytest.approx(0.25)
+
+
+def test_repeatability_uses_n_minus_one_and_separates_the_axes(tmp_path):
+    found = only(write_csv(tmp_path / "t.csv", BY_HAND))["repeatability"]
+    assert found["axis_sd_mm"] == pytest.approx(
+        (1.0, 2.0, 0.0)
+    )  # sums of squares 2 and 8 over two degrees of freedom
+    assert found["sd_mm"] == pytest.approx(math.sqrt(5.0))
+    assert (found["worst_mm"], found["worst_at"]) == (pytest.approx(math.sqrt(8.0)), "1")
+
+
+def test_the_documented_mapping_file_is_valid(tmp_path):
+    text = (Path(__file__).parents[4] / "docs/tracking/evaluate.md").read_text(encoding="utf-8")
+    mapping = tmp_path / "map.toml"
+    mapping.write_text(text.split("```toml\n")[1].split("```")[0])
+    assert column_map([str(mapping)]) == {"x_mm": "X [mm]", "point_id": "id"}

@@ -1,0 +1,117 @@
+"""Notes on a table: a different frame of the tracker, environments measured at different points."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from em_tables import GRID, random_rows, rows_of, write_csv
+from flexneedle.errors import InputError
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+
+
+def notes(path, rows, **options):
+    return evaluate(write_csv(path / "t.csv", rows), Options(**options)).notes
+
+
+def rotated(rows):
+    for row in rows:
+        x = Rotation.from_euler("z", 20, degrees=True).apply([row[f"{axis}_mm"] for axis in "xyz"]) + 200.0
+        row |= dict(zip(("x_mm", "y_mm", "z_mm"), map(float, x), strict=True))
+    return rows
+
+
+def test_a_note_suggests_register_for_a_tracker_with_another_frame(tmp_path):
+    rows = rotated(random_rows(0)) + rotated(random_rows(1, sensor="reference"))
+    (found,) = notes(tmp_path, rows)
+    fit = evaluate(tmp_path / "t.csv", Options(register=True)).results
+    assert "add --register" in found
+    assert ", and 1 more)" in found
+    assert any(f"to {result.accuracy.rmse_mm:.2g} mm (" in found for result in fit)
+
+
+@pytest.mark.parametrize(
+    "case", ["registered", "in the stage's frame", "few points", "points on a line", "wrong, but not rigidly"]
+)
+def test_no_note_if_a_rigid_fit_would_not_help_or_was_made(tmp_path, case):
+    rows = rotated(random_rows(0)) if case != "in the stage's frame" else random_rows(0)
+    if case == "few points":
+        rows = [row for row in rows if row["point_id"] in (0, 1, 3, 9)]
+    if case == "points on a line":
+        line = np.outer(np.arange(8.0), (10.0, 0.0, 0.0))
+        rows = rows_of(line, np.repeat(line[:, None], 2, axis=1) + 100.0)
+    if case == "wrong, but not rigidly":
+        rows = rows_of(GRID, np.repeat(2.0 * (GRID - 25.0)[:, None] + 25.0, 2, axis=1))
+    assert notes(tmp_path, rows, register=case == "registered") == []
+
+
+def test_a_note_reports_a_position_with_two_ids(tmp_path):
+    rows = random_rows(0)
+    assert notes(tmp_path, rows) == []
+    for row in rows[3:6]:
+        row["point_id"] = "first again"
+    assert notes(tmp_path, rows)[0].startswith(
+        "tip, ideal: 1 of 28 grid points repeat a position under another point_id (counted as"
+    )
+
+
+@pytest.mark.parametrize(("times", "expected"), [(4.5, False), (5.5, True)])
+def test_the_note_on_the_frame_appears_from_five_times_the_residual(tmp_path, times, expected):
+    """Positions 1 % too far from the centroid, shifted so that the RMSE is `times` the residual of a fit."""
+    middle = GRID.mean(axis=0)
+    residual = 0.01 * np.sqrt(((GRID - middle) ** 2).sum(axis=1).mean())
+    shift = np.array([0.0, 0.0, residual * np.sqrt(times**2 - 1.0)])
+    positions = np.repeat((middle + 1.01 * (GRID - middle) + shift)[:, None], 2, axis=1)
+    found = notes(tmp_path, rows_of(GRID, positions))
+    assert len(found) == expected
+    assert all(
+        f"reduce the RMSE from {times * residual:.3g} mm to {residual:.2g} mm" in note for note in found
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p * (1, 1, -1), "a mirrored frame fits far better"),
+        (lambda p: p[:, [0, 2, 1]] * (1, 1, 2.0), "the fit has a residual of"),
+    ],
+)
+def test_a_note_reports_a_poor_rigid_fit(tmp_path, change, message):
+    positions = np.repeat(
+        change(GRID + np.random.default_rng(0).normal(0.0, 0.1, GRID.shape))[:, None], 2, axis=1
+    )
+    (found,) = notes(tmp_path, rows_of(GRID, positions), register=True)
+    assert found.startswith(f"tip, ideal: {message}")
+    assert notes(tmp_path, rotated(random_rows(0)), register=True) == []
+
+
+def test_grid_points_that_only_one_environment_has_are_counted(tmp_path):
+    some = [row for row in random_rows(1, environment="noisy") if row["point_id"] < 21]
+    assert notes(tmp_path, random_rows(0) + some) == [
+        "tip: grid points: 27 in ideal, 21 in noisy, 21 in common: the compared positions differ"
+    ]
+    assert notes(tmp_path, random_rows(0) + random_rows(1, environment="noisy")) == []
+
+
+def test_points_with_other_ids_are_other_points(tmp_path):
+    other = [{**row, "point_id": row["point_id"] + 5} for row in random_rows(1, environment="noisy")]
+    (found,) = notes(tmp_path, random_rows(0) + other)
+    assert "27 in ideal, 27 in noisy, 22 in common" in found
+
+
+def test_a_sensor_missing_in_an_environment_is_named(tmp_path):
+    rows = [
+        *random_rows(0),
+        *random_rows(1, sensor="reference"),
+        *random_rows(2, sensor="reference", environment="noisy"),
+    ]
+    assert notes(tmp_path, rows) == ["tip: not in noisy, only in ideal"]
+
+
+def test_a_single_environment_of_any_name_needs_no_note(tmp_path):
+    assert notes(tmp_path, random_rows(0, environment="lab")) == []
+
+
+@pytest.mark.parametrize("option", ["ideal", "noisy"])
+def test_an_unknown_environment_in_an_option_is_refused(tmp_path, option):
+    with pytest.raises(InputError, match=f"--{option}: no environment 'lab emty': choose from lab empty"):
+        notes(tmp_path, random_rows(0, environment="lab empty"), **{option: "lab emty"})

@@ -1,0 +1,200 @@
+"""Figures of an evaluation show their data; checked by their artists, not their pixels."""
+
+import numpy as np
+import pytest
+from matplotlib.collections import PathCollection
+from matplotlib.quiver import Quiver
+from matplotlib.text import Text
+from numpy.testing import assert_allclose
+
+from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, distance_figure
+from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, field_figure
+from flexneedle.lab.tracker_evaluation.figures.indicator import (
+    IndicatorPanel,
+    PlottedPoints,
+    indicator_figure,
+)
+from flexneedle.lab.tracker_evaluation.figures.roc import RocLine, roc_figure
+
+GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def words(figure):
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+def field_row(true=GRID, error=0.5, title="tip, ideal"):
+    return FieldRow(title, true, np.random.default_rng(0).normal(0.0, error, true.shape))
+
+
+def arrows(figure):
+    return [[one for one in ax.collections if isinstance(one, Quiver)] for ax in figure.axes]
+
+
+def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
+    row = field_row()
+    figure = field_figure([row])
+    drawn = [one[0] for one in arrows(figure) if one]
+    assert [len(one.U) for one in drawn] == [25] * 5
+    chosen = GRID[:, 2] == 25.0
+    factor = (drawn[1].U / row.error[chosen, 0])[0]
+    assert_allclose(np.stack([drawn[1].U, drawn[1].V], axis=1), factor * row.error[chosen, :2])
+    assert f"arrows: errors in x, y × {round(factor)}" in words(figure)
+    assert_allclose(drawn[1].get_array(), np.linalg.norm(row.error[chosen], axis=1))
+    assert "z = 25 mm" in words(figure)
+
+
+def test_scattered_points_are_divided_into_five_slabs():
+    true = np.random.default_rng(1).uniform(-50, 50, (300, 3))
+    drawn = [one[0] for one in arrows(field_figure([field_row(true)])) if one]
+    assert len(drawn) == 5
+    assert sum(len(one.U) for one in drawn) == 300
+
+
+@pytest.mark.parametrize("true", [GRID[:1], GRID[:2], GRID[GRID[:, 2] == 0.0]])
+def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
+    figure = field_figure([field_row(true), field_row(true, error=0.0)])
+    assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
+
+
+@pytest.mark.parametrize("shift", [0.0, 240.0])  # with 240 mm, one tenth would be about a grid step
+def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(shift):
+    row = field_row()
+    row = FieldRow(row.title, row.true, row.error + np.array([shift, 0.0, 0.0]))
+    figure = field_figure([row])
+    drawn = [(ax, one) for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
+    ends = np.concatenate([one.XY + np.stack([one.U, one.V], axis=1) for _, one in drawn])
+    (low, high), (bottom, top) = drawn[0][0].get_xlim(), drawn[0][0].get_ylim()
+    inside = (ends > (low, bottom)).all(axis=1) & (ends < (high, top)).all(axis=1)
+    assert inside.mean() >= 0.95
+    assert all(one.get_clip_on() for _, one in drawn)
+    lengths = np.concatenate([np.hypot(one.U, one.V) for _, one in drawn])
+    assert np.quantile(lengths, 0.95) > 3.0  # mm: long enough to be visible
+
+
+def test_single_slices_are_drawn_in_pairs():
+    plane = GRID[GRID[:, 2] == 0.0]
+    one, two, three = (field_figure([field_row(plane)] * k) for k in (1, 2, 3))
+    assert two.get_figheight() <= one.get_figheight() < three.get_figheight() <= 2 * two.get_figheight()
+    two.draw_without_rendering()
+    left, right = (ax.get_window_extent() for ax in two.axes[::2])
+    assert left.y0 == pytest.approx(right.y0)
+    assert left.x1 < two.bbox.width / 2 < right.x0
+
+
+def test_rows_beyond_the_sixth_are_counted():
+    figure = field_figure([field_row(title=f"coil {k}") for k in range(8)])
+    assert "2 more not shown" in words(figure)
+    assert "coil 5" in words(figure)
+    assert "coil 6" not in words(figure)
+
+
+def panel(**changes):
+    ideal = PlottedPoints("ideal", np.linspace(0.01, 0.06, 20), np.full(20, 0.5), "0.500 ± 0.100 mm")
+    noisy = PlottedPoints(
+        "noisy", np.linspace(0.1, 0.5, 40), np.linspace(1.0, 5.0, 40), "10.000 I + 0.000 mm"
+    )
+    values = {
+        "ideal": ideal,
+        "noisy": noisy,
+        "constant": (0.5, 0.1),
+        "line": (10.0, 0.0),
+        "threshold": 0.055,
+    }
+    return IndicatorPanel("reference", **{**values, **changes})
+
+
+def shown_points(figure):
+    return [one.get_offsets() for one in figure.axes[0].collections if isinstance(one, PathCollection)]
+
+
+def test_all_indicators_are_shown():
+    figure = indicator_figure([panel()])
+    assert [len(one) for one in shown_points(figure)] == [20, 40]
+    assert figure.axes[0].get_xlim() == pytest.approx((0.0, 1.04 * 0.5))
+    assert "not shown" not in words(figure)
+    assert "threshold 0.0550" in words(figure)
+
+
+def test_a_few_indicators_far_out_are_counted_instead():
+    indicator, error = np.append(np.linspace(0.1, 0.5, 40), 6.0), np.append(np.full(40, 2.0), 90.0)
+    figure = indicator_figure([panel(noisy=PlottedPoints("noisy", indicator, error, "a line"))])
+    assert [len(one) for one in shown_points(figure)] == [20, 40]
+    assert "(1 point not shown, up to I = 6)" in words(figure)
+    (ax,) = figure.axes
+    assert 0.5 < ax.get_xlim()[1] < 0.7
+    assert ax.get_ylim()[1] < 5.0
+
+
+def test_omitted_sensors_are_counted():
+    assert "5 more sensors not shown" in words(indicator_figure([panel()] * 3, 5))
+    assert "1 more sensor not shown" in words(indicator_figure([panel()] * 3, 1))
+
+
+def test_a_threshold_beyond_all_indicators_is_shown():
+    figure = indicator_figure([panel(noisy=None, line=None, threshold=0.9)])
+    assert figure.axes[0].get_xlim()[1] > 0.9
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noisy": None, "line": None},
+        {"ideal": None, "constant": None, "threshold": None},
+        {"line": (np.nan, np.nan)},
+        {"constant": (0.5, np.nan)},
+    ],
+)
+def test_an_environment_or_a_fit_may_be_missing(changes):
+    assert "reference" in words(indicator_figure([panel(**changes), panel()]))
+
+
+def test_the_figure_of_distances_shows_rmse_limit_and_note():
+    far, rmse = np.array([500.0, 600.0, 700.0]), np.array([1.2, 0.8, 0.5])
+    lines = [DistanceLine("tip, ideal", far, rmse, 0.7, "within 0.7 mm from 700 mm")]
+    figure = distance_figure([*lines, DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")])
+    assert "limit 0.7" in words(figure)
+    assert "within 0.7 mm from 700 mm" in words(figure)
+    assert_allclose(figure.axes[0].lines[0].get_xydata(), np.stack([far, rmse], axis=1))
+
+
+def test_the_roc_marks_the_threshold_in_use():
+    curve = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.9, 1.0])
+    values = np.linspace(0.01, 0.06, 20), np.linspace(0.05, 0.4, 20)
+    figure = roc_figure(
+        [RocLine("reference", ("lab", "with table"), *curve, values, 0.055, (0.05, 0.95), "area 0.9500")]
+    )
+    marked = [line.get_xydata()[0] for line in figure.axes[0].lines if len(line.get_xydata()) == 1]
+    assert_allclose(marked, [(0.05, 0.95)])
+    assert "area 0.9500" in words(figure)
+    for text in (
+        "points above (lab)",
+        "points above (with table)",
+        "reference, lab",
+        "reference, with table",
+    ):
+        assert text in words(figure)
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_legends_stay_inside_the_figure_and_off_the_axes(count):
+    names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
+    pair = "the laboratory after all the metal had been carried out", "the same with its table"
+    values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)
+    note = "within 1.4 mm up to 700 mm, and the first bin beyond is too far off"
+    roc = roc_figure(
+        [
+            RocLine(name, pair, *values, values, 0.5, (0.05, 0.95), "0.0547, 5.6 % false, 98.4 % detected")
+            for name in names
+        ]
+    )
+    distance = distance_figure([DistanceLine(name, *values, 0.7, note) for name in names])
+    for figure in (roc, distance):
+        figure.draw_without_rendering()
+        legends = [legend for part in (figure, *figure.subfigs) for legend in part.legends]
+        assert legends
+        for legend in legends:
+            box = legend.get_window_extent()
+            assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+            assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+            assert not any(box.overlaps(other.get_window_extent()) for other in figure.axes)

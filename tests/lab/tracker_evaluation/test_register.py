@@ -1,0 +1,239 @@
+"""`em register`: rigid transform and errors from pairs of points; invalid pairs are refused in one line."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from flexneedle import load_scenario
+from flexneedle.cli.main import main
+from flexneedle.errors import InputError
+from flexneedle.geometry.quaternion import from_vector, to_matrix
+from flexneedle.geometry.registration import Rigid
+from flexneedle.lab.tracker_evaluation.register import read_pairs, register
+from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
+from flexneedle.scenario.files import load_registration
+
+PHANTOM = load_scenario("phantom")
+STAGE = np.array([[x, y, z] for x in (0.0, 80.0) for y in (-40.0, 40.0) for z in (0.0, 50.0)])
+TRUE = Rigid(to_matrix(from_vector(np.array([[0.4, -1.0, 0.7]]))[0]), np.array([10.0, 20.0, -500.0]))
+HEAD = "point_id,true_x_mm,true_y_mm,true_z_mm,x_mm,y_mm,z_mm,sensor"
+
+
+def table(tmp_path, rows, head=HEAD, name="pairs.csv"):
+    path = tmp_path / name
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def rows(error=0.0, repeats=1, seed=0, sensor="ref1"):
+    rng = np.random.default_rng(seed)
+    measured = TRUE.inverse().apply(STAGE) + rng.normal(0.0, error / np.sqrt(3.0), STAGE.shape)
+    return [
+        (f"p{k}", *STAGE[k], *measured[k], sensor)
+        for _ in range(repeats)
+        for k in rng.permutation(len(STAGE)).tolist()
+    ]
+
+
+def test_exact_pairs_give_the_exact_transform(tmp_path):
+    found = register(read_pairs(table(tmp_path, rows(repeats=3))))
+    np.testing.assert_allclose(found.rigid.rotation, TRUE.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.rigid.translation, TRUE.translation, atol=1e-9)
+    assert found.fre < 1e-9
+    assert found.pairs.samples.tolist() == [3] * 8
+    again = to_stage(found.registration)
+    np.testing.assert_allclose(again.apply(STAGE), TRUE.apply(STAGE), atol=1e-9)
+
+
+@pytest.mark.long
+def test_the_estimated_errors_are_the_planted_ones(tmp_path):
+    """The RMS localisation error of 50 registrations is the planted one; leave-one-out errors exceed the residuals."""
+    found = [register(read_pairs(table(tmp_path, rows(0.3, seed=seed)))) for seed in range(50)]
+    assert np.sqrt(np.mean([one.fle**2 for one in found])) == pytest.approx(0.3, rel=0.1)
+    assert all(np.all(one.leave_one_out >= one.residuals) for one in found)
+
+
+def test_rows_of_a_point_are_averaged_and_missing_ones_ignored(tmp_path):
+    data = rows(repeats=2)
+    data += [(*row[:4], "", "", "", "ref1") for row in data[:3]]
+    data = [
+        (*row[:4], row[4] + (0.1 if k < 8 else -0.1), *row[5:]) if k < 16 else row
+        for k, row in enumerate(data)
+    ]
+    found = register(read_pairs(table(tmp_path, data)))
+    assert found.fre < 1e-9
+    assert found.pairs.missing == 3
+
+
+def test_rows_of_other_sensors_and_missing_samples_are_not_checked(tmp_path):
+    code = -3.697314e28
+    others = [("p0", 1, 2, 3, code, code, code, "tip"), ("p1", "", 2, 3, 4, 5, 6, "tip")]
+    data = [*others, *rows(0.3), ("p2", "", "", "", "", "", "", "ref1")]
+    found = read_pairs(table(tmp_path, data), sensor="ref1")
+    alone = read_pairs(table(tmp_path, rows(0.3), name="alone.csv"))
+    np.testing.assert_array_equal(found.tracker, alone.tracker)
+    np.testing.assert_array_equal(found.stage, alone.stage)
+    assert (found.names, found.missing) == (alone.names, 1)
+
+
+def test_metres_are_read_with_unit_m(tmp_path):
+    data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
+    in_metres = register(read_pairs(table(tmp_path, data), unit="m"))
+    np.testing.assert_allclose(in_metres.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
+
+
+def test_a_target_with_nan_is_refused_before_writing(tmp_path, capsys):
+    out = tmp_path / "r.toml"
+    with pytest.raises(SystemExit):
+        main(["em", "register", str(table(tmp_path, rows())), "--target", "nan", "0", "0", "--out", str(out)])
+    assert "must be a finite number" in capsys.readouterr().err
+    assert not list(tmp_path.glob("r.*"))
+
+
+def test_a_row_without_an_id_is_its_own_point(tmp_path):
+    data = [("1", *rows()[0][1:]), ("", *rows()[1][1:]), *rows()[2:]]
+    data[1], data[0] = data[0], data[1]
+    assert len(read_pairs(table(tmp_path, data)).names) == 8
+
+
+def test_without_point_ids_each_row_is_a_point(tmp_path):
+    path = table(tmp_path, [row[1:7] for row in rows()], HEAD[9:-7])
+    assert register(read_pairs(path)).values()["points"] == 8
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ([], "has no rows"),
+        (rows()[:2], "2 pairs of points"),
+        (
+            [*rows()[:5], ("p9", 1, 2, 3, 4, "", 6, "ref1")],
+            "row 6: x_mm, y_mm, z_mm: must all have values, or all be empty",
+        ),
+        ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several positions in the stage's frame"),
+        ([*rows(), *rows(sensor="tip")], "has several values of sensor: choose one with --sensor: ref1, tip"),
+        ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a position"),
+        ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
+        (
+            [(row[0], *(1e-3 * v for v in row[1:7]), "ref1") for row in rows()],
+            "are they in metres",
+        ),
+        ([(*row[:4], -row[4], *row[5:]) for row in rows()], "one of the two frames is left-handed"),
+        (
+            [(*a[:4], *b[4:]) for a, b in zip(rows(), rows()[1:] + rows()[:1], strict=True)],
+            "are points swapped",
+        ),
+        (
+            [(*row[:4], 1.0 + 1e-3 * k, 2.0, 3.0 + 1e-6 * k**2, "ref1") for k, row in enumerate(rows())],
+            "have moved",
+        ),
+        (
+            [*rows()[1:], (*rows()[0][:4], -3.697314e28, -3.697314e28, -3.697314e28, "ref1")],
+            "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm (a code for a missing position?)",
+        ),
+    ],
+    ids=[
+        *(
+            "empty",
+            "two",
+            "incomplete position",
+            "two positions",
+            "two sensors",
+            "missing",
+            "metres",
+            "both in metres",
+            "mirrored",
+            "swapped",
+        ),
+        *("not moved", "code"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(tmp_path, data, message, capsys):
+    assert main(["em", "register", str(table(tmp_path, data)), "--out", str(tmp_path / "r.toml")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "r.toml").exists()
+
+
+def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp_path, capsys):
+    data, out = table(tmp_path, [*rows(0.3), *rows(sensor="tip")]), tmp_path / "rig.toml"
+    command = ["em", "register", str(data), "--sensor", "ref1", "--target", "40", "5", "0", "--out", str(out)]
+    assert main([*command, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    found = register(read_pairs(data, sensor="ref1"), [(40.0, 5.0, 0.0)])
+    assert printed["fre_mm"] == found.fre
+    assert printed["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
+    assert {path.name for path in tmp_path.glob("rig.*")} == {"rig.toml", "rig.png", "rig.svg"}
+    assert tomllib.loads(out.read_text())["result"]["points"] == 8
+    scenario = load_registration(out, PHANTOM)
+    assert scenario.tracker.registration == found.registration
+    assert main(command) == 2
+    assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a = [", "not TOML"),
+        ("a = 1", r"has no table \[tracker.registration\]"),
+        ("tracker = 5", r"has no table \[tracker.registration\]"),
+        ("[tracker.registration]\nrotation = [1, 1, 0, 0]\n", "must be a unit quaternion"),
+    ],
+)
+def test_a_file_without_a_registration_is_refused(tmp_path, text, message):
+    path = tmp_path / "r.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_registration(path, PHANTOM)
+    with pytest.raises(InputError, match="no such file"):
+        load_registration(tmp_path / "none.toml", PHANTOM)
+
+
+@pytest.mark.parametrize(
+    ("points", "rule"),
+    [
+        ([[0.0, 0.0, 0.0]], "must have at least 3 entries"),
+        ([[float(k), 2.0 * k, 0.0] for k in range(4)], "must not be on one line"),
+        ([[1.0, 1.0, 1.0]] * 3, "must not be on one line"),
+    ],
+)
+def test_a_scenario_refuses_degenerate_fiducials(points, rule):
+    with pytest.raises(InputError, match=rule):
+        PHANTOM.with_values({"tracker.registration.fiducials_mm": points})
+
+
+# ---- in insertions
+
+
+def rig_of(seed, **values):
+    quiet = {"tracker.jitter_mm": 0.0, "phantom.missing_fraction": 0.0, "phantom.delay_periods": 0.0}
+    scenario = PHANTOM.with_values({**quiet, **values})
+    return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (4, 5, seed))))
+
+
+def off(rig):
+    """In-plane error (mm) of the tracker at rest."""
+    rig.clock.wait(0.5)
+    sample = rig.tracker.read()[-1]
+    return np.array([sample.x, sample.y]) - rig.truth().tip[:2]
+
+
+@pytest.mark.parametrize("environment", ["none", "ideal"])
+def test_an_insertion_has_the_error_of_its_registration(tmp_path, environment):
+    """Exact pairs change nothing; others add the expected error, drawn for each insertion."""
+    found = register(read_pairs(table(tmp_path, rows(3.0))), [(-28.5, 0.0, 0.0)])
+    registration = found.registration.model_dump(mode="json")
+    world = {"tracker.environment": environment, "tracker.field_seed": 1}
+    exact = {**registration, "localisation_mm": 0.0}
+    bare = off(rig_of(6, **world))
+    np.testing.assert_allclose(off(rig_of(6, **world, **{"tracker.registration": exact})), bare, atol=0.3)
+    errors = np.array(
+        [
+            off(rig_of(seed, **world, **{"tracker.registration": registration}))
+            - off(rig_of(seed, **world, **{"tracker.registration": exact}))
+            for seed in range(60)
+        ]
+    )
+    expected = found.tre[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, with about equal errors
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) == pytest.approx(expected, rel=0.35)

@@ -1,0 +1,164 @@
+"""Endings of an insertion away from its target, and drivers that do not execute the command exactly."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+import flexneedle.control
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, adaptive_mpc
+from flexneedle.errors import RunError
+from flexneedle.loop.virtual import Rig
+from flexneedle.simulator.state import State
+from flexneedle.types import Measurement
+from insertions import (
+    PHANTOM,
+    STILL,
+    Stage,
+    Tank,
+    first_periods,
+    moving,
+    of_any_scenario,
+    run,
+)
+
+
+def missing_by(plan, miss):
+    tips = plan.tips.copy()
+    tips[-1, :2] = plan.target[0], plan.target[1] + miss
+    return replace(plan, tips=tips, limit="setup.max_guide_step_mm = 0.5")
+
+
+def test_a_plan_that_misses_by_more_than_a_millimetre_is_rejected_unless_forced(plan):
+    tank = Tank(plan.roll)
+    with pytest.raises(
+        RunError, match=r"misses the target by 1\.01 mm .*limited by setup\.max_guide_step_mm"
+    ):
+        run(missing_by(plan, 1.01), tank.rig(), controller="open-loop")
+    assert tank.moves == []
+    with pytest.raises(RunError):
+        flexneedle.insert(PHANTOM, missing_by(plan, 1.01), seed=2001, controller="open-loop")
+    for miss, force in ((1.01, True), (0.99, False)):
+        rig = Tank(plan.roll).rig()
+        assert first_periods(1, missing_by(plan, miss), rig, force=force, controller="open-loop")
+
+
+def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan(plan):
+    """The miss of the plan does not apply to the phantom's needle; the insertion itself predicts the miss."""
+    assert CONTROLLERS[DEFAULT].predicts
+    assert not any(method.predicts for name, method in CONTROLLERS.items() if name != DEFAULT)
+    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig())
+
+
+class Stuck(Stage):
+    """A driver that does not move, with a tracker that measures the needle at rest."""
+
+    def __init__(self):
+        super().__init__([])
+
+    def apply(self, command, duration):
+        return super().apply(command, duration)._replace(control=STILL)
+
+    def read(self):
+        return (Measurement(self.time, -28.5, 0.0),)
+
+
+def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(plan):
+    short = replace(plan, controls=plan.controls[:5], tips=plan.tips[:6], guide=plan.guide[:6])
+    done = run(short, Stuck().rig(), force=True)
+    assert done.outcome == "failed"
+    assert "within 4 times the planned steps" in done.reason
+    assert len(done.periods) == 20
+    assert {period.applied for period in done.periods} == {STILL}
+    assert done.periods[0].command.db_x > 0.0
+
+
+def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
+    monkeypatch.setattr(State, "converged", property(lambda _: False))
+    done = run(plan, Tank(plan.roll).rig())
+    assert done.outcome == "failed"
+    assert done.reason.startswith("the model did not converge")
+    assert len(done.periods) == 1
+    assert not done.periods[0].converged
+
+
+def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
+    rollout, calls = adaptive_mpc.measured_rollout, itertools.count()
+
+    def lost(fitted, controls):
+        outcome = rollout(fitted, controls)
+        kept = next(calls) < 20
+        return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
+
+    monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
+    done = run(plan, Tank(plan.roll).rig(), controller=DEFAULT)
+    assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
+    assert {period.applied for period in done.periods[-3:]} == {STILL}
+    assert done.periods[-1].decision == "held: no path converges on the fitted model"
+
+
+def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
+    """It does not end the insertion, since the controller has no access to it; but its periods are not converged."""
+    tank = Tank(plan.roll)
+    lost_after = 1.0
+
+    def truth():
+        return tank.phantom.condition()._replace(converged=tank.phantom.now() < lost_after)
+
+    in_air = replace(plan, target=(-20.0, 0.0, 0.0))
+    done = run(in_air, Rig(tank.phantom, tank, tank, truth), force=True)
+    assert done.outcome == "done"
+    assert [period.converged for period in done.periods] == [p.time < lost_after for p in done.periods]
+    assert {period.converged for period in done.periods} == {True, False}
+
+
+def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
+    short = PHANTOM.with_values({"setup.stroke_mm": 40.0, "target.depth_mm": 10.0})
+    tank = Tank(plan.roll, scenario=short)
+    done = run(of_any_scenario(plan), tank.rig(), short)
+    assert sum(command.db_x for _, command in tank.moves) == pytest.approx(40.0, abs=0.01)
+    left = plan.target[0] - done.periods[-1].estimate.x
+    assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
+    assert not done.reached
+
+
+class Rounding(Tank):
+    """A driver with a resolution of 0.05 mm in the guide."""
+
+    def apply(self, command, duration):
+        rounded = round(command.dg_y / 0.05) * 0.05
+        return super().apply(command._replace(dg_y=rounded), duration)
+
+
+def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
+    known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
+    tank = Rounding(plan.roll, scenario=known)
+    done = run(plan, tank.rig(), known)
+    assert any(period.command.dg_y != period.applied.dg_y for period in done.periods)
+    applied = np.cumsum([period.applied.dg_y for period in done.periods])
+    np.testing.assert_allclose([period.guide[0] for period in done.periods], applied, atol=1e-12)
+    advance = sum(period.applied.db_x for period in done.periods)
+    assert done.periods[-1].base.x == pytest.approx(PHANTOM.start_base_x + advance)
+    assert [period.applied for period in moving(done)] == tank.applied
+    assert done.outcome == "done"
+
+
+def test_without_a_truth_the_true_error_is_not_known(real, replayed):
+    """Whether it reached the target, the tracker says."""
+    assert math.isnan(replayed.true_error_mm)
+    assert replayed.error_mm == replayed.residual_mm <= 1.0
+    assert replayed.reached
+    assert (
+        replayed.summary
+        == f"reached: the tip ended {replayed.residual_mm:.3f} mm from the target by the tracker"
+    )
+    missed = replace(replayed, plan=replace(replayed.plan, target=(40.0, 7.0, 0.0)))
+    assert not missed.reached
+    assert missed.summary.endswith("mm from the target by the tracker, more than 1 mm")
+    assert {period.true_tip for period in replayed.periods} == {None}
+    assert {period.true_strain_energy for period in replayed.periods} == {None}
+    assert {period.true_stretch for period in replayed.periods} == {None}
+    assert replayed.residual_mm == real[0].residual_mm

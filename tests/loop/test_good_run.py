@@ -1,0 +1,225 @@
+"""The closed loop without faults: its record, its random streams, and its access to the phantom."""
+
+import dataclasses
+import math
+import pkgutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flexneedle
+import flexneedle.control
+from flexneedle.errors import InputError
+from flexneedle.loop import insert as insertion
+from flexneedle.loop.virtual import Rig
+from flexneedle.phantom.plants import PLANTS
+from flexneedle.types import Insertion, Outcome
+from insertions import (
+    PHANTOM,
+    READING,
+    STILL,
+    Stage,
+    Tank,
+    commanded_and_estimated,
+    facts,
+    loop,
+    moving,
+    run,
+)
+
+
+def test_record_is_complete_for_every_period(plan, real):
+    done, tank = real
+    assert (done.outcome, done.reason) == ("done", "")
+    assert done.plan is plan
+    assert [period.index for period in done.periods] == list(range(len(done.periods)))
+    times = [period.time for period in done.periods]
+    assert all(np.diff(times) > 0.0)
+    assert times[-1] == pytest.approx(tank.phantom.now())
+    assert [period.command for period in moving(done)] == [command for _, command in tank.moves]
+    assert [period.applied for period in moving(done)] == tank.applied
+    for period, batch in zip(done.periods, tank.tape, strict=True):
+        assert period.measurement == batch[-1]
+        assert str(period.verdict) == "ok"
+        np.testing.assert_allclose(
+            period.applied, period.command, atol=0.01
+        )  # except for the motors' resolution
+        assert period.shape.shape == (61, 5)
+        assert period.decision
+        assert math.isfinite(period.cost)
+        assert period.spread > 0.0
+        on_plan = np.clip(period.estimate.x, plan.tips[0, 0], plan.tips[-1, 0])
+        assert period.path.x == pytest.approx(on_plan, abs=0.02)
+        assert period.true_stretch <= 1.0
+        assert period.true_strain_energy >= 0.0
+        assert np.isfinite([*period.estimate, *period.base, *period.true_tip, *period.tip_load]).all()
+        assert period.durations.keys() == {"decide", "apply", "observe", "total"}
+        parts = period.durations["decide"] + period.durations["observe"]
+        assert period.durations["total"] == pytest.approx(parts)
+        assert period.converged
+
+
+def test_the_record_ends_with_the_true_state(plan, real):
+    done, tank = real
+    condition = tank.phantom.condition()
+    assert done.true_error_mm == pytest.approx(math.dist(condition.tip[:3], plan.target))
+    last = tank.tape[-1][-1]
+    assert done.residual_mm == pytest.approx(math.dist((last.x, last.y), plan.target[:2]))
+    assert done.flips == sum(command.rolls for _, command in tank.moves)
+    assert done.periods[-1].true_strain_energy == condition.strain_energy
+    assert done.periods[-1].true_stretch == condition.least_stretch < 1.0
+    assert all(np.diff([period.true_stretch for period in done.periods]) <= 0.0)
+    assert done.reached
+    assert done.periods[-1].estimate.x >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
+    assert done.periods[-2].estimate.x < plan.target[0] - PHANTOM.control.depth_tolerance_mm
+
+
+def test_the_duration_of_a_move_is_rounded_up_to_whole_tracker_periods(real):
+    done, _ = real
+    times = [0.0, *(period.time for period in done.periods)]
+    for period, duration in zip(done.periods, np.diff(times), strict=True):
+        if period.command == STILL:  # a rest, for delayed readings
+            continue
+        needed = period.command.db_x / PHANTOM.setup.insertion_speed_mm_s
+        assert needed - 1e-6 <= duration < needed + READING
+        assert duration / READING == pytest.approx(round(duration / READING))
+
+
+@pytest.mark.long
+def test_phantoms_of_other_seeds_are_reached(plan, inserted):
+    """With all default imperfections; extra periods are the rest for the last reading, or holds for missing ones."""
+    done = [inserted(seed) for seed in range(2001, 2005)]
+    assert all(one.reached for one in done)
+    assert np.mean([one.true_error_mm for one in done]) < 0.4
+    assert all(len(moving(one)) <= 1.1 * len(plan.controls) for one in done)
+    assert all(period.converged for one in done for period in one.periods)
+
+
+@pytest.mark.parametrize("phantom", ["exact", "model"])
+def test_the_record_depends_on_the_seed_and_not_on_the_threads(inserted, phantom):
+    """To the last bit, with both plants."""
+    one, again = (inserted(2001, phantom, threads=threads) for threads in (None, 1))
+    assert list(map(facts, one.periods)) == list(map(facts, again.periods))
+    assert (one.seed, one.phantom, one.controller) == (2001, phantom, "adaptive-mpc")
+    assert (one.outcome, one.reason) == (again.outcome, again.reason) == ("done", "")
+
+
+def test_another_seed_changes_phantom_tracker_and_search(inserted):
+    one, other = inserted(2001), inserted(2002)
+    assert one.true_error_mm != other.true_error_mm
+    assert one.periods[0].true_tip != other.periods[0].true_tip
+    assert one.periods[0].measurement != other.periods[0].measurement
+    assert one.periods[0].spread != other.periods[0].spread
+
+
+def test_both_plants_have_the_same_start(inserted):
+    """Same draw, same noise; some imperfections exist only in the exact plant."""
+    exact, model = inserted(2001), inserted(2001, "model")
+    assert exact.periods[0].true_tip.y == pytest.approx(model.periods[0].true_tip.y, abs=0.5)
+    assert exact.periods[-1].true_tip != model.periods[-1].true_tip
+    assert model.true_error_mm < 1.0
+
+
+def test_unknown_names_of_plant_and_controller_are_rejected_with_the_choices(plan):
+    with pytest.raises(InputError, match="phantom = 'gel': must be one of exact, model"):
+        flexneedle.insert(PHANTOM, plan, 0, phantom="gel")
+    with pytest.raises(InputError, match="controller = 'pid': must be one of adaptive-mpc, "):
+        flexneedle.insert(PHANTOM, plan, 0, controller="pid")
+
+
+def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkeypatch):
+    drawn, plants = [], []
+
+    def virtual_rig(_scenario, _roll, seeds, phantom, **_options):
+        drawn.extend(np.random.default_rng(seed).random() for seed in dataclasses.astuple(seeds))
+        plants.append(phantom)
+
+    def no_run(_scenario, plan, _rig, rng, *_args, **_options):
+        drawn.append(rng.random())
+        return Insertion(plan, 0, (), Outcome("done"), "")
+
+    monkeypatch.setattr(insertion, "virtual_rig", virtual_rig)
+    monkeypatch.setattr(insertion, "run", no_run)
+    for seed, phantom in ((0, "exact"), (1, "exact"), (0, "model")):
+        insertion.insert(PHANTOM, plan, seed, phantom=phantom)
+    assert len(set(drawn)) == 8
+    assert drawn[:4] == drawn[8:]
+    assert plants == [PLANTS["exact"], PLANTS["exact"], PLANTS["model"]]
+
+
+def test_on_period_gets_each_period_as_it_ends(plan):
+    periods = []
+    tank = Tank(plan.roll)
+    part = replace(plan, target=(-20.0, 0.0, 0.0))
+
+    def watch(period):
+        periods.append(period)
+        moved = [one for one in periods if one.command != STILL]
+        assert len(tank.moves) == len(moved)  # before the next one moves
+
+    done = run(part, tank.rig(), on_period=watch, force=True)
+    assert done.periods == tuple(periods)
+    assert len(periods) > 5
+
+
+# ---- no other access to the phantom
+
+
+def test_replayed_readings_without_any_phantom_give_the_same_commands(real, replayed):
+    """The controller has access only to the readings and the applied commands: these give the same record."""
+    assert list(map(commanded_and_estimated, replayed.periods)) == list(
+        map(commanded_and_estimated, real[0].periods)
+    )
+    assert replayed.outcome == "done"
+
+
+def test_replayed_delayed_readings_give_the_same_commands(plan, late):
+    done, tank = late
+    replayed = run(plan, Stage(tank.tape, tank.applied).rig())
+    assert list(map(commanded_and_estimated, replayed.periods)) == list(
+        map(commanded_and_estimated, done.periods)
+    )
+    assert replayed.outcome == "done"
+
+
+def test_replayed_readings_with_another_phantom_give_the_same_commands(plan, real):
+    done, tank = real
+    other, stage = Tank(plan.roll, seed=2777), Stage(tank.tape)
+    swapped = run(plan, Rig(other.phantom, other, stage, other.phantom.condition))
+    assert list(map(commanded_and_estimated, swapped.periods)) == list(
+        map(commanded_and_estimated, done.periods)
+    )
+    assert swapped.periods[-1].true_tip != done.periods[-1].true_tip
+
+
+def test_other_readings_give_other_commands(plan, real):
+    """The replay is sensitive: an error of 1.5 mm in one reading changes the commands that follow."""
+    done, tank = real
+    at = 40
+    changed = [replace(tank.tape[at][-1], y=tank.tape[at][-1].y + 1.5)]
+    tape = [*tank.tape[:at], (*tank.tape[at][:-1], *changed), *tank.tape[at + 1 :]]
+    other = run(plan, Stage(loop(tape), tank.applied[: at + 1]).rig())
+    commands = [[period.command for period in one.periods] for one in (done, other)]
+    assert commands[0][: at + 1] == commands[1][: at + 1]
+    assert commands[0][at + 1] != commands[1][at + 1]
+
+
+def test_control_does_not_load_the_phantom():
+    package = flexneedle.control
+    modules = [found.name for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
+    assert {"flexneedle.control.mpc", "flexneedle.control.controllers.adaptive_mpc"} <= set(modules)
+    code = "; ".join([f"import {name}" for name in modules])
+    code += "; import sys; sys.exit('flexneedle.lab.rig' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_layers_forbid_control_to_import_the_phantom():
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    contracts = tomllib.loads(text)["tool"]["importlinter"]["contracts"]
+    (layers,) = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
+    assert layers.index("(rig)") < layers.index("(control)")

@@ -1,0 +1,207 @@
+"""The guard between loop and driver: no controller gets needle or tissue beyond a limit."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexneedle.control.controllers import DEFAULT
+from flexneedle.control.interface import Controller, Decision
+from flexneedle.loop.guard import Guard, bending_strain
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.tissue.layer import laws_of
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import STILL, Action, Control, Outcome
+from insertions import PHANTOM, Tank, run
+from observed import begun, in_tissue
+
+FAR = {"setup.max_guide_travel_mm": 60.0, "setup.max_guide_step_mm": 2.0}
+ASIDE = Control(dg_y=0.5)
+
+
+def guard_of(plan, **values):
+    keys = {f"guard.{key}": value for key, value in values.items()}
+    return Guard.of(PHANTOM.with_values(keys), plan)
+
+
+def driven(simulator, state, command, count):
+    for _ in range(count):
+        state = simulator.step(state, command)
+    return state
+
+
+def estimate_at(state):
+    return begun(Simulator(state.scenario, 1), state)
+
+
+# ---- limits
+
+
+def test_by_default_tissue_may_be_compressed_to_a_share_of_what_its_law_allows(plan):
+    linear = {"law": "linear", "thickness_mm": 20.0, "shear_modulus_kpa": 1.82, "compression_length_mm": 20.0}
+    layers = [{**linear, "engaged_width_mm": 5.2}, PHANTOM.values()["tissue"][1]]
+    scenario = Scenario.from_values({**PHANTOM.values(), "tissue": layers})
+    laws = laws_of(scenario.tissue)[0]
+    assert len({law.law for law in laws}) == 2
+    assert Guard.of(scenario, plan).compression == pytest.approx([0.95 * law.limit for law in laws])
+    assert guard_of(plan, least_stretch=0.6).compression == pytest.approx([0.4])
+
+
+def test_the_strain_of_a_cantilever_is_that_of_the_beam():
+    """In air the guide bends the needle over its distance a from the clamp: M = F a, strain M d/2EI."""
+    simulator, needle = Simulator(PHANTOM, 1), PHANTOM.needle
+    bent = driven(simulator, simulator.start(), ASIDE, 10)
+    arm = -PHANTOM.setup.guide_to_skin_mm - float(bent.base[0])
+    moment = 3.0 * needle.bending_stiffness * 5.0 / arm**2
+    assert bent.reactions.guide_force[0] * arm == pytest.approx(moment, rel=1e-3)
+    expected = moment * needle.outer_diameter / (2.0 * needle.bending_stiffness)
+    assert bending_strain(bent) == pytest.approx(expected, rel=1e-3)
+    assert bending_strain(simulator.start()) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_in_tissue_it_is_that_of_the_curvature_of_its_shape():
+    simulator = Simulator(PHANTOM, 1)
+    bent = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
+    curvature = np.abs(np.gradient(bent.nodes[:, 3], bent.nodes[:, 0]))
+    expected = curvature.max() * PHANTOM.needle.outer_diameter / 2.0
+    assert bending_strain(bent) == pytest.approx(expected, rel=0.1)
+
+
+def test_limits_are_those_of_the_scenario(plan):
+    guard = guard_of(plan, guide_force_n=0.2, past_target_mm=0.5, needle_strain_percent=0.1)
+    assert (guard.force, guard.past, guard.depth, guard.strain) == (0.2, 0.5, plan.target[0], 0.001)
+    assert (guard_of(plan).force, guard_of(plan).strain) == (math.inf, 0.01)
+
+
+# ---- commands
+
+
+def test_a_command_within_the_limits_is_not_refused(plan):
+    estimate = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40))
+    for command in (
+        STILL,
+        Control(db_x=1.0),
+        ASIDE,
+        Control(db_x=1.0, dg_y=-0.5, flip=True),
+        Control(db_x=-1.0),
+    ):
+        assert Guard.of(PHANTOM, plan).refusal(estimate, command) == ""
+
+
+@pytest.mark.parametrize(
+    ("limit", "reason", "back"),
+    [
+        ({"guide_force_n": 0.05}, r"guard: guide force 0\.\d+ N > 0\.05 N", Control(dg_y=-0.5)),
+        ({"needle_strain_percent": 0.01}, r"guard: needle strain 0\.\d{3} % > 0\.01 %", Control(dg_y=-0.5)),
+        ({"least_stretch": 0.99}, r"guard: tissue stretch 0\.\d{3} < 0\.990", Control(dg_y=-0.5)),
+        ({"past_target_mm": 0.1}, r"guard: tip \d\.\d\d mm past the target > 0\.1 mm", Control(db_x=-1.0)),
+    ],
+)
+def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, back):
+    """What counts is the state after the command, against the one before it."""
+    simulator = Simulator(PHANTOM, 1)
+    state = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
+    guard = guard_of(replace(plan, target=(20.0, 0.0, 0.0)), **limit)
+    estimate, worse = estimate_at(state), Control(db_x=1.0, dg_y=0.5)
+    assert re.fullmatch(reason, guard.refusal(estimate, worse))
+    assert guard.refusal(estimate, back) == ""
+    assert guard.refusal(estimate, STILL) == ""
+
+
+def test_the_reason_has_the_value_and_the_limit(plan):
+    estimate = estimate_at(in_tissue(Simulator(PHANTOM, 1), 49))
+    guard = guard_of(replace(plan, target=(18.0, 0.0, 0.0)))
+    tip = Simulator(PHANTOM, 1).step(estimate.state, Control(db_x=1.0)).tip[0]
+    assert (
+        guard.refusal(estimate, Control(db_x=1.0)) == f"guard: tip {tip - 18.0:.2f} mm past the target > 2 mm"
+    )
+
+
+def test_a_model_that_does_not_converge_is_no_prediction(plan, monkeypatch):
+    estimate = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40))
+    monkeypatch.setattr(State, "converged", property(lambda _: False))
+    assert Guard.of(PHANTOM, plan).refusal(estimate, ASIDE).startswith("guard: the model does not converge")
+
+
+def test_a_refusal_takes_one_step_of_the_model(plan, monkeypatch):
+    estimate, rows = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40)), []
+    carried_out = Simulator._carried_out
+    monkeypatch.setattr(
+        Simulator, "_carried_out", lambda *given: rows.append(len(given[2])) or carried_out(*given)
+    )
+    Guard.of(PHANTOM, plan).refusal(estimate, ASIDE)
+    assert rows == [1]
+
+
+# ---- in the loop
+
+
+def wild(begin_at, command):
+    """A controller that advances straight, and from a depth (mm) on gives one command."""
+
+    def decide(_task, _memory, estimate, _rng):
+        inside = estimate.state.tip[0] > begin_at
+        return Decision(command if inside else Control(db_x=1.0), "wild" if inside else "straight"), None
+
+    return Controller(
+        "wild", "goes wild in the tissue", decide=decide, arrived=lambda *_: False, predicts=True
+    )
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan, force):
+    scenario = PHANTOM.with_values(FAR)
+    tank = Tank(plan.roll, scenario=scenario)
+    aside = replace(plan, scenario=None, target=(30.0, 0.0, 0.0))
+    done = run(aside, tank.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=force)
+    assert done.outcome is Outcome.HELD
+    assert done.reason.startswith(("guard: needle strain", "guard: tissue stretch"))
+    held = [period for period in done.periods if period.decision.startswith("held: guard: ")]
+    assert {(period.action, period.command, period.applied) for period in held} == {
+        (Action.HOLD, STILL, STILL)
+    }
+    limit = PHANTOM.control.hold_limit_s
+    assert done.periods[-1].time - held[0].time == pytest.approx(limit, abs=0.05)
+    aside_s = [period for period in done.periods if period.decision == "wild"]
+    assert len(aside_s) >= 3
+    assert done.periods[-1].true_stretch >= 0.3
+
+
+def test_a_controller_that_does_not_stop_is_held_behind_the_target(plan):
+    short = replace(plan, target=(5.0, 0.0, 0.0))
+    done = run(short, Tank(plan.roll).rig(), controller=wild(100.0, STILL), force=True)
+    assert done.outcome is Outcome.HELD
+    assert "mm past the target > 2 mm" in done.reason
+    assert 5.0 < done.periods[-1].true_tip.x <= 7.2
+
+
+def test_a_hold_ends_with_a_command_that_the_guard_admits(plan):
+    """Refused four times, then back."""
+
+    def decide(_task, memory, estimate, _rng):
+        before, refused = memory or (-100.0, 0)
+        tip = float(estimate.state.tip[0])
+        refused += tip > 5.0 and abs(tip - before) < 0.5
+        return Decision(Control(db_x=-1.0 if refused == 4 else 1.0), "back" if refused == 4 else "on"), (
+            tip,
+            refused,
+        )
+
+    method = Controller(
+        "doubting", "goes on, then back", decide=decide, arrived=lambda _, memory, __: memory[1] == 4
+    )
+    done = run(replace(plan, target=(5.0, 0.0, 0.0)), Tank(plan.roll).rig(), controller=method, force=True)
+    back = next(period.index for period in done.periods if period.decision == "back")
+    actions = [period.action for period in done.periods[back - 5 : back + 1]]
+    assert actions == [Action.MOVE, *[Action.HOLD] * 4, Action.MOVE]
+
+
+@pytest.mark.parametrize("seed", [2000, 2001])
+def test_an_ordinary_insertion_is_not_held_by_it(plan, seed):
+    done = run(plan, Tank(plan.roll, seed).rig(), controller=DEFAULT)
+    assert done.outcome is Outcome.DONE
+    assert not any("guard" in period.decision for period in done.periods)
+    assert np.isfinite(done.true_error_mm)

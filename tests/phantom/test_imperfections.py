@@ -1,0 +1,253 @@
+"""Each key of `[phantom]` alone: the size of its effect."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flexneedle import Control
+from flexneedle.errors import CommandError
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.phantom.plants import PLANTS
+from flexneedle.types import PSI, THETA, Y, Z
+from reference.rods import IDEAL, planar
+from tanks import AHEAD, COARSE, PHANTOM, SKIN, STRAIGHT, TURN, alone, both_plants, driven, tank, tip
+
+
+def free(scenario=IDEAL):
+    """The same needle, held only by its clamp."""
+    return scenario.with_values({"setup.guide_to_skin_mm": None})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_initial_bend_is_the_deflection_of_the_free_tip(seed):
+    """0.5 mm over 150 mm, to the drawn side; it is mirrored when the bevel rolls."""
+    scenario = free().with_values({"phantom.initial_bend_mm": 0.5})
+    phantom = Phantom(draw(scenario, np.random.default_rng(seed)), 0.0)
+    off = tip(phantom)[1]
+    assert abs(off) == pytest.approx(0.5, rel=1e-4)
+    assert tip(driven(phantom, TURN))[1] == pytest.approx(-off)
+    assert tip(phantom)[THETA] == pytest.approx(-2.0 * off / 150.0, rel=5e-3)  # slope of an arc
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_the_tip_moves_by_the_run_out_when_the_bevel_rolls(kind, seed):
+    """0.2 mm, normal to the tip, at once; and back with the next roll."""
+    phantom = alone(seed, kind, run_out_mm=0.2)
+    here = tip(phantom)
+    there = tip(driven(phantom, TURN))
+    assert abs(there[1] - here[1]) == pytest.approx(0.2)
+    assert abs(here[1]) == pytest.approx(0.1)
+    np.testing.assert_allclose(tip(driven(phantom, TURN)), here, atol=1e-9)
+
+
+@both_plants
+def test_the_run_out_is_normal_to_the_needle(kind):
+    """A rotation of the base by 0.1 rad also rotates its direction."""
+    plain, off = (
+        driven(tank(free(), kind, run_out=run_out), Control(db_theta=5e-3), times=20)
+        for run_out in (0.0, 0.1)
+    )
+    expected = 0.1 * np.array([-math.sin(0.1), math.cos(0.1)])
+    np.testing.assert_allclose((tip(off) - tip(plain))[:2], expected, atol=1e-6)
+    assert tip(off)[THETA] == tip(plain)[THETA]
+
+
+def test_within_its_clearance_the_guide_does_not_move_the_needle():
+    """Beyond it the needle is 0.05 mm behind the guide, on both sides; a guide without clearance moves it at once."""
+    reach = tip(driven(tank(), Control(dg_y=0.1)))[1]
+    assert reach > 0.1
+    for side in (1.0, -1.0):
+        phantom = driven(alone(guide_clearance_mm=0.05), Control(dg_y=0.05 * side))
+        assert tip(phantom)[1] == 0.0
+        driven(phantom, Control(dg_y=0.1 * side))
+        assert tip(phantom)[1] == pytest.approx(side * reach, rel=1e-6)
+
+
+@pytest.mark.parametrize("friction", [5.0, 10.0])
+def test_the_friction_at_the_base_is_proportional_to_the_inserted_length(friction):
+    blunt = IDEAL.with_values({"needle.bevel.offset_mm": 0.0, "phantom.friction_mn_per_mm": friction})
+    phantom = driven(tank(blunt), STRAIGHT, times=SKIN + 19)
+    depth = tip(phantom)[0]
+    assert depth == pytest.approx(19.5)
+    assert phantom._plant.state["base_force"][0] == pytest.approx(1e-3 * friction * depth)
+
+
+def test_friction_increases_the_deflection_of_a_bent_needle():
+    """An axial force on a bent needle: twice the friction gives a larger deflection."""
+    tips = [
+        tip(driven(tank(IDEAL.with_values({"phantom.friction_mn_per_mm": friction})), AHEAD, times=40))[1]
+        for friction in (0.0, 5.0, 10.0)
+    ]
+    once, twice = tips[1] - tips[0], tips[2] - tips[0]
+    assert abs(once) > 1e-4
+    assert twice == pytest.approx(2.0 * once, rel=0.1)
+
+
+def test_layer_boundaries_are_at_their_drawn_depths():
+    """Displaced by 1.5 mm (sd) around 20 mm: the stiffness of the cells changes there, within one cell."""
+    steps = []
+    for seed in range(150):
+        phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
+        rod = phantom._plant.rod
+        k = rod.foundation
+        (jump,) = np.flatnonzero(np.diff(k))
+        assert k[jump + 1] / k[jump] == pytest.approx(3.63 / 1.82)
+        drawn = phantom._truth.scenario.layer_tops[1]
+        assert (jump + 1) * rod.cell == pytest.approx(drawn, abs=0.5 * rod.cell + 1e-9)
+        steps.append(drawn)
+    assert np.mean(steps) == pytest.approx(20.0, abs=4.0 * 1.5 / math.sqrt(150))
+    assert np.std(steps) == pytest.approx(1.5, rel=0.2)
+
+
+def test_stiffness_varies_along_the_depth_with_its_size_and_correlation():
+    """20 % (sd) with a correlation of 1/e over 10 mm in the cells along the needle; higher over 5 mm."""
+    for length in (10.0, 5.0):
+        cells = []
+        for seed in range(200):
+            rod = alone(
+                seed, shear_modulus_variation=0.2, variation_length_mm=length, element_mm=30.0
+            )._plant.rod
+            plain = np.where((np.arange(rod.law.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
+            cells.append(rod.foundation / plain)
+        factor = np.array(cells) / np.mean(cells)
+        assert factor.std() == pytest.approx(0.2, rel=0.08)
+        lag = round(10.0 / 0.25)
+        level = np.log(factor)
+        found = np.corrcoef(level[:, :-lag].ravel(), level[:, lag:].ravel())[0, 1]
+        assert found == pytest.approx(math.exp(-10.0 / length), abs=0.06)
+
+
+@both_plants
+def test_factors_of_tissue_and_bevel_equal_a_changed_scenario(kind):
+    """1.5 times the modulus of both layers and half the bevel, compared with a scenario with these values."""
+    phantom = alone(0, kind, shear_modulus_factor=[1.5, 1.5], bevel_factor=[0.5, 0.5])
+    values = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
+    spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
+    other = tank(IDEAL.with_values(values | spacing | {"needle.bevel.offset_mm": 2.0}), kind)
+    np.testing.assert_allclose(
+        tip(driven(phantom, AHEAD, times=35)), tip(driven(other, AHEAD, times=35)), atol=1e-9
+    )
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_start_offset_and_slope_move_the_clamp(kind, seed):
+    """The tip of a free needle moves by the offset, and by 150 mm times the slope."""
+    rng = np.random.default_rng(seed)
+    offset = draw(free().with_values({"phantom.start_offset_sd_mm": 0.5}), rng)
+    slope = draw(free().with_values({"phantom.start_angle_sd_mrad": 3.0}), rng)
+    np.testing.assert_allclose(planar(tip(Phantom(offset, 0.0, kind)))[1:], [offset.base_y, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        planar(tip(Phantom(slope, 0.0, kind)))[1:], [150.0 * slope.base_turn, slope.base_turn], rtol=1e-4
+    )
+    assert offset.base_y != 0.0 != slope.base_turn
+
+
+@pytest.mark.parametrize("kind", ["exact"])
+@pytest.mark.parametrize("angle", [0.5, -1.2])
+def test_a_bend_out_of_the_bevels_plane_rolls_with_the_needle(kind, angle):
+    """The free tip is 0.5 mm off in the direction of the bevel turned by the angle."""
+    tips = [tip(tank(free(), kind, roll=roll, bend=0.5, bend_angle=angle)) for roll in (0.0, math.pi)]
+    for at, sign in zip(tips, (1.0, -1.0), strict=True):
+        expected = sign * 0.5 * np.array([math.cos(angle), math.sin(angle)])
+        np.testing.assert_allclose(at[[Y, Z]], expected, rtol=1e-4)
+        np.testing.assert_allclose(at[[THETA, PSI]], 2.0 * expected / 150.0, rtol=5e-3)
+
+
+@both_plants
+def test_a_run_out_is_across_the_tilted_tip(kind):
+    """Along the bevel's direction of the tip, turned by its angle; in the plane exactly without z."""
+    pose = {"base_turn": 0.02, "base_psi": -0.03}
+    plain, off = (tank(free(), kind, run_out=size, run_out_angle=0.7, **pose) for size in (0.0, 0.1))
+    theta, psi = tip(off)[[THETA, PSI]]
+    frame = Rotation.from_rotvec([0.0, -psi, theta]) * Rotation.from_rotvec([0.7, 0.0, 0.0])
+    np.testing.assert_allclose((tip(off) - tip(plain))[:3], frame.apply([0.0, 0.1, 0.0]), atol=1e-12)
+    for roll in (0.0, math.pi):
+        assert tip(tank(IDEAL, kind, roll=roll, run_out=0.1))[Z] == 0.0
+
+
+@both_plants
+def test_a_clamp_out_of_the_plane_moves_the_free_tip_there(kind):
+    """By base z, and 150 mm times its slope ψ; also where the controller steers in the plane."""
+    here = tip(tank(free(), kind, base_z=0.4, base_psi=-0.002))
+    np.testing.assert_allclose(here[[Y, Z]], [0.0, 0.4 - 0.3], atol=1e-5)
+    np.testing.assert_allclose(here[[THETA, PSI]], [0.0, -0.002], atol=1e-9)
+
+
+def test_the_shaft_has_the_torsional_stiffness_of_steel():
+    """GJ = E/(2(1 + ν)) πd⁴/32 with ν = 0.3, of a needle of 0.82 mm."""
+    needle = IDEAL.needle
+    modulus = 1e3 * needle.youngs_modulus_gpa / 2.6
+    expected = modulus * math.pi * needle.outer_diameter**4 / 32.0
+    assert tank()._plant.rod.torsion == pytest.approx(expected, rel=1e-12)
+
+
+@both_plants
+def test_a_true_load_deflects_the_free_tip(kind):
+    """Pl³/3EI in both axes."""
+    load = np.array([2e-4, -3e-4])
+    here = tip(tank(free(), kind, load=tuple(load)))
+    expected = load * 150.0**3 / (3.0 * IDEAL.needle.bending_stiffness)
+    np.testing.assert_allclose(here[[Y, Z]], expected, rtol=1e-3)
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axial_start_error_moves_base_and_tip_and_keeps_the_stroke(kind, seed):
+    scenario = IDEAL.with_values({**COARSE, "phantom.start_axial_sd_mm": 3.0})
+    truth = draw(scenario, np.random.default_rng(seed))
+    error = scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
+    assert error != 0.0
+    phantom = Phantom(truth, 0.0, kind)
+    assert truth.scenario.start_base_x == pytest.approx(scenario.start_base_x + error)
+    np.testing.assert_allclose(
+        tip(phantom), [scenario.setup.start_tip_x + error, 0.0, 0.0, 0.0, 0.0], atol=1e-9
+    )
+    driven(phantom, STRAIGHT, times=110)
+    assert tip(phantom)[0] == pytest.approx(scenario.setup.max_depth + error, abs=0.5)  # except for its bend
+    assert phantom.condition().converged
+    with pytest.raises(CommandError):
+        driven(phantom, STRAIGHT)
+
+
+@both_plants
+def test_a_modulus_factor_of_the_needle_equals_a_changed_scenario(kind):
+    truth = draw(IDEAL.with_values({"phantom.youngs_modulus_variation": 0.3}), np.random.default_rng(0))
+    modulus = truth.scenario.needle.youngs_modulus_gpa
+    assert abs(modulus - 200.0) > 1.0
+    spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
+    other = tank(IDEAL.with_values({**spacing, "needle.youngs_modulus_gpa": modulus}), kind)
+    found = tip(driven(Phantom(truth, 0.0, kind), AHEAD, times=40))
+    np.testing.assert_allclose(found, tip(driven(other, AHEAD, times=40)), atol=1e-9)
+    assert found[1] != tip(driven(tank(kind=kind), AHEAD, times=40))[1]
+
+
+def rough_truth(**changes):
+    """A drawn phantom with all default imperfections except motors, and these changes."""
+    scenario = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0, **changes})
+    return draw(scenario, np.random.default_rng(11))
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "initial_bend_mm",
+        "guide_clearance_mm",
+        "friction_mn_per_mm",
+        "shear_modulus_variation",
+        "layer_shift_sd_mm",
+        "run_out_mm",
+    ],
+)
+def test_the_model_plant_lacks_its_documented_imperfections_and_the_exact_one_has_all(key):
+    only_exact = {"initial_bend_mm", "guide_clearance_mm", "friction_mn_per_mm", "shear_modulus_variation"}
+    for kind in PLANTS:
+        ends = [
+            tip(driven(Phantom(rough_truth(**{f"phantom.{key}": value}), 0.0, kind), AHEAD, times=55))[1]
+            for value in (0.0, getattr(PHANTOM.phantom, key))
+        ]
+        assert (ends[0] == ends[1]) == (kind == "model" and key in only_exact)

@@ -1,0 +1,102 @@
+"""The kernels are compiled ahead of their first call, and never later."""
+
+import subprocess
+import sys
+
+import pytest
+from numba.core import config
+
+from flexneedle.phantom import kernels
+from flexneedle.phantom.kernels import all_compiled, compile_kernels
+
+EVERYTHING = """
+import sys
+
+import flexneedle
+from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.mechanics import insertion, shape
+from flexneedle.phantom import equilibrium
+from flexneedle.phantom.plants import PLANTS
+from flexneedle.phantom.kernels import all_compiled, compile_kernels
+
+def signatures():
+    parts = {"insertion": insertion, "shape": shape, "equilibrium": equilibrium}
+    found = {f"{part}.{name}": value for part, module in parts.items() for name, value in vars(module).items()}
+    return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
+
+preset, axes = sys.argv[1], int(sys.argv[2])
+compile_kernels(axes)
+before = signatures()
+assert all_compiled(axes)
+entries = "insertion._settle", "insertion._rollout", "insertion.energies", "shape.equal_arc_nodes", "equilibrium.step"
+assert all(before[name] == 1 for name in entries), before
+quick = {"samples": 16, "iterations": 2}
+scenario = flexneedle.load_scenario(preset).with_values({
+    **{f"plan.{key}": value for key, value in quick.items()},
+    **{f"control.ce_mpc.{key}": value for key, value in quick.items()},
+    "control.ce_mpc.horizon": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0, "target.lateral_mm": 0.5,
+})
+plans = [flexneedle.plan(scenario, strategy=strategy) for strategy in ("manipulation", "steering")]
+for name in CONTROLLERS:
+    for kind in PLANTS:
+        flexneedle.insert(scenario, plans[0], controller=name, phantom=kind, force=True)
+assert signatures() == before, (signatures(), before)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("preset", "axes"), [("phantom", 1), ("phantom3d", 2)])
+def test_plans_and_insertions_compile_no_further_kernel(preset, axes):
+    command = [sys.executable, "-c", EVERYTHING, preset, str(axes)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of its own."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.usefixtures("cache")
+def test_kernels_of_the_plane_are_not_those_of_space():
+    assert not all_compiled(1)
+    compile_kernels(1)
+    assert all_compiled(1)
+    assert not all_compiled(2)
+
+
+def test_those_of_other_sources_are_not_these(cache, monkeypatch):
+    compile_kernels(1)
+    monkeypatch.setattr(kernels, "cache_folder", lambda home: str(cache / home.name))
+    assert not all_compiled(1)
+
+
+def test_one_process_compiles_at_a_time(cache, monkeypatch):
+    held = []
+
+    def simulator(_scenario, threads):
+        held.append((threads, locked(cache)))
+        return Compiled()
+
+    monkeypatch.setattr(kernels, "load_scenario", lambda _name: None)
+    monkeypatch.setattr(kernels, "Simulator", simulator)
+    monkeypatch.setattr(kernels, "PLANTS", ())
+    compile_kernels(2)
+    assert held == [(1, True)]
+    assert not locked(cache)
+
+
+class Compiled:
+    """A simulator whose kernels are compiled."""
+
+    def compile(self):
+        """Do nothing."""
+
+
+def locked(cache):
+    """Whether another process cannot take the lock."""
+    (path,) = cache.rglob("lock")
+    command = f"import fcntl; fcntl.flock(open({str(path)!r}), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+    return subprocess.run([sys.executable, "-c", command], capture_output=True, check=False).returncode != 0

@@ -1,0 +1,138 @@
+"""Structural mismatch: the effects of `[phantom.structure]` on the true phantom, and no others."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle import Control, load_scenario
+from flexneedle.errors import ScenarioError
+from flexneedle.phantom.draw import draw
+from flexneedle.phantom.phantom import Phantom
+from flexneedle.phantom.plants import PLANTS
+from reference.rods import IDEAL
+
+PHANTOM = load_scenario("phantom")
+COARSE = {"phantom.element_mm": 2.0, "phantom.contact_spacing_mm": 1.0}
+
+
+def structured(scenario=PHANTOM, **values):
+    return scenario.with_values({f"phantom.structure.{key}": value for key, value in values.items()})
+
+
+def truth_of(scenario, seed=0):
+    return draw(scenario, np.random.default_rng(seed))
+
+
+def modulus_at(scenario, depth):
+    return scenario.tissue[np.searchsorted(scenario.layer_tops, depth, side="right") - 1].shear_modulus_kpa
+
+
+HIDDEN = {"top_mm": 18.0, "thickness_mm": 4.0, "modulus_factor": 5.0}
+KINDS = [
+    ({"alpha": 3.5}, {"tissue.0.alpha": 3.5, "tissue.1.alpha": 3.5}),
+    (
+        {"compression_length_factor": 0.7},
+        {f"tissue.{k}.compression_length_mm": pytest.approx(14.0) for k in (0, 1)},
+    ),
+    ({"bevel_length_factor": 2.0}, {"needle.bevel.length_mm": 6.0}),
+    ({"guide_shift_mm": 3.0}, {"setup.guide_to_skin_mm": 38.0}),
+    ({"guide_shift_mm": -2.5}, {"setup.guide_to_skin_mm": 43.5}),
+]
+
+
+@pytest.mark.parametrize(("structure", "expected"), KINDS)
+def test_a_structural_change_does_not_change_other_draws(structure, expected):
+    for seed in range(3):
+        plain, changed = truth_of(PHANTOM, seed), truth_of(structured(**structure), seed)
+        before, after = plain.scenario.flat(), changed.scenario.flat()
+        assert {key: value for key, value in after.items() if before[key] != value} == expected
+        assert changed.variation == plain.variation
+
+
+@given(
+    top=st.floats(0.0, 60.0),
+    thickness=st.floats(0.01, 30.0),
+    factor=st.floats(0.1, 10.0),
+    seed=st.integers(0, 50),
+)
+@hypothesis_settings(max_examples=60)
+def test_a_hidden_layer_multiplies_the_modulus_inside_and_nowhere_else(top, thickness, factor, seed):
+    hidden = {"top_mm": top, "thickness_mm": thickness, "modulus_factor": factor}
+    plain = truth_of(PHANTOM, seed).scenario
+    found = truth_of(structured(hidden_layer=hidden), seed).scenario
+    edges = np.array([top, top + thickness, *plain.layer_tops])
+    for depth in np.linspace(0.05, 80.0, 200):
+        if np.abs(edges - depth).min() > 2e-3:
+            expected = modulus_at(plain, depth) * (factor if top < depth < top + thickness else 1.0)
+            assert modulus_at(found, depth) == pytest.approx(expected)
+    assert np.abs(np.subtract.outer(found.layer_tops, plain.layer_tops)).min(axis=0).max() < 1e-9
+
+
+def test_a_hidden_layer_across_a_boundary_is_stiffer_on_both_sides():
+    truth = truth_of(structured(IDEAL, hidden_layer=HIDDEN)).scenario
+    assert truth.layer_tops == pytest.approx((0.0, 18.0, 20.0, 22.0))
+    assert [layer.shear_modulus_kpa for layer in truth.tissue] == [1.82, 5 * 1.82, 5 * 3.63, 3.63]
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+@pytest.mark.parametrize("structure", [structure for structure, _ in KINDS] + [{"hidden_layer": HIDDEN}])
+def test_each_structural_change_moves_the_tip_of_both_plants(kind, structure):
+    ends = []
+    for scenario in (IDEAL, structured(IDEAL, **structure)):
+        phantom = Phantom(truth_of(scenario.with_values(COARSE)), 0.0, kind)
+        for _ in range(60):
+            phantom.apply(Control(db_x=1.0, dg_y=0.05), 0.2)
+        assert phantom.condition().converged
+        ends.append(phantom.condition().tip[1])
+    assert abs(ends[0] - ends[1]) > 1e-3
+
+
+def test_shorter_compression_lengths_bound_the_bevel_that_is_drawn():
+    """b < 0.7 h of the phantom: with h = 7 mm at most 4.9 mm, in a range up to 6 mm."""
+    scenario = structured(compression_length_factor=0.35)
+    offsets = [truth_of(scenario, seed).scenario.needle.bevel.offset_mm for seed in range(100)]
+    assert 4.7 < max(offsets) < 4.9
+
+
+def test_the_start_error_is_at_most_half_of_the_distance_to_the_shifted_guide():
+    scenario = structured(guide_shift_mm=11.5).with_values({"phantom.start_axial_sd_mm": 50.0})
+    gaps = [truth_of(scenario, seed).scenario.setup.tip_to_skin_mm for seed in range(30)]
+    assert max(gaps) == pytest.approx(28.5 + 0.5)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"guide_shift_mm": 12.5},
+            "phantom.structure.guide_shift_mm = 12.5: must be between -27.5 and 12.5: guide behind the tip, "
+            "and before the base at full stroke",
+        ),
+        (
+            {"guide_shift_mm": -27.5},
+            "phantom.structure.guide_shift_mm = -27.5: must be between -27.5 and 12.5",
+        ),
+        (
+            {"bevel_length_factor": 50.0},
+            "phantom.structure.bevel_length_factor = 50.0: makes the bevel 150 mm long: must be below "
+            "needle.length_mm (150)",
+        ),
+        ({"alpha": 0.0}, "phantom.structure.alpha = 0.0: must not be 0"),
+        ({"hidden_layer": {"top_mm": 3.0}}, "phantom.structure.hidden_layer.thickness_mm: missing"),
+        (
+            {"compression_factor": 2.0},
+            "phantom.structure.compression_factor = 2.0: unknown key; did you mean",
+        ),
+    ],
+)
+def test_an_invalid_structure_is_rejected(values, message):
+    with pytest.raises(ScenarioError) as caught:
+        structured(**values)
+    assert caught.value.problems[0].startswith(message)
+
+
+def test_a_shift_needs_a_guide():
+    with pytest.raises(ScenarioError, match=r"guide_shift_mm = 1\.0: there is no guide"):
+        structured(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), guide_shift_mm=1.0)

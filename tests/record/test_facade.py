@@ -1,0 +1,239 @@
+"""The Python interface: figures, tables and run folders, the same as those of the commands."""
+
+import builtins
+import json
+from dataclasses import fields, replace
+from io import StringIO
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+import flexneedle
+from flexneedle.cli import main as cli
+from flexneedle.errors import InputError, RunError
+from flexneedle.figures.insertion import insertion_figure
+from flexneedle.figures.plans import plan_figure
+from flexneedle.record.columns import COLUMNS
+from flexneedle.record.figures import draw_run
+from flexneedle.record.folder import TRACE_FILE
+from flexneedle.record.results import insertion_result
+from synthetic import blind, make_insertion, make_plan
+
+PHANTOM = flexneedle.load_scenario("phantom")
+PLAN = replace(make_plan(), scenario=PHANTOM)
+INSERTION = replace(make_insertion(PLAN), scenario=PHANTOM, controller="ce-mpc", phantom="exact")
+
+TARGET = ("--target", "15", "2")
+SHALLOW = PHANTOM.with_values({"target.depth_mm": 15.0, "target.lateral_mm": 2.0})
+
+
+@pytest.fixture(scope="module")
+def executed():
+    """A real plan to `TARGET`, and its insertion."""
+    plan = flexneedle.plan(SHALLOW, seed=0)
+    return plan, flexneedle.insert(SHALLOW, plan, seed=3)
+
+
+def same(one, other):
+    """Whether two records agree, except for wall-clock times."""
+    for field in fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if field.name in ("durations", "seconds"):
+            continue
+        if field.name in ("shape", "true_shape"):  # in a trace lengths are in m, angles are quaternions
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+        elif field.name == "predicted" and a is not None:
+            for mine, theirs in zip(a, b, strict=True):
+                np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12)
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+        elif field.name == "periods":
+            assert len(a) == len(b)
+            all(same(mine, theirs) for mine, theirs in zip(a, b, strict=True))
+        elif field.name == "plan":
+            same(a, b)
+        elif field.name == "history":
+            np.testing.assert_equal([dict(each) for each in a], [dict(each) for each in b])
+        else:
+            np.testing.assert_equal(a, b, err_msg=field.name)
+    return True
+
+
+def drawn(figure, path):
+    """The picture of a figure as bytes."""
+    figure.savefig(path, format="png", metadata={"Software": None})
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        (PLAN, lambda: plan_figure(PHANTOM, [PLAN])),
+        (INSERTION, lambda: insertion_figure(PHANTOM, INSERTION)),
+        (replace(INSERTION, scenario=None), lambda: insertion_figure(PHANTOM, INSERTION)),
+        (replace(INSERTION, periods=()), lambda: plan_figure(PHANTOM, [PLAN])),
+    ],
+    ids=["plan", "insertion", "its plan's scenario", "no period"],
+)
+def test_plot_returns_the_figure_that_the_commands_draw(record, expected, tmp_path):
+    figure = flexneedle.plot(record)
+    assert isinstance(figure, Figure)
+    assert drawn(figure, tmp_path / "a.png") == drawn(expected(), tmp_path / "b.png")
+
+
+def test_plot_rejects_other_types():
+    with pytest.raises(
+        InputError, match="record = 3: must be a Plan or an Insertion; make one with flexneedle"
+    ):
+        flexneedle.plot(3)
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, capsys):
+    half = replace(INSERTION, periods=(*INSERTION.periods[:-1], blind(INSERTION.periods[-1])))
+    flexneedle.save(half, tmp_path / "run")
+    assert cli.main(["export", str(tmp_path / "run"), "--csv", str(tmp_path / "periods.csv")]) == 0
+    capsys.readouterr()
+    frame = flexneedle.to_dataframe(half)
+    assert tuple(frame.columns) == COLUMNS
+    assert len(frame) == len(half.periods)
+    texts = {"verdict": str, "action": str, "decision": str, "warning": str}
+    missing = {name: ["", "nan"] for name in COLUMNS if name not in texts}
+    exported = pd.read_csv(tmp_path / "periods.csv", dtype=texts, keep_default_na=False, na_values=missing)
+    pd.testing.assert_frame_equal(frame, exported, check_dtype=False, check_exact=True)
+    assert np.isnan(frame["true_x_mm"].iloc[-1])
+    assert frame["true_x_mm"].dtype == frame["measured_z_mm"].dtype == float
+    assert frame["converged"].dtype == bool
+
+
+def test_each_record_of_a_dry_run_is_marked_as_one(tmp_path, capsys):
+    dry, folder = replace(INSERTION, phantom="", rig="Bench", dry_run=True), tmp_path / "run"
+    assert dry.summary == f"dry run: {INSERTION.summary}"
+    flexneedle.save(dry, folder)
+    stored = json.loads((folder / "run.json").read_text())
+    assert (stored["dry_run"], stored["result"]["dry_run"]) == (True, True)
+    loaded = flexneedle.load(folder)
+    assert loaded.dry_run
+    assert dry.summary in {text.get_text() for text in flexneedle.plot(loaded).findobj(Text)}
+    assert cli.main(["export", str(folder), "--csv", "-"]) == 0
+    table = pd.read_csv(StringIO(capsys.readouterr().out))
+    assert table["dry_run"].all()
+    pd.testing.assert_series_equal(flexneedle.to_dataframe(loaded)["dry_run"], table["dry_run"])
+
+
+def test_an_insertion_that_moved_a_needle_has_no_mark_of_a_dry_run():
+    assert "dry_run" not in flexneedle.to_dataframe(INSERTION)
+    assert insertion_result(INSERTION)["dry_run"] is False
+
+
+def test_a_dataframe_without_periods_has_the_columns():
+    assert tuple(flexneedle.to_dataframe(replace(INSERTION, periods=())).columns) == COLUMNS
+
+
+def test_without_pandas_the_error_names_the_remedy(monkeypatch):
+    imported = builtins.__import__
+
+    def failing_import(name, *more, **options):
+        if name == "pandas":
+            raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
+        return imported(name, *more, **options)
+
+    monkeypatch.setattr(builtins, "__import__", failing_import)
+    with pytest.raises(InputError) as caught:
+        flexneedle.to_dataframe(INSERTION)
+    assert str(caught.value) == "to_dataframe needs pandas, which is not installed: pip install pandas"
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_saved_record_loads_unchanged(executed, tmp_path):
+    """The loaded scenario of the plan includes the settings of the controllers."""
+    plan = replace(executed[0], scenario=executed[1].scenario)
+    insertion = replace(executed[1], plan=plan)
+    assert same(flexneedle.load(flexneedle.save(insertion, tmp_path / "insertion")), insertion)
+    assert same(flexneedle.load(str(flexneedle.save(executed[0], str(tmp_path / "plan")))), plan)
+
+
+@pytest.mark.long
+def test_save_writes_the_same_folder_as_the_command(executed, tmp_path, monkeypatch, capsys):
+    """The same seeds give the same files, except for wall-clock times."""
+    plan, insertion = executed
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["insert", *TARGET, "--seed", "3", "--plan-seed", "0", "--out", "insert"]) == 0
+    assert cli.main(["plan", *TARGET, "--out", "plan"]) == 0
+    capsys.readouterr()
+    for command, record in (("insert", insertion), ("plan", plan)):
+        ours, theirs = flexneedle.save(record, f"our-{command}"), tmp_path / command
+        assert sorted(p.name for p in ours.iterdir()) == sorted(p.name for p in theirs.iterdir())
+        mine, other = (json.loads((folder / "run.json").read_text()) for folder in (ours, theirs))
+        assert mine.pop("timing").keys() == other.pop("timing").keys()
+        assert json.dumps(mine) == json.dumps(other)
+        for picture in ours.glob("*.png"):
+            assert picture.read_bytes() == (theirs / picture.name).read_bytes()
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_folder_of_both_strategies_loads_as_plans_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["plan", "--target", "10", "0.2", "--strategy", "both", "--out", "both"])
+    capsys.readouterr()
+    plans = flexneedle.load("both")
+    assert list(plans) == ["manipulation", "steering"]
+    assert all(plan.strategy == name and plan.scenario is not None for name, plan in plans.items())
+
+
+def test_a_record_without_a_scenario_is_rejected_with_the_remedy(tmp_path):
+    bare = replace(PLAN, scenario=None)
+    for use in (flexneedle.plot, lambda record: flexneedle.save(record, tmp_path / "a")):
+        with pytest.raises(
+            InputError, match=r"give one with dataclasses\.replace\(record, scenario=scenario\)$"
+        ):
+            use(bare)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "use",
+    [flexneedle.to_dataframe, lambda record: flexneedle.save(record, "a"), flexneedle.plot],
+    ids=["to_dataframe", "save", "plot"],
+)
+def test_another_type_is_rejected_in_one_line(use, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        use([1, 2])
+    assert str(caught.value).partition(": must be a")[0] in ("record = [1, 2]", "insertion = [1, 2]")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_folder_without_a_run_is_rejected(tmp_path):
+    with pytest.raises(InputError, match=r"contains no run: run\.json is missing"):
+        flexneedle.load(tmp_path)
+    with pytest.raises(InputError, match="already contains a run"):
+        flexneedle.save(PLAN, flexneedle.save(PLAN, tmp_path / "a"))
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_run_without_a_plan_is_rejected(tmp_path):
+    path = flexneedle.save(PLAN, tmp_path / "a") / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"plans": {}}))
+    with pytest.raises(RunError, match="the run ended before planning finished"):
+        flexneedle.load(tmp_path / "a")
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
+    trace = flexneedle.save(INSERTION, tmp_path / "a") / "trace.mcap"
+    trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
+    with pytest.warns(RuntimeWarning, match="incomplete: .* complete periods read"):
+        torn = flexneedle.load(tmp_path / "a")
+    assert 0 < len(torn.periods) < len(INSERTION.periods)
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
+    folder = flexneedle.save(INSERTION, tmp_path / "run")
+    (folder / TRACE_FILE).unlink()
+    assert [path.name for path in draw_run(folder)] == ["plan.png", "plan.svg"]

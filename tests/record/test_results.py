@@ -1,0 +1,164 @@
+"""One-line summaries, results, and the entry angle."""
+
+from dataclasses import replace
+from math import atan, nan
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.record.results import insertion_result, insertion_row, insertion_timing
+from flexneedle.types import UNKNOWN, Insertion, Outcome, Shape
+from synthetic import blind, make_insertion, make_plan
+from synthetic_space import in_space
+
+PLAN = make_plan()
+
+
+def straight(slope, start=-3.5):
+    """A plan with a straight tip path and a slope that grows with depth."""
+    depth = start + np.arange(8.0)
+    still = np.zeros_like(depth)
+    return replace(PLAN, tips=np.column_stack([depth, slope * depth, still, slope + 0.01 * depth, still]))
+
+
+def test_the_entry_angle_is_that_at_the_skin():
+    assert straight(atan(0.2)).entry_angle == pytest.approx(atan(0.2), abs=1e-12)
+    assert straight(-0.1, start=-7.0).entry_angle == pytest.approx(-0.1, abs=1e-12)
+    assert straight(-0.1, start=0.0).entry_angle == pytest.approx(-0.1, abs=1e-12)
+
+
+def test_a_tip_outside_the_skin_has_no_entry_angle():
+    assert np.isnan(straight(0.1, start=-20.0).entry_angle)
+
+
+def test_a_plan_that_misses_names_distance_and_limit():
+    missing = replace(PLAN, target=(40.0, 8.0, 0.0), limit="setup.stroke_mm = 60")
+    assert missing.summary == (
+        "MISSES the target: best distance 2.990 mm, more than 1 mm, limited by setup.stroke_mm = 60"
+    )
+    assert PLAN.summary == "reaches the target to 0.010 mm"
+
+
+def test_the_summary_of_an_insertion_is_one_line():
+    assert make_insertion().summary == "reached: the tip ended 0.070 mm from the target"
+    assert (
+        make_insertion(miss=1.0).summary == "MISSED: the tip ended 1.010 mm from the target, more than 1 mm"
+    )
+    assert (
+        make_insertion(outcome="held", reason="no sample", periods=3).summary
+        == "held after 3 periods: no sample"
+    )
+    unknown_tip = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
+    assert unknown_tip.summary == "done: neither the true tip nor a reading of it is known"
+
+
+def test_missing_values_are_null():
+    unknown_tip = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
+    result = insertion_result(unknown_tip)
+    unknown = {name for name, value in result.items() if value is None}
+    errors = {"true_error_mm", "residual_mm"}
+    parts = {"phantom", "rig", "disturbed", "tip_true_mm", "tip_measured_mm", "strain_energy_mj", "warning"}
+    assert unknown == parts | errors
+    assert result["reached"] is False
+    empty = Insertion(PLAN, 0, (), Outcome("failed"), "")
+    assert insertion_result(empty)["steps"] == 0
+    assert insertion_timing(empty)["period_ms"] == {"p50": None, "p99": None, "max": None}
+
+
+def test_the_result_has_the_names_of_controller_and_phantom():
+    result = insertion_result(replace(make_insertion(), controller="ce-mpc", phantom="model"))
+    assert (result["controller"], result["phantom"]) == ("ce-mpc", "model")
+
+
+def test_one_unconverged_period_is_not_hidden():
+    insertion = make_insertion()
+    assert insertion_result(insertion)["converged"] is True
+    periods = (replace(insertion.periods[0], converged=False, cost=nan), *insertion.periods[1:])
+    assert insertion_result(replace(insertion, periods=periods))["converged"] is False
+
+
+# ---- deviations from the predictions, in standard deviations
+
+SPACE = flexneedle.load_scenario("phantom3d")
+MISS, MISS_SD, SHAPE_SD = (0.3, -0.2), 0.1, (0.2, 0.05)
+
+
+def predicting(insertion, miss=MISS, off=(0.4, 0.1)):
+    """The insertion with these predictions of tip and shape, off the final true needle, from half of the depth on."""
+    true = insertion.periods[-1].true_shape
+    nodes = np.column_stack([true, np.zeros((len(true), 2))]) - [0.0, *off, 0.0, 0.0]
+    shape = Shape(nodes, np.tile(SHAPE_SD, (len(true), 1)))
+    deep = 0.5 * insertion.target[0]
+    periods = tuple(
+        replace(period, miss=miss, miss_sd=MISS_SD if miss == MISS else np.nan, predicted=shape)
+        if period.estimate.x >= deep
+        else replace(period, miss=UNKNOWN, predicted=None)
+        for period in insertion.periods
+    )
+    return replace(insertion, periods=periods)
+
+
+def sds(insertion, fraction="half"):
+    row = insertion_row(insertion)
+    names = [f"predicted_{fraction}_{part}_{axis}_sds" for part in ("tip", "middle") for axis in "yz"]
+    return [row[name] for name in names]
+
+
+@pytest.fixture(scope="module")
+def in_any_direction():
+    """An insertion in space, with its true needle."""
+    turned = in_space(make_insertion(miss=1.0), 0.7)
+    shape = turned.periods[-1].shape[:, :3]
+    last = replace(turned.periods[-1], true_shape=shape)
+    return replace(turned, periods=(*turned.periods[:-1], last), scenario=SPACE)
+
+
+def test_the_tip_is_compared_with_the_predicted_miss_and_the_middle_with_the_shape(in_any_direction):
+    insertion = predicting(in_any_direction)
+    true, target = insertion.periods[-1].true_tip, insertion.target
+    tip = [(true[k] - target[k] - MISS[k - 1]) / MISS_SD for k in (1, 2)]
+    assert sds(insertion) == pytest.approx([*tip, 0.4 / SHAPE_SD[0], 0.1 / SHAPE_SD[1]], rel=1e-9)
+    assert sds(insertion, "quarter") == sds(insertion)  # the first prediction after it
+    assert sds(insertion, "three_quarters") == sds(insertion)
+    row = insertion_row(insertion)
+    assert (row["predicted_half_y_mm"], row["predicted_half_z_mm"]) == MISS
+    assert row["predicted_half_sd_mm"] == MISS_SD
+    assert (row["tip_y_mm"], row["tip_z_mm"]) == (true.y, true.z)
+
+
+def test_the_middle_is_that_of_the_inserted_part(in_any_direction):
+    """A shape that is predicted too low in the second half of the depth does not change it."""
+    insertion = predicting(in_any_direction)
+    nodes, sd = insertion.periods[-1].predicted
+    lower = np.where(nodes[:, :1] > 0.6 * insertion.target[0], nodes - [0.0, 5.0, 5.0, 0.0, 0.0], nodes)
+    beyond = Shape(lower, sd)
+    changed = replace(insertion, periods=tuple(replace(p, predicted=beyond) for p in insertion.periods))
+    assert sds(changed)[2:] == pytest.approx(sds(insertion)[2:], rel=1e-12)
+
+
+def test_without_a_predicted_miss_the_tip_is_that_of_the_shape(in_any_direction):
+    insertion = predicting(in_any_direction, miss=UNKNOWN)
+    last = insertion.periods[-1]
+    off = [last.true_tip[k] - last.predicted.nodes[-1, k] for k in (1, 2)]
+    assert sds(insertion)[:2] == pytest.approx([off[0] / SHAPE_SD[0], off[1] / SHAPE_SD[1]], rel=1e-9)
+
+
+def test_out_of_the_plane_nothing_is_compared():
+    insertion = replace(make_insertion(), scenario=flexneedle.load_scenario("phantom"))
+    assert [value is None for value in sds(predicting(insertion))] == [False, True, False, True]
+
+
+def test_an_insertion_that_was_held_or_predicts_nothing_is_not_compared(in_any_direction):
+    held = replace(predicting(in_any_direction), outcome=Outcome.HELD)
+    silent = tuple(replace(p, miss=UNKNOWN, predicted=None) for p in in_any_direction.periods)
+    for insertion in (held, replace(in_any_direction, periods=silent), replace(held, periods=())):
+        assert sds(insertion) == [None] * 4
+
+
+def test_tips_in_space_have_three_coordinates(in_any_direction):
+    result = insertion_result(in_any_direction)
+    true, target = in_any_direction.periods[-1].true_tip, in_any_direction.target
+    assert result["tip_true_mm"] == [true.x, true.y, true.z]
+    assert result["target_mm"] == list(target)
+    assert len(result["tip_measured_mm"]) == 3

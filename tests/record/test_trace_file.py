@@ -1,0 +1,342 @@
+"""`trace.mcap`: periods are restored exactly, by this package and by others, also after a kill."""
+
+import signal
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from flexneedle.errors import InputError
+from flexneedle.record.columns import COLUMNS, from_row, to_row, verdict_of
+from flexneedle.record.messages import joints
+from flexneedle.record.reader import read_trace
+from flexneedle.record.topics import TOPICS
+from flexneedle.record.writer import TraceWriter
+from flexneedle.types import (
+    CheckedMeasurement,
+    Control,
+    Frame,
+    Measurement,
+    Pose,
+    SensorReading,
+    Shape,
+    Verdict,
+    VerdictKind,
+)
+from synthetic import blind, make_periods, make_plan
+
+PLAN = make_plan()
+OFF = np.array([0.0, 0.1, -0.2, 0.01, -0.02])
+PERIODS = [
+    replace(period, predicted=Shape(period.shape + OFF, period.shape[:, 1:3] ** 2))
+    for period in list(make_periods(PLAN))[:12]
+]
+ABOUT = {"seed": "0", "flexneedle": "0.1.0"}
+SCENARIO = {"name": "Größe", "target": {"depth_mm": 40.0}}
+
+WRITE_AND_DIE = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from synthetic import make_periods, make_plan
+from flexneedle.record.writer import TraceWriter
+
+plan = make_plan()
+writer = TraceWriter(Path(sys.argv[1]), plan, about={"seed": "0"}, scenario={})
+for period in list(make_periods(plan))[:12]:
+    writer.add(period)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def write(path, periods=PERIODS):
+    with TraceWriter(path, PLAN, about=ABOUT, scenario=SCENARIO) as writer:
+        for period in periods:
+            writer.add(period)
+    return path
+
+
+def messages(path):
+    """Return all messages except the wall-clock ones, read with mcap."""
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(log_time_order=False)
+        return [(c.topic, m.log_time, m.data) for _, c, m in found if c.topic != "/timing"]
+
+
+def until_the_end(records):
+    """Yield the records before the truncated end of the file."""
+    try:
+        yield from records
+    except EndOfFile:
+        return
+    pytest.fail("the file ends like a complete one")
+
+
+@pytest.fixture(scope="module")
+def trace_file(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("trace") / "trace.mcap")
+
+
+@pytest.fixture(scope="module")
+def killed_file(tmp_path_factory):
+    """The trace of a process that was killed (SIGKILL) after its 12th period."""
+    path = tmp_path_factory.mktemp("killed") / "trace.mcap"
+    script = [sys.executable, "-c", WRITE_AND_DIE, str(path), str(Path(__file__).parents[1])]
+    assert subprocess.run(script, check=False).returncode == -signal.SIGKILL
+    return path
+
+
+def test_periods_are_restored_to_the_last_bit_of_every_scalar(trace_file):
+    trace = read_trace(trace_file)
+    assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
+    assert [p.durations for p in trace.periods] == [p.durations for p in PERIODS]
+    assert (trace.about, trace.scenario, trace.note) == (ABOUT, SCENARIO, "")
+
+
+def test_shapes_are_restored(trace_file):
+    for again, period in zip(read_trace(trace_file).periods, PERIODS, strict=True):
+        np.testing.assert_allclose(again.shape, period.shape, rtol=1e-14, atol=1e-14)
+        for found, known in zip(again.predicted, period.predicted, strict=True):
+            np.testing.assert_allclose(found, known, rtol=1e-14, atol=1e-13)
+
+
+def test_what_was_not_predicted_is_not_that_of_the_period_before(tmp_path):
+    blank = replace(PERIODS[4], predicted=None)
+    first, second = read_trace(write(tmp_path / "trace.mcap", [PERIODS[3], blank])).periods
+    assert first.predicted is not None
+    assert second.predicted is None
+
+
+def test_a_period_in_space_is_restored(tmp_path):
+    """Every column out of the plane, a roll to any angle and a spin; to the last bit."""
+    out = {
+        "command": Control(1.0, 0.1, -0.2, 1e-3, -2e-3, 0.3, -0.4, 0.5, -0.6),
+        "applied": Control(0.9, 0.2, -0.3, 2e-3, -3e-3, 0.4, -0.5, 0.6, -0.7),
+        "innovation": (1 / 3, 0.1, -0.2), "estimate": Pose(30.0, 1.0, -1 / 3, 0.1, -0.2), "guide": (0.3, -1 / 7),
+        "base": Pose(-120.0, 0.2, -0.3, 1e-3, -1 / 3), "path": Pose(30.0, 1.1, -0.4, 0.1, -0.3), "roll": 7.0,
+        "tip_load": (0.01, -0.02), "true_tip": Pose(30.1, 1.2, -0.5, 0.2, -0.3), "miss": (0.5, -1 / 7),
+        "shape": PERIODS[3].shape + OFF, "true_shape": (PERIODS[3].shape + OFF)[:, :3],
+    }  # fmt: skip
+    period = replace(PERIODS[3], **out)
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    for name, value in out.items():
+        if name.endswith("shape"):
+            np.testing.assert_allclose(getattr(again, name), value, rtol=1e-13, atol=1e-13)
+        else:
+            assert getattr(again, name) == value, name
+
+
+def test_a_period_does_not_have_the_shapes_of_the_previous_one(tmp_path):
+    shape = PERIODS[3].shape
+    with_shapes = replace(PERIODS[3], predicted=Shape(shape, shape[:, 1:3]), true_shape=shape[:, :3])
+    without = replace(PERIODS[4], predicted=None, true_shape=None)
+    first, second = read_trace(write(tmp_path / "trace.mcap", [with_shapes, without])).periods
+    assert first.predicted is not None
+    assert first.true_shape.shape == (len(shape), 3)
+    assert (second.predicted, second.true_shape) == (None, None)
+
+
+def test_a_period_without_a_tip_is_restored(tmp_path):
+    period = blind(PERIODS[3])
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    assert to_row(again) == to_row(period)
+    assert (again.measurement.x, again.true_tip, again.true_strain_energy) == (None, None, None)
+    assert again.true_stretch is None
+    assert (str(again.verdict), again.measurement.time) == ("missing", period.measurement.time)
+
+
+def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
+    """To the last bit, as every scalar."""
+    found = [float(to_row(period)["true_stretch"]) for period in read_trace(trace_file).periods]
+    assert found == [period.true_stretch for period in PERIODS]
+    assert found[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    "measurement",
+    [
+        Measurement(0.1, 30.1, 1 / 3),
+        Measurement(0.1, None, None, None),
+        Measurement(
+            0.1,
+            30.1,
+            1 / 3,
+            -0.7,
+            Frame(
+                0.1,
+                4711,
+                {
+                    "tip": SensorReading((1 / 7, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5)),
+                    "ref1": SensorReading((4.0, 5.0, 6.0), (1.0, 0.0, 0.0, 0.0), 0.0547),
+                    "ref 2": SensorReading(None, status="out of volume"),
+                },
+            ),
+        ),
+    ],
+)
+def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, measurement):
+    frozen = Verdict(VerdictKind.FROZEN, "4 identical readings")
+    checked = (CheckedMeasurement(measurement, Verdict()), CheckedMeasurement(measurement, frozen))
+    period = replace(PERIODS[3], readings=checked, measurement=measurement)
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    assert again.readings == checked
+    assert (again.measurement.x, again.measurement.z) == (measurement.x, measurement.z)
+
+
+@pytest.mark.parametrize("kind", VerdictKind)
+@pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.4 mm", "ref1: 0.09", ": "])
+def test_a_verdict_is_restored_from_its_text(kind, reason):
+    verdict = Verdict(kind, reason)
+    assert verdict_of(str(verdict)) == verdict
+
+
+def test_the_text_of_a_verdict_is_that_of_earlier_traces():
+    assert verdict_of("not a number") == Verdict(VerdictKind.NOT_A_NUMBER)
+    assert verdict_of("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
+    assert verdict_of("ok") == Verdict()
+
+
+@pytest.mark.parametrize("text", ["fine", "", "okay", "missing the tip", "field"])
+def test_a_text_that_is_not_a_verdict_is_rejected(text):
+    with pytest.raises(ValueError, match=f"'{text}' is not a valid VerdictKind"):
+        verdict_of(text)
+
+
+def test_a_row_of_an_earlier_version_is_read():
+    """There the columns of the measurement began with `sample_`."""
+    period = PERIODS[3]
+    earlier = {name.replace("measured_", "sample_"): text for name, text in to_row(period).items()}
+    assert {name for name in earlier if name not in COLUMNS} == {
+        f"sample_{part}" for part in ("time_s", "x_mm", "y_mm", "z_mm")
+    }
+    assert to_row(from_row(earlier, period.shape, period.durations)) == to_row(period)
+
+
+def test_a_period_does_not_have_the_readings_of_the_previous_one(tmp_path):
+    with_reading = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict()),))
+    first, second = read_trace(write(tmp_path / "trace.mcap", [with_reading, PERIODS[4]])).periods
+    assert (len(first.readings), len(second.readings)) == (1, 0)
+
+
+def test_columns_carry_units():
+    bare = {
+        "index",
+        "verdict",
+        "cost",
+        "action",
+        "decision",
+        "converged",
+    }
+    bare |= {"warning", "late"}
+    bare |= {"true_stretch"}  # a ratio
+    units = {"mm", "rad", "s", "mj", "n"}
+    assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
+
+
+def test_every_topic_has_a_message_each_period(trace_file):
+    with trace_file.open("rb") as file:
+        found = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert found == {topic: 1 if topic == "/plan/path" else len(PERIODS) for topic in TOPICS}
+
+
+def test_rosbags_reads_types_units_and_frame(trace_file):
+    with AnyReader([trace_file], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        found = {
+            c.topic: (time, reader.deserialize(raw, c.msgtype)) for c, time, raw in reader.messages()
+        }  # the last one of each topic
+    last = PERIODS[-1]
+    time, estimate = found["/tip/estimate"]
+    assert time == round(last.time * 1e9)
+    assert estimate.header.frame_id == "skin"
+    assert estimate.pose.position.y == pytest.approx(last.estimate.y * 1e-3, rel=1e-15)
+    assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate.theta, rel=1e-3)
+    assert found["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
+    command = found["/command"][1]
+    assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command.db_x * 1e-3
+    assert len(found["/needle/shape"][1].poses) == len(last.shape)
+    measured = found["/tip/measured"][1].header.stamp
+    assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.measurement.time)
+
+
+def test_the_plan_is_latched(trace_file):
+    with trace_file.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()
+    latched = {c.topic for c in channels if "durability: 1" in c.metadata.get("offered_qos_profiles", "")}
+    assert latched == {"/plan/path"}
+
+
+def test_content_except_for_timing_is_the_same_for_the_same_run(trace_file, tmp_path):
+    slower = [p.__class__(**{**vars(p), "durations": {"total": 1.0}}) for p in PERIODS]
+    assert messages(trace_file) == messages(write(tmp_path / "again.mcap", slower))
+
+
+def test_a_killed_writer_leaves_all_its_periods(killed_file):
+    trace = read_trace(killed_file)
+    assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
+    assert "incomplete: 12 complete periods read" in trace.note
+
+
+def test_a_killed_writer_leaves_a_file_for_the_mcap_reader(killed_file):
+    with killed_file.open("rb") as file:
+        found = NonSeekingReader(file).iter_messages(log_time_order=False)
+        topics = [channel.topic for _, channel, _ in until_the_end(found)]
+    assert topics.count("/control/status") == 12
+
+
+def test_the_file_of_a_killed_writer_ends_with_a_complete_record(killed_file):
+    size = killed_file.stat().st_size
+    with killed_file.open("rb") as file:
+        positions = [file.tell() for _ in until_the_end(StreamReader(file, emit_chunks=True).records)]
+    assert positions[-1] == size
+
+
+def test_a_truncated_file_loses_only_the_truncated_periods(trace_file, tmp_path):
+    torn = tmp_path / "torn.mcap"
+    data = trace_file.read_bytes()
+    counts = []
+    for length in range(len(data) // 2, len(data), 997):
+        torn.write_bytes(data[:length])
+        trace = read_trace(torn)
+        counts.append(len(trace.periods))
+        assert trace.note
+    assert counts == sorted(counts)
+    assert counts[-1] == len(PERIODS)
+
+
+@pytest.mark.parametrize("content", [b"", b"no trace at all", b"\x89MCAP0\r\n"])
+def test_a_file_that_is_not_a_trace_is_rejected(content, tmp_path):
+    path = tmp_path / "trace.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not a trace of flexneedle"):
+        read_trace(path)
+
+
+def test_a_missing_trace_is_rejected(tmp_path):
+    with pytest.raises(InputError, match=r"trace\.mcap: cannot be read: No such file"):
+        read_trace(tmp_path / "trace.mcap")
+
+
+def test_a_trace_is_never_overwritten(trace_file):
+    before = trace_file.read_bytes()
+    with pytest.raises(FileExistsError):
+        TraceWriter(trace_file, PLAN, about=ABOUT, scenario=SCENARIO)
+    assert trace_file.read_bytes() == before
+
+
+def test_joints_are_in_metres_and_radians():
+    message = joints(1.5, (-170.0, 0.25, -0.5, 2e-3, -1e-3, -1.5, 2.5, np.pi))
+    assert message.name == [
+        "base_x", "base_y", "base_z", "base_theta", "base_psi", "guide_y", "guide_z", "roll",
+    ]  # fmt: skip
+    np.testing.assert_allclose(
+        message.position, [-0.170, 2.5e-4, -5e-4, 2e-3, -1e-3, -1.5e-3, 2.5e-3, np.pi], rtol=1e-12
+    )
