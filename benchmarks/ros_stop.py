@@ -21,6 +21,8 @@ from threading import Event, Thread
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from ros import LOOPBACK
+
 import flexneedle
 from flexneedle.errors import StoppedError
 from flexneedle.geometry.registration import identity
@@ -31,7 +33,6 @@ from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.dds import Writer, participant
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from ros import LOOPBACK
 from stages import RIG
 
 HERE = Path(__file__).resolve()

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab.ros.fastdds.build import build, label, missing
 
 import flexneedle
 from emulated import DEADLINE_S, until
@@ -18,6 +17,7 @@ from flexneedle.lab.ros.messages import Composer
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, load_profile
 from flexneedle.lab.ros.records import JointTargets, RigState, ShapeReading, Stop, TipReading
 from flexneedle.types import Measurement, Shape
+from lab.ros.fastdds.build import build, label, missing
 from ros_peers import Bool, Peer, cdr
 from synthetic import make_periods, make_plan
 
