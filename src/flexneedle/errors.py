@@ -82,3 +82,13 @@ class ScenarioWarning(UserWarning):
 def one_line(error: FlexneedleError) -> str:
     """Return the message of an error in one line, also if it has several problems."""
     return "; ".join(str(error).splitlines())
+
+
+def make_printable(text: str) -> str:
+    """Return a text in one line, with line ends and other invisible characters escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the type and the message of any exception in one line."""
+    return make_printable(": ".join(filter(None, (type(error).__name__, " ".join(str(error).split())))))

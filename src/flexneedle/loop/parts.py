@@ -15,13 +15,12 @@ import numpy as np
 from flexneedle.arguments import shown
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import Controller
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, make_printable
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS, PlantFactory
 from flexneedle.ports import TipTracker
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.own import OWN, a_kind_of, is_own, not_callable_with, resolved
-from flexneedle.scenario.problems import printable
 
 TrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
 """Makes a tracker of the tip, from a scenario, the phantom (tip_at, pose_at, now) and a random generator."""
@@ -124,5 +123,5 @@ def _name(given: object) -> str:
 
 def _shown(given: object) -> str:
     if isinstance(given, str):
-        return printable(repr(given))
-    return printable(getattr(given, "__name__", shown(given)))
+        return make_printable(repr(given))
+    return make_printable(getattr(given, "__name__", shown(given)))

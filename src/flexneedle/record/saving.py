@@ -7,13 +7,12 @@ from typing import Any
 
 from flexneedle.arguments import path
 from flexneedle.control.controllers import used
-from flexneedle.errors import RecordError
+from flexneedle.errors import RecordError, describe_error
 from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE, Folder, versions
 from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.record.writer import TraceWriter
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.problems import unexpected
 from flexneedle.types import Insertion, Plan, scenario_of
 
 PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
@@ -100,4 +99,4 @@ def _draw(folder: Folder) -> None:
     except RecordError:
         raise
     except Exception as error:  # noqa: BLE001 - whatever drawing raises, the record and the result stay
-        folder.undrawn.append(f"figures cannot be drawn: {unexpected(error)}")
+        folder.undrawn.append(f"figures cannot be drawn: {describe_error(error)}")

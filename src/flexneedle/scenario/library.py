@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from flexneedle.errors import FileError
-from flexneedle.scenario.problems import describe, printable
+from flexneedle.errors import FileError, make_printable
+from flexneedle.scenario.problems import describe
 
 _SUFFIX = ".toml"
 # Such a file has a few kB; the limit keeps an endless one such as /dev/zero from filling the memory.
@@ -89,9 +89,9 @@ class Library:
         except RecursionError:
             raise self.error(f"{opening}: not TOML: nested too deeply") from None
         except ValueError as error:
-            raise self.error(f"{opening}: not TOML: {printable(str(error))}") from None
+            raise self.error(f"{opening}: not TOML: {make_printable(str(error))}") from None
 
 
 def label(source: str | Path) -> str:
     """A name or path as it opens a message."""
-    return printable(fspath(source)) or '""'
+    return make_printable(fspath(source)) or '""'

@@ -10,8 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from flexneedle.errors import InputError
-from flexneedle.scenario.problems import printable, unexpected
+from flexneedle.errors import InputError, describe_error, make_printable
 
 OWN = "module:NAME of your own"
 
@@ -98,6 +97,6 @@ def _module(name: str) -> Any:
             rule = f"no module {missing} in {Path.cwd()} or installed"
         else:
             rule = f"{name} cannot be imported: it needs the module {missing}"
-        raise InputError(printable(rule)) from None
+        raise InputError(make_printable(rule)) from None
     except (Exception, SystemExit) as error:
-        raise InputError(f"{name} cannot be imported: {unexpected(error)}") from error
+        raise InputError(f"{name} cannot be imported: {describe_error(error)}") from error

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from flexneedle.errors import make_printable
 from flexneedle.scenario.dotted import split_key
 
 _BROKEN = "broken_rules"
@@ -48,16 +49,6 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
     return [problem for detail in reported for problem in _problems(detail, model)]
 
 
-def printable(text: str) -> str:
-    """Return the text in one line: line ends and other invisible characters escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
-def unexpected(error: BaseException) -> str:
-    """Return the type and the message of an error of any code in one line."""
-    return printable(": ".join(filter(None, (type(error).__name__, " ".join(str(error).split())))))
-
-
 def key_path(loc: Sequence[str | int]) -> str:
     """Return a path as it is written in messages: `tissue[1].alpha`."""
     path = ""
@@ -91,7 +82,7 @@ def _path(key: str | tuple[str | int, ...]) -> Sequence[str | int]:
 
 def _line(loc: Sequence[str | int], value: object, rule: str) -> str:
     shown = "" if value is None else f" = {_shown(value)}"
-    return printable(f"{key_path(loc) or 'scenario'}{shown}: {rule}")
+    return make_printable(f"{key_path(loc) or 'scenario'}{shown}: {rule}")
 
 
 def _shown(value: object) -> str:

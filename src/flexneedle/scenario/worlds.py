@@ -29,10 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.errors import ScenarioError
+from flexneedle.errors import ScenarioError, make_printable
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.preset import PRESETS, WORLD
-from flexneedle.scenario.problems import printable
 from flexneedle.scenario.sections.needle import GAUGES
 
 TRAINING = 1000
@@ -154,7 +153,7 @@ def named_world(name: str) -> Scenario:
     if found is None or (found[2] or REAL) not in CASES:
         rule = f"must be {WORLD}NUMBER, with :CASE, :RIG or :CASE:RIG after it"
         rule += f", cases: {', '.join(CASES)}, rigs: {', '.join(RIGS)}"
-        raise ScenarioError(f"{printable(name)}: {rule}")
+        raise ScenarioError(f"{make_printable(name)}: {rule}")
     return world(int(found[1]), found[2] or REAL, found[3] or PLANE)
 
 

@@ -9,7 +9,7 @@ from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any, Self
 
-from flexneedle.errors import RigError, RunError, StoppedError
+from flexneedle.errors import RigError, RunError, StoppedError, describe_error
 from flexneedle.interrupts import uninterrupted
 from flexneedle.lab.rig.rig_file import RosSettings
 from flexneedle.lab.rig.supervisor.client import Supervisor
@@ -18,7 +18,7 @@ from flexneedle.lab.rig.supervisor.messages import Report
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import Profile, load_profile
 from flexneedle.lab.ros.records import Arm, Lost, Refused, Request, RigState, Stop, Target
-from flexneedle.scenario.problems import Problem, to_line, unexpected
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.types import Period, Plan, Point
 
 POLL_S = 0.01
@@ -190,7 +190,7 @@ class Bridge:
         try:
             self._keep_listening()
         except Exception as error:
-            self._lost = f"the connection to ROS has failed: {unexpected(error)}"
+            self._lost = f"the connection to ROS has failed: {describe_error(error)}"
             self._stop(self._lost)
             raise
 

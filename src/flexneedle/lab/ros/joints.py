@@ -5,12 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from threading import Thread
 
-from flexneedle.errors import DriverError
+from flexneedle.errors import DriverError, make_printable
 from flexneedle.lab.rig.devices.priority import set_normal_priority
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.profile import Profile
 from flexneedle.lab.ros.records import JointReading, JointTargets, Lost, Refused
-from flexneedle.scenario.problems import printable
 
 _CONNECT_S = 5.0
 _LONGEST = 200  # characters of a list of joints
@@ -58,7 +57,7 @@ class JointLink:
             raise DriverError(f"{name}: the last joint states are {age:.2f} s old{self._refused}")
         missing = [channel for channel in self._channels if channel not in reading.positions]
         if missing:
-            found = printable(", ".join(reading.positions))[:_LONGEST]
+            found = make_printable(", ".join(reading.positions))[:_LONGEST]
             raise DriverError(f"{name}: no joint {', '.join(missing)}; joints: {found}")
         return reading
 

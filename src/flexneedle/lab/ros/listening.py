@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass, field
 
+from flexneedle.errors import make_printable
 from flexneedle.lab.ros.dds import Directory, Reader, participant
 from flexneedle.lab.ros.idl import dds_name, dds_topic, ros_name
 from flexneedle.lab.ros.node import readers_of
@@ -10,7 +11,6 @@ from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import SUBSCRIBED, Profile
 from flexneedle.lab.ros.records import Refused, Stop
 from flexneedle.ports import Clock
-from flexneedle.scenario.problems import printable
 
 _PAUSE_S = 0.01
 
@@ -105,7 +105,7 @@ class _Topic:
         wrong = [kind for kind in kinds if kind != dds_name(one.kind)]
         problem = self.problem
         if wrong:
-            problem = f"a publisher has the type {printable(ros_name(wrong[0]))}, which is not received"
+            problem = f"a publisher has the type {make_printable(ros_name(wrong[0]))}, which is not received"
         elif len(kinds) > matched:
             problem = "a publisher is not received: its quality of service must be reliable"
         sent = max((time for _, time in self.sources), default=None)

@@ -5,7 +5,7 @@ from typing import Any
 
 from rosbags.serde import SerdeError
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.ros.frames import FrameMap
 from flexneedle.lab.ros.profile import SUBSCRIBED, PlacedTopic, Profile
 from flexneedle.lab.ros.records import (
@@ -20,7 +20,6 @@ from flexneedle.lab.ros.records import (
 )
 from flexneedle.lab.ros.stamps import Stamps
 from flexneedle.record.messages import STORE, Header
-from flexneedle.scenario.problems import printable
 from flexneedle.types import VISIBLE, Point
 
 _BOOL, _HEADER = "std_msgs/msg/Bool", 4  # bytes before the value
@@ -77,7 +76,7 @@ class Subscription:
         try:
             message = STORE.deserialize_cdr(data, self.kind)
         except SerdeError as error:
-            raise InputError(f"not a {self.kind}: {printable(str(error))}") from None
+            raise InputError(f"not a {self.kind}: {make_printable(str(error))}") from None
         if self.kind == _BOOL and data[_HEADER] > 1:  # anything but 0 would be true
             raise InputError(f"not a {self.kind}: {data[_HEADER]} is neither true nor false")
         return message
@@ -141,7 +140,7 @@ def _joints(subscription: Subscription, message: Any, arrival: float) -> JointRe
 
 
 def _shown(text: str) -> str:
-    shown = printable(text)
+    shown = make_printable(text)
     return repr(shown if len(shown) <= _LONGEST_SHOWN else shown[:_LONGEST_SHOWN] + "…")
 
 

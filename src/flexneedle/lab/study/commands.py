@@ -158,8 +158,8 @@ def _duration(seconds: float) -> str:
 
 
 def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
+    from flexneedle.errors import make_printable
     from flexneedle.lab.study.summary import summarise
-    from flexneedle.scenario.problems import printable
 
     summary = summarise(folder, study)
     summary["time"]["wall_s"] = seconds
@@ -170,7 +170,7 @@ def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
     if "done" in summary["outcomes"]:
         return 0
     if summary["first_failure"] is not None:
-        message = printable(summary["first_failure"])
+        message = make_printable(summary["first_failure"])
         print(f"flexneedle: no insertion finished; the first failure: {message}", file=sys.stderr)
     return 1
 

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexneedle.errors import InputError, one_line
+from flexneedle.errors import InputError, describe_error, make_printable, one_line
 from flexneedle.files import RUNS, new_folder, replace_file
 from flexneedle.lab.study.grid import Study, StudyInsertion, recorded_study
 from flexneedle.lab.study.journal import Journal, read_rows
 from flexneedle.record.folder import STUDY_FILE, versions
 from flexneedle.record.plain import to_text
 from flexneedle.scenario.dotted import flatten
-from flexneedle.scenario.problems import printable, unexpected
 
 JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
@@ -58,7 +57,7 @@ def read_folder(path: Path) -> Recorded:
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path / STUDY_FILE}: damaged: {unexpected(error)}") from None
+        raise InputError(f"{path / STUDY_FILE}: damaged: {describe_error(error)}") from None
     return Recorded(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
 
 
@@ -158,7 +157,7 @@ def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> 
             edited = (
                 "the code of flexneedle has changed since the start of the study: " if key == _SOURCE else ""
             )
-            return printable(f"{edited}{name} is {before} in the folder, {now} now")
+            return make_printable(f"{edited}{name} is {before} in the folder, {now} now")
     return None
 
 

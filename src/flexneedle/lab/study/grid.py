@@ -12,7 +12,7 @@ from typing import Any
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT, checked
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
-from flexneedle.errors import InputError, ScenarioError
+from flexneedle.errors import InputError, ScenarioError, make_printable
 from flexneedle.lab.study.spec import (
     ALL,
     LARGEST_SEED,
@@ -43,7 +43,7 @@ from flexneedle.planning.planner import STRATEGIES
 from flexneedle.record.plain import plain
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.own import is_own
-from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.settings import Target
 from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
 
@@ -330,7 +330,7 @@ def _place(settings: Mapping[str, Any]) -> tuple[float | str, ...]:
 def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> GridPoint:
     case, chosen, kind = choice.case, choice.chosen, choice.kind
     named = {"case": case, **chosen} if case else chosen
-    at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+    at = make_printable(", ".join(f"{key} = {value}" for key, value in named.items()))
     start = parts.base if choice.world is None else worlds(choice.world, *kind.values())
     scenario = _varied(start, {**parts.left_out, **choice.settings}, parts.own, at)
     _check_guide(choice.run, scenario, at)

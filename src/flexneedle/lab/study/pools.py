@@ -9,9 +9,9 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.study.worker import set_up
-from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.problems import Problem, to_line
 
 _CONNECT_S = 20
 _LAST_PORT = 65535
@@ -80,4 +80,4 @@ def _client(address: str) -> Any:
         return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
     except Exception as error:  # noqa: BLE001  Dask raises many types for the response of another server
         message = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(printable(f"{address}: no Dask scheduler responds: {message}")) from None
+        raise InputError(make_printable(f"{address}: no Dask scheduler responds: {message}")) from None

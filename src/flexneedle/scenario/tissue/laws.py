@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, make_printable
 from flexneedle.scenario.own import resolved
-from flexneedle.scenario.problems import Problem, printable, problems_of, refuse
+from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.scenario.tissue.linear import Linear
 from flexneedle.scenario.tissue.ogden import Ogden
@@ -89,7 +89,7 @@ def _broken_rule(layer: Layer) -> str:
             with np.errstate(all="ignore"):
                 values = np.asarray(getattr(layer, name)(e), dtype=float)
         except Exception as error:  # noqa: BLE001 - whatever the function of a user raises
-            return f"{name} raises {type(error).__name__}: {printable(str(error))}"
+            return f"{name} raises {type(error).__name__}: {make_printable(str(error))}"
         if values.shape != e.shape:
             return f"{name} must return an array of the shape of e, {e.shape}, not {values.shape}"
         if not np.isfinite(values).all():

@@ -11,12 +11,12 @@ from typing import Any
 from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from flexneedle.errors import make_printable
 from flexneedle.lab.page.messages import REQUESTS, AnyRequest, Done, Load, Refused, Stop
 from flexneedle.lab.page.server.desk import Desk
 from flexneedle.lab.page.server.hub import Outbox
 from flexneedle.lab.page.server.limits import Limits, Rate
 from flexneedle.lab.page.server.refusal import Refusal
-from flexneedle.scenario.problems import printable
 
 _TRY_LATER, _AGAINST_RULES = 1013, 1008
 _LONGEST_REASON = 120  # bytes of the reason of a close frame, of which 123 are allowed
@@ -146,10 +146,10 @@ def _require_length(text: str | None, longest: int) -> None:
 def _reason(error: ValueError) -> str:
     """The first problem of a message in one line."""
     if not isinstance(error, ValidationError):
-        return printable(str(error))
+        return make_printable(str(error))
     detail = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(map(str, detail["loc"]))
-    return printable(f"{where or 'message'}: {detail['msg']}")[:300]
+    return make_printable(f"{where or 'message'}: {detail['msg']}")[:300]
 
 
 @contextmanager

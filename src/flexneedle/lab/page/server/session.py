@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from flexneedle.errors import ScenarioError, ScenarioWarning
+from flexneedle.errors import ScenarioError, ScenarioWarning, make_printable
 from flexneedle.lab.page.messages import Options, Strategy
 from flexneedle.lab.page.messages import Session as SessionNews
 from flexneedle.lab.page.server.refusal import Refusal
@@ -17,7 +17,6 @@ from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
-from flexneedle.scenario.problems import printable
 from flexneedle.scenario.sections.needle import GAUGES, Needle
 from flexneedle.scenario.sections.settings import Target
 
@@ -73,7 +72,7 @@ class Session:
         except RecursionError:
             raise Refusal(f"{name}: not TOML: nested too deeply") from None
         except ValueError as error:
-            raise Refusal(f"{name}: not TOML: {printable(str(error))}") from None
+            raise Refusal(f"{name}: not TOML: {make_printable(str(error))}") from None
         with warnings.catch_warnings(record=True) as caught, _refused(name):
             warnings.simplefilter("always", ScenarioWarning)
             scenario = Scenario.from_values(values)

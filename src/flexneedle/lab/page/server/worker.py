@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from flexneedle.errors import describe_error
 from flexneedle.lab.page.channel import Message, packed, received
 from flexneedle.lab.page.orders import Ready, Signal, Work
-from flexneedle.scenario.problems import unexpected
 
 OnMessage = Callable[[Message, dict[str, Any] | None], None]
 """Called with each message; a text also as values."""
@@ -109,7 +109,9 @@ class Worker:
             while (message := await received(process.stdout)) is not None:
                 self._hear(message, json.loads(message) if isinstance(message, str) else None)
         except Exception as error:  # noqa: BLE001 - whatever a worker writes, the server stays
-            print(f"flexneedle: the worker of {self._name} is ended: {unexpected(error)}", file=sys.stderr)
+            print(
+                f"flexneedle: the worker of {self._name} is ended: {describe_error(error)}", file=sys.stderr
+            )
             kill_process(process)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import BinaryIO
 
-from flexneedle.errors import FlexneedleError, ScenarioWarning, one_line
+from flexneedle.errors import FlexneedleError, ScenarioWarning, describe_error, one_line
 from flexneedle.lab.page import channel
 from flexneedle.lab.page.orders import Do, Ready
 from flexneedle.lab.page.worker.inbox import Inbox
@@ -24,7 +24,6 @@ from flexneedle.lab.page.worker.signals import Cancelled
 from flexneedle.lab.page.worker.study import Rows, rows
 from flexneedle.lab.page.worker.task import Task
 from flexneedle.lab.page.worker.warm import warm_up
-from flexneedle.scenario.problems import unexpected
 
 Actions = Mapping[Do, Callable[[Task], None]]
 _NICE = 10
@@ -79,7 +78,7 @@ def carry_out(task: Task, actions: Actions) -> None:
         task.tell("failed", text=one_line(error))
     except Exception as error:  # noqa: BLE001 - whatever one job raises, the worker does the next
         traceback.print_exc()
-        task.tell("failed", text=unexpected(error))
+        task.tell("failed", text=describe_error(error))
     else:
         task.tell("done", 1.0)
 

@@ -7,10 +7,9 @@ from pathlib import Path
 from traceback import extract_tb
 from typing import Any
 
-from flexneedle.errors import DriverError, FlexneedleError, one_line
+from flexneedle.errors import DriverError, FlexneedleError, describe_error, make_printable, one_line
 from flexneedle.lab.rig.devices.answers import Answers, Rule, text
 from flexneedle.scenario.own import a_kind_of
-from flexneedle.scenario.problems import printable, unexpected
 
 _NONE = object()
 
@@ -25,7 +24,7 @@ def errors_named(name: str) -> Iterator[None]:
     except Exception as error:
         last = extract_tb(error.__traceback__)[-1]
         where = f"{Path(last.filename).name}, line {last.lineno}"
-        raise DriverError(f"{name}: {unexpected(error)} ({where})") from error
+        raise DriverError(f"{name}: {describe_error(error)} ({where})") from error
 
 
 class Guarded:
@@ -58,7 +57,7 @@ class Guarded:
         except DriverError:
             raise
         except FlexneedleError as error:  # such as that of a function of this package which the device calls
-            raise DriverError(printable(f"{self._name}: {part}: {one_line(error)}")) from error
+            raise DriverError(make_printable(f"{self._name}: {part}: {one_line(error)}")) from error
         rule = self._answers.methods.get(part)
         return value if rule is None else self._checked(f"{part}()", rule, value)
 
@@ -70,4 +69,4 @@ class Guarded:
         return value
 
     def _wrong(self, part: str, problem: str) -> DriverError:
-        return DriverError(printable(f"{self._name}: {self._owner}.{part}: {problem}"))
+        return DriverError(make_printable(f"{self._name}: {self._owner}.{part}: {problem}"))

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flexneedle.errors import DriverError
-from flexneedle.scenario.problems import printable
+from flexneedle.errors import DriverError, make_printable
 
 FOLDER = Path("/tmp")  # in which all users of a machine may make files; TMPDIR may be another one for each
 _LONGEST = 2000
@@ -18,7 +17,7 @@ _LONGEST = 2000
 
 def this_program() -> str:
     """Number and command of this process, for the one that holds motors for it."""
-    return printable(f"pid {os.getpid()} ({shlex.join(sys.argv)})")[:_LONGEST]
+    return make_printable(f"pid {os.getpid()} ({shlex.join(sys.argv)})")[:_LONGEST]
 
 
 @contextmanager
@@ -52,7 +51,7 @@ def _lock(descriptor: int, address: str) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         holder = os.pread(descriptor, _LONGEST, 0).decode(errors="replace") or "another program"
-        raise DriverError(f"{address}: in use by {printable(holder)}: end it first") from None
+        raise DriverError(f"{address}: in use by {make_printable(holder)}: end it first") from None
 
 
 def _opened(path: Path) -> int:

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
-from flexneedle.errors import FlexneedleError, InputError, RigError
+from flexneedle.errors import FlexneedleError, InputError, RigError, make_printable
 from flexneedle.lab.rig.devices.answers import MOTORS, TRACKER
 from flexneedle.lab.rig.devices.guarded import Guarded, errors_named
 from flexneedle.lab.rig.rig_file import Part, RigFile
 from flexneedle.ports import Clock, MotorPaces, Motors, Tracker
 from flexneedle.scenario.own import a_kind_of, attribute, not_callable_with, resolved
-from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.axes import Axis
 from flexneedle.types import Frame
 
@@ -173,7 +173,7 @@ def _factory(section: str, group: str, part: Part, arguments: tuple[str, ...]) -
         if rule := not_callable_with(found, arguments):
             raise InputError(rule)
     except InputError as error:
-        raise RigError(printable(f'{section}.kind = "{part.kind}": {error}')) from error
+        raise RigError(make_printable(f'{section}.kind = "{part.kind}": {error}')) from error
     factory: Callable[..., Any] = found
     return factory
 
@@ -210,7 +210,7 @@ def _made(section: str, part: Part, make: Callable[[], Any]) -> Any:
 
 
 def _name(section: str, part: Part) -> str:
-    return printable(f"{section} {part.kind}")
+    return make_printable(f"{section} {part.kind}")
 
 
 def _check_parts(section: str, part: Part, made: object, wanted: Sequence[str]) -> None:
@@ -222,4 +222,4 @@ def _check_parts(section: str, part: Part, made: object, wanted: Sequence[str]) 
 
 
 def _error(section: str, part: Part, rule: str) -> RigError:
-    return RigError(printable(f'{section}.kind = "{part.kind}": {rule}'))
+    return RigError(make_printable(f'{section}.kind = "{part.kind}": {rule}'))

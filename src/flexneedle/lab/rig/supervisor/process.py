@@ -16,7 +16,7 @@ from threading import Thread
 from time import monotonic
 from typing import Any
 
-from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.errors import FlexneedleError, describe_error, one_line
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.devices.lock import held
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
@@ -26,7 +26,6 @@ from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.lab.rig.supervisor.dry import DryMotors
 from flexneedle.lab.rig.supervisor.signals import listen, named
 from flexneedle.lab.rig.supervisor.suspension import LONGEST_S, Suspension
-from flexneedle.scenario.problems import unexpected
 from flexneedle.types import Frame
 
 _MOST_WAITING = 400  # reports that a client has not taken: 10 s
@@ -83,7 +82,7 @@ def main(requests: int, received: int, sent: int) -> None:
     except FlexneedleError as error:
         why = one_line(error)
     except Exception as error:
-        why = f"the supervisor failed: {unexpected(error)}"
+        why = f"the supervisor failed: {describe_error(error)}"
         raise
     finally:
         outbox.put(say.Ended(why))
