@@ -1,4 +1,4 @@
-"""Writes docs/rig/file.md from the models of rig files and shipped devices, and the advice in rig_advice.toml.
+"""Write docs/rig/file.md from the models of rig files and included devices, and the advice in rig_advice.toml.
 
 python tools/docs/rig_reference.py
 """
@@ -21,8 +21,9 @@ SHIPPED: dict[str, dict[str, Any]] = {
     "driver": {"ros": DriverSettings},
     "tracker": {"aurora": AuroraSettings, "replay": ReplaySettings, "ros": TrackerSettings},
 }
-"""Settings of the kinds that come with the package, by section; those of `galil` are on its page."""
+"""Settings of the included kinds, by section; docs/rig/galil.md has the settings of `galil`."""
 _REPEATED = tuple(f"axes.{name}" for name in LINEAR_AXES[1:])  # the keys of the first
+_ELSEWHERE = ("axes.rotation", "registration")  # keys are described with the linear axes and the scenario
 
 
 def page() -> str:
@@ -32,11 +33,11 @@ def page() -> str:
 
 
 def all_tables() -> Iterator[Table]:
-    """Yield the sections of a rig file, those of driver and tracker followed by the settings of the shipped ones."""
+    """Yield the sections of a rig file, driver and tracker followed by the settings of included kinds."""
     for table in tables(RigFile.model_json_schema()):
         if table.name in _REPEATED:
             continue
-        yield table
+        yield table._replace(keys=()) if table.name in _ELSEWHERE else table
         for kind, model in SHIPPED.get(table.name, {}).items():
             yield _shipped(f"{table.name}.{kind}", model)
 

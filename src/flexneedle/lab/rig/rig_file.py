@@ -30,35 +30,33 @@ _ROUNDING = 1e-9
 
 
 class Part(Section):
-    """A kind, and settings of its own, which are checked where it is made."""
+    """Kind of a device and its settings, which the device checks."""
 
     model_config = ConfigDict(extra="allow")
 
     kind: Annotated[str, Field(max_length=200), AfterValidator(one_line)]
-    """Name of one that is installed, or `module:NAME` for your own."""
+    """Name of an installed device, or `module:NAME` for your own."""
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Its own settings by key."""
+        """Settings of the device by key."""
         return dict(self.model_extra or {})
 
 
 class LoopSettings(Section):
-    """Section `loop`: times of the supervisor and of the decisions."""
+    """Section `loop`: times of the supervisor and the decisions."""
 
     rate_hz: Annotated[float, Field(ge=_SLOWEST_HZ, le=_FASTEST_HZ)] = 40.0
-    """Rate at which tracker and motors are read and checked, and targets sent. At a lower one the motors would stop
-    between two ticks."""
+    """Rate at which tracker and motors are read and checked and targets are sent."""
     queue_ms: Annotated[float, Field(gt=0, le=_LONGEST_QUEUE_MS)] | None = None
-    """Time of the motion that is queued in the motors: what they still do after the computer has stopped. Not set:
-    three ticks, at least 75 and at most 100."""
+    """Time of the motion queued in the motors, which they complete if the computer fails. Not set: three ticks, 75 to
+    100."""
     queue_mm: Positive = 0.5
-    """Largest distance of that motion, for axes with a length. A faster axis is slowed down. At least twice the
-    tolerance of each axis."""
+    """Largest distance of that motion, for linear axes: a faster axis is slowed down. At least twice each tolerance."""
     decision_ms: Positive = 200.0
-    """Time for a decision. While it takes longer the needle rests, and the period counts as late."""
+    """Time for a decision. After it the needle rests until the decision arrives, and the period counts as late."""
     decision_limit_s: Positive = 2.0
-    """Time without a command after which the insertion is stopped: the controller does not answer."""
+    """Time without a command after which the insertion is stopped."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -90,18 +88,18 @@ class LoopSettings(Section):
 
 
 class RosSettings(Section):
-    """Section `ros`: the topics by which an insertion is followed and stopped."""
+    """Section `ros`: topics that publish, arm and stop an insertion."""
 
     profile: Annotated[str, Field(max_length=1000), AfterValidator(one_line)] = "neutral"
-    """Name or file of the profile of topics."""
+    """Name or file of the profile."""
     arm: bool = False
-    """Whether the rig is armed only after an arm on its topic, and stopped if the ROS node is lost."""
+    """Arm the rig only after an arm on its topic, and stop if the ROS node is lost."""
     target: bool = False
-    """Whether the target is taken from its topic, before planning."""
+    """Take the target from its topic, before planning."""
 
 
 class RigFile(Section):
-    """A rig, as its file describes it."""
+    """Description of a rig."""
 
     name: Title
     """Title in messages and records."""
@@ -109,10 +107,10 @@ class RigFile(Section):
     axes: Axes
     tracker: Part
     registration: Registration | None = None
-    """In place of the scenario's, where it is set."""
+    """Replaces the registration of the scenario."""
     loop: LoopSettings = LoopSettings()
     ros: RosSettings | None = None
-    """Connection to ROS 2. Not set: none."""
+    """Not set: no connection to ROS 2."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

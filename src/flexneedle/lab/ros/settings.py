@@ -18,7 +18,7 @@ class DriverSettings(Section):
     """Settings beside `kind = "ros"` in the section `driver`."""
 
     profile: str = "neutral"
-    """Name or file of the profile; `publish.joint_targets` and `subscribe.joint_states` are used."""
+    """Name or file of the profile."""
     stale_ms: _Age = 200.0
     """Age of the last joint states beyond which the motors count as lost."""
 
@@ -27,11 +27,11 @@ class TrackerSettings(Section):
     """Settings beside `kind = "ros"` in the section `tracker`."""
 
     profile: str = "neutral"
-    """Name or file of the profile; `subscribe.tip` or `subscribe.shape` is used."""
+    """Name or file of the profile."""
     source: Literal["tip", "shape"] = "tip"
-    """Topic of the tip, or of a shape, whose last pose is the tip."""
+    """Topic of the tip, or of a shape with the tip as its last pose."""
     late_ms: _Age = 250.0
-    """Time without a frame after which the tracker's status is the reason."""
+    """Time without a frame after which the tracker's status is not ok."""
 
 
 def checked(settings: Mapping[str, Any], model: type[_Settings]) -> _Settings:

@@ -48,12 +48,11 @@ class Axis(Section, ABC):
     usual_tolerances: ClassVar[tuple[float, float]]
 
     channel: Channel
-    """The motor's name at its controller, such as "A"."""
+    """Name of the motor at its controller."""
     direction: Annotated[Literal[-1, 1], BeforeValidator(_whole)] = 1
-    """1 if counts increase with the axis's positive direction, else −1."""
+    """1 if counts increase in the positive direction of the axis, else −1."""
     home: Home = "here"
-    """How `rig home` finds the zero: where the axis is, at a limit switch of the controller, or never (an absolute
-    encoder)."""
+    """Home for `rig home`: the present position, a limit switch, or none (absolute encoder)."""
 
     @property
     @abstractmethod
@@ -131,7 +130,7 @@ class Axis(Section, ABC):
 
 
 class LinearAxis(Axis):
-    """Section `axes.insertion`: an axis with a length, as those of guide and base."""
+    """Section `axes.insertion`: a linear axis."""
 
     unit = "mm"
     size = 1.0
@@ -141,7 +140,7 @@ class LinearAxis(Axis):
     counts_per_mm: Positive
     """Counts of the encoder per mm."""
     range_mm: Range
-    """Soft limits [lowest, highest]: no command goes beyond."""
+    """Soft limits [lowest, highest] of all commands."""
     speed_mm_s: Positive
     """Largest speed."""
     acceleration_mm_s2: Positive
@@ -149,13 +148,12 @@ class LinearAxis(Axis):
     home_mm: Coordinate = 0.0
     """Position of the axis at its home."""
     backlash_mm: NonNegative = 0.0
-    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
-    the position is uncertain by half of it."""
+    """Lost motion when the motor reverses."""
     max_error_mm: Positive | None = None
-    """Largest difference of commanded and measured position; beyond it the rig stops with a fault. Not set: the way of
-    40 ms at `speed_mm_s`, at most 0.2 mm, at least four times the usual tolerance."""
+    """Largest difference of commanded and measured position; a larger one is a fault. Not set: the distance of 40 ms at
+    `speed_mm_s`, at most 0.2 mm, at least four default tolerances."""
     tolerance_mm: Positive | None = None
-    """A motion has arrived within this distance from its goal. Not set: 3 counts, 0.02 to 0.1 mm."""
+    """Distance from the goal within which a motion has arrived. Not set: 3 counts, 0.02 to 0.1 mm."""
 
     @property
     def scale(self) -> float:
@@ -203,7 +201,7 @@ class RotaryAxis(Axis):
     counts_per_deg: Positive
     """Counts of the encoder per degree."""
     range_deg: Range
-    """Soft limits [lowest, highest]: no command goes beyond."""
+    """Soft limits [lowest, highest] of all commands."""
     speed_deg_s: Positive
     """Largest speed."""
     acceleration_deg_s2: Positive
@@ -211,13 +209,12 @@ class RotaryAxis(Axis):
     home_deg: Coordinate = 0.0
     """Angle of the axis at its home."""
     backlash_deg: NonNegative = 0.0
-    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
-    the angle is uncertain by half of it."""
+    """Lost motion when the motor reverses."""
     max_error_deg: Positive | None = None
-    """Largest difference of commanded and measured angle; beyond it the rig stops with a fault. Not set: the angle of
-    40 ms at `speed_deg_s`, at most 5°, at least four times the usual tolerance."""
+    """Largest difference of commanded and measured angle; a larger one is a fault. Not set: the angle of 40 ms at
+    `speed_deg_s`, at most 5°, at least four default tolerances."""
     tolerance_deg: Positive | None = None
-    """A roll has arrived within this angle from its goal. Not set: 3 counts, 1° to 2°."""
+    """Angle from the goal within which a roll has arrived. Not set: 3 counts, 1° to 2°."""
 
     @property
     def scale(self) -> float:
@@ -285,7 +282,7 @@ def _misplaced(axis: Axis, low: float, high: float) -> str:
 
 
 class Axes(Section):
-    """Section `axes`: the axes that the rig has. All but `insertion` may be left out."""
+    """Section `axes`: the axes of the rig. Only `insertion` is required."""
 
     insertion: LinearAxis
     rotation: RotaryAxis | None = None

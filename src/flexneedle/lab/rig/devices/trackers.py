@@ -34,7 +34,7 @@ class AuroraSettings(Section):
     port: PathText
     """Serial port."""
     sensors: Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_different)] = NAMES
-    """Names of the sensors at the tracker's ports 1, 2, …."""
+    """Names of the sensors at the tracker's ports 1, 2, …"""
 
 
 class ReplaySettings(Section):
@@ -43,7 +43,7 @@ class ReplaySettings(Section):
     file: PathText
     """A recording (`flexneedle em watch --record`), a table of measurements, or the folder of a run."""
     speed: Positive = 1.0
-    """The frames arrive this many times as fast as they were recorded."""
+    """Replay speed relative to the recording."""
 
 
 def aurora(settings: Mapping[str, Any], clock: Clock) -> Aurora:
