@@ -87,7 +87,9 @@ def test_options_of_studies_and_benchmarks_are_theirs():
     shown = {
         match
         for text in TEXTS.values()
-        for match in re.findall(r"python ((?:studies|campaigns|benchmarks)/\w+\.py)((?: --?[\w-]+(?: [\w.]+)*)*)", text)
+        for match in re.findall(
+            r"python ((?:studies|campaigns|benchmarks)/\w+\.py)((?: --?[\w-]+(?: [\w.]+)*)*)", text
+        )
     }
     assert len(shown) > 15
     for script, options in shown:
