@@ -18,8 +18,11 @@ ROOT = Path(__file__).parents[2]
 CHECKED = (
     "README.md",
     "docs/architecture.md",
+    "docs/how-to",
     "docs/index.md",
+    "docs/reference/api.md",
     "docs/reference/commands.md",
+    "docs/tutorial.md",
     "src/flexneedle/arguments.py",
     "src/flexneedle/errors.py",
     "src/flexneedle/files.py",
