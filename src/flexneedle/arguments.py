@@ -2,6 +2,7 @@
 
 import reprlib
 from collections.abc import Mapping
+from importlib.util import find_spec
 from math import inf, isfinite
 from numbers import Real
 from operator import index
@@ -103,3 +104,10 @@ def shown(value: object) -> str:
 def refusal(name: str, value: object, rule: str, remedy: str = "") -> InputError:
     """Return the error for a value that violates a rule."""
     return InputError(f"{name} = {shown(value)}: {rule}{remedy and f'; {remedy}'}")
+
+
+def require_extra(extra: str, *modules: str) -> None:
+    """Raise InputError, with the command to install the extra, if one of its modules is not installed."""
+    missing = [name for name in modules if find_spec(name) is None]
+    if missing:
+        raise InputError(f"needs {' and '.join(missing)}: pip install 'flexneedle[{extra}]'")

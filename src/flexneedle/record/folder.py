@@ -112,7 +112,7 @@ class Folder:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions on which the numbers of a run and the bytes of a table depend.
+    """Return the versions on which the numbers of a run depend.
 
     source: digest of the code and data of this package, by which an edited copy differs from the release.
     """
@@ -121,7 +121,6 @@ def versions() -> dict[str, str]:
         "python": platform.python_version(),
         "numpy": version("numpy"),
         "numba": version("numba"),
-        "pyarrow": version("pyarrow"),
         "source": source_digest(_PACKAGE),
     }
 

@@ -89,7 +89,7 @@ def test_the_record_has_the_command_versions_and_the_whole_study(capsys):
     assert record["command"] == "flexneedle study my.toml --workers 2 --out a"
     assert record["study"]["scenario"]["name"] == "Two-layer tissue phantom"
     assert record["study"]["axes"] == {"plant": ["exact", "model"], "target.depth_mm": [8, 10]}
-    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}
+    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "source"}
 
 
 def test_an_existing_study_folder_is_used_only_to_resume(capsys):

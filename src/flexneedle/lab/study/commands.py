@@ -61,6 +61,7 @@ def _workers(text: str) -> int:
 
 
 def _study(args: argparse.Namespace) -> int:
+    from flexneedle.arguments import require_extra
     from flexneedle.cli.progress import Progress
     from flexneedle.errors import InputError, RunError
     from flexneedle.files import new_folder
@@ -68,6 +69,7 @@ def _study(args: argparse.Namespace) -> int:
     from flexneedle.lab.study.pools import check_address
     from flexneedle.lab.study.runner import run_study
 
+    require_extra("study", "pyarrow")
     if args.resume and args.out is None:
         raise InputError("--resume needs the folder of the study: add --out DIR")
     if args.workers is not None and args.scheduler is not None:

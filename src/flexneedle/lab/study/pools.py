@@ -9,6 +9,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
 
+from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.study.worker import set_up
 from flexneedle.scenario.problems import Problem, to_line

@@ -36,6 +36,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def _report(args: argparse.Namespace) -> int:
+    from flexneedle.arguments import require_extra
+
+    require_extra("study", "pyarrow", "jinja2")
     from flexneedle.lab.study.report.report import write_report
 
     report = write_report(args.study, args.out, args.tuning)

@@ -10,7 +10,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from flexneedle.arguments import path, whole
+from flexneedle.arguments import path, require_extra, whole
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.study import pools
 from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder, remove_unused, study_folder
@@ -18,7 +18,6 @@ from flexneedle.lab.study.grid import GridPoint, Study, load_study
 from flexneedle.lab.study.journal import Journal
 from flexneedle.lab.study.plans import Plans, plan_key, truth_key
 from flexneedle.lab.study.rows import Job, JobResult, PlanResult, make_plan, run_job
-from flexneedle.lab.study.tables import write_tables
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.record.folder import versions
 
@@ -57,9 +56,12 @@ def run_study(
     recorded in `study.json`. A script that calls this needs an `if __name__ == "__main__"` guard, since workers import
     it.
 
-    Raises InputError for an invalid study, folder or scheduler; RunError if a worker dies or has other package
+    Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker dies or has other package
     versions than this process; KeyboardInterrupt, after the tables are written, if the user interrupts it.
     """
+    require_extra("study", "pyarrow")
+    from flexneedle.lab.study.tables import write_tables
+
     if not isinstance(source, Study):
         path("source", source)
     study = load_study(source)
