@@ -110,4 +110,4 @@ def require_extra(extra: str, *modules: str) -> None:
     """Raise InputError, with the command to install the extra, if one of its modules is not installed."""
     missing = [name for name in modules if find_spec(name) is None]
     if missing:
-        raise InputError(f"needs {' and '.join(missing)}: pip install 'flexneedle[{extra}]'")
+        raise InputError(f"{' and '.join(missing)}: not installed: pip install 'flexneedle[{extra}]'")

@@ -68,10 +68,9 @@ def cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> I
 
 
 def _client(address: str) -> Any:
-    try:
-        from distributed import Client, Security
-    except ImportError:
-        raise InputError("--scheduler needs Dask: pip install 'flexneedle[cluster]'") from None
+    require_extra("cluster", "distributed")
+    from distributed import Client, Security
+
     connect, secure = cast("Any", Client), cast("Any", Security)  # not typed
     security = secure()
     # Checked here: a client that fails for this reason closes slowly and prints to stderr.
