@@ -56,8 +56,9 @@ def run_study(
     recorded in `study.json`. A script that calls this needs an `if __name__ == "__main__"` guard, since workers import
     it.
 
-    Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker dies or has other package
-    versions than this process; KeyboardInterrupt, after the tables are written, if the user interrupts it.
+    Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker
+    dies or has other package versions than this process; KeyboardInterrupt, after the
+    tables are written, if the user interrupts it.
     """
     require_extra("study", "pyarrow")
     from flexneedle.lab.study.tables import write_tables
