@@ -142,7 +142,6 @@ docs: setup  ## build the documentation site into site/; warnings are errors
 	$(BIN)/python tools/docs/rig_reference.py
 	$(BIN)/python tools/docs/command_reference.py
 	$(BIN)/python tools/docs/rig_states.py
-	$(BIN)/python tools/docs/page_catalog.py
 	PYTHONPATH=tools/docs $(BIN)/zensical build --strict --clean
 
 lint: setup  ## style, types, layers, words

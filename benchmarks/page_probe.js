@@ -12,7 +12,6 @@
   // their paint.
   probe.reset = () => Object.assign(probe, { frames: [], paints: [], clicks: [], answered: [], moves: [], releases: [], edits: [], estimates: [], plans: [], refused: [] });
   probe.reset();
-  if (location.protocol.startsWith("http")) localStorage.setItem("flexneedle tour", "seen");
 
   for (const name of DRAWS) {
     WebGL2RenderingContext.prototype[name] = () => {

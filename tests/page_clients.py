@@ -12,7 +12,6 @@ from time import monotonic
 from websockets.sync.client import connect
 
 from flexneedle.lab.page.frames import unpacked
-from flexneedle.lab.page.server.catalog import CONTROLLERS
 from flexneedle.lab.page.server.desk import Setup
 from flexneedle.lab.page.server.hub import frame_key, key_of
 from flexneedle.lab.page.server.limits import Limits
@@ -30,7 +29,7 @@ QUICK = Limits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
 @contextmanager
 def served(runs: Path, *, limits=QUICK, rig=None, host="127.0.0.1", workers=(STUB, STUB)):
     """A server in a thread, on a free port."""
-    session = Session.of("phantom", load_scenario("phantom"), CONTROLLERS[0]["name"])
+    session = Session.of("phantom", load_scenario("phantom"))
     server = PageServer(Setup(session, runs, limits, workers, rig), host, 0)
     listens = Event()
     server.on_start = listens.set

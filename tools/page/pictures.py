@@ -42,11 +42,10 @@ def _served(scenario: str) -> Iterator[str]:
 def _visited(
     browser: Browser, address: str, width: int, height: int, scheme: Literal["light", "dark"]
 ) -> Iterator[Page]:
-    """Open the page, without its tour, with a plan."""
+    """Open the page with a plan."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     page = context.new_page()
     page.set_default_timeout(_WAIT_MS)
-    page.add_init_script("localStorage.setItem('flexneedle tour', 'seen')")
     page.goto(address)
     _await(page, "window.flexneedle?.store.get('scene')")
     _hide(page, "WebGL runs in software")  # as here, without a graphics card

@@ -1,6 +1,5 @@
 """`flexneedle serve`: its start, its messages, its end."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -9,31 +8,21 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from importlib.resources import files
-from pathlib import Path
 
 import pytest
 
 from flexneedle.cli.main import main
 from flexneedle.lab.page import commands as serve
-from flexneedle.lab.page.server.catalog import CONTROLLERS, SCHEMA
+from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.lab.page.server.limits import Limits
 from flexneedle.lab.page.server.rig import ConnectedRig
 from page_clients import PATIENCE_S
 
-ROOT = Path(__file__).parents[3]
-
-
-def test_the_catalog_is_that_of_the_controllers():
-    spec = importlib.util.spec_from_file_location("page_catalog", ROOT / "tools" / "docs" / "page_catalog.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert module.CATALOG.read_text(encoding="utf-8") == module.catalog(), "run tools/docs/page_catalog.py"
-
 
 def test_the_schema_is_what_the_command_prints(capsys):
     assert main(["scenario", "schema"]) == 0
-    assert json.loads(SCHEMA) == json.loads(capsys.readouterr().out)
-    assert CONTROLLERS[0]["name"] == "adaptive-mpc"
+    assert json.loads(build_catalog().schema) == json.loads(capsys.readouterr().out)
+    assert build_catalog().controllers[0]["name"] == "adaptive-mpc"
 
 
 def test_the_server_does_not_import_the_compiler_or_the_simulator():

@@ -13,7 +13,7 @@ from flexneedle.scenario.sections.needle import GAUGES
 
 @pytest.fixture
 def session():
-    return Session.of("phantom", load_scenario("phantom"), "adaptive-mpc")
+    return Session.of("phantom", load_scenario("phantom"))
 
 
 def test_an_edit_changes_values_by_key(session):
@@ -197,5 +197,5 @@ def test_a_file_that_would_take_long_to_read_is_refused_before(session, monkeypa
 
 def test_options_that_are_not_set_stay(session):
     changed = session.with_options(Options(type="options", seed=7))
-    assert (changed.seed, changed.strategy, changed.controller) == (7, "manipulation", "adaptive-mpc")
+    assert (changed.seed, changed.strategy, changed.controller) == (7, "manipulation", "")
     assert changed.revision == session.revision + 1

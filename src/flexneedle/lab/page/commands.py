@@ -96,13 +96,12 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> Setup:
-    from flexneedle.lab.page.server.catalog import CONTROLLERS
     from flexneedle.lab.page.server.desk import Setup
     from flexneedle.lab.page.server.limits import RIG, Limits
     from flexneedle.lab.page.server.session import Session
     from flexneedle.scenario.files import load_scenario
 
-    session = Session.of(Path(args.scenario).name, load_scenario(args.scenario), CONTROLLERS[0]["name"])
+    session = Session.of(Path(args.scenario).name, load_scenario(args.scenario))
     rig = None if args.rig is None else _connected(args.rig)
     workers = (*_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (*_WORKER, "insertion")
     return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)

@@ -7,7 +7,6 @@ import pytest
 
 from chromium import ARGUMENTS, CHROMIUM
 
-TOUR_SEEN = "if (origin !== 'null') localStorage.setItem('flexneedle tour', 'seen')"
 # In software each drawing of the view in space takes as long as the rest of a test.
 DRAWS_NOTHING = """for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
   WebGL2RenderingContext.prototype[name] = () => {};
@@ -28,9 +27,9 @@ def browser():
 @pytest.fixture(scope="session")
 def kept_server():
     from fake_page import FakePage
-    from flexneedle.lab.page.server.catalog import SCHEMA
+    from flexneedle.lab.page.server.catalog import build_catalog
 
-    with FakePage(SCHEMA) as server:
+    with FakePage(build_catalog().schema) as server:
         yield server
 
 
@@ -65,8 +64,7 @@ def kept_tabs():
 def tab(browser, kept_tabs):
     """A function that opens an empty tab. Errors on its pages, in `errors`, fail the test at its end.
 
-    before: a script that runs before those of a page; tour: whether the tour is shown, as on a first visit; draws:
-    whether WebGL draws; touch: whether it is touched.
+    before: a script that runs before those of a page; draws: whether WebGL draws; touch: whether it is touched.
     """
     kept, fresh, errors = [], [], []
 
@@ -77,22 +75,20 @@ def tab(browser, kept_tabs):
         if message.type == "error":
             errors.append(message.text)
 
-    def made(before, tour, draws, touch=False):
+    def made(before, draws, touch=False):
         page = browser.new_context(has_touch=touch).new_page()
         page.set_default_timeout(20_000)
-        for script in ("" if tour else TOUR_SEEN, "" if draws else DRAWS_NOTHING, before):
+        for script in ("" if draws else DRAWS_NOTHING, before):
             if script:
                 page.add_init_script(script)
         return page
 
-    def opened(
-        width, height, scheme, before=None, tour=False, draws="SCREENSHOTS" in os.environ, touch=False
-    ):
-        if before or tour or touch or any(draws == as_kept for as_kept, _ in kept):
-            page = made(before, tour, draws, touch)
+    def opened(width, height, scheme, before=None, draws="SCREENSHOTS" in os.environ, touch=False):
+        if before or touch or any(draws == as_kept for as_kept, _ in kept):
+            page = made(before, draws, touch)
             fresh.append(page)
         else:
-            page = kept_tabs.pop(draws, None) or made(None, tour, draws)
+            page = kept_tabs.pop(draws, None) or made(None, draws)
             kept.append((draws, page))
         page.on("pageerror", failed)
         page.on("console", printed)
@@ -116,18 +112,17 @@ def tab(browser, kept_tabs):
 
 @pytest.fixture
 def visit(server, tab):
-    """A function that opens the page and returns it; before: a script that runs first, tour: as on a first visit."""
+    """A function that opens the page and returns it; before: a script that runs first."""
 
     def opened(
         width=1280,
         height=800,
         scheme="light",
         before=None,
-        tour=False,
         ready="[data-panel=status] .connection",
         **how,
     ):
-        page = tab(width, height, scheme, before, tour, **how)
+        page = tab(width, height, scheme, before, **how)
         page.goto(server.url)
         page.wait_for_selector(ready)
         return page

@@ -11,7 +11,7 @@ from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.frames import Source
 from flexneedle.lab.page.messages import Job, Runs, StudyRow, StudyRows
-from recorded_page import insertion, people, period_frames, rows, session
+from recorded_page import insertion, period_frames, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -109,107 +109,11 @@ def test_a_file_that_is_dropped_on_the_panel_is_loaded(files, server):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
 def test_it_fits_its_width(files, server, pictures, size, scheme):
-    page = files(width=size[0], height=size[1], scheme=scheme, before=NO_CLIPBOARD)
+    page = files(width=size[0], height=size[1], scheme=scheme)
     server.send(insertion("done", of="first", name="mine"), rows(0, 3, "first"))
     page.click("summary:has-text('Download')")
-    page.click("text=Copy a link")
-    page.wait_for_selector("[aria-label='Link to copy']")
     assert too_wide(page) == []
     pictures(page.locator(FILES), f"files-{size[0]}-{scheme}")
-
-
-CLIPBOARD = """
-  const writeText = async (text) => { window.copied = text; };
-  Object.defineProperty(navigator, "clipboard", { value: { writeText } });
-"""
-NO_CLIPBOARD = "Object.defineProperty(navigator, 'clipboard', { value: undefined });"
-
-
-def test_a_link_reproduces_scenario_and_options(files, server):
-    page = files(before=CLIPBOARD)
-    page.click("text=Copy a link")
-    page.wait_for_selector(f"{FILES} >> text=Copied")
-    address = page.evaluate("window.copied")
-    assert address.startswith(f"{server.url}#state=")
-    page.goto("about:blank")
-    page.goto(address)
-    page.wait_for_selector("text=you are in control")
-    until(page, "!location.hash")
-    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
-    assert server.asked("options") == [
-        {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
-    ]
-
-
-def test_copying_a_link_leaves_the_address_so_a_reload_keeps_later_changes(files, server):
-    page = files(before=CLIPBOARD)
-    page.click("text=Copy a link")
-    page.wait_for_selector(f"{FILES} >> text=Copied")
-    assert page.url == server.url
-    page.reload()
-    page.wait_for_selector("text=nobody is in control")
-    page.wait_for_timeout(200)
-    assert not server.asked("load")
-
-
-def test_without_a_clipboard_the_link_is_shown_to_be_copied(files, server):
-    page = files(before=NO_CLIPBOARD)
-    assert not page.is_visible("[aria-label='Link to copy']")
-    page.click("text=Copy a link")
-    page.wait_for_selector("text=The clipboard is not available")
-    assert page.input_value("[aria-label='Link to copy']").startswith(f"{server.url}#state=")
-    selected = "(({ value, selectionStart, selectionEnd }) => value.slice(selectionStart, selectionEnd))"
-    assert page.evaluate(f"{selected}(document.activeElement)").startswith(f"{server.url}#state=")
-    assert page.url == server.url
-
-
-def test_a_link_that_is_followed_while_another_is_in_control_is_opened_afterwards(files, server):
-    page = files(before=CLIPBOARD)
-    page.click("text=Copy a link")
-    page.wait_for_selector(f"{FILES} >> text=Copied")
-    link = page.evaluate("window.copied").partition("#")[2]
-    server.send(people(2, steering=2))
-    page.wait_for_selector("text=person 2 is in control")
-    page.evaluate("link => { location.hash = link; }", link)
-    page.wait_for_selector("text=The link is opened when you are in control")
-    server.send(people(2))  # who was in control may be back in a moment
-    page.wait_for_selector("text=nobody is in control")
-    page.evaluate(PAINTED)
-    assert not server.asked("steer")
-    assert not server.asked("load")
-    page.click("text=Take control")
-    assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
-    until(page, "!location.hash")
-
-
-@pytest.mark.parametrize("opened", [True, False])
-def test_a_link_asks_before_changes_are_lost(files, server, opened):
-    """Any web site can send a browser to one."""
-    page = files(before=CLIPBOARD)
-    page.click("text=Copy a link")
-    page.wait_for_selector(f"{FILES} >> text=Copied")
-    link = page.evaluate("window.copied").partition("#")[2]
-    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
-    until(page, "flexneedle.store.get('session').changed.length")
-    page.evaluate("link => { location.hash = link; }", link)
-    page.wait_for_selector(
-        f"{FILES} >> text=The link has the scenario phantom3d. To open it drops the changes"
-    )
-    assert not server.asked("load")
-    page.click("text=Open the link" if opened else "text=Keep this scenario")
-    page.wait_for_selector(f"{FILES} >> text=The link has the scenario", state="detached")
-    if opened:
-        assert server.wait_for("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
-    page.evaluate(PAINTED)
-    assert len(server.asked("load")) == opened
-
-
-@pytest.mark.parametrize("damaged", ["x", "xyz", "A" * 3000])
-def test_a_damaged_link_is_reported(files, server, damaged):
-    page = files()
-    page.evaluate("damaged => { location.hash = `#state=${damaged}`; }", damaged)
-    page.wait_for_selector("text=The link is damaged")
-    assert not server.asked("load")
 
 
 def test_a_run_is_opened_compared_closed_and_downloaded(files, server):

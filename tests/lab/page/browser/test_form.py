@@ -7,7 +7,7 @@ import pytest
 from browser_layout import too_wide
 from fake_page import until
 from flexneedle.lab.page.messages import Refused, Session
-from flexneedle.lab.page.server.catalog import SCHEMA
+from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
 from recorded_page import WELCOME, opening, people, scene, scene_frames
@@ -58,7 +58,7 @@ def test_every_table_that_may_be_set_has_a_field_with_values_to_begin_with(form)
     """One after the other, since tables have others inside; the field shows which it is, and takes it back."""
     page, scenario, seen = form(), load_scenario("phantom3d"), {}
     while True:
-        fields = page.evaluate(FIELDS, [json.loads(SCHEMA), scenario.flat()])
+        fields = page.evaluate(FIELDS, [json.loads(build_catalog().schema), scenario.flat()])
         starts = {
             each["key"]: each["start"] for each in fields if "start" in each and each["key"] not in seen
         }
@@ -410,7 +410,7 @@ def test_it_fits_its_width(form, pictures, size, scheme):
 
 def test_no_unit_is_left_in_a_label(form):
     noisy = load_scenario("phantom3d").with_values({"tracker.environment": "noisy"})
-    fields = form().evaluate(FIELDS, [json.loads(SCHEMA), noisy.flat()])
+    fields = form().evaluate(FIELDS, [json.loads(build_catalog().schema), noisy.flat()])
     labels = {each["key"]: [each["label"], each["unit"]] for each in fields}
     assert labels["tracker.environment.tilt_mrad_per_mm"] == ["Tilt", "mrad/mm"]
     units = {"mm", "mrad", "rad", "deg", "kpa", "gpa", "mn", "mj", "hz", "per"}

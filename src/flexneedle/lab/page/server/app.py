@@ -16,7 +16,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
-from flexneedle.lab.page.server.catalog import SCHEMA
+from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.lab.page.server.desk import Desk
 from flexneedle.lab.page.server.folder import FIGURES, replay_html, trace_csv, zipped
 from flexneedle.lab.page.server.guard import Gate, Guard
@@ -34,7 +34,7 @@ def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
-        desk.start()
+        await desk.start()
         yield
         await desk.end()
 
@@ -42,7 +42,7 @@ def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
         return FileResponse(static / "index.html")
 
     async def schema(_request: Request) -> Response:
-        return Response(SCHEMA, media_type="application/schema+json")
+        return Response(build_catalog().schema, media_type="application/schema+json")
 
     async def socket(connection: WebSocket) -> None:
         await live(connection, desk)

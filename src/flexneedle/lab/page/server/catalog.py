@@ -1,18 +1,29 @@
-"""What can be chosen, from a file, since the controllers themselves load the compiler.
-
-`python tools/docs/page_catalog.py` writes the file.
-"""
+"""Controllers that a client can choose, and the JSON schema of its form."""
 
 import json
-from importlib.resources import files
-from typing import Any, get_args
+from dataclasses import dataclass
+from functools import cache
+from typing import get_args
 
 from flexneedle.lab.page.messages import Strategy
 
-_CATALOG: dict[str, Any] = json.loads((files(__package__) / "catalog.json").read_text(encoding="utf-8"))
-
-CONTROLLERS: list[dict[str, str]] = _CATALOG["controllers"]
-"""Name and summary of each controller, the default first."""
 STRATEGIES: list[str] = list(get_args(Strategy))
-SCHEMA = json.dumps(_CATALOG["schema"], ensure_ascii=False).encode()
-"""JSON schema of scenario files, as `flexneedle scenario schema` prints it."""
+
+
+@dataclass(frozen=True)
+class Catalog:
+    """Choices of the page. controllers: name and summary of each, the default first; schema: of scenario files."""
+
+    controllers: list[dict[str, str]]
+    schema: bytes
+
+
+@cache
+def build_catalog() -> Catalog:
+    """Return the choices. The first call imports the controllers, which takes about 0.6 s."""
+    from flexneedle.control.controllers import CONTROLLERS
+    from flexneedle.control.tables import typed_scenario
+
+    controllers = [{"name": one.name, "summary": one.summary} for one in CONTROLLERS.values()]
+    schema = typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
+    return Catalog(controllers, json.dumps(schema, ensure_ascii=False).encode())

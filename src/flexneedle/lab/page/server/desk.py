@@ -4,7 +4,7 @@ import asyncio
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal, assert_never
@@ -13,7 +13,7 @@ from flexneedle.lab.page import messages as m
 from flexneedle.lab.page.frames import Source
 from flexneedle.lab.page.orders import Do, Kind, Work
 from flexneedle.lab.page.scene import scene_of
-from flexneedle.lab.page.server.catalog import CONTROLLERS, STRATEGIES
+from flexneedle.lab.page.server.catalog import STRATEGIES, build_catalog
 from flexneedle.lab.page.server.folder import RunsFolder
 from flexneedle.lab.page.server.hub import Hub, Outbox
 from flexneedle.lab.page.server.insertion import Live
@@ -69,10 +69,12 @@ class Desk:
 
     # Start and end
 
-    def start(self) -> None:
+    async def start(self) -> None:
         """Start the workers, and the plan of the first scenario."""
         for jobs in (self._plans, self._insertions):
             jobs.worker.start()
+        default = (await asyncio.to_thread(build_catalog)).controllers[0]["name"]
+        self.session = replace(self.session, controller=self.session.controller or default)
         self.hub.publish(self.people.news())
         self._begin(self.session)
         self._order("plan", "plan")
@@ -115,7 +117,7 @@ class Desk:
         return m.Welcome(
             client=client,
             presets=PRESETS.names(),
-            controllers=CONTROLLERS,
+            controllers=build_catalog().controllers,
             strategies=STRATEGIES,
             rig=self._rig_name,
         )
@@ -233,7 +235,7 @@ class Desk:
         self._start_timer("plan", self.limits.rest_s, self._at_rest)
 
     def _with_options(self, options: m.Options) -> Session:
-        known = [controller["name"] for controller in CONTROLLERS]
+        known = [controller["name"] for controller in build_catalog().controllers]
         if options.controller is not None and options.controller not in known:
             raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
         return self.session.with_options(options)

@@ -87,10 +87,6 @@ class Outbox:
         self._answered += 1
         self._add(f"answer {self._answered}", news)
 
-    def notice(self, news: News) -> None:
-        """Add an answer that replaces the last notice, if that is not sent yet."""
-        self._add("notice", news)
-
     def touch(self, key: str) -> None:
         """Note that a key has news. The state of a job comes after what the job has sent before."""
         if _is_job(key):

@@ -2,28 +2,22 @@
 
 from dataclasses import dataclass
 
-_BYTES_OF_A_MESSAGE = 4_000
-
 
 @dataclass(frozen=True)
 class Limits:
     """Limits of clients and waits; `_s` in seconds.
 
-    message_bytes: of a message but a scenario file's; rate and burst: messages a second, and at once, where each
-    4000 bytes count as one more; excess: refused messages after which a client is disconnected.
+    message_bytes: of a message but a scenario file's; answers: unread answers before a client is disconnected.
     """
 
     clients: int = 32
     message_bytes: int = 16_000
     file_bytes: int = 380_000
-    rate: float = 100.0
-    burst: float = 200.0
-    excess: int = 1_000
     answers: int = 500
     ping_s: float = 1.0
     pong_s: float = 10.0
     silent_s: int = 10
-    """A connection that is no web socket is closed when it has asked for nothing for this time, or up to twice it."""
+    """An HTTP connection is closed when it has been idle for this time after a response."""
     send_s: float = 10.0
     """A client that does not take a message for this time is disconnected."""
     rest_s: float = 0.1
@@ -46,28 +40,3 @@ class Limits:
 
 RIG = Limits(ping_s=0.5, pong_s=1.5, send_s=1.5)
 """With a connected rig: a client that is silent is lost after 2 s at most, the sum of the first two."""
-
-
-class Rate:
-    """The budget of a client: full at first, refilled with time."""
-
-    def __init__(self, limits: Limits, now: float) -> None:
-        self._limits, self._left, self._then = limits, limits.burst, now
-        self.refused = 0
-
-    def allows(self, size: int, now: float) -> bool:
-        """Whether a message of `size` bytes at the time `now` (s) is within the budget, from which it is taken."""
-        limits = self._limits
-        self._left = min(limits.burst, self._left + (now - self._then) * limits.rate)
-        self._then = now
-        cost = 1.0 + size / _BYTES_OF_A_MESSAGE
-        if cost > self._left:
-            self.refused += 1
-            return False
-        self._left -= cost
-        return True
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether so many messages were refused that the client is disconnected."""
-        return self.refused > self._limits.excess

@@ -12,15 +12,14 @@ from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from flexneedle.errors import make_printable
-from flexneedle.lab.page.messages import REQUESTS, AnyRequest, Done, Load, Refused, Stop
+from flexneedle.lab.page.messages import REQUESTS, AnyRequest, Done, Load, Refused
 from flexneedle.lab.page.server.desk import Desk
 from flexneedle.lab.page.server.hub import Outbox
-from flexneedle.lab.page.server.limits import Limits, Rate
+from flexneedle.lab.page.server.limits import Limits
 from flexneedle.lab.page.server.refusal import Refusal
 
 _TRY_LATER, _AGAINST_RULES = 1013, 1008
 _LONGEST_REASON = 120  # bytes of the reason of a close frame, of which 123 are allowed
-_LONGEST_STOP = 100
 _LONGEST_NUMBER = 40
 _NUMBER = re.compile(r'"request"\s*:\s*(\d{1,15})\s*\}\s*$')
 
@@ -72,30 +71,11 @@ async def _received(socket: WebSocket) -> Mapping[str, Any]:
 
 
 async def _read(socket: WebSocket, desk: Desk, client: int, outbox: Outbox) -> None:
-    clock = asyncio.get_running_loop().time
-    rate = Rate(desk.limits, clock())
     while True:
-        received = await _received(socket)
-        text = received.get("text")
-        size = len(text or received.get("bytes") or "")
-        if not rate.allows(size, clock()):
-            if _is_stop(text):
-                _answer(desk, client, outbox, text)
-            if rate.exhausted:
-                raise _Closing(_AGAINST_RULES, "too many messages")
-            outbox.notice(Refused(what="message", reason="too many messages: wait a moment"))
-            continue
+        text = (await _received(socket)).get("text")
         if outbox.waiting > desk.limits.answers:
             raise _Closing(_AGAINST_RULES, "too many requests whose answers were not read")
         _answer(desk, client, outbox, text)
-
-
-def _is_stop(text: str | None) -> bool:
-    """Whether a message stops the insertion, which anybody may at any time, also a page that has sent too much."""
-    try:
-        return isinstance(_parsed(text, _LONGEST_STOP), Stop)
-    except Refusal:
-        return False
 
 
 def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:

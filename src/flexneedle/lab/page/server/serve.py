@@ -10,7 +10,6 @@ import uvicorn
 
 from flexneedle.errors import InputError
 from flexneedle.lab.page.server.app import STATIC, application
-from flexneedle.lab.page.server.connections import Connection
 from flexneedle.lab.page.server.desk import Desk, Setup
 from flexneedle.lab.page.server.guard import Gate, is_loopback
 from flexneedle.lab.page.server.limits import Limits
@@ -93,7 +92,7 @@ def _config(application: Any, limits: Limits) -> uvicorn.Config:
     return uvicorn.Config(
         application,
         loop="asyncio",
-        http=Connection,
+        http="h11",
         ws="websockets-sansio",
         ws_max_size=_LONGEST_MESSAGE,
         ws_ping_interval=limits.ping_s,

@@ -38,7 +38,7 @@ class Session:
     name: str
     origin: Scenario
     scenario: Scenario
-    controller: str
+    controller: str = ""
     seed: int = 0
     strategy: Strategy = "manipulation"
     revision: int = 1
@@ -46,9 +46,9 @@ class Session:
     notes: tuple[str, ...] = field(default=())
 
     @classmethod
-    def of(cls, name: str, scenario: Scenario, controller: str) -> "Session":
-        """A new session of a scenario."""
-        return cls(name, scenario, scenario, controller)
+    def of(cls, name: str, scenario: Scenario) -> "Session":
+        """A new session of a scenario, with the default controller."""
+        return cls(name, scenario, scenario)
 
     def edited(self, values: Mapping[str, Any]) -> "Session":
         """The session with values of the scenario changed by key. Raises Refusal with the problems by key."""

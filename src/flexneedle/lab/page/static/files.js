@@ -1,8 +1,7 @@
-// Scenarios and runs: presets, files, a link to the present state, recorded runs with downloads, pictures.
+// Scenarios and runs: presets, files, recorded runs with downloads, pictures.
 
 import { button, make } from "./dom.js";
 import { unlessChanged } from "./files/changes.js";
-import { followLink, linkOf } from "./files/link.js";
 import { safe } from "./files/names.js";
 import { saveGif, savePng } from "./files/pictures.js";
 import { showRuns } from "./files/runs.js";
@@ -21,13 +20,11 @@ export function mount(element, store, link) {
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
   const status = make("span.quiet", { role: "status" });
-  const address = make("input", { type: "text", readonly: true, "aria-label": "Link to copy", hidden: true });
-  const copy = button("Copy a link", () => copyLink(store, status, address), { title: "A link to this scenario with seed, strategy and controller" });
   const picture = button("Picture", savePng, { title: "The scene as PNG: in space, or in section where WebGL is missing" });
   const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
-  element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), address, runs);
+  element.append(steered, make("div.tools", {}, save, picture, gif, status), runs);
 
   file.addEventListener("change", () => loadFile(file, store, link, status));
   acceptDrops(element, store, link, status);
@@ -36,7 +33,6 @@ export function mount(element, store, link) {
     steered.disabled = !maySteer(store);
   });
   showRuns(runs, store, link);
-  followLink(store, link, status);
 }
 
 function choosePreset(select, store) {
@@ -78,21 +74,6 @@ function acceptDrops(element, store, link, status) {
     const [file] = event.dataTransfer.files;
     if (file) send(file, store, link, status);
   });
-}
-
-// A browser may refuse the clipboard; it has none for a page that another computer serves without encryption.
-async function copyLink(store, status, field) {
-  field.value = await linkOf(store);
-  try {
-    await navigator.clipboard.writeText(field.value);
-    status.textContent = "Copied";
-    field.hidden = true;
-  } catch {
-    status.textContent = "The clipboard is not available: copy the link below";
-    field.hidden = false;
-    field.focus();
-    field.select();
-  }
 }
 
 // A GIF of the insertion that is shown, with its progress.

@@ -6,7 +6,7 @@ import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
 const SCENE = ["status", "section", "axial", "space"];
-const OTHERS = ["form", "insertion", "player", "plans", "plots", "files", "tour"];
+const OTHERS = ["form", "insertion", "player", "plans", "plots", "files"];
 const PATIENCE = 2000; // ms
 const FRAMES = 3; // until what is mounted is on the screen
 

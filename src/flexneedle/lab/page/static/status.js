@@ -29,9 +29,6 @@ export function mount(element, store, link) {
   const stop = button("Stop the insertion", () => link.ask({ type: "stop" }), { class: "danger", hidden: true });
   const refusals = make("div.refusals", { role: "alert" });
   element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
-  new ResizeObserver(([{ target }]) => { // above which the tour is
-    document.documentElement.style.setProperty("--status-height", `${target.offsetHeight}px`);
-  }).observe(element);
 
   store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
   followSteering(steering, store, link);
