@@ -250,12 +250,11 @@ def test_an_answer_comes_after_the_news():
     assert [message["type"] for message in drained(outbox)] == ["session", "refused", "scene"]
 
 
-def test_answers_are_not_replaced_and_notices_are():
+def test_answers_are_not_replaced():
     outbox = joined(Hub())
     for number in range(3):
         outbox.answer(Refused(request=number, what="edit", reason="no"))
-        outbox.notice(Refused(request=number, what="message", reason="no"))
-    assert [message["request"] for message in drained(outbox)] == [0, 2, 1, 2]
+    assert [message["request"] for message in drained(outbox)] == [0, 1, 2]
 
 
 def test_next_waits_for_news():
