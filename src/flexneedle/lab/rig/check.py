@@ -8,7 +8,7 @@ from statistics import median
 from typing import Protocol, TypeVar
 
 from flexneedle.errors import FlexneedleError, one_line
-from flexneedle.lab.rig.devices.registry import OpenTracker, open_motors, open_tracker
+from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
 from flexneedle.lab.rig.fit import fit_problems, queued, room_problems
 from flexneedle.lab.rig.moves import uncertain
 from flexneedle.lab.rig.rig_file import RigFile

@@ -328,7 +328,7 @@ def _off(args: argparse.Namespace) -> int:
 
 def _positions(rig: RigFile) -> dict[str, float]:
     """Where the axes are, mm or rad. Raises DriverError if the driver has no such channel, or cannot be read."""
-    from flexneedle.lab.rig.devices.registry import open_motors
+    from flexneedle.lab.rig.devices.opening import open_motors
 
     with closing(open_motors(rig)) as motors:
         states = motors.read()

@@ -1,13 +1,17 @@
 """How fast the axes of a rig are with their acceleration and the queue of the loop. Pure functions."""
 
 import math
+from collections.abc import Iterator
 
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.lab.rig.supervisor.trajectory import between, shortest
+from flexneedle.ports import MotorPaces
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.axes import Axis
 
 _ROUNDING = 1e-9
+_SHOWN = 1e6  # digits of a limit in a message
 
 
 def attained(axis: Axis, loop: LoopSettings, speed: float) -> float:
@@ -39,3 +43,29 @@ def _kept(axis: Axis, speed: float) -> str:
         return f"{most} {unit}/s"
     why = f"acceleration_{unit}_s2 = {axis.shown(axis.acceleration)} brakes from no more within the queue"
     return f"{speed / axis.size:.3g} of {most} {unit}/s: {why}"
+
+
+def pace_problems(rig: RigFile, paces: MotorPaces | None) -> list[str]:
+    """Return a line for each speed and acceleration of a rig that its motor controller does not take."""
+    return [] if paces is None else [to_line(problem) for problem in _pace_problems(rig, paces)]
+
+
+def _pace_problems(rig: RigFile, paces: MotorPaces) -> Iterator[Problem]:
+    for name, axis in rig.axes.items():
+        for key, per, limits in (("speed", "s", paces.speeds), ("acceleration", "s2", paces.accelerations)):
+            value = getattr(axis, key)
+            if rule := _pace_rule(axis, value, limits, per.replace("2", "²")):
+                yield Problem(f"axes.{name}.{key}_{axis.unit}_{per}", float(axis.shown(value)), rule)
+
+
+def _pace_rule(axis: Axis, value: float, limits: tuple[float, float], per: str) -> str:
+    """Return the rule that a speed or an acceleration (mm or rad, and s) breaks, or "". limits: in counts."""
+    (least, most), counts = limits, abs(axis.scale)
+    file = _SHOWN / (counts * axis.size)
+    if value * counts < least:
+        limit = math.ceil(least * file) / _SHOWN  # rounded to a value that is accepted
+        return f"must be at least {limit:.12g}: the controller takes {least:.12g} counts/{per} and more"
+    if value * counts > most:
+        limit = math.floor(most * file) / _SHOWN
+        return f"must be at most {limit:.12g}: the controller takes {most:.12g} counts/{per} and less"
+    return ""

@@ -33,16 +33,15 @@ from flexneedle.lab.study.spec import (
 from flexneedle.loop.parts import (
     SCENARIO_TRACKER,
     controller_of,
-    digests,
     own_controllers,
     plant_of,
     tracker_of,
 )
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
 from flexneedle.planning.planner import STRATEGIES
+from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.own import is_own
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.settings import Target
 from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
@@ -218,7 +217,7 @@ def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
         **settings,
         "scenario": base.values(),
         "insertions": len(grid) * repeats,
-        "own": digests(name for of_key in names.values() for name in of_key),
+        "own": digest_modules(name for of_key in names.values() for name in of_key),
     }
     return Study(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 

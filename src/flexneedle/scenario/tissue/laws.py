@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 
 from flexneedle.errors import InputError, make_printable
-from flexneedle.scenario.own import resolved
+from flexneedle.plugins import load_part
 from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.scenario.tissue.linear import Linear
@@ -61,7 +61,7 @@ def _law(name: object) -> type[Layer]:
     if not isinstance(name, str):
         refuse([Problem("law", name, "must be text in quotes")])
     try:
-        law = LAWS[str(name)] if name in LAWS else resolved(str(name), LAWS)
+        law = LAWS[str(name)] if name in LAWS else load_part(str(name), LAWS)
     except InputError as error:
         refuse([Problem("law", name, str(error))])
     if not _is_law(law):

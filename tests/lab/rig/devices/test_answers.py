@@ -11,7 +11,7 @@ import bench_rig
 from bench_rig import Clock, Motors, Tracker, rig
 from commands import run
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.devices.registry import open_motors, open_tracker
+from flexneedle.lab.rig.devices.opening import open_motors, open_tracker
 from flexneedle.ports import MotorSetup, MotorState
 from flexneedle.types import Frame, SensorReading
 
@@ -63,10 +63,10 @@ def frame(**reading):
         ([STATE], "must be a mapping of each channel to a MotorState, not a list"),
         ({1: STATE}, "must have text as each channel, not an int"),
         ({"A": 3.0}, "must have a MotorState for channel A, not a float"),
-        ({"A": MotorState("3", 0.0)}, "channel A: position must be a number, not a str"),
+        ({"A": MotorState("3", 0.0)}, "channel A: position must be a number, not '3'"),
         ({"A": MotorState(0.0, None)}, "channel A: commanded must be a number, not None"),
-        ({"A": MotorState(0.0, 0.0, on="off")}, "channel A: on must be True or False, not a str"),
-        ({"A": MotorState(0.0, 0.0, repeated="no")}, "channel A: repeated must be True or False, not a str"),
+        ({"A": MotorState(0.0, 0.0, on="off")}, "channel A: on must be True or False, not 'off'"),
+        ({"A": MotorState(0.0, 0.0, repeated="no")}, "channel A: repeated must be True or False, not 'no'"),
         ({"A": MotorState(0.0, 0.0, stopped=None)}, "channel A: stopped must be text, not None"),
     ],
 )
@@ -91,7 +91,7 @@ def test_states_of_motors_are_of_their_type(monkeypatch, answer, line):
         (
             "setup",
             lambda _: {"A": MotorSetup(0.0, 1.0, "2", False)},
-            "Stage.setup(): channel A: most_error must be a number, not a str",
+            "Stage.setup(): channel A: most_error must be a number, not '2'",
         ),
     ],
 )
@@ -114,15 +114,18 @@ def test_what_a_driver_has_besides_is_of_its_type(monkeypatch, part, value, line
         (None, "must be a tuple of Frame, not None"),
         (frame()[0], "must be a tuple of Frame, not a Frame"),
         (("tip",), "must be a tuple of Frame, but one is a str"),
-        ((Frame("0", 1, {}),), "Frame: time must be a number, not a str"),
+        ((Frame("0", 1, {}),), "Frame: time must be a number, not '0'"),
         ((Frame(0.0, 1, []),), "Frame: must be a mapping of each sensor to a SensorReading, not a list"),
         (
             (Frame(0.0, 1, {"tip": (1, 2, 3)}),),
             "Frame: must have a SensorReading for sensor tip, not a tuple",
         ),
-        (frame(position=(1.0, 2.0)), "Frame: sensor tip: position must be 3 numbers or None"),
-        (frame(position="123"), "Frame: sensor tip: position must be 3 numbers or None"),
-        (frame(orientation=(1.0, 0.0)), "Frame: sensor tip: orientation must be 4 numbers or None"),
+        (frame(position=(1.0, 2.0)), "Frame: sensor tip: position must be 3 numbers or None, not (1.0, 2.0)"),
+        (frame(position="123"), "Frame: sensor tip: position must be 3 numbers or None, not '123'"),
+        (
+            frame(orientation=(1.0, 0.0)),
+            "Frame: sensor tip: orientation must be 4 numbers or None, not (1.0, 0.0)",
+        ),
         (
             frame(orientation=(0.0, 1.02, 0.0, 0.0)),
             "Frame: sensor tip: orientation must be a unit quaternion w, x, y, z, not one of length 1.02",
@@ -131,7 +134,7 @@ def test_what_a_driver_has_besides_is_of_its_type(monkeypatch, part, value, line
             frame(orientation=(0.0, 0.0, 0.0, 0.0)),
             "Frame: sensor tip: orientation must be a unit quaternion w, x, y, z, not one of length 0",
         ),
-        (frame(indicator="0"), "Frame: sensor tip: indicator must be a number or None, not a str"),
+        (frame(indicator="0"), "Frame: sensor tip: indicator must be a number or None, not '0'"),
         (frame(status=None), "Frame: sensor tip: status must be text, not None"),
     ],
 )

@@ -13,7 +13,7 @@ from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices import lock
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.devices.lock import held, lock_file, this_program
-from flexneedle.lab.rig.devices.registry import address_of
+from flexneedle.lab.rig.devices.opening import address_of
 from flexneedle.lab.rig.rig_file import Part
 from galil_peer import peer
 

@@ -19,8 +19,8 @@ from typing import Any
 from flexneedle.errors import FlexneedleError, describe_error, one_line
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.devices.lock import held
+from flexneedle.lab.rig.devices.opening import address_of, open_motors, open_tracker
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
-from flexneedle.lab.rig.devices.registry import address_of, open_motors, open_tracker
 from flexneedle.lab.rig.supervisor import messages as say
 from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.lab.rig.supervisor.dry import DryMotors

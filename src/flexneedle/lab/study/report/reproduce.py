@@ -10,9 +10,9 @@ from flexneedle.control.controllers import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.files import replace_file
 from flexneedle.lab.study.findings.rows import Rows
+from flexneedle.plugins import is_own
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.own import is_own
 from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.worlds import PLANE, world_name
 

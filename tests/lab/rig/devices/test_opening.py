@@ -9,9 +9,9 @@ import pytest
 
 from bench_rig import Clock, Motors, Tracker, rig
 from flexneedle.errors import DriverError, InputError, RigError, RunError
-from flexneedle.lab.rig.devices.registry import DRIVERS, TRACKERS, open_motors, open_tracker
+from flexneedle.lab.rig.devices.opening import DRIVERS, TRACKERS, open_motors, open_tracker
+from flexneedle.plugins import load_part
 from flexneedle.ports import MotorPaces
-from flexneedle.scenario.own import resolved
 from galil_peer import peer
 
 PROJECT = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())["project"]
@@ -112,7 +112,7 @@ def message(call, *arguments):
 @pytest.mark.parametrize("group", [DRIVERS, TRACKERS])
 def test_what_the_package_registers_exists(group):
     points = PROJECT["entry-points"].get(group, {})
-    assert all(callable(resolved(value, ())) for value in points.values())
+    assert all(callable(load_part(value, ())) for value in points.values())
     assert group != TRACKERS or {"aurora", "replay"} <= set(points)
 
 
@@ -201,7 +201,7 @@ def test_any_error_in_a_device_of_your_own_names_it_the_call_and_the_line():
     motors.stop()
     assert not hasattr(motors, "describe")
     with pytest.raises(
-        DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_registry\.py, "
+        DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_opening\.py, "
     ):
         open_motors(rig(driver={"kind": "parts:does_not_open"}))
     with pytest.raises(DriverError, match=r"^tracker parts:does_not_open: KeyError: 'nothing' "):
