@@ -18,8 +18,11 @@ ROOT = Path(__file__).parents[2]
 CHECKED = (
     "README.md",
     "docs/architecture.md",
+    "docs/choose-values.md",
+    "docs/extend.md",
     "docs/how-to",
     "docs/index.md",
+    "docs/page.md",
     "docs/reference/api.md",
     "docs/reference/commands.md",
     "docs/tutorial.md",
