@@ -120,7 +120,6 @@ def test_few_blocks_are_not_run_and_each_has_a_reason():
         "installs into an environment of yours",
         "needs an Aurora",
         "runs until Ctrl-C",
-        "tests/rig/devices/test_docs.py runs it",
     }
     assert len(skipped) < 12
 

@@ -2,7 +2,6 @@
 
 import re
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,15 +75,13 @@ fiducials_mm = [[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 80.0, 0.0]]
 """
 
 
-def test_the_example_in_the_docs_measures_the_tip_in_the_stages_frame(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[3] / "docs/tracking/register.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_a_registered_tracker_measures_the_tip_in_the_stages_frame(tmp_path):
     preset = files("flexneedle.scenario").joinpath("presets/phantom.toml").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(preset + REGISTERED, encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    with emulated("--still") as path:
-        names = {"driver": Motors(None), "samples": [], "until": until}
-        within = "    until(lambda: samples.extend(rig.tracker.read()) or samples)\n"
-        exec(code.replace("/dev/ttyUSB0", path) + within, names)
-    sample = names["samples"][0]
+    settings = flexneedle.load_scenario(tmp_path / "mine.toml").tracker
+    with emulated("--still") as path, Aurora(path, WallClock()) as tracker:
+        tip = OnStage(tracker, to_stage(settings.registration), settings.tip_offset_mm)
+        samples = []
+        until(lambda: samples.extend(tip.read()) or samples)
+    sample = samples[0]
     np.testing.assert_allclose((sample.x, sample.y, sample.z), (1.0, 202.0, 3.0), atol=1.0)
