@@ -2,6 +2,8 @@
 
 import math
 
+from flexneedle.costs.terms import ADAPTIVE_MPC, CE_MPC, PLAN
+
 HUGE = 10**400
 ABOVE_ZERO = "must be above 0"
 NUMBER = "must be a number"
@@ -64,6 +66,9 @@ POSITIVE = [
     "phantom.structure.bevel_length_factor",
 ]
 NOT_NEGATIVE = [
+    *(f"plan.{weight.key}" for weight in PLAN.settings()),
+    *(f"control.ce_mpc.{weight.key}" for weight in CE_MPC.settings()),
+    *(f"control.adaptive_mpc.{weight.key}" for weight in ADAPTIVE_MPC.settings()),
     "needle.inner_diameter_mm",
     "needle.bevel.offset_mm",
     "tissue[0].energy_weight",
@@ -71,31 +76,15 @@ NOT_NEGATIVE = [
     "plan.guide_sigma_mm",
     "plan.base_sigma_mm",
     "plan.base_turn_sigma_mrad",
-    "plan.accuracy_weight_per_mm",
-    "plan.energy_weight_per_mj",
-    "plan.deflection_weight",
-    "plan.guide_weight",
-    "plan.flip_weight",
     "plan.smoothing",
     "control.ce_mpc.orientation_weight_mm",
     "control.ce_mpc.curvature_per_m",
     "control.load_gain",
-    "control.ce_mpc.guide_weight",
-    "control.ce_mpc.energy_weight_per_mj",
     "control.ce_mpc.flip_dead_band",
     "control.start_offset_sd_mm",
     "control.start_angle_sd_mrad",
     "control.start_axial_sd_mm",
     "control.adaptive_mpc.urgency",
-    "control.adaptive_mpc.energy_weight_mm",
-    "control.adaptive_mpc.unguided_energy_weight_mm",
-    "control.adaptive_mpc.line_weight",
-    "control.adaptive_mpc.unguided_line_weight",
-    "control.adaptive_mpc.slope_weight_mm",
-    "control.adaptive_mpc.roll_weight_mm",
-    "control.adaptive_mpc.late_roll_weight",
-    "control.adaptive_mpc.reach_weight",
-    "control.adaptive_mpc.unguided_reach_weight",
     "control.adaptive_mpc.unguided_reach_margin",
     "control.adaptive_mpc.clearance_mm",
     "control.adaptive_mpc.clearance_sd_mm",

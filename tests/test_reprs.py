@@ -8,10 +8,10 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
+from flexneedle.costs.table import Trajectories
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.phantom.draw import draw
-from flexneedle.planning.terms import Trajectories
 from flexneedle.types import Frame, SensorReading
 from synthetic import make_insertion, make_plan
 from tasks import begun_with, task_of

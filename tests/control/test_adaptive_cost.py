@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
 from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.control.path import of_plan
-from flexneedle.planning import terms
+from flexneedle.costs import terms
+from flexneedle.costs.table import charges
 from flexneedle.planning.planner import bevel_reach
-from flexneedle.planning.terms import charges
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Y
@@ -69,7 +69,7 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
     trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
-    past = float(terms.past(trajectories, quick_plan.target)[0].real)
+    past = float(terms.past_target(trajectories, quick_plan.target)[0].real)
     assert abs(past) > 1e-3
     blur = 0.3 * ahead.left / 40.0
     assert blur < 0.25
@@ -85,7 +85,7 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
     trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
-    off = terms.past(trajectories, quick_plan.target)[0].real
+    off = terms.past_target(trajectories, quick_plan.target)[0].real
     tips = np.repeat(trajectories.tips, 3, axis=0)
     tips[:, -1, Y] += np.array([0.01, 0.3, 30.0]) - off
     charged = charges(
@@ -126,8 +126,9 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least), 0.0), roll=roll)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, unrolled(of_plan(plan)))
-    expected = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task), 1.0)
-    kept, _, rolled, _ = expected(adaptive_mpc.measured_rollout(estimate, ahead.constant))
+    expected, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task), 1.0)
+    rollout = adaptive_mpc.measured_rollout(estimate, ahead.constant)
+    kept, _, rolled, _ = terms.out_of_reach(rollout, expected, angle)
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == state.bevel.real)
 
@@ -142,7 +143,7 @@ def test_the_bevel_keeps_its_reach_with_a_margin_where_it_steers_alone(quick_pla
     ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
     charged = {term.name: term.value for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
     sure, wide, wider = (
-        adaptive_mpc.out_of_reach(task, estimate, ahead, memory, margin).keywords["expected"]
+        adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, margin)[0]
         for margin in (0.0, 1.0, task.settings.unguided_reach_margin)
     )
     assert (sure <= wide).all()

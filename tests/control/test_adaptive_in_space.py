@@ -79,15 +79,14 @@ def test_the_reach_after_a_step_is_the_disc_of_what_the_bevel_does_then(state, d
     radius = np.mean([np.abs(np.array(around) - np.mean(around)).mean() for around in rolled.values()])
     target = middle + (radius + beyond) * cmath.exp(1j * direction)
     task, estimate, memory, ahead = prepared(state, target)
-    term = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0)
-    angle = term.keywords["angle"]
+    distances, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
     aimed = state.bevel * cmath.exp(1j * angle)
     assert aimed == pytest.approx((target - middle) / abs(target - middle), abs=1e-2)
-    for expected, first in zip(term.keywords["expected"], (angle, angle + math.pi), strict=True):
+    for expected, first in zip(distances, (angle, angle + math.pi), strict=True):
         around = np.array([ends(state, first=first, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
         away = abs(target - around.mean()) - np.abs(around - around.mean()).mean()
         assert expected == pytest.approx(max(0.0, away), abs=0.03)
-    towards, back = term.keywords["expected"]
+    towards, back = distances
     assert towards < back or beyond < 0.0
 
 
@@ -99,12 +98,12 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
     far = middle + side * 3.0j
     task, estimate, memory, ahead = prepared(state, far)
-    both = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0).keywords
+    both, _ = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
     task, estimate, memory, ahead = prepared(there, far + 5.0, one_axis)
-    across = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0).keywords
-    assert across["expected"] == pytest.approx(both["expected"], abs=0.02)
-    assert across["expected"][0] > 1.0
-    assert there.bevel * cmath.exp(1j * across["angle"]) == pytest.approx(side * 1j, abs=1e-9)
+    across, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, 1.0)
+    assert across == pytest.approx(both, abs=0.02)
+    assert across[0] > 1.0
+    assert there.bevel * cmath.exp(1j * angle) == pytest.approx(side * 1j, abs=1e-9)
     weight = {term.name: term.weight for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
     assert weight["reach"] == task.settings.unguided_reach_weight
 
@@ -115,8 +114,7 @@ def test_the_disc_is_charged_with_a_margin_of_its_uncertainty(state):
     task, estimate, memory, ahead = prepared(state, middle + 2.0)
     estimate = replace(estimate, precision=1e-8 * estimate.precision)
     one, three = (
-        adaptive_mpc.out_of_reach(task, estimate, ahead, memory, margin).keywords["expected"]
-        for margin in (1.0, 3.0)
+        adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, margin)[0] for margin in (1.0, 3.0)
     )
     assert (three > one).all()
 

@@ -13,9 +13,9 @@ from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_o
 from flexneedle.control.controllers import DEFAULT, adaptive_mpc
 from flexneedle.control.interface import travel_left
 from flexneedle.control.path import of_plan
+from flexneedle.costs.table import cost
 from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation
-from flexneedle.planning.terms import cost
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator

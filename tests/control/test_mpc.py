@@ -9,8 +9,9 @@ import flexneedle
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import at_depth
+from flexneedle.costs.table import Trajectories, cost
+from flexneedle.costs.terms import CE_MPC
 from flexneedle.estimation.task import Task
-from flexneedle.planning.terms import Trajectories, cost
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DB_Y, DG_Y, DG_Z, ROLL, STILL, Control, X, Y
 from tasks import stretched, task_of
@@ -164,7 +165,14 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc.controls_of(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
     trajectories = Trajectories(controls, *simulator.rollout(state, controls)[:3])
-    best = cost(mpc.cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, [DG_Y, DG_Z]]), trajectories).min()
+    settings = mpc.CeMpc(horizon=1)
+    charged = CE_MPC.terms(
+        settings,
+        reference=reference,
+        orientation=settings.orientation_weight_mm,
+        nominal=nominal[:, [DG_Y, DG_Z]],
+    )
+    best = cost(charged, trajectories).min()
     assert choice.cost <= best + 0.002
 
 

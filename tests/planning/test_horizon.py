@@ -9,9 +9,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from flexneedle import controls as controls_of
+from flexneedle.costs import terms
+from flexneedle.costs.table import Term, Trajectories, cost
 from flexneedle.planning import cross_entropy as ce
-from flexneedle.planning import horizon, terms
-from flexneedle.planning.terms import Term, Trajectories
+from flexneedle.planning import horizon
 from flexneedle.types import DB_X, DG_Y, X, Y
 
 SEARCH = ce.Search(samples=16, elite=4, iterations=3, smoothing=0.2, tolerance=1e-9)
@@ -67,7 +68,7 @@ def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
     """The same samples, the same bytes as the method called by hand."""
     settings = ce.Settings(**vars(SEARCH), lower=VARIABLES.lower, upper=VARIABLES.upper)
     by_hand = ce.minimize(
-        lambda z: terms.cost(TERMS, rigid(controls(z))),
+        lambda z: cost(TERMS, rigid(controls(z))),
         ce.start(VARIABLES.mean, VARIABLES.sigma),
         settings,
         np.random.default_rng(0),
@@ -90,7 +91,7 @@ def test_a_correlation_is_that_of_the_first_samples():
 @hypothesis_settings(max_examples=40)
 def test_it_is_never_worse_than_the_incumbent(seed, z):
     incumbent = np.array([z])
-    before = terms.cost(TERMS, rigid(controls(incumbent)))[0]
+    before = cost(TERMS, rigid(controls(incumbent)))[0]
     others = np.random.default_rng(seed).uniform(-1.0, 1.0, (16, 4))
     found = search(
         seed=seed, settings=replace(SEARCH, iterations=2), first=np.concatenate([incumbent, others])

@@ -11,18 +11,26 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flexneedle import controls as controls_of
-from flexneedle.planning import insertion
+from flexneedle.costs.table import Trajectories, charges
+from flexneedle.costs.terms import PLAN
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem, optimise, schedule, widened
-from flexneedle.planning.terms import Trajectories, charges
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, X, Y
 
+WEIGHTS = PlanSettings(
+    accuracy_weight_per_mm=20.0,
+    energy_weight_per_mj=5.0,
+    deflection_weight=0.002,
+    guide_weight=1.0,
+    flip_weight=0.3,
+)
 PROBLEM = PlanProblem(
     target=(8.0, 2.0, 0.0), travel=12.0, air=4.0, primitives=3,
     step=np.array([1.0, 0.5, 0.0, 0.005, 0.0, 0.5, 0.0]),
     reach=np.array([20.0, 1.0, 1.0, np.inf, np.inf, 2.0, 2.0]),
     sigma=np.array([0.1, 0.0, 0.0, 0.25, 1.0, 0.3]),
-    accuracy_weight=20.0, energy_weight=5.0, deflection_weight=0.002, guide_weight=1.0, flip_weight=0.3,
+    settings=WEIGHTS,
 )  # fmt: skip
 SEARCH = Search(samples=64, elite=8, iterations=30, smoothing=0.2, tolerance=1e-6)
 BOUNDS = np.array([0.25, 0.5, 0.005, 0.5, 3.0, 1.0])
@@ -137,9 +145,7 @@ def made_up(n):
 def terms(z, change=lambda *arrays: arrays, problem=PROBLEM):
     controls, _ = schedule(problem, z)
     trajectories = Trajectories(controls, *change(*made_up(len(controls))))
-    return {
-        name: float(value[0]) for name, value in charges(insertion.cost_terms(problem), trajectories).items()
-    }
+    return {name: float(value[0]) for name, value in charges(problem.terms, trajectories).items()}
 
 
 GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05, 1, 0))
@@ -159,7 +165,8 @@ def test_cost_term_by_term_against_a_computation_by_hand():
 def test_each_weight_scales_its_own_term_alone():
     base = terms(GUIDED)
     for name in base:
-        changed = terms(GUIDED, problem=replace(PROBLEM, **{f"{name.removesuffix('s')}_weight": 7.0}))
+        settings = WEIGHTS.model_copy(update={PLAN.key(name): 7.0})
+        changed = terms(GUIDED, problem=replace(PROBLEM, settings=settings))
         assert changed[name] != pytest.approx(base[name])
         assert {k: v for k, v in changed.items() if k != name} == {k: v for k, v in base.items() if k != name}
 
@@ -185,7 +192,7 @@ def test_padding_of_a_shorter_sample_is_not_charged():
     trajectories = Trajectories(
         controls, np.ones((n, m, 5)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
     )
-    found = charges(insertion.cost_terms(PROBLEM), trajectories)
+    found = charges(PROBLEM.terms, trajectories)
     np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
 
 

@@ -10,23 +10,31 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flexneedle.costs.table import Trajectories
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem
-from flexneedle.planning.terms import Trajectories
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import DB_X, DB_Y, ROLL, THETA, X, Y
 
 SEARCH = Search(samples=16, elite=4, iterations=60, smoothing=0.2, tolerance=1e-6)
 BEND = 0.01  # curvature of the tip's path, 1/mm
 
 
-def problem(lateral, **changes):
+def problem(lateral, energy_weight=0.0, **changes):
     """8 mm in air and 20 mm in tissue, steps of 3 mm, which do not divide it."""
+    settings = PlanSettings(
+        accuracy_weight_per_mm=20.0,
+        energy_weight_per_mj=energy_weight,
+        deflection_weight=0.0,
+        guide_weight=0.0,
+        flip_weight=0.01,
+    )
     made = PlanProblem(
         target=(20.0, lateral, 0.0), travel=28.0, air=8.0, primitives=1,
         step=np.array([3.0, 0.5, 0.0, 0.005, 0.0, 0.5, 0.0]),
         reach=np.array([50.0, 1.0, 1.0, np.inf, np.inf, 2.0, 2.0]), sigma=np.zeros(6),
-        accuracy_weight=20.0, energy_weight=0.0, deflection_weight=0.0, guide_weight=0.0, flip_weight=0.01,
+        settings=settings,
     )  # fmt: skip
     return replace(made, **changes)
 

@@ -23,7 +23,6 @@ _UNITS = {
     "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_ms": "ms", "_s": "s",
     "_periods": "periods", "_mn": "mN", "_deg": "°",
 }  # fmt: skip
-_WITHOUT_ENDING = {"plan.deflection_weight": "1/mm²", "plan.guide_weight": "1/mm²"}
 _LARGEST = 1e6
 
 
@@ -56,8 +55,7 @@ def tables(root: dict[str, Any]) -> Iterator[Table]:
 
 def unit(name: str) -> str:
     """Return the unit of a key by its ending."""
-    ending = next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "–")
-    return _WITHOUT_ENDING.get(name, ending)
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "–")
 
 
 def page() -> str:
@@ -68,7 +66,7 @@ def page() -> str:
 
 def heading(table: Table) -> str:
     """Return the heading of a section."""
-    name = f"[[{table.name}]]" if table.name == "tissue" else f"[{table.name}]"
+    name = f"[[{table.name}]]" if table.name.endswith(("tissue", "own_terms")) else f"[{table.name}]"
     return f"## `{name}`" if table.name else "## Top level"
 
 
@@ -89,7 +87,8 @@ def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) ->
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
     """The schema of the table that a key holds (a list of tables too), None if it holds a value."""
     items = value.get("items", {})
-    choices = [value, items, *items.get("anyOf", []), *value.get("anyOf", [])]
+    either = value.get("anyOf", [])
+    choices = [value, items, *items.get("anyOf", []), *either, *(each.get("items", {}) for each in either)]
     names = [choice["$ref"].rsplit("/", 1)[1] for choice in choices if "$ref" in choice]
     return known[names[0]] if names else None
 
@@ -119,9 +118,9 @@ def _about(table: Table) -> str:
 
 def _row(key: Key, advice: dict[str, Any]) -> str:
     meaning = " ".join(key.schema.get("description", "").split())
-    text = f"{meaning} *Choose:* {advice['keys'][key.name]}"
+    text = f"{meaning} *Choose:* {key.schema.get('choose') or advice['keys'][key.name]}"
     short = key.name.rsplit(".", 1)[-1]
-    cells = (f"`{short}`", unit(key.name), _default(key), allowed(key.schema), text)
+    cells = (f"`{short}`", key.schema.get("unit") or unit(key.name), _default(key), allowed(key.schema), text)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

@@ -1,20 +1,20 @@
 """Cross-entropy model predictive control of advance and guide (paper eq. 13)."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.guide import guide_reach, most_guide_step
 from flexneedle.control.interface import travel_left
-from flexneedle.planning import terms
+from flexneedle.costs.table import Trajectories
+from flexneedle.costs.terms import CE_MPC
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Samples, Variables, best
-from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
+from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.simulator.control import MOVES, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
@@ -23,6 +23,7 @@ from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, Pla
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
 
+@with_weights(CE_MPC)
 class CeMpc(BevelRule):
     """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule for the bevel."""
 
@@ -39,10 +40,6 @@ class CeMpc(BevelRule):
     flip_dead_band: Fraction = 0.875
     """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
     than this off the tip's line the bevel is not rolled."""
-    guide_weight: NonNegative = 0.075
-    """Weight of the squared difference (mm²) between a guide step and the plan's."""
-    energy_weight_per_mj: NonNegative = 2.74
-    """Weight of the tissue's strain energy after each step of the horizon, in mm² per mJ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +82,12 @@ def choose(
     def rollout(rows: Floats) -> Trajectories:
         return Trajectories(rows, *simulator.rollout(state, rows)[:3])
 
-    found = best(variables, rollout, cost_terms(control, reference, nominal[:, DG_Y : DG_Y + 2]), search, rng)
+    steps_of_guide = nominal[:, DG_Y : DG_Y + 2]
+    weight = control.orientation_weight_mm
+    charged = CE_MPC.terms(
+        control, target=plan.target, reference=reference, orientation=weight, nominal=steps_of_guide
+    )
+    found = best(variables, rollout, charged, search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
     return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread, found.samples)
 
@@ -143,16 +145,6 @@ def _variables(
         mean=np.clip(np.concatenate(planned), lower, upper),
         sigma=np.repeat([scenario.plan.advance_sigma_mm, *[sigma] * axes], steps),
         controls=lambda z: controls_of(scenario, state, z, base, travel, roll),
-    )
-
-
-def cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
-    """Deviation from poses (steps, 5), departure from guide steps (steps, 2), tissue energy (paper eq. 13)."""
-    poses = partial(terms.deviation, reference=reference, orientation=control.orientation_weight_mm)
-    return (
-        Term("deviation", 1.0, poses),
-        Term("guide", control.guide_weight, partial(terms.guide_departure, nominal=nominal)),
-        Term("energy", control.energy_weight_per_mj, terms.energy_of_steps),
     )
 
 

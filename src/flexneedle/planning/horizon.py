@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flexneedle.costs.table import RolloutFunction, Term, Trajectories, charges, cost
 from flexneedle.planning import cross_entropy as ce
-from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, charges, cost
 from flexneedle.types import Floats
 
 OnIteration = Callable[[dict[str, Any]], None]

@@ -8,16 +8,16 @@ the sign of ε_y is the direction. The needle is rolled, and charged by the angl
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.planning import terms
+from flexneedle.costs.table import RolloutFunction, Term
+from flexneedle.costs.terms import PLAN
 from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.terms import RolloutFunction, Term
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import (
     COLUMNS,
     DB_PSI,
@@ -50,16 +50,16 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 
 @dataclass(frozen=True)
 class PlanProblem:
-    """Target, limits and weights of a plan: mm, rad.
+    """Target, limits and cost of a plan: mm, rad.
 
     travel: insertion from the start to the target depth, of which `air` comes before the skin; step (7,) and reach
     (7,): largest step of each column of travel of a control, and largest sum of steps; sigma (c,): first standard
-    deviation of each coordinate of a primitive, 0 if not free; axes: 1 or 2; half_turns: the only rolls; rotation:
-    largest angle of the needle to either side; frame: the direction in which the first of two lateral coordinates
-    points; entry: largest change of the point on the skin (mm) and of the slope (rad); mounts: x of base and guide at
-    the start; axis: y + iz of the needle's axis at the target's depth; slope: that of the axis (rad); steepest: its
-    largest size on each lateral axis; lateral_travel: largest distance (mm) on each of the target from the axis;
-    home: an entry that keeps it; left: vector y + iz (mm) to the target from the nearest axis that is free.
+    deviation of each coordinate of a primitive, 0 if not free; settings: weights of the cost; axes: 1 or 2;
+    half_turns: the only rolls; rotation: largest angle of the needle to either side; frame: the direction in which the
+    first of two lateral coordinates points; entry: largest change of the point on the skin (mm) and of the slope (rad); mounts: x of base
+    and guide at the start; axis: y + iz of the needle's axis at the target's depth; slope: that of the axis (rad);
+    steepest: its largest size on each lateral axis; lateral_travel: largest distance (mm) on each of the target from
+    the axis; home: an entry that keeps it; left: vector y + iz (mm) to the target from the nearest axis that is free.
     """
 
     target: Point
@@ -69,11 +69,7 @@ class PlanProblem:
     step: Floats
     reach: Floats
     sigma: Floats
-    accuracy_weight: float  # gamma_1, 1/mm
-    energy_weight: float  # gamma_2, 1/mJ
-    deflection_weight: float  # Q, 1/mm²
-    guide_weight: float  # R, 1/mm²
-    flip_weight: float  # R of a half turn
+    settings: PlanSettings
     axes: int = 1
     half_turns: bool = True
     rotation: float = np.inf
@@ -86,6 +82,11 @@ class PlanProblem:
     lateral_travel: float = np.inf
     home: tuple[complex, complex] = (0.0, 0.0)
     left: complex = 0.0
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Terms of the cost. A roll before the first step is not charged."""
+        return PLAN.terms(self.settings, target=self.target, first=1)
 
     @property
     def entry_coordinates(self) -> int:
@@ -156,7 +157,7 @@ def optimise(
     `rollout` starts without roll in air; a sample that wants another direction rolls in its first step, which is not
     charged.
     """
-    found = best(_variables(problem), rollout, cost_terms(problem), search, rng, progress=progress)
+    found = best(_variables(problem), rollout, problem.terms, search, rng, progress=progress)
     return solution(problem, found)
 
 
@@ -271,17 +272,6 @@ def mounted(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
     rest[:, 0, ROLL] = 0.0
     _add_along(rest, slope)
     return np.concatenate([first, rest], axis=1)
-
-
-def cost_terms(problem: PlanProblem) -> tuple[Term, ...]:
-    """The cost of a plan (paper eq. 9 and 10)."""
-    return (
-        Term("accuracy", problem.accuracy_weight, partial(terms.miss, target=problem.target)),
-        Term("energy", problem.energy_weight, terms.energy_at_end),
-        Term("deflection", problem.deflection_weight, terms.deflection),
-        Term("guide", problem.guide_weight, terms.guide_motion),
-        Term("flips", problem.flip_weight, partial(terms.flips, first=1)),
-    )
 
 
 def _correlation(problem: PlanProblem) -> Floats:

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.arguments import point, whole
+from flexneedle.costs.table import Trajectories
+from flexneedle.costs.terms import PLAN
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import OnIteration, counted
 from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise, widened
 from flexneedle.planning.steering import MOST_ROLLS, radius, reach, steer
-from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -260,11 +261,7 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
         step=limits.step,
         reach=limits.travel[:, 1],
         sigma=sigma,
-        accuracy_weight=plan.accuracy_weight_per_mm,
-        energy_weight=plan.energy_weight_per_mj,
-        deflection_weight=plan.deflection_weight,
-        guide_weight=plan.guide_weight,
-        flip_weight=plan.flip_weight,
+        settings=plan,
         axes=axes,
         half_turns=setup.half_turns,
         rotation=setup.max_rotation,
@@ -352,7 +349,8 @@ def _binding_limit(simulator: Simulator, problem: PlanProblem, rows: Floats, sta
     ):
         if largest > _AT_LIMIT * getattr(setup, name):
             return f"setup.{name} = {getattr(setup, name):g}"
-    return f"plan.accuracy_weight_per_mm = {scenario.plan.accuracy_weight_per_mm:g} (other costs outweigh the miss)"
+    weight = PLAN.weights(scenario.plan)["accuracy"]
+    return f"plan.{PLAN.key('accuracy')} = {weight:g} (other costs outweigh the miss)"
 
 
 def _beyond_the_bevel(simulator: Simulator, problem: PlanProblem) -> str:

@@ -14,19 +14,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from flexneedle.costs.table import RolloutFunction, Term, Trajectories
+from flexneedle.costs.terms import past_target
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, OnIteration, Variables, best, counted
 from flexneedle.planning.insertion import (
     PlanProblem,
     Solution,
-    cost_terms,
     entry_bounds,
     entry_of,
     mounted,
     solution,
     without_small_rolls,
 )
-from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, past
 from flexneedle.simulator.control import controls
 from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
 
@@ -53,7 +53,7 @@ def steer(
     side.
     """
     found: list[tuple[float, int, Found]] = []
-    charged = (*cost_terms(problem), *_margin(rollout, problem))
+    charged = (*problem.terms, *_margin(rollout, problem))
     size = radius(rollout, problem) if problem.narrow else 0.0
     for rolls in range(most + 1):
         before = min((one.cost for *_, one in found), default=np.inf)
@@ -108,7 +108,8 @@ def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
         outside: Floats = np.maximum(np.abs(off - middle) - half, 0.0)
         return outside
 
-    return (Term("margin", problem.accuracy_weight, beyond),)
+    weight = next(term.weight for term in problem.terms if term.name == "accuracy")
+    return (Term("margin", weight, beyond),)
 
 
 def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigma: float) -> Variables:
@@ -221,14 +222,14 @@ def radius(rollout: RolloutFunction, problem: PlanProblem) -> float:
     preferred direction, so it is the same for each angle of the bevel.
     """
     ahead = (problem.target[0], problem.axis.real, problem.axis.imag)
-    end = past(rollout(turned(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
+    end = past_target(rollout(turned(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
     return float(abs(end[0]))
 
 
 def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
     """Least and greatest position (mm) in the problem's direction where the two insertions without rolls end."""
     ahead = (problem.target[0], 0.0, 0.0)
-    ends = [past(rollout(rolled(problem, np.empty((1, 0)), side)), ahead)[0] for side in (-1.0, 1.0)]
+    ends = [past_target(rollout(rolled(problem, np.empty((1, 0)), side)), ahead)[0] for side in (-1.0, 1.0)]
     along = [float((end * problem.direction.conjugate()).real) for end in ends]
     return min(along), max(along)
 

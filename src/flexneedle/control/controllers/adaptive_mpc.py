@@ -10,7 +10,6 @@ Each decision comes with the predicted miss and its standard deviation (`control
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -23,16 +22,17 @@ from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
+from flexneedle.costs.table import Term, Trajectories
+from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.lateral import facing
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
-from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.sections.fields import NonNegative, count
+from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
@@ -47,6 +47,7 @@ _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the be
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
+@with_weights(ADAPTIVE_MPC)
 class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
@@ -59,26 +60,9 @@ class AdaptiveMpc(Priors):
     urgency: float = Field(default=1.5, ge=0.0, le=10.0)
     """Exponent u of the factor r^(−u) on a predicted miss above its standard deviation; r is the share of the path that
     is left, at least five control steps. 0: no factor."""
-    energy_weight_mm: NonNegative = 0.7
-    """Weight of the tissue energy, in units of the energy of all tissue down to the target displaced by 1 mm."""
-    unguided_energy_weight_mm: NonNegative = 1.0
-    """`energy_weight_mm` where the guide may not move."""
-    line_weight: NonNegative = 0.4
-    """Weight of the mean distance of the tip from the line to the target, times the share of the path that is left."""
-    unguided_line_weight: NonNegative = 0.0
-    """`line_weight` where the guide may not move."""
-    slope_weight_mm: NonNegative = 0.5
-    """Weight of the mean square slope of the guide's path, times the share of the path that is left."""
-    roll_weight_mm: NonNegative = 0.03
-    """Cost of a roll of the bevel."""
-    reach_weight: NonNegative = 1.0
-    """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
-    unguided_reach_weight: NonNegative = 100.0
-    """`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone."""
     unguided_reach_margin: NonNegative = 3.0
-    """Factor there on the standard deviation of that distance: reach is kept until as much is to spare."""
-    late_roll_weight: NonNegative = 1.0
-    """Weight of the standard deviation of the tip's motion in a roll just before the target."""
+    """Factor on the standard deviation of the distance that `unguided_reach_weight` charges: reach is kept until as
+    much is to spare."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +175,7 @@ def _aim(task: Task, fitted: Identified, ahead: Ahead) -> complex:
     if ahead.setup.half_turns:
         return 1.0
     along = measured_rollout(fitted, ahead.controls(ahead.current[None])[0])
-    return complex(-terms.past(along, task.plan.target)[0])
+    return complex(-past_target(along, task.plan.target)[0])
 
 
 def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
@@ -205,38 +189,43 @@ def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
 
 
 def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
+    """Return the terms of the cost of a path, in mm."""
     settings, target = task.settings, task.plan.target
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
-    energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
-    line = settings.line_weight if guided else settings.unguided_line_weight
-    alone = _bevel_alone_across(task, ahead)
-    spare = guided and not alone
-    reach = settings.reach_weight if spare else settings.unguided_reach_weight
-    margin = 1.0 if spare else settings.unguided_reach_margin
+    spare = guided and not _bevel_alone_across(task, ahead)
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
-    late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
     whole = max(target[0], uncorrected)
     share = min(1.0, ahead.left / whole)  # of the path
     urgent = min(1.0, max(ahead.left, uncorrected) / whole)
-    miss = partial(terms.miss, target=target, blur=memory.blur * share)
-    large = partial(terms.large_miss, target=target, blur=memory.blur * share, sd=memory.blur)
-    start = Pose.of(fitted.tip).point
-    return (
-        Term("miss", 1.0, miss),
-        Term("large miss", urgent**-settings.urgency - 1.0, large),
-        Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
-        Term("line", line * share, partial(terms.distance_from_line, start=start, target=target)),
-        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
-        Term("flips", settings.roll_weight_mm, terms.flips),
-        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        Term("reach", reach, out_of_reach(task, fitted, ahead, memory, margin)),
+    weights = ADAPTIVE_MPC.weights(settings, guided=guided)
+    weights["large miss"] = urgent**-settings.urgency - 1.0
+    weights["energy"] = weights["energy"] / memory.scale if memory.scale > 0.0 else 0.0
+    weights["line"] *= share
+    weights["slope"] *= share
+    weights["late"] *= fitted.roll_sd
+    weights["reach"] = ADAPTIVE_MPC.weights(settings, guided=spare)["reach"]
+    margin = 1.0 if spare else settings.unguided_reach_margin
+    expected, angle = expected_out_of_reach(task, fitted, ahead, memory, margin)
+    return ADAPTIVE_MPC.terms(
+        settings,
+        weights,
+        target=target,
+        start=Pose.of(fitted.tip).point,
+        blur=memory.blur * share,
+        sd=memory.blur,
+        depth=target[0],
+        length=uncorrected,
+        expected=expected,
+        angle=angle,
     )
 
 
-def out_of_reach(
+def expected_out_of_reach(
     task: Task, fitted: Identified, ahead: Ahead, memory: Memory, margin: float
-) -> Callable[[Trajectories], Floats]:
-    """Expected distance (N,), mm, of the target from the bevel's reach after the first step of trajectories.
+) -> tuple[Floats, float]:
+    """Return the expected distances (2,), mm, of the target from the bevel's reach after the first step, and an angle.
+
+    The first distance is for a first roll that turns the bevel by that angle (rad), the second for the opposite roll.
 
     The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
     the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
@@ -247,13 +236,13 @@ def out_of_reach(
     """
     trajectories = measured_rollout(fitted, ahead.constant)
     if not trajectories.converged.all():
-        return partial(terms.out_of_reach, expected=np.zeros(2))
-    past = terms.past(trajectories, task.plan.target).reshape(2, 2)
+        return np.zeros(2), 0.0
+    past = past_target(trajectories, task.plan.target).reshape(2, 2)
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
     if ahead.setup.half_turns:
         low, high = past.real.min(axis=1), past.real.max(axis=1)
         sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-        return partial(terms.out_of_reach, expected=above_zero(low, sd) + above_zero(-high, sd))
+        return above_zero(low, sd) + above_zero(-high, sd), 0.0
     # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
     # the middle towards the target or away from it: the ends are that much farther, or nearer.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
@@ -261,7 +250,7 @@ def out_of_reach(
         away = 1j * away.imag
     sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
     angle = float(np.angle(complex(away) * fitted.state.bevel.conjugate()))
-    return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
+    return above_zero(abs(away) - radius, sd), angle
 
 
 def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
@@ -285,7 +274,7 @@ def _forecast(
     """Derivatives ahead of the tip, the predicted miss (mm; y + iz in space), its standard deviation on an axis (mm),
     and the predicted shape at the target.
     """
-    past = complex(terms.past(found.trajectories, task.plan.target)[0])
+    past = complex(past_target(found.trajectories, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
     both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.leaning(found.z)[None])[0]])
     shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, shapes=True).shapes

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexneedle.control.guide import guide_axes
+from flexneedle.costs.terms import PLAN
 from flexneedle.loop.parts import plant_of
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom
@@ -15,12 +16,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import Control, Point, X, Y, Z
 
-_ONLY_THE_MISS = {
-    "plan.energy_weight_per_mj": 0.0,
-    "plan.deflection_weight": 0.0,
-    "plan.guide_weight": 0.0,
-    "plan.flip_weight": 0.0,
-}
+_ONLY_THE_MISS = {f"plan.{key}": value for key, value in PLAN.only("accuracy").items()}
 _SEARCHES = ((48, 10), (160, 25))
 """Samples and iterations: the second search, 14 times the longest decision of the default controller, is made if the
 first one misses. The planner makes each of them again, with wider samples, if its plan misses by more than 1 mm."""

@@ -4,6 +4,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
+from flexneedle.costs.terms import PLAN
 from flexneedle.scenario.problems import Problem, refuse, unknown_key
 from flexneedle.scenario.sections.fields import (
     Fraction,
@@ -15,6 +16,7 @@ from flexneedle.scenario.sections.fields import (
     count,
 )
 from flexneedle.scenario.sections.structure import Structure
+from flexneedle.scenario.sections.weights import with_weights
 
 
 class Target(Section):
@@ -33,6 +35,7 @@ class Target(Section):
         return self.depth_mm, self.lateral_mm, self.lateral_z_mm
 
 
+@with_weights(PLAN)
 class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
 
@@ -58,16 +61,6 @@ class PlanSettings(Section):
     """Initial standard deviation of the base's lateral travel in a step; 0: fixed."""
     base_turn_sigma_mrad: NonNegative = 0.0
     """Initial standard deviation of the base's rotation in a step; 0: fixed."""
-    accuracy_weight_per_mm: NonNegative = 20.0
-    """γ₁, weight of the distance between tip and target at the end."""
-    energy_weight_per_mj: NonNegative = 5.0
-    """γ₂, weight of the tissue's strain energy W at the end."""
-    deflection_weight: NonNegative = 0.002
-    """Q, weight of the needle's mean square deflection (mm²), summed over the steps."""
-    guide_weight: NonNegative = 1.0
-    """R, weight of the guide's squared travel (mm²), summed over the steps."""
-    flip_weight: NonNegative = 0.3
-    """R of the flip input, cost of a roll of the bevel."""
 
     @property
     def base_turn_sigma(self) -> float:

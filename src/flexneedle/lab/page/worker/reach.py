@@ -6,8 +6,8 @@ the reach there. Small searches find it from below, to some tenths of a millimet
 
 import cmath
 import math
-from typing import Any
 
+from flexneedle.costs.terms import PLAN
 from flexneedle.lab.page.frames import Kind, Source, frame_of
 from flexneedle.lab.page.messages import Reach
 from flexneedle.lab.page.worker.plans import smaller
@@ -21,12 +21,6 @@ Size = tuple[int, int]
 _PASSES: tuple[tuple[int, Size], ...] = ((4, (24, 5)), (8, (24, 5)), (8, (48, 12)))
 """Number of depths of each pass, evenly down to the deepest, and the size of its searches. A pass does again what was
 searched with less, and keeps the farther end."""
-_ONLY_THE_MISS: dict[str, Any] = {
-    "energy_weight_per_mj": 0.0,
-    "deflection_weight": 0.0,
-    "guide_weight": 0.0,
-    "flip_weight": 0.0,
-}
 _DIRECTIONS = 8
 _DEEPEST = 0.95
 """Of the depth that a straight needle reaches; a bent one ends short of it, and is shown where it ends."""
@@ -80,7 +74,7 @@ def _end(task: Task, size: Size, depth: float, direction: complex) -> Point:
     far = axis + direction * most / max(abs(direction.real), abs(direction.imag)) * (1.0 - 1e-9)
     target: Point = (depth, far.real, far.imag if scenario.setup.axes == 2 else 0.0)
     found = plan(
-        smaller(scenario, *size, **_ONLY_THE_MISS),
+        smaller(scenario, *size, **PLAN.only("accuracy")),
         target,
         task.work.strategy,
         task.work.seed,

@@ -10,6 +10,7 @@ const FAR = 20; // a bound this many times the usual value is none for a slider
 const STEPS = 200; // of a slider
 const OWN = "own values"; // of a table, none of those that have a name
 const LAW = "Law of radial compression. One of your own is set in a scenario file.";
+const OWN_TERMS = "own_terms"; // cost terms of a user are set in a scenario file
 const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by that of the value
 
 // Sections with their fields: [{name, title, description, fields}]; a layer of the tissue and a table is a section.
@@ -25,7 +26,7 @@ function addSection(sections, schema, name, table, values) {
   for (const [part, property] of Object.entries(table.properties ?? {})) {
     const key = name ? `${name}.${part}` : part;
     if (key === "tissue") addLayers(sections, schema, property, values);
-    else addValue(sections, section, schema, key, property, values);
+    else if (part !== OWN_TERMS) addValue(sections, section, schema, key, property, values);
   }
 }
 

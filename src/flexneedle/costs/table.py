@@ -1,0 +1,175 @@
+"""Costs as weighted sums of terms: trajectories, the table of terms, and the cost of each user."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from inspect import signature
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.types import DB_X, Floats, X
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """N sequences of m control steps, and their simulation.
+
+    controls (N, m, 9): columns of `Control`; tips (N, m, 5): poses after each step, mm and rad; energy (N, m): strain
+    energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the needle's lateral deflection, mm²,
+    in the planner only.
+    """
+
+    controls: Floats
+    tips: Floats
+    energy: Floats
+    converged: NDArray[np.bool_]
+    deflection: Floats = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Steps (N, m) that advance and end with the tip in the tissue."""
+        inside: NDArray[np.bool_] = (self.tips[:, :, X] > 0.0) & (self.controls[:, :, DB_X] > 0.0)
+        return inside
+
+    def __repr__(self) -> str:
+        sequences, steps = self.energy.shape
+        share = f"{np.mean(self.converged):.0%} converged"
+        return f"<Trajectories of {sequences} sequences of {steps} steps, {share}>"
+
+
+RolloutFunction = Callable[[Floats], Trajectories]
+"""Simulates controls (N, m, 9)."""
+TermFunction = Callable[..., Floats]
+"""Maps trajectories, and further arguments by name, to (N,)."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of a cost that is ready to evaluate: `weight` times `value` of trajectories, which is (N,)."""
+
+    name: str
+    weight: float
+    value: Callable[[Trajectories], Floats]
+
+
+def charges(terms: Sequence[Term], trajectories: Trajectories) -> dict[str, Floats]:
+    """Return the weighted terms (N,) by name."""
+    return {term.name: term.weight * term.value(trajectories) for term in terms}
+
+
+def cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
+    """Return the sum (N,) of the weighted terms; infinite where the model did not converge."""
+    total: Floats = np.sum(list(charges(terms, trajectories).values()), axis=0)
+    return np.where(trajectories.converged.all(axis=1), total, np.inf)
+
+
+@dataclass(frozen=True)
+class Weight:
+    """The weight of a term in the cost of one user.
+
+    name: of the term in reports; key: of the weight in the user's settings, "" for a weight that is no setting; unit:
+    of the weight; default: its value; about, choose: description and advice for the reference of scenarios; unguided:
+    the weight that replaces it where the guide may not move (default: the same).
+    """
+
+    name: str
+    key: str = ""
+    unit: str = "–"
+    default: float = 1.0
+    about: str = ""
+    choose: str = ""
+    unguided: "Weight | None" = None
+
+
+@dataclass(frozen=True)
+class CostTerm:
+    """A row of the table: a function, the unit of its values, and its weights by user."""
+
+    value: TermFunction
+    unit: str
+    weights: Mapping[str, Weight]
+
+
+TERMS: list[CostTerm] = []
+"""The table, in the order of `flexneedle.costs.terms`."""
+
+
+def cost_term(unit: str, **weights: Weight) -> Callable[[TermFunction], TermFunction]:
+    """Return a decorator that enters a function in the table; weights: by user."""
+
+    def enter(value: TermFunction) -> TermFunction:
+        TERMS.append(CostTerm(value, unit, weights))
+        return value
+
+    return enter
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The cost of one user."""
+
+    user: str
+
+    def rows(self) -> Iterator[tuple[CostTerm, Weight]]:
+        """Yield the terms of this cost, each with its weight."""
+        return ((term, term.weights[self.user]) for term in TERMS if self.user in term.weights)
+
+    def settings(self) -> Iterator[Weight]:
+        """Yield the weights that are settings, in the order of the schema."""
+        for _, weight in self.rows():
+            yield from (each for each in (weight, weight.unguided) if each is not None and each.key)
+
+    def key(self, name: str) -> str:
+        """Return the key of a term's weight."""
+        return next(weight.key for _, weight in self.rows() if weight.name == name)
+
+    def only(self, name: str) -> dict[str, Any]:
+        """Return the weights, by key, with which no term but one counts: 0 for each of the others."""
+        return {weight.key: 0.0 for weight in self.settings() if weight.name != name}
+
+    def weights(self, settings: Any, *, guided: bool = True) -> dict[str, float]:
+        """Return the weights by the names of the terms, from the user's settings."""
+        chosen = {w.name: w if guided or w.unguided is None else w.unguided for _, w in self.rows()}
+        return {
+            name: getattr(settings, weight.key) if weight.key else weight.default
+            for name, weight in chosen.items()
+        }
+
+    def terms(
+        self, settings: Any, weights: Mapping[str, float] | None = None, **values: Any
+    ) -> tuple[Term, ...]:
+        """Return the terms of this cost, those of the user's own in `settings.own_terms` last.
+
+        weights: by the names of the terms (default: as in the settings); values: arguments of the functions by name,
+        each passed to every function that takes it.
+        """
+        weights = self.weights(settings) if weights is None else weights
+        found = [Term(w.name, weights[w.name], _with_values(term.value, values)) for term, w in self.rows()]
+        own = [
+            Term(each.term, each.weight, _checked(each.term, _with_values(each.function, values)))
+            for each in settings.own_terms or ()
+        ]
+        return *found, *own
+
+
+def _with_values(value: TermFunction, values: Mapping[str, Any]) -> Callable[[Trajectories], Floats]:
+    """Return the function with those of the values bound that it takes."""
+    return partial(value, **{name: values[name] for name in signature(value).parameters if name in values})
+
+
+def _checked(name: str, value: Callable[[Trajectories], Floats]) -> Callable[[Trajectories], Floats]:
+    """Return the function of a user, which then raises InputError unless it returns an array (N,)."""
+
+    def checked(trajectories: Trajectories) -> Floats:
+        try:
+            found = np.asarray(value(trajectories), dtype=float)
+        except Exception as error:
+            raise InputError(f"cost term {name} raises {type(error).__name__}: {error}") from error
+        if found.shape != (expected := trajectories.energy.shape[:1]):
+            raise InputError(f"cost term {name}: must return an array of shape {expected}, not {found.shape}")
+        return found
+
+    return checked

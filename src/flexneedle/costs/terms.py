@@ -1,0 +1,271 @@
+"""The terms of all costs: each with its function, its unit, and its weight in the settings of every user.
+
+The users are the planner (`plan`) and two controllers (`ce_mpc`, `adaptive_mpc`). A cost is the weighted sum of its
+terms, in the order of this file. A term is added by one decorated function:
+
+    @cost_term("mJ", plan=Weight("energy", "energy_weight_per_mj", "1/mJ", 5.0, "Weight of …", "raise it to …"))
+    def energy_at_end(trajectories):
+        return trajectories.energy[:, -1]
+
+The key of each weight then is a setting of its user: in scenario files, `flexneedle scenario schema`, the page's form
+and docs/reference/scenario.md. Reports list the term by its name. A function takes `Trajectories` and returns one
+number for each sequence, (N,). It gets its further arguments by name from the values that the user provides: always
+`target` (x, y, z in mm); the others are those that the functions below take.
+
+A term outside of the package is a function of `trajectories`, or of `trajectories` and `target`. It is listed in a
+scenario with its weight, as `[[plan.own_terms]]`, `[[control.ce_mpc.own_terms]]` or
+`[[control.adaptive_mpc.own_terms]]`: `term = "module:NAME"`, `weight = 0.5`.
+
+The terms with sums over steps are from the paper (eq. 10 and 13) and depend on the length of a step.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.costs.table import Cost, Trajectories, Weight, cost_term
+from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
+
+PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")
+
+Complexes = NDArray[np.complex128]
+
+
+def past_target(trajectories: Trajectories, target: Point) -> Complexes:
+    """Lateral miss y + iz (N,), mm, at the target's depth, to which the tip's line is extended from the end."""
+    end = trajectories.tips[:, -1]
+    slope = np.tan(end[:, THETA]) + 1j * np.tan(end[:, PSI])
+    vector: Complexes = across(end, Y) + slope * (target[0] - end[:, X]) - complex(*target[1:])
+    return vector
+
+
+@cost_term(
+    "mm",
+    plan=Weight(
+        "accuracy", "accuracy_weight_per_mm", "1/mm", 20.0,
+        "γ₁, weight of the distance between tip and target at the end.",
+        "raise it if the other terms keep a plan from its target (the plan names this key as its limit).",
+    ),
+    adaptive_mpc=Weight("miss"),
+)  # fmt: skip
+def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
+    """Lateral distance (mm) from the target at its depth, the size of `past_target`.
+
+    blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
+    """
+    blurred: Floats = np.hypot(np.abs(past_target(trajectories, target)), blur) - blur
+    return blurred
+
+
+@cost_term("mm", adaptive_mpc=Weight("large miss"))
+def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float) -> Floats:
+    """The share d² / (d² + sd²) of the `miss` (mm): near 0 for a distance d far below its standard deviation sd (mm),
+    near 1 far above it.
+    """
+    square = np.abs(past_target(trajectories, target)) ** 2
+    least = np.finfo(float).tiny
+    share = square / np.maximum(square + sd**2, least)
+    large: Floats = share * miss(trajectories, target, blur)
+    return large
+
+
+@cost_term(
+    "mJ",
+    plan=Weight(
+        "energy", "energy_weight_per_mj", "1/mJ", 5.0,
+        "γ₂, weight of the tissue's strain energy W at the end.",
+        "raise it to spare the tissue.",
+    ),
+    adaptive_mpc=Weight(
+        "energy", "energy_weight_mm", "mm", 0.7,
+        "Weight of the tissue energy, in units of the energy of all tissue down to the target displaced by 1 mm.",
+        "raise it to spare the tissue at the expense of accuracy.",
+        Weight(
+            "energy", "unguided_energy_weight_mm", "mm", 1.0,
+            "`energy_weight_mm` where the guide may not move.",
+            "as `energy_weight_mm`, for needles without a guide and `steering` plans.",
+        ),
+    ),
+)  # fmt: skip
+def energy_at_end(trajectories: Trajectories) -> Floats:
+    """Strain energy of the tissue after the last step (mJ)."""
+    return trajectories.energy[:, -1]
+
+
+@cost_term(
+    "mm²",
+    plan=Weight(
+        "deflection", "deflection_weight", "1/mm²", 0.002,
+        "Q, weight of the needle's mean square deflection (mm²), summed over the steps.",
+        "raise it for straighter needles.",
+    ),
+)  # fmt: skip
+def deflection(trajectories: Trajectories) -> Floats:
+    """Mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    total: Floats = (trajectories.deflection * trajectories.inside).sum(axis=1)
+    return total
+
+
+@cost_term(
+    "mm²",
+    plan=Weight(
+        "guide", "guide_weight", "1/mm²", 1.0,
+        "R, weight of the guide's squared travel (mm²), summed over the steps.",
+        "raise it for less motion of the guide.",
+    ),
+)  # fmt: skip
+def guide_motion(trajectories: Trajectories) -> Floats:
+    """Squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    total: Floats = (_guide_squares(trajectories) * trajectories.inside).sum(axis=1)
+    return total
+
+
+@cost_term(
+    "mm",
+    adaptive_mpc=Weight(
+        "line", "line_weight", "–", 0.4,
+        "Weight of the mean distance of the tip from the line to the target, times the share of the path that is left.",
+        "raise it to keep the tip nearer to the straight line to the target, at the expense of tissue energy.",
+        Weight(
+            "line", "unguided_line_weight", "–", 0.0,
+            "`line_weight` where the guide may not move.",
+            "0, unless the path matters: without a guide, rolls to keep the tip near the line consume bevel reach.",
+        ),
+    ),
+)  # fmt: skip
+def distance_from_line(trajectories: Trajectories, start: Point, target: Point) -> Floats:
+    """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
+    x, y = trajectories.tips[:, :, X], across(trajectories.tips, Y)
+    length, begin = target[0] - start[0], complex(*start[1:])
+    slope = (complex(*target[1:]) - begin) / length if length != 0.0 else 0.0
+    away = np.abs(y - begin - slope * (x - start[0]))
+    share = np.where(trajectories.inside, trajectories.controls[:, :, DB_X], 0.0)
+    mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
+    return mean
+
+
+@cost_term(
+    "1",
+    adaptive_mpc=Weight(
+        "slope", "slope_weight_mm", "mm", 0.5,
+        "Weight of the mean square slope of the guide's path, times the share of the path that is left.",
+        "raise it for a calmer guide; too large delays corrections.",
+    ),
+)  # fmt: skip
+def guide_slope(trajectories: Trajectories) -> Floats:
+    """Mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
+    advance = trajectories.controls[:, :, DB_X]
+    squares = np.divide(
+        _guide_squares(trajectories), advance, out=np.zeros_like(advance), where=advance > 0.0
+    )
+    slope: Floats = squares.sum(axis=1) / np.maximum(advance.sum(axis=1), np.finfo(float).tiny)
+    return slope
+
+
+@cost_term(
+    "1",
+    plan=Weight(
+        "flips", "flip_weight", "–", 0.3,
+        "R of the flip input, cost of a roll of the bevel.",
+        "raise it for fewer flips of the bevel.",
+    ),
+    adaptive_mpc=Weight(
+        "flips", "roll_weight_mm", "mm", 0.03,
+        "Cost of a roll of the bevel.",
+        "raise it for fewer flips of the bevel.",
+    ),
+)  # fmt: skip
+def flips(trajectories: Trajectories, first: int = 0) -> Floats:
+    """Flips of the bevel from step `first` on, by their angle: each half turn counts as one."""
+    count: Floats = _half_turns(trajectories)[:, first:].sum(axis=1)
+    return count
+
+
+@cost_term(
+    "1",
+    adaptive_mpc=Weight(
+        "late", "late_roll_weight", "–", 1.0,
+        "Weight of the standard deviation of the tip's motion in a roll just before the target.",
+        "raise it if late rolls make the tip jump, as with a bent needle; 0 allows them at no cost.",
+    ),
+)  # fmt: skip
+def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Floats:
+    """Sum over the rolls of the bevel of e^(−d/length), d the distance (mm) of the tip from the depth (mm) then."""
+    before = trajectories.tips[:, :, X] - trajectories.controls[:, :, DB_X]
+    near = np.exp(np.minimum(0.0, before - depth) / length)
+    sum_: Floats = (near * _half_turns(trajectories)).sum(axis=1)
+    return sum_
+
+
+@cost_term(
+    "mm",
+    adaptive_mpc=Weight(
+        "reach", "reach_weight", "–", 1.0,
+        "Weight of the expected distance of the target from the bevel's reach, with the guide fixed.",
+        "raise it where the guide hardly moves the tip, as for deep targets, so that the bevel can still reach them.",
+        Weight(
+            "reach", "unguided_reach_weight", "–", 100.0,
+            "`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone.",
+            "large: without a guide, reach that is lost cannot be regained.",
+        ),
+    ),
+)  # fmt: skip
+def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.0) -> Floats:
+    """Expected distance (mm) of the target from the bevel's reach after the first step.
+
+    expected (2,): if the roll before that step turns the bevel by `angle` (rad), and if it turns it the other way.
+    """
+    away = 0.5 - 0.5 * np.cos(trajectories.controls[:, 0, ROLL] - angle)
+    value: Floats = (1.0 - away) * expected[0] + away * expected[1]
+    return value
+
+
+@cost_term("mm²", ce_mpc=Weight("deviation"))
+def deviation(trajectories: Trajectories, reference: Floats, orientation: float) -> Floats:
+    """Squared deviation (mm²) from poses (m, 5), summed over the steps (paper eq. 13).
+
+    orientation: weight of the slopes, as the distance (mm) that is equivalent to 1 rad.
+    """
+    off = trajectories.tips - reference
+    off[:, :, THETA:] *= orientation
+    total: Floats = (off**2).sum(axis=(1, 2))
+    return total
+
+
+@cost_term(
+    "mm²",
+    ce_mpc=Weight(
+        "guide", "guide_weight", "–", 0.075,
+        "Weight of the squared difference (mm²) between a guide step and the plan's.",
+        "larger keeps the guide nearer to the plan; 0 leaves it free.",
+    ),
+)  # fmt: skip
+def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
+    """Squared differences (mm²) of the guide steps from `nominal` (m, 2), summed over the steps."""
+    off = trajectories.controls[:, :, DG_Y : DG_Y + 2] - nominal
+    total: Floats = (off**2).sum(axis=(1, 2))
+    return total
+
+
+@cost_term(
+    "mJ",
+    ce_mpc=Weight(
+        "energy", "energy_weight_per_mj", "1/mJ", 2.74,
+        "Weight of the tissue's strain energy after each step of the horizon, in mm² per mJ.",
+        "raise it to spare the tissue at the expense of accuracy.",
+    ),
+)  # fmt: skip
+def energy_of_steps(trajectories: Trajectories) -> Floats:
+    """Strain energy of the tissue, summed over the steps (mJ)."""
+    total: Floats = trajectories.energy.sum(axis=1)
+    return total
+
+
+def _guide_squares(trajectories: Trajectories) -> Floats:
+    squares: Floats = (trajectories.controls[:, :, DG_Y : DG_Y + 2] ** 2).sum(axis=2)
+    return squares
+
+
+def _half_turns(trajectories: Trajectories) -> Floats:
+    angles = np.abs(trajectories.controls[:, :, ROLL]) + np.abs(trajectories.controls[:, :, SPIN])
+    turns: Floats = angles / np.pi
+    return turns

@@ -1,0 +1,91 @@
+"""The weights of a cost as settings, and cost terms of the user's own."""
+
+from collections.abc import Callable, Iterable
+from inspect import Parameter, signature
+from typing import Annotated, Any, TypeVar, cast
+
+from pydantic import AfterValidator, BeforeValidator, Field, create_model
+
+from flexneedle.costs.table import Cost, TermFunction, Weight
+from flexneedle.errors import InputError
+from flexneedle.plugins import function_rule, is_own, load_part
+from flexneedle.scenario.sections.fields import NonNegative, Section
+
+_Settings = TypeVar("_Settings", bound=Section)
+
+
+def _with_name(given: Any) -> Any:
+    """Return `module:NAME` of a function, anything else unchanged."""
+    return f"{given.__module__}:{given.__qualname__}" if callable(given) else given
+
+
+def _resolve(name: str) -> TermFunction:
+    """Return the function of a name `module:NAME`. Raises InputError with the rule that is broken."""
+    if not is_own(name):
+        raise InputError("must be module:NAME, such as mymodule:bending")
+    function: Any = load_part(name, ())
+    rule = function_rule(function, "trajectories")
+    required = [each.name for each in _parameters(function) if each.default is Parameter.empty]
+    if rule and required[1:] != ["target"]:
+        raise InputError(rule)
+    return cast(TermFunction, function)
+
+
+def _parameters(function: object) -> Iterable[Parameter]:
+    return signature(function).parameters.values() if callable(function) else ()
+
+
+def _check_name(name: str) -> str:
+    try:
+        _resolve(name)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    return name
+
+
+def _choose(advice: str) -> Any:
+    return Field(json_schema_extra={"choose": advice})
+
+
+class OwnTerm(Section):
+    """One `[[own_terms]]`: a cost term of the user's own."""
+
+    term: Annotated[
+        str,
+        BeforeValidator(_with_name),
+        AfterValidator(_check_name),
+        _choose("a function in a module of the current directory or of a package."),
+    ]
+    """Function of `trajectories`, or of `trajectories` and `target`, as `module:NAME`."""
+    weight: Annotated[NonNegative, _choose("by the term's share of the printed cost.")]
+    """Weight of its values in the cost."""
+
+    @property
+    def function(self) -> TermFunction:
+        """The function."""
+        return _resolve(self.term)
+
+
+OwnTerms = Annotated[tuple[OwnTerm, ...] | None, Field(strict=False, max_length=100)]
+
+
+def _field(weight: Weight) -> Any:
+    extra: dict[str, Any] = {"unit": weight.unit, "choose": weight.choose}
+    return Field(default=weight.default, description=weight.about, json_schema_extra=extra)
+
+
+def with_weights(cost: Cost) -> Callable[[type[_Settings]], type[_Settings]]:
+    """Return a decorator of a class of settings that adds a key for each weight of a cost, and `own_terms`."""
+
+    def add(settings: type[_Settings]) -> type[_Settings]:
+        fields: dict[str, Any] = {weight.key: (NonNegative, _field(weight)) for weight in cost.settings()}
+        fields["own_terms"] = (OwnTerms, Field(default=None, description="Further terms of the cost."))
+        return create_model(
+            settings.__name__,
+            __base__=settings,
+            __module__=settings.__module__,
+            __doc__=settings.__doc__,
+            **fields,
+        )
+
+    return add
