@@ -52,14 +52,27 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 class PlanProblem:
     """Target, limits and cost of a plan: mm, rad.
 
-    travel: insertion from the start to the target depth, of which `air` comes before the skin; step (7,) and reach
-    (7,): largest step of each column of travel of a control, and largest sum of steps; sigma (c,): first standard
-    deviation of each coordinate of a primitive, 0 if not free; settings: weights of the cost; axes: 1 or 2;
-    half_turns: the only rolls; rotation: largest angle of the needle to either side; frame: the direction in which the
-    first of two lateral coordinates points; entry: largest change of the point on the skin (mm) and of the slope (rad); mounts: x of base
-    and guide at the start; axis: y + iz of the needle's axis at the target's depth; slope: that of the axis (rad);
-    steepest: its largest size on each lateral axis; lateral_travel: largest distance (mm) on each of the target from
-    the axis; home: an entry that keeps it; left: vector y + iz (mm) to the target from the nearest axis that is free.
+    Attributes:
+        target: x, y, z.
+        travel: Insertion from the start to the target depth.
+        air: The part of the travel before the skin.
+        primitives: Number of primitives.
+        step: Largest step of each column of travel of a control, (7,).
+        reach: Largest sum of the steps of each column, (7,).
+        sigma: Initial standard deviation of each coordinate of a primitive, (c,); 0: fixed.
+        settings: Weights of the cost.
+        axes: 1 or 2 lateral axes.
+        half_turns: Whether the needle rolls by half turns only.
+        rotation: Largest angle of the needle to either side.
+        frame: Direction of the first of two lateral coordinates.
+        entry: Largest change of the point on the skin and of the slope.
+        mounts: x of base and guide at the start.
+        axis: y + iz of the needle's axis at the target's depth.
+        slope: Slope of the axis.
+        steepest: Largest slope of the axis on each lateral axis.
+        lateral_travel: Largest distance of the target from the axis, on each lateral axis.
+        home: Changes of point and slope of an entry within `lateral_travel`.
+        left: Vector y + iz from the nearest axis that is permitted to the target.
     """
 
     target: Point
