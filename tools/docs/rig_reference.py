@@ -45,7 +45,7 @@ def all_tables() -> Iterator[Table]:
 def _shipped(name: str, model: Any) -> Table:
     (table,) = tables(model.model_json_schema())
     keys = tuple(Key(f"{name}.{key.name}", key.schema, key.required) for key in table.keys)
-    return Table(name, table.about, "", keys)
+    return Table(name, "", "", keys)
 
 
 def _title(table: Table) -> str:
