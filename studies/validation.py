@@ -23,7 +23,6 @@ from reference.cases import EI, FOUNDATION
 from validation_figures import draw
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMAND = "*`python studies/validation.py`, or `make validation`*"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -51,7 +50,6 @@ def document(found: problems.Found) -> str:
         "# Validation of the exact plant",
         INTRODUCTION,
         summary(found),
-        COMMAND,
         *needle(found),
         *model(found),
         *bevel(found),
@@ -73,15 +71,14 @@ def wrapped(text: str) -> str:
 
 
 INTRODUCTION = (
-    "The needle of the virtual phantom (`--phantom exact`, [theory.md](theory.md) section 11) is compared with closed"
-    " forms, a second solver and the controller's model. A script computes every value of this page and draws the"
-    " figures; the tests assert them (`pytest tests/phantom`). The page verifies the solution of the equations; it"
-    " does not validate the tissue model."
+    "`python studies/validation.py` (`make validation`) compares the needle of the virtual phantom (`--phantom exact`,"
+    " [theory](theory.md), section 11) with closed forms, a second solver and the controller's model. It writes this"
+    " page; the tests assert its values (`pytest tests/phantom`)."
 )
 LIMITS = (
-    "The exact plant and the controller's model share the tissue law (1), the springs normal to the needle and the rule"
-    " of the bevel's rest point, so this page cannot validate those: only an experiment can. They differ in kinematics,"
-    " mesh, position and direction of the tissue forces, imperfections, and the solver."
+    "This page verifies that the equations are solved; it does not validate the tissue. The exact plant and the"
+    " controller's model share the tissue law (1), the springs normal to the needle and the rule of the bevel's rest"
+    " point, which only an experiment can validate."
 )
 
 
@@ -90,7 +87,7 @@ def summary(found: problems.Found) -> str:
     finest = {load: errors[-1] for load, errors in found.cantilever.items()}
     rows = [
         (
-            f"cantilever, PL²/EI = {load:g}: tip deflection over L",
+            f"cantilever, PL²/EI = {load:g}: deflection over L",
             f"{problems.LOADS[load]:.4f}",
             f"{elastica.cantilever(load)[1] + errors[1]:.4f}",
         )
@@ -98,10 +95,10 @@ def summary(found: problems.Found) -> str:
     ]
     last = found.gaps[1][0.125][problems.CUBIC]
     worst = max(abs(errors[-1]) for errors in found.curvature.values())
-    moved = max(abs(done / stored - 1.0) for done, stored in found.moves.values())
+    moved = largest_gap(found)
     rows += [
         (
-            "cantilever: order of convergence in the segment length",
+            "cantilever: order in the segment length",
             "2",
             power(1.0 / problems.SEGMENTS, found.cantilever[5.0][:, 1]),
         ),
@@ -114,19 +111,24 @@ def summary(found: problems.Found) -> str:
         ("steady bevel curvature: relative error", "0", small(worst)),
         ("work over stored energy without cutting, minus 1", "0", small(moved)),
         ("insertion: share of the work neither stored nor dissipated", "0", small(abs(lost(found)))),
-        ("second solver: largest lateral difference of the tips (mm)", "0", small(found.second[-1, 1])),
+        ("second solver: largest lateral difference of tips (mm)", "0", small(found.second[-1, 1])),
         (
-            "in space: order of convergence to a second solver",
+            "space: order of convergence to a second solver",
             "2",
             power(1.0 / np.array(in_space.SEGMENTS), np.max(found.space.solver, axis=0)),
         ),
         (
-            "in space: moment that buckles a twisted rod over Greenhill's",
+            "space: buckling moment of a twisted rod over Greenhill's",
             "1",
             f"{found.space.twist[0.0]:.3f}",
         ),
     ]
     return table(("check", "expected", "found"), rows)
+
+
+def largest_gap(found: problems.Found) -> float:
+    """Return the largest difference of work over stored energy from 1 in moves without cutting."""
+    return max(abs(done / stored - 1.0) for done, stored in found.moves.values())
 
 
 def lost(found: problems.Found) -> float:
@@ -136,33 +138,22 @@ def lost(found: problems.Found) -> float:
 
 def needle(found: problems.Found) -> list[str]:
     """Section on the rod alone."""
-    rows = []
-    for load, errors in found.cantilever.items():
-        expected, orders = (
-            elastica.cantilever(load),
-            [power(1.0 / problems.SEGMENTS, column) for column in errors.T],
+    rows = [
+        (
+            f"{load:g}",
+            f"{elastica.cantilever(load)[1]:.6f}",
+            f"{elastica.cantilever(load)[1] + errors[-1, 1]:.6f}",
+            *(small(value) for value in np.abs(errors[-1])),
         )
-        rows.append(
-            (
-                f"{load:g}",
-                f"{problems.LOADS[load]:.4f}",
-                f"{expected[1]:.6f}",
-                f"{expected[1] + errors[-1, 1]:.6f}",
-                *(small(value) for value in np.abs(errors[-1])),
-                ", ".join(orders),
-            )
-        )
-    head = ("PL²/EI", "table, y/L", "elastica, y/L", f"plant, {problems.SEGMENTS[-1]} segments")
+        for load, errors in found.cantilever.items()
+    ]
+    head = ("PL²/EI", "elastica, y/L", f"plant, {problems.SEGMENTS[-1]} segments")
     return [
         "## The needle alone",
-        "A cantilever with a transverse dead load P at its end, compared with the elastica by elliptic integrals"
-        " (Bisshopp and Drucker 1945) and with published tables of four digits. The discrete rod converges with second"
-        " order.",
-        table((*head, "error x/L", "error y/L", "error θ (rad)", "orders x, y, θ"), rows),
-        "![Bent cantilevers with the tips of the elastica, and the error over the number of segments]"
-        "(images/validation-needle.png)",
-        COMMAND,
-        f"A straight column of 64 segments buckles at {found.buckling:.5f} times the Euler load π²EI/4L².",
+        "A cantilever with a transverse dead load P at its end is compared with the elastica by elliptic integrals"
+        " (Bisshopp and Drucker 1945):",
+        table((*head, "error x/L", "error y/L", "error θ (rad)"), rows),
+        "![Bent cantilevers; error over the number of segments](images/validation-needle.png)",
     ]
 
 
@@ -170,41 +161,24 @@ def model(found: problems.Found) -> list[str]:
     """Section on the controller's model."""
     one, two = found.gaps[1], found.gaps[2][0.125]
     rows = [
-        (
-            f"{fine.angle:.4f}",
-            *(small(one[h][k].lateral) for h in problems.MESHES),
-            small(fine.energy),
-            f"{two[k].angle:.4f}",
-            small(two[k].lateral),
-        )
-        for k, fine in enumerate(one[0.125])
+        (f"{a.angle:.4f}", small(a.lateral), f"{b.angle:.4f}", small(b.lateral))
+        for a, b in list(zip(one[0.125], two, strict=True))[::2]
     ]
     last = one[0.125][problems.CUBIC]
     slope = power([gap.angle for gap in last], [gap.lateral for gap in last])
-    meshes = [f"distance (mm), segments of {h:g} mm" for h in problems.MESHES]
     return [
         "## The controller's model at small angles",
-        "The same insertion to 44.5 mm with guide motion and a flip in both formulations, with bevel offset and guide"
-        " motion scaled together: the table gives the largest distance between the two tips and the largest slope of"
-        " the tip. The contact spacing equals the segment length; steps are half as long. Mirrored commands give the"
-        " mirror image, so the effect of finite rotations starts with the third power of the slope.",
-        f"With the finest mesh and one layer, the fitted power from {last[-1].angle:.3f} to {last[0].angle:.3f} rad is"
-        f" {slope}. At smaller slopes the discretisation error remains, in proportion to the slope; at larger ones"
-        " higher powers contribute. Results with two layers are similar but less smooth, since single contact points"
-        " are in a different layer than the model's. The guide is as rigid as the model's here (1e5 N/mm instead of the"
-        " phantom's 1e3).",
+        "Both formulations carry out the same insertion to 44.5 mm with guide motion and a flip. Bevel offset and guide"
+        " motion are scaled together; segments are 0.125 mm, and the guide is as rigid as in the model. Largest slope of"
+        " the tip and largest distance between the tips:",
         table(
-            (
-                "slope (rad), one layer",
-                *meshes,
-                "tissue energy, relative difference",
-                "slope (rad), two layers",
-                "distance (mm), segments of 0.125 mm",
-            ),
+            ("slope (rad), one layer", "distance (mm)", "slope (rad), two layers", "distance (mm)"),
             rows,
         ),
-        "![Distance between the two formulations over the slope, with the third power](images/validation-model.png)",
-        COMMAND,
+        "![Distance over the slope, with the third power](images/validation-model.png)",
+        "Mirrored commands give the mirror image, so the effect of finite rotations begins with the third power of the"
+        f" slope. The fitted power from {last[-1].angle:.3f} to {last[0].angle:.3f} rad is {slope}. At smaller slopes"
+        " the discretisation error dominates, at larger ones higher powers contribute.",
     ]
 
 
@@ -217,57 +191,37 @@ def bevel(found: problems.Found) -> list[str]:
         rows.append((f"{length:g}", f"{expected:.4e}".replace("e-0", "e−"), *shares))
     return [
         "## Steady curvature of the bevel",
-        "Far from skin and base and at small strain the path is a circle, κ = F/(EIβ), with the spring force reduced by"
-        " the lateral slide of the tip ([theory.md](theory.md) eq. 10). Needle with 1/β = 10 mm, depth 250 mm, offset"
-        " 0.01 mm; curvature over the last 60 mm.",
+        "Far from skin and base and at small strain the path is a circle with κ = F/(EIβ), where the spring force is"
+        " reduced by the lateral slide of the tip ([theory](theory.md), eq. 10). Curvature over the last 60 mm of a"
+        " path of 250 mm, 1/β = 10 mm, offset 0.01 mm:",
         table(
             (
                 "bevel length (mm)",
                 "κ (1/mm)",
-                *(f"error, spacing and segments of {r:g} mm" for r in problems.RESOLUTIONS),
+                *(f"error, {r:g} mm segments" for r in problems.RESOLUTIONS),
             ),
             rows,
         ),
-        COMMAND,
     ]
 
 
 def energy(found: problems.Found) -> list[str]:
     """Section on energies."""
-    moved = [
-        (name, style.signed(done, ".6f"), style.signed(stored, ".6f"), small(done / stored - 1.0))
-        for name, (done, stored) in found.moves.items()
-    ]
+    moved = largest_gap(found)
     rows = [
-        (
-            f"{step:g}",
-            f"{friction:g}",
-            *(f"{style.signed(value, '.5f')}" for value in (b.base, b.guide, b.bevel)),
-            *(f"{value:.5f}" for value in (b.needle, b.tissue + b.spring, b.friction)),
-            small(b.gap),
-        )
-        for friction, balances in found.balances.items()
-        for step, b in zip(problems.STEPS, balances, strict=True)
+        (f"{step:g}", *(small(balances[k].gap) for balances in found.balances.values()))
+        for k, step in enumerate(problems.STEPS)
     ]
     gaps = [balance.gap for balance in found.balances[0.0]]
     return [
         "## Energy",
-        "Without cutting, energy is conserved: work of base and guide (trapezoidal rule, 40 steps) and change of the"
-        " stored energy (mJ) for a bent needle at a depth of 28 mm that is moved without insertion.",
-        table(("motion", "work", "stored", "work/stored − 1"), moved),
-        COMMAND,
-        "An insertion to 40 mm with guide motion and a flip: work of base, guide and the tissue on the bevel (negative"
-        " if the tip moves against its force), compared with the energy stored in needle, tissue and guide and the"
-        " energy dissipated by friction (mJ). The relative energy error decreases with the step, without friction with"
-        f" the power {power(problems.STEPS, gaps)}.",
-        table(
-            (
-                *("step (mm)", "friction (mN/mm)", "base", "guide", "bevel"),
-                *("needle", "tissue and guide", "friction", "relative error"),
-            ),
-            rows,
-        ),
-        COMMAND,
+        "Without cutting, energy is conserved: when base and guide move a bent needle at a depth of 28 mm without"
+        " insertion, their work (trapezoidal rule, 40 steps) equals the change of the stored energy within"
+        f" {small(moved)}.",
+        "In an insertion to 40 mm with guide motion and a flip, the work of base, guide and the tissue on the bevel is"
+        " compared with the stored energy and the energy dissipated by friction. The relative error decreases with the"
+        f" step, without friction with the power {power(problems.STEPS, gaps)}:",
+        table(("step (mm)", *(f"friction {friction:g} mN/mm" for friction in found.balances)), rows),
     ]
 
 
@@ -275,93 +229,68 @@ def solver(found: problems.Found) -> list[str]:
     """Section on the second solver."""
     rows = [
         (f"{h:g}", *(small(value) for value in gaps))
-        for h, gaps in zip(problems.ELEMENTS.tolist(), found.second, strict=True)
+        for h, gaps in list(zip(problems.ELEMENTS.tolist(), found.second, strict=True))[::2]
     ]
     orders = [power(problems.ELEMENTS, column) for column in found.second.T]
     return [
         "## A second solver",
-        "`Shooting` in `tests/reference/rods.py` integrates the continuous rod from the tip to the base, with"
-        " equilibrium of forces instead of minimal energy, and solves for the tip pose that satisfies the clamp"
-        " condition. The test has 48 steps of all inputs with a retraction, two flips, two layers, varying stiffness,"
-        " start errors, bend and guide clearance. Largest differences of the tip:",
+        "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, with"
+        " equilibrium of forces instead of minimal energy. The test has 48 steps of all inputs with a retraction, two"
+        " flips, two layers, varying stiffness, start errors, bend and guide clearance. Differences of the tips:",
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
-        "θ converges with first order, since the slope of the last segment is that half a segment before the tip and"
-        f" the natural bend extends to the tip: {small(found.second[2, 2])} rad with segments of 0.5 mm. With ten times"
-        f" the default friction the tips differ by {small(found.rubbed[0])} mm, and by {small(found.rubbed[1])} mm with"
-        " half the step: friction acts along the needle as it was before the step.",
-        COMMAND,
+        "θ converges with first order: the slope of the last segment is the slope half a segment before the tip. With"
+        f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm, with half the step by"
+        f" {small(found.rubbed[1])} mm, since friction acts along the needle as it was before the step.",
     ]
 
 
 def refinement(found: problems.Found) -> list[str]:
     """Section on element, step and spacing."""
     key = {"element": "element_mm", "step": "step_mm", "spacing": "contact_spacing_mm"}
-    rows = [
-        (
-            f"`{key[name]}`",
-            f"{size:g}",
-            small(error),
-            "default" if size == problems.SHIPPED[name] else "",
-        )
-        for name, errors in found.refined.items()
-        for size, error in zip(problems.SIZES[name].tolist(), errors, strict=False)
-    ]
+    rows = []
+    for name, errors in found.refined.items():
+        sizes = problems.SIZES[name][:-1]
+        (shipped,) = np.flatnonzero(sizes == problems.SHIPPED[name])
+        rows.append((f"`{key[name]}`", f"{sizes[shipped]:g}", small(errors[shipped]), power(sizes, errors)))
     finest = ", ".join(f"{problems.SIZES[name][-1]:g}" for name in problems.SIZES)
     return [
         "## Refinement of an insertion",
         "Tip after 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance from the"
-        f" result with {finest} mm for element, step and spacing. The errors are not smooth, since single channel"
-        " points change their segment or layer or are cut one step later.",
-        table(("key of `[phantom]`", "mm", "distance (mm)", ""), rows),
-        f"Orders: element {power(problems.SIZES['element'][:-1], found.refined['element'])}, step"
-        f" {power(problems.SIZES['step'][:-1], found.refined['step'])}, spacing"
-        f" {power(problems.SIZES['spacing'][:-1], found.refined['spacing'])}.",
-        "![Error over element, step and spacing; difference from the second solver over the element length]"
-        "(images/validation-insertion.png)",
-        COMMAND,
+        f" result with {finest} mm for element, step and spacing.",
+        table(("key of `[phantom]`", "default (mm)", "distance (mm)", "order"), rows),
+        "![Error over element, step and spacing; difference from the second solver](images/validation-insertion.png)",
     ]
 
 
 def space(found: in_space.Space) -> list[str]:
     """Section on space."""
-    sizes = 1.0 / np.array(in_space.SEGMENTS)
+    gaps = np.max(found.solver, axis=0)
     rows = [
-        (f"rod {k}", *(small(gap) for gap in gaps), power(sizes, gaps))
-        for k, gaps in enumerate(found.solver, 1)
-    ]
-    rows.append(
+        ("rods", *(small(gap) for gap in gaps), power(1.0 / np.array(in_space.SEGMENTS), gaps)),
         (
             "helix",
             *(small(left) for left in found.helix),
             power(1.0 / np.array(in_space.HELIX_SEGMENTS), found.helix),
-        )
-    )
-    buckling = [
-        (
-            f"{share:g}",
-            f"{elastica.twisted_buckling_moment(1.0, 1.0, share * 4.0 * np.pi**2):.4f}",
-            f"{factor:.3f}",
-        )
-        for share, factor in found.twist.items()
+        ),
     ]
+    buckling = " and ".join(
+        f"{factor:.3f} times the moment with {share:g} of Euler's load"
+        for share, factor in found.twist.items()
+    )
     counts = [f"{n}, {m} segments" for n, m in zip(in_space.SEGMENTS, in_space.HELIX_SEGMENTS, strict=True)]
     return [
         "## In space",
-        "The same kernel in the plane is what its planar predecessor was: tips within 1e-6 mm over random insertions"
-        " with all inputs, z exactly 0 (`pytest tests/phantom/test_rod_plane.py`). All inputs turned about the axis"
-        " turn the needle (1e-9 mm), and a roll by π is a flip (`test_rod_rotation.py`).",
-        "Rods of 100 mm with a natural bend, tilted and rolled at their base, under a force in any direction on their"
-        " tip: distance of the tip (mm) from that of Kirchhoff's equations, integrated from the base with a search for"
-        " its moment (`tests/reference/kirchhoff.py`). A twisted helix under its wrench: largest moment per mm that is"
-        " not balanced, over EIκ².",
+        "In the plane z is exactly 0. All inputs turned about the axis turn the needle (1e-9 mm), and a roll by π is a"
+        " flip.",
+        "Rods of 100 mm with a natural bend, tilted and rolled at their base, have a force in any direction on their"
+        " tip; the table has the largest distance (mm) to the tip by Kirchhoff's equations"
+        " (`tests/reference/kirchhoff.py`). For a twisted helix under its wrench it has the largest unbalanced moment"
+        " per mm over EIκ².",
         table(("problem", *counts, "order"), rows),
-        COMMAND,
-        "A straight rod between two clamps, twisted by its base under an axial load, buckles at Greenhill's moment T."
-        " Its second clamp is stiff tissue with friction against rotation, which gives by about half a millimetre.",
-        table(("axial load over Euler's", "TL/EI", "found over closed form"), buckling),
-        COMMAND,
-        "The roll of the tip lags behind that of the base by c l²/2GJ and c l over the free length, for a couple c per"
-        f" mm of friction against rotation: relative error {small(abs(found.lag))} while it slides.",
+        "A straight rod between two clamps, twisted by its base under an axial load, buckles at Greenhill's moment:"
+        f" found at {buckling}. The second clamp is stiff tissue, which gives by about half a millimetre.",
+        "The roll of the tip lags behind the roll of the base by c l²/2GJ over the inserted length l, for a couple c"
+        f" per mm of friction, and by c l/GJ per mm of the free length: relative error {small(abs(found.lag))}.",
     ]
 
 
