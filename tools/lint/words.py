@@ -25,6 +25,7 @@ CHECKED = (
     "docs/page.md",
     "docs/reference/api.md",
     "docs/reference/commands.md",
+    "docs/theory.md",
     "docs/tutorial.md",
     "src/flexneedle/arguments.py",
     "src/flexneedle/errors.py",
