@@ -58,14 +58,6 @@ def test_show_prints_the_settings_of_every_controller_and_round_trips(capsys, tm
     assert run(capsys, "scenario", "show", str(path)) == (0, out, [])
 
 
-def test_a_renamed_key_is_a_warning_in_one_line(capsys, minimal_text, scenario_file):
-    path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
-    status, out, err = run(capsys, "scenario", "show", str(path))
-    assert status == 0
-    assert tomllib.loads(out)["control"]["ce_mpc"]["horizon"] == 9
-    assert err == [f"flexneedle: {path}: control.horizon is now control.ce_mpc.horizon: rename it"]
-
-
 def test_check_rejects_unknown_controller_keys_and_tables(capsys, minimal_text, scenario_file):
     tables = "\n[control.bevel_only]\ncurvature = 0.1\n[control.bevel_olny]\n"
     path = scenario_file(minimal_text + tables)
@@ -180,14 +172,6 @@ def test_check_warns_of_implausible_values(capsys, minimal_text, scenario_file):
         f"flexneedle: {path}: tissue[0].thickness_mm = 9: has no effect",
     ]
     assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", err)
-
-
-def test_strict_fails_for_a_renamed_key_and_for_nothing_else(capsys, minimal_text, scenario_file):
-    path = scenario_file(minimal_text)
-    assert run(capsys, "scenario", "check", "--strict", str(path))[0] == 0
-    path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
-    line = f"flexneedle: {path}: control.horizon is now control.ce_mpc.horizon: rename it"
-    assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", [line])
 
 
 def test_check_explains_how_to_omit_the_guide(capsys, minimal_text, scenario_file):

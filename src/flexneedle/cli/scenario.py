@@ -57,7 +57,7 @@ def _add_check(commands: Commands) -> None:
         "flexneedle scenario check mine.toml --strict",
         "flexneedle scenario check mine.toml --controller follow_path:METHOD",
         about="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
-        "for each value that is not used, has been renamed, or is an order of magnitude outside the usual range.",
+        "for each value that is not used, or is an order of magnitude outside the usual range.",
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(parser)

@@ -69,4 +69,4 @@ def unowned(scenario: Scenario, methods: Iterable[Controller], source: str = "")
 
 
 def _typed(scenario: Scenario, methods: tuple[Controller, ...], source: str) -> Scenario:
-    return typed_scenario(methods).from_record(scenario.model_dump(exclude_none=True), source)
+    return typed_scenario(methods).from_values(scenario.model_dump(exclude_none=True), source)

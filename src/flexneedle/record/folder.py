@@ -167,7 +167,7 @@ def _checked(path: Path, values: Any) -> RunFile:
             name: values.get(name, "") for name in ("controller", "phantom", "tracker", "rig", "disturbed")
         }
         named["dry_run"] = values.get("dry_run", False) is True
-        scenario = Scenario.from_record(values["scenario"])
+        scenario = Scenario.from_values(values["scenario"])
         plans = {name: _plan(plan, values["scenario"]) for name, plan in read}
         return RunFile(path.parent, scenario=scenario, plans=plans, **named)
     except ScenarioError as error:
@@ -180,7 +180,7 @@ def _plan(values: dict[str, Any], scenario: dict[str, Any]) -> Plan:
     """The plan of a run, with the run's scenario, at the entry that the plan has chosen."""
     chosen = {name: values[name] for name in ("entry",) if name in values}
     plan = plan_from_values({name: value for name, value in values.items() if name not in chosen})
-    return replace(plan, scenario=Scenario.from_record(scenario | chosen))
+    return replace(plan, scenario=Scenario.from_values(scenario | chosen))
 
 
 def _make(path: Path) -> Path:

@@ -1,6 +1,5 @@
 """The scenario: everything that plan and insertion depend on, except the seed."""
 
-import warnings
 from collections.abc import Collection, Mapping
 from itertools import chain
 from typing import Annotated, Any, Self
@@ -8,10 +7,9 @@ from typing import Annotated, Any, Self
 from pydantic import Field, ValidationError, model_validator
 
 from flexneedle.arguments import refusal
-from flexneedle.errors import ScenarioError, ScenarioWarning
+from flexneedle.errors import ScenarioError
 from flexneedle.scenario.dotted import flatten, set_value, split_key
 from flexneedle.scenario.problems import describe, key_path, refuse, to_line
-from flexneedle.scenario.renamed import current_key, current_values, given_twice
 from flexneedle.scenario.rules import (
     entry_problems,
     geometry_problems,
@@ -81,23 +79,20 @@ class Scenario(Section):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], source: str = "") -> Self:
-        """Return the scenario of nested tables, or raise ScenarioError, whose lines open with `source`.
+        """Return the scenario of nested tables.
 
-        Warns (ScenarioWarning) of a key that has been renamed.
+        Args:
+            values: The tables, by section.
+            source: Opening of each line of an error, such as the path of a file.
+
+        Raises:
+            ScenarioError: A key is unknown or a rule is broken.
         """
-        current = dict(current_values(values, source))
         try:
-            return cls.model_validate(current)
+            return cls.model_validate(dict(values))
         except ScenarioError as error:
             opening = f"{source}: " if source else ""
             raise ScenarioError(*(opening + line for line in error.problems)) from None
-
-    @classmethod
-    def from_record(cls, values: Mapping[str, Any], source: str = "") -> Self:
-        """Return the scenario of a record, as `from_values`, without warnings: a record is not edited."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ScenarioWarning)
-            return cls.from_values(values, source)
 
     def values(self) -> dict[str, Any]:
         """Return nested tables, with all defaults, without the keys that are not set."""
@@ -110,11 +105,9 @@ class Scenario(Section):
         """
         if not isinstance(changes, Mapping):
             raise refusal("changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}')
-        values, changed = self.values(), {key: current_key(key) for key in changes}
+        values = self.values()
         for key, value in changes.items():
-            if changed[key] != key and changed[key] in changes:
-                raise ScenarioError(given_twice(key, value))
-            set_value(values, changed[key], _expanded(key, value))
+            set_value(values, key, _expanded(key, value))
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

@@ -44,7 +44,7 @@ PLANE = "plane"
 
 
 @dataclass(frozen=True)
-class Rig:
+class WorldRig:
     """The driver of a needle in space. guide_axes: axes in which its guide moves, 0 without a guide."""
 
     guide_axes: int
@@ -64,12 +64,12 @@ class Rig:
 
 
 _IN_SPACE = {
-    "two-axes": Rig(2, half_turns=False),
-    "two-axes-half-turns": Rig(2, half_turns=True),
-    "one-axis": Rig(1, half_turns=False),
-    "one-axis-half-turns": Rig(1, half_turns=True),
-    "no-guide": Rig(0, half_turns=False),
-    "no-guide-half-turns": Rig(0, half_turns=True),
+    "two-axes": WorldRig(2, half_turns=False),
+    "two-axes-half-turns": WorldRig(2, half_turns=True),
+    "one-axis": WorldRig(1, half_turns=False),
+    "one-axis-half-turns": WorldRig(1, half_turns=True),
+    "no-guide": WorldRig(0, half_turns=False),
+    "no-guide-half-turns": WorldRig(0, half_turns=True),
 }
 RIGS = (PLANE, *_IN_SPACE)
 

@@ -274,7 +274,7 @@ def load_state(path: str | Path, start: State) -> State:
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        saved = Scenario.from_record(json.loads(str(arrays.pop("scenario"))), source=str(path))
+        saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
     except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
         raise StateError(f"{path}: not a saved state ({error})") from error
     if (key := mechanics_difference(saved, start.scenario)) is not None:

@@ -154,12 +154,6 @@ def test_a_file_is_loaded_with_its_warnings(session, minimal_text):
     assert (loaded.name, loaded.scenario.name, loaded.news().changed) == ("mine", "Minimal", [])
 
 
-def test_a_renamed_key_of_a_file_is_a_doubt(session, minimal_text):
-    text = minimal_text + "[control.adaptive_mpc]\nmodel_sd_mm = 0.1\n"
-    (doubt,) = session.with_file("mine", text).edited({"target.depth_mm": 35.0}).news().doubts
-    assert "least_model_sd_mm" in doubt
-
-
 def test_a_file_that_was_written_is_the_same_scenario(session):
     assert session.with_file("mine", dump_scenario(session.scenario)).scenario == session.scenario
 

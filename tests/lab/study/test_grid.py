@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from flexneedle.control.controllers import CONTROLLERS, checked
-from flexneedle.errors import InputError, ScenarioWarning
+from flexneedle.errors import InputError
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.spec import LARGEST_SEED, STUDIES
 from flexneedle.planning.planner import bevel_reach
@@ -199,24 +199,6 @@ def test_keys_of_the_base_can_be_removed(study):
     )
     needle = study(text).points[0].scenario.needle
     assert (needle.gauge, needle.outer_diameter_mm, needle.outer_diameter) == ("19G", None, 1.067)
-
-
-def test_renamed_keys_are_accepted_in_values_cases_and_axes(study):
-    axis = '[[axes]]\nkey = "control.horizon"\nvalues = [3, 4]\n'
-    rest = '[values]\ncontrol.samples = 9\n[[cases]]\nname = "a"\nvalues = { control.iterations = 2 }\n'
-    with pytest.warns(ScenarioWarning) as caught:
-        points = study(rest + axis).points
-    assert {str(warning.message).split()[0] for warning in caught} == {
-        "control.horizon",
-        "control.samples",
-        "control.iterations",
-    }
-    tables = [point.scenario.control.tables["ce_mpc"] for point in points]
-    assert [(t["horizon"], t["samples"], t["iterations"]) for t in tables] == [(3, 9, 2), (4, 9, 2)]
-    assert [dict(point.varied) for point in points] == [{"control.ce_mpc.horizon": k} for k in (3, 4)]
-    twice = axis + '[[cases]]\nname = "a"\nvalues = { control.ce_mpc.horizon = 2 }\n'
-    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="also set by an axis"):
-        study(twice)
 
 
 def test_an_unknown_controller_table_is_rejected(study):

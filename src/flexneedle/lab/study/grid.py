@@ -168,7 +168,7 @@ def recorded_study(definition: Mapping[str, Any]) -> Study:
     Raises InputError if this version makes another number of insertions of it, or for one of its parts that is missing;
     KeyError, TypeError, ValueError or AttributeError for values that are no definition.
     """
-    study = _study(definition, Scenario.from_record(definition["scenario"]))
+    study = _study(definition, Scenario.from_values(definition["scenario"]))
     if len(study) != definition["insertions"]:
         rule = f"this version of flexneedle makes {len(study)} of it: its rows cannot be assigned"
         raise InputError(to_line(Problem("insertions", definition["insertions"], rule)))

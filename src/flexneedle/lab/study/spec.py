@@ -15,7 +15,6 @@ from flexneedle.scenario.library import Library, label
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.problems import Problem, refuse
-from flexneedle.scenario.renamed import current_key
 from flexneedle.scenario.sections.fields import Section, Title, count
 from flexneedle.scenario.worlds import LARGEST_WORLD
 
@@ -45,7 +44,7 @@ def _seed(value: int) -> int:
 class Axis(Section):
     """One `[[axes]]`: a key and its values; axes are combined in all ways."""
 
-    key: Annotated[str, AfterValidator(current_key)]
+    key: str
     """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case,
     world_rig."""
     values: Any
@@ -88,7 +87,7 @@ class StudyFile(Section):
     """Title of tables and reports."""
     scenario: str = "phantom"
     """Base scenario: name of a preset, or path relative to the folder of the study file."""
-    without: Annotated[tuple[Annotated[str, AfterValidator(current_key)], ...], Field(strict=False)] = ()
+    without: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Keys of the base to remove, for example diameters if a gauge is set."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key for the whole study."""
@@ -141,7 +140,7 @@ def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by dotted key; a target [depth, y] or [depth, y, z] becomes the three keys of the scenario."""
-    flat = {current_key(key): value for key, value in flatten(values).items()}
+    flat = flatten(values)
     if TARGET in flat:
         x, y, z = (*flat.pop(TARGET), 0.0)[:3]
         flat |= dict(zip(TARGET_KEYS, (x, y, z), strict=True))

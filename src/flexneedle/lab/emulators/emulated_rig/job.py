@@ -54,7 +54,7 @@ class Job:
         values = json.loads(line)
         return cls(
             RigFile.model_validate(values["rig"]),
-            Scenario.from_record(values["scenario"]),
+            Scenario.from_values(values["scenario"]),
             values["seed"],
             None if values["truth"] is None else Path(values["truth"]),
             tuple((name, text) for name, text in values["faults"]),

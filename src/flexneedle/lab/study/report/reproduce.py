@@ -50,7 +50,7 @@ def _scenario_of(rows: Rows, row: int) -> Scenario | None:
     settings = {key: rows.value(key, row) for key in keys}
     known = {key: value for key, value in settings.items() if value is not None}
     try:
-        return Scenario.from_record({"name": "Scenario of a study", **_nested(known)})
+        return Scenario.from_values({"name": "Scenario of a study", **_nested(known)})
     except (ScenarioError, TypeError):
         return None
 
