@@ -5,7 +5,7 @@
 Five parts, each until N inputs (default: a million) or S seconds (default: 600):
 
 readings  values of a sensor from the link: a reading, whose position, if it has one, is finite and in range
-link      lines in place of the link's messages: a message, or ValueError, which ends the link and is counted; bounded
+link      bytes in place of the link's messages: a message, or ValueError, which ends the link and is counted; bounded
           memory; frames are new, and not of the future
 emulator  commands to the emulated Aurora: an intact reply to each, a valid state, tracking only after TSTART
 watch     frames to the supervisor's check: a verdict, not OK if the newest reading is not a number, repeated or stale
@@ -30,7 +30,7 @@ from flexneedle.geometry.registration import Rigid
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
 from flexneedle.lab.rig.devices.aurora.incoming import Incoming
-from flexneedle.lab.rig.devices.aurora.messages import LONGEST_LINE
+from flexneedle.lab.rig.devices.aurora.messages import parse
 from flexneedle.lab.rig.devices.aurora.readings import NAMES, readings, sensor_name
 from flexneedle.lab.rig.supervisor.messages import Expectation
 from flexneedle.lab.rig.supervisor.watch import Watch
@@ -127,7 +127,7 @@ class Feeding:
 
 
 def link_inputs(random: Random) -> Iterator[str]:
-    """Send one line after another, to an adapter that lasts for some thousand."""
+    """Send one message after another, to an adapter that lasts for some thousand."""
     while True:
         feeding = Feeding()
         for _ in range(2000):
@@ -137,15 +137,15 @@ def link_inputs(random: Random) -> Iterator[str]:
 
 
 def random_line(random: Random, feeding: Feeding) -> bytes:
-    """A line with its end, most of them a message that may be damaged."""
+    """Bytes, most of them a message that may be damaged."""
     kind = random.random()
     if kind < 0.03:
-        return random.randbytes(random.randint(0, 100)) + b"\n"
+        return random.randbytes(random.randint(0, 100))
     if kind < 0.06:
-        return json.dumps(random_json(random, 4)).encode() + b"\n"
+        return json.dumps(random_json(random, 4)).encode()
     if kind < 0.062:
         return random.choice((b"[", b'{"a":', b"9", b" ", b"\x00")) * random.choice((1000, 70000, 200000))
-    line = json.dumps(random_message(random, feeding)).encode() + b"\n"
+    line = json.dumps(random_message(random, feeding)).encode()
     return mutated(random, line, BYTES) if random.random() < 0.15 else line
 
 
@@ -196,13 +196,11 @@ def random_message(random: Random, feeding: Feeding) -> list[Any]:
 
 
 def fed(feeding: Feeding, line: bytes, random: Random) -> None:
-    """Send a line in pieces, as the thread of the adapter does; then read. Raises Failure."""
-    incoming, cut = feeding.incoming, random.randint(0, len(line))
+    """Take a message, as the thread of the adapter does; then read. Raises Failure."""
+    incoming = feeding.incoming
     try:
-        for piece in (line[:cut], line[cut:]):
-            incoming.feed(piece)
+        incoming.take(parse(line))
         if random.random() < 0.01:  # the link ends
-            incoming.finish()
             incoming.begin()
             feeding.device_number = 0
     except ValueError as error:
@@ -220,17 +218,12 @@ def fed(feeding: Feeding, line: bytes, random: Random) -> None:
 
 
 def is_no_message(line: bytes) -> bool:
-    """Whether a complete line is none of the link's messages, by its first item."""
-    if not line.endswith(b"\n"):
-        return len(line) > LONGEST_LINE
-    for part in line.split(b"\n")[:-1]:
-        try:
-            found = json.loads(part)
-        except (ValueError, RecursionError):
-            return True
-        if not (isinstance(found, list) and found and found[0] in ("ready", "frame", "error", "end")):
-            return True
-    return False
+    """Whether these bytes are none of the link's messages, by their first item."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return True
+    return not (isinstance(found, list) and found and found[0] in ("ready", "frame", "error", "end"))
 
 
 def check_incoming(feeding: Feeding, line: bytes) -> None:
@@ -239,8 +232,8 @@ def check_incoming(feeding: Feeding, line: bytes) -> None:
     status = incoming.status
     if len(status) > 200 or (status and not status.isprintable()):
         raise Failure(f"{line[:500]!r}: status {status!r}")
-    if len(incoming._rest) > LONGEST_LINE or len(counts.errors) > MOST_ERRORS:
-        raise Failure(f"{line[:500]!r}: {len(incoming._rest)} bytes kept, {counts}")
+    if len(counts.errors) > MOST_ERRORS:
+        raise Failure(f"{line[:500]!r}: {counts}")
     if counts.errors.get("crash", 0) != feeding.errors:
         raise Failure(f"{line[:500]!r}: {feeding.errors} links failed, {counts}")
     frames = incoming.read()

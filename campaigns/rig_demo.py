@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import flexneedle
 from decision_time import MOST_GROWTH_MM
 from flexneedle.scenario.files import dump_scenario

@@ -38,6 +38,7 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import flexneedle
 from decision_time import MOST_GROWTH_MM, MOST_INNOVATION_MM, TARGETS
 from flexneedle.lab.rig.fit import fit_problems

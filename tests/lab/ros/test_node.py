@@ -17,12 +17,12 @@ from cyclonedds.sub import DataReader
 import flexneedle
 from emulated import until
 from flexneedle.errors import InputError, RunError
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.ros import client
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.dds import Reader, Writer
 from flexneedle.lab.ros.idl import type_hash
 from flexneedle.lab.ros.messages import Composer
-from flexneedle.lab.ros.pipe import Pipe
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import (
     Arm,
@@ -146,15 +146,18 @@ def test_a_stop_that_was_latched_before_the_start_is_received():
 
 def test_a_stop_that_comes_before_the_first_sign_of_life_is_received(monkeypatch):
     class Process:
-        def __init__(self, _command, pass_fds, **_):
-            self.end = Pipe(socket.socket(fileno=os.dup(pass_fds[0])))
-            self.end.send(Stop(1.0, "/stop"))
-            self.end.send(Beat(time.monotonic(), {}, {}))
+        def __init__(self, _module, **_):
+            self.channel, self.other = map(MessageChannel, socket.socketpair())
+            self.other.send(Stop(1.0, "/stop"))
+            self.other.send(Beat(time.monotonic(), {}, {}))
 
-        def wait(self, _seconds):
-            self.end.close()
+        def end(self, _seconds):
+            self.other.close()
 
-    monkeypatch.setattr("flexneedle.lab.ros.client.subprocess.Popen", Process)
+        def close(self):
+            self.channel.close()
+
+    monkeypatch.setattr(client, "ChildProcess", Process)
     with open_node(NEUTRAL) as node:
         assert Stop(1.0, "/stop") in node.poll()
 
@@ -293,10 +296,9 @@ def test_publishing_does_not_wait_for_a_node_that_hangs():
 def test_the_node_ends_with_the_rig():
     node = open_node(NEUTRAL)
     process = node._process
-    node._pipe.close()
-    until(lambda: process.poll() is not None)
-    assert process.returncode == 0
-    node._errors.close()
+    process.channel.close()
+    assert process.wait(20.0) == 0
+    process.close()
 
 
 def test_a_wrong_domain_is_one_line(monkeypatch):

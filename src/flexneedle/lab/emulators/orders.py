@@ -1,14 +1,26 @@
 """Commands to rest the emulated tip at a position: lines `X Y Z` on a stream, in mm in the tracker's frame."""
 
 import os
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from math import isfinite
+from typing import Protocol
 
 from flexneedle.errors import InputError
 from flexneedle.types import Point
 
 _FARTHEST_MM = 1000.0
 _LONGEST_LINE = 4096
+
+
+class OrderSource(Protocol):
+    """Source of orders, one line each."""
+
+    @property
+    def sources(self) -> Sequence[int]:
+        """Descriptors to wait for."""
+
+    def read(self, ready: Container[int]) -> list[str]:
+        """Return the orders received; ready: descriptors with data to read."""
 
 
 class Orders:

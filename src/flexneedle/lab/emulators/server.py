@@ -31,7 +31,7 @@ from flexneedle.lab.emulators.motion import (
     is_missing,
     pose,
 )
-from flexneedle.lab.emulators.orders import Orders, parse_position
+from flexneedle.lab.emulators.orders import OrderSource, parse_position
 
 _TICK_S = 0.005  # longest sleep of the loop
 _LONGEST_STEP_S = 2 * _TICK_S
@@ -216,7 +216,7 @@ def device_time(before: float, served: float, now: float) -> float:
 def serve(
     session: EmulatorSession,
     serial: Serial,
-    orders: Orders,
+    orders: OrderSource,
     obey: Callable[[str], None],
     say: Callable[[str], None],
 ) -> NoReturn:

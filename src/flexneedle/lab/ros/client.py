@@ -1,9 +1,5 @@
 """The rig's end of its ROS node. No call waits, but for the start."""
 
-import socket
-import subprocess
-import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
@@ -12,8 +8,7 @@ from time import monotonic
 from typing import Self
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.processes import end_process, last_line
-from flexneedle.lab.ros.pipe import Pipe
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.ros.profile import OF_THE_LOOP, Profile
 from flexneedle.lab.ros.records import Beat, Lost, Published, Request, RigState, Setup, Target
 from flexneedle.types import VISIBLE, Period, Plan
@@ -45,20 +40,13 @@ class NodeClient:
 
     def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
         check_installed()
-        ours, theirs = socket.socketpair()
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the node
-        command = [sys.executable, "-m", "flexneedle.lab.ros.node", "--fd", str(theirs.fileno())]
-        # In a separate session, so that Ctrl-C reaches only the rig.
-        self._process = subprocess.Popen(
-            command, pass_fds=(theirs.fileno(),), stderr=self._errors, start_new_session=True
-        )
-        theirs.close()
-        self._pipe, self._lost = Pipe(ours), ""
+        self._process = ChildProcess(f"{__package__}.node", keep_printed=True)
+        self._channel, self._lost = self._process.channel, ""
         self._beat_at: float | None = None
         self._early: list[Request] = []
         self.subscribers: Mapping[str, int] = {}
         self.publishers: Mapping[str, int] = {}
-        self._pipe.send(Setup(profile, epoch))
+        self._channel.send(Setup(profile, epoch))
         try:
             self._await_ready()
         except BaseException:  # also on Ctrl-C: the process must end
@@ -74,13 +62,13 @@ class NodeClient:
     def publish(self, record: Plan | Period | Published) -> None:
         """Publish a record. Where the node does not keep up, the oldest periods and joint targets are dropped."""
         light = replace(record, shapes=record.shapes[:0], history=()) if isinstance(record, Plan) else record
-        self._pipe.send(light, keep=isinstance(record, Plan | Target | RigState))
+        self._channel.send(light, keep=isinstance(record, Plan | Target | RigState))
 
     def poll(self) -> list[Request]:
         """What was received since the last call, oldest first. A `Lost` is the last record of all."""
-        self._pipe.flush()
+        self._channel.flush()
         requests, self._early = self._early, []
-        for record in self._pipe.receive():
+        for record in self._channel.receive():
             if isinstance(record, Beat):
                 self._beat_at = record.time
                 self.subscribers, self.publishers = record.subscribers, record.publishers
@@ -93,7 +81,7 @@ class NodeClient:
 
     def wait(self, seconds: float) -> None:
         """Wait until something is received, at most for `seconds`."""
-        select([self._pipe.socket], [], [], seconds)
+        select([self._channel], [], [], seconds)
 
     @property
     def status(self) -> str:
@@ -108,18 +96,17 @@ class NodeClient:
     @property
     def dropped(self) -> int:
         """Records that were not published, because the node did not keep up."""
-        return self._pipe.dropped
+        return self._channel.dropped
 
     def close(self) -> None:
         """End the node."""
-        self._pipe.close()
-        end_process(self._process, _STOP_S)
-        self._errors.close()
+        self._process.end(_STOP_S)
+        self._process.close()
 
     def _silent(self) -> str:
         """Why nothing is received any more, or ""."""
-        if self._pipe.ended:
-            words = last_line(self._errors)
+        if self._channel.ended:
+            words = self._process.last_line()
             return f"the ROS node has ended: {words}" if words else "the ROS node has ended"
         silent = 0.0 if self._beat_at is None else monotonic() - self._beat_at
         return f"the ROS node does not answer for {silent:.1f} s" if silent > _SILENT_S else ""
@@ -129,7 +116,7 @@ class NodeClient:
         while self._beat_at is None:
             if monotonic() > deadline:
                 raise RunError(f"the ROS node has not started within {_START_S:g} s")
-            select([self._pipe.socket], [], [], 0.1)
+            self.wait(0.1)
             self._early = self.poll()  # a stop may come first
             if self._lost:
                 raise RunError(self._lost)

@@ -1,15 +1,13 @@
 """The ROS node of a rig: a process of its own, so that no thread of DDS runs in the rig's or the controller's.
 
-    python -m flexneedle.lab.ros.node --fd N
+    python -m flexneedle.lab.ros.node CHANNEL
 
-N is a socket whose other end is `flexneedle.lab.ros.client.NodeClient`. The first record on it is the `Setup`. The node
-publishes the messages of the records that follow and sends back what it receives. It ends when the other end is closed.
+CHANNEL is a descriptor whose other end is at `flexneedle.lab.ros.client.NodeClient`. The first record
+on it is the `Setup`. The node publishes the messages of the records that follow and sends back what it receives. It
+ends when the other end is closed.
 """
 
-import argparse
-import select
 import signal
-import socket
 import sys
 from threading import Event, Thread
 from time import monotonic
@@ -17,10 +15,10 @@ from time import monotonic
 from cyclonedds.domain import DomainParticipant
 
 from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.ros.dds import Reader, Writer, participant, waitset
 from flexneedle.lab.ros.messages import Composer
 from flexneedle.lab.ros.parsing import Subscription
-from flexneedle.lab.ros.pipe import Pipe
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED
 from flexneedle.lab.ros.records import Arm, Beat, JointTargets, Lost, Refused, Request, Setup, Stop
 
@@ -46,8 +44,8 @@ def readers_of(domain: DomainParticipant, subscription: Subscription) -> list[Re
 class Node:
     """Writers and readers of a profile."""
 
-    def __init__(self, setup: Setup, pipe: Pipe) -> None:
-        self._pipe, self._composer, self._ended = pipe, Composer(setup.profile, setup.epoch), Event()
+    def __init__(self, setup: Setup, channel: MessageChannel) -> None:
+        self._channel, self._composer, self._ended = channel, Composer(setup.profile, setup.epoch), Event()
         self._domain = participant()
         publish, subscribe = setup.profile.publish, setup.profile.subscribe
         self._writers = {
@@ -64,11 +62,10 @@ class Node:
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
 
     def run(self) -> None:
-        """Publish and receive until the other end of the pipe is closed."""
+        """Publish and receive until the other end of the channel is closed."""
         self._listener.start()
-        while not self._pipe.ended and self._listener.is_alive():
-            select.select([self._pipe.socket], [], [], BEAT_S)
-            for record in self._pipe.receive():
+        while not self._channel.ended and self._listener.is_alive():
+            for record in self._channel.receive(BEAT_S):
                 self._publish(record)
         self._ended.set()
         self._listener.join()
@@ -89,7 +86,7 @@ class Node:
                     self._forward(subscription, reader)
             if (now := monotonic()) - last >= BEAT_S:
                 last = now
-                self._pipe.send(self._beat(now), keep=False)
+                self._channel.send(self._beat(now), keep=False)
             waiting.wait(round(1e9 * BEAT_S))
 
     def _beat(self, now: float) -> Beat:
@@ -102,7 +99,7 @@ class Node:
             if self._seen.get(subscription.key) != source:  # a stop has several readers
                 record = subscription.read(data, monotonic(), publishers)
                 if record is not None and not self._repeats(record):
-                    self._pipe.send(record, keep=isinstance(record, Stop | Arm))
+                    self._channel.send(record, keep=isinstance(record, Stop | Arm))
             self._seen[subscription.key] = source
 
     def _repeats(self, record: Request) -> bool:
@@ -113,34 +110,22 @@ class Node:
         return False
 
 
-def main() -> int:
-    """Run a node on the socket of the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--fd", type=int, required=True)
-    pipe = Pipe(socket.socket(fileno=parser.parse_args().fd))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the rig, which then closes the pipe
+def main(descriptor: int) -> int:
+    """Run a node on the channel of the command line."""
+    channel = open_channel(descriptor)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the rig, which then closes the channel
     sys.setswitchinterval(_SWITCH_S)
-    setup = _setup(pipe)
-    if setup is None:
-        return 0
     try:
-        node = Node(setup, pipe)
+        node = Node(channel.receive_first(), channel)
+    except EOFError:
+        return 0
     except FlexneedleError as error:
-        pipe.send(Lost(monotonic(), one_line(error)))
+        channel.send(Lost(monotonic(), one_line(error)))
+        channel.flush(BEAT_S)
         return 1
     node.run()
     return 0
 
 
-def _setup(pipe: Pipe) -> Setup | None:
-    """The first record; None if the other end was closed before."""
-    while not pipe.ended:
-        select.select([pipe.socket], [], [], BEAT_S)
-        for record in pipe.receive():
-            if isinstance(record, Setup):
-                return record
-    return None
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(int(sys.argv[1])))

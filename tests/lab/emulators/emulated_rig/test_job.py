@@ -1,7 +1,7 @@
-"""What can be emulated, and what a job is after its way through a line."""
+"""What can be emulated, and the records and orders of its processes."""
 
-import json
-import os
+import pickle
+import socket
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +9,20 @@ import pytest
 
 from flexneedle.cli.main import main
 from flexneedle.errors import InputError, RigError, RunError
-from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, checked_job
+from flexneedle.lab.emulators.emulated_rig.child import Parent
+from flexneedle.lab.emulators.emulated_rig.job import Job, checked_job
 from flexneedle.lab.emulators.emulated_rig.motors import address_of, device_of
 from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle
 from flexneedle.lab.emulators.emulated_rig.phantom import drawn, sensor_of
 from flexneedle.lab.emulators.emulated_rig.rig import split_fault
-from flexneedle.lab.emulators.emulated_rig.stream import Sink, Source, StreamEnded
+from flexneedle.lab.emulators.emulated_rig.stream import (
+    ChannelEnded,
+    Record,
+    receive_records,
+    send_record,
+)
 from flexneedle.lab.emulators.emulated_rig.tracker import noise_of, port_of
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.rig_file import RIGS, RigFile, load_rig
 from flexneedle.loop.virtual import Seeds, registration_error, virtual_rig
 from flexneedle.scenario.files import load_scenario
@@ -44,10 +51,9 @@ def test_the_rig_of_the_package_fits_both_presets():
     assert (address_of(RIG), port_of(RIG)) == (("127.0.0.1", 2323), "/tmp/aurora")
 
 
-def test_a_job_is_the_same_after_its_way_through_a_line(tmp_path):
+def test_a_job_is_the_same_in_another_process(tmp_path):
     job = Job(RIG, load_scenario("world:100012"), 7, tmp_path / "truth.csv", (("galil", "stall=A@5"),))
-    assert Job.of_line(job.to_line()) == job
-    assert "\n" not in job.to_line()
+    assert pickle.loads(pickle.dumps(job)) == job
 
 
 @pytest.mark.parametrize(
@@ -170,50 +176,49 @@ def test_the_controller_has_the_switches_of_its_axes():
     assert device.axes[2].switches == (-32_000.0, 32_000.0)
 
 
-def test_records_pass_a_pipe_whole_and_in_order():
-    source, sink = os.pipe()
-    reading, writing = Source(source, 2), Sink(sink, 2, "reader")
-    assert reading.read() == []
-    for k in range(3):
-        writing.write(k, (k + 0.5, -k), k == 1)
-    assert [tuple(record) for record in reading.read()] == [
-        (0.0, (0.5, 0.0), False),
-        (1.0, (1.5, -1.0), True),
-        (2.0, (2.5, -2.0), False),
-    ]
-    os.write(sink, b"half a")
-    assert reading.read() == []
-    os.close(sink)
-    with pytest.raises(StreamEnded):
-        reading.read()
-    os.close(source)
+def channels():
+    return map(MessageChannel, socket.socketpair())
+
+
+def test_records_arrive_in_order_and_the_end_after_the_last():
+    reading, writing = channels()
+    assert receive_records(reading) == []
+    records = [Record(k, (k + 0.5, -k), k == 1) for k in range(3)]
+    for record in records:
+        send_record(writing, record, "reader")
+    writing.close()
+    assert receive_records(reading) == records
+    with pytest.raises(ChannelEnded):
+        receive_records(reading)
+    reading.close()
 
 
 def test_a_reader_that_does_not_keep_up_is_an_error_and_one_that_is_gone_the_end():
-    source, sink = os.pipe()
-    writing = Sink(sink, 4, "phantom")
+    reading, writing = channels()
+    record = Record(0.0, (0.0,) * 4, True)
 
     def fill():
-        for k in range(10_000):
-            writing.write(k, (0.0,) * 4, True)
+        for _ in range(100_000):
+            send_record(writing, record, "phantom")
 
-    with pytest.raises(RunError, match="the phantom does not keep up"):
+    with pytest.raises(RunError, match="phantom"):
         fill()
-    os.close(source)
-    with pytest.raises(StreamEnded):
-        writing.write(0.0, (0.0,) * 4, True)
-    os.close(sink)
+    reading.close()
+    with pytest.raises(ChannelEnded):
+        send_record(writing, record, "phantom")
+    writing.close()
 
 
-def test_a_lifeline_ends_with_the_process_at_its_other_end():
-    source, sink = os.pipe()
-    lifeline = Lifeline(source)
-    os.write(sink, b"clear\nfau")
-    assert lifeline.read(lifeline.sources) == ["clear"]
-    os.close(sink)
-    with pytest.raises(StreamEnded):
-        lifeline.read(lifeline.sources)
-    os.close(source)
+def test_a_child_ends_with_its_parent():
+    ours, theirs = channels()
+    parent = Parent(ours)
+    theirs.send("clear")
+    assert parent.read(parent.sources) == ["clear"]
+    assert parent.read([]) == []
+    theirs.close()
+    with pytest.raises(ChannelEnded):
+        parent.read(parent.sources)
+    ours.close()
 
 
 @pytest.mark.parametrize(
@@ -231,7 +236,3 @@ def test_the_command_refuses_in_one_line(arguments, message, capsys):
     assert out == ""
     assert message in err
     assert err.count("\n") == 1
-
-
-def test_a_job_is_plain_json():
-    assert json.loads(Job(RIG, PHANTOM).to_line())["rig"]["driver"]["address"] == "127.0.0.1:2323"

@@ -1,10 +1,9 @@
 """The whole emulated rig in processes: motors move the needle, the tracker measures it, faults and endings."""
 
-import json
 import math
+import os
 import signal
 import socket
-import subprocess
 from time import monotonic
 
 import numpy as np
@@ -15,9 +14,10 @@ from emulated import DEADLINE_S, read_until, until
 from emulated_rig import emulated_rig, rig_file, started
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators.emulated_rig.job import Job
-from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig, _Part
+from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.emulators.motion import RATE_HZ
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.loop.virtual import to_stage
@@ -196,21 +196,25 @@ def test_where_a_process_is_lost_all_end(tmp_path):
     until(gone(children))
 
 
-def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch):
+def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch, tmp_path):
     """Whichever of them is noticed first: the others end in good order."""
 
-    def part(name, command):
-        process = subprocess.Popen(["sh", "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        return _Part(name, process)
-
+    (tmp_path / "ending.py").write_text(
+        "import sys\n"
+        "from flexneedle.lab.process import open_channel\n"
+        "channel = open_channel(int(sys.argv[1]))\n"
+        "if sys.argv[2:]:\n"
+        "    channel.send({'failed': sys.argv[2], 'input': False})\n"
+        "    sys.exit(1)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     rig = EmulatedRig(Job(load_rig("emulated"), load_scenario("phantom")), print)
-    failure = json.dumps({"failed": "the disk is full", "input": False})
-    parts = {"phantom": part("phantom", "true"), "galil": part("galil", f"echo '{failure}'; exit 1")}
+    parts = {"phantom": ChildProcess("ending"), "galil": ChildProcess("ending", "the disk is full")}
     monkeypatch.setattr(rig, "_parts", parts)
     with pytest.raises(RunError, match="the disk is full"):
-        list(rig._messages(parts["phantom"]))
+        list(rig._messages("phantom"))
     rig._end()
-    assert [one.process.returncode for one in parts.values()] == [0, 1]
+    assert [one.wait() for one in parts.values()] == [0, 1]
 
 
 def test_an_address_that_is_taken_is_found_out_before_anything_is_started(tmp_path):

@@ -1,17 +1,17 @@
 """The phantom's process without processes: records of the motors in, records of the tip and true states out."""
 
-import os
+import socket
 from time import monotonic
 
 import numpy as np
 import pytest
 
 from flexneedle.lab.emulators.emulated_rig import phantom
-from flexneedle.lab.emulators.emulated_rig.following import VALUES
 from flexneedle.lab.emulators.emulated_rig.job import Job
 from flexneedle.lab.emulators.emulated_rig.phantom import World
-from flexneedle.lab.emulators.emulated_rig.stream import Record, Sink, Source
+from flexneedle.lab.emulators.emulated_rig.stream import Record
 from flexneedle.lab.emulators.emulated_rig.truth import TruthWriter, read_truth
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
 
@@ -21,27 +21,28 @@ AXES = tuple(name for name, _ in RIG.axes.items())
 
 @pytest.fixture
 def world(tmp_path):
-    """A world, the reading end of what it sends, and the file of its true states."""
-    source, sink = os.pipe()
-    path = tmp_path / "truth.csv"
+    """A world, the reading end of what it sends, the file of its true states, and its notes."""
+    reading, sending = map(MessageChannel, socket.socketpair())
+    path, notes = tmp_path / "truth.csv", []
     with TruthWriter(path, AXES) as writer:
         yield (
-            World(Job(RIG, load_scenario("phantom"), 3), Sink(sink, VALUES, "tracker"), writer),
-            Source(source, VALUES),
+            World(Job(RIG, load_scenario("phantom"), 3), sending, writer, notes.append),
+            reading,
             path,
+            notes,
         )
-    os.close(source)
-    os.close(sink)
+    reading.close()
+    sending.close()
 
 
 def test_each_record_of_the_motors_is_one_of_the_tip_at_the_same_time(world):
     """And a row of the true states, with the tip and the axes that belong to it."""
-    moving, seen, path = world
+    moving, seen, path, _ = world
     now = monotonic()
     moving.follow(Record(now - 0.01, (0.0, 0.0, 0.0, 0.0), False))
     moving.follow(Record(now - 0.005, (0.0, 0.0, 0.0, 0.0), True))
     moving.follow(Record(now, (4000.0, 9000.0, 200.0, -100.0), True))
-    records, truth = seen.read(), read_truth(path)
+    records, truth = seen.receive(), read_truth(path)
     sent = [(record.time, record.moving) for record in records]
     assert sent == [(now - 0.01, False), (now - 0.005, True), (now, True)]
     np.testing.assert_allclose(truth.time, [record.time for record in records], atol=1e-6)
@@ -57,10 +58,8 @@ def test_each_record_of_the_motors_is_one_of_the_tip_at_the_same_time(world):
 
 
 def test_the_lag_is_the_age_of_a_record_when_it_has_been_followed(world, monkeypatch):
-    moving, _, path = world
+    moving, _, path, notes = world
     monkeypatch.setattr(phantom, "monotonic", lambda: 100.25)
-    notes = []
-    monkeypatch.setattr(phantom, "note", notes.append)
     for _ in range(3):
         moving.follow(Record(100.0, (0.0,) * 4, True))
     assert read_truth(path).lag.tolist() == [0.25] * 3
@@ -69,9 +68,7 @@ def test_the_lag_is_the_age_of_a_record_when_it_has_been_followed(world, monkeyp
 
 
 def test_a_needle_without_equilibrium_is_reported_once(world, monkeypatch):
-    moving, _, path = world
-    notes = []
-    monkeypatch.setattr(phantom, "note", notes.append)
+    moving, _, path, notes = world
     monkeypatch.setattr(phantom.DrivenNeedle, "converged", False)
     for _ in range(2):
         moving.follow(Record(monotonic(), (0.0,) * 4, False))

@@ -1,14 +1,14 @@
 """The client waits for what its requests have changed, and takes no earlier report for it."""
 
-import os
+import socket
 import threading
-from multiprocessing.connection import Connection
 from threading import Thread
 
 import pytest
 
 from flexneedle.errors import RefusedError
 from flexneedle.geometry.registration import identity
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.supervisor import client
 from flexneedle.lab.rig.supervisor import messages as say
 from flexneedle.lab.rig.supervisor.client import Supervisor
@@ -24,30 +24,34 @@ class Scripted:
 
     pid = 0
 
-    def __init__(self, _command, pass_fds, **_options):
-        self._line = Connection(os.dup(pass_fds[0]))
+    def __init__(self, _module, **_options):
+        ours, theirs = socket.socketpair()
+        self.channel, self._line = MessageChannel(theirs), MessageChannel(ours)
         self._requests, self._next = 0, []
         self._thread = Thread(target=self._serve)
         self._thread.start()
 
-    def wait(self, _seconds):
+    def end(self, _seconds):
         self._thread.join()
+
+    def close(self):
+        self.channel.close()
 
     def _report(self, requests, *, rests):
         self._line.send(say.Report(0.0, State.STOPPED, "the test", requests=requests, at_rest=rests))
 
     def _take(self):
-        request = self._line.recv()
+        request = self._line.receive_first()
         self._requests += 1
         return request
 
     def _serve(self):
-        self._line.recv()
+        self._line.receive_first()
         self._report(0, rests=True)
-        with self._line:
-            while not isinstance(request := self._take(), say.Close):
-                self._answer(request)
-            self._line.send(say.Ended())
+        while not isinstance(request := self._take(), say.Close):
+            self._answer(request)
+        self._line.send(say.Ended())
+        self._line.close()
 
     def _answer(self, request):
         match request:
@@ -68,7 +72,7 @@ class Scripted:
 
 @pytest.fixture
 def scripted(monkeypatch):
-    monkeypatch.setattr(client.subprocess, "Popen", Scripted)
+    monkeypatch.setattr(client, "ChildProcess", Scripted)
     monkeypatch.setattr(client, "_SILENT_S", 60.0)  # it reports only when it is asked
 
 

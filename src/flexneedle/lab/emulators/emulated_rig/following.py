@@ -11,9 +11,6 @@ from flexneedle.lab.emulators.emulated_rig.stream import Record
 from flexneedle.lab.emulators.motion import RATE_HZ
 from flexneedle.types import Point, Quaternion
 
-VALUES = 6
-"""Numbers of a record: position x, y, z (mm) of the sensor and direction of the needle, in the tracker's frame."""
-
 _LONGEST = 4000  # records: 16 s of motion
 
 
@@ -21,8 +18,9 @@ class Followed:
     """The tip's sensor between records, linear in time. Frame n is taken n periods after `power_on` (s).
 
     Its roll, which one coil does not measure, is that of the shortest rotation of the z axis to the needle's direction.
-    A frame is there when the needle is known at its time: none is extrapolated. While the needle moves, that is a few
-    milliseconds after it was taken.
+    The numbers of a record are position x, y, z (mm) and direction of the needle, in the tracker's frame. A frame is
+    there when the needle is known at its time: none is extrapolated. While the needle moves, that is a few milliseconds
+    after it was taken.
     """
 
     def __init__(self, power_on: float, first: Record) -> None:

@@ -1,21 +1,21 @@
 """The motors of an emulated rig: a Galil whose travel is sent to the phantom, as a process of its own.
 
-`python -m flexneedle.lab.emulators.emulated_rig.motors SINK`, with the descriptor of the pipe to the phantom.
+`python -m flexneedle.lab.emulators.emulated_rig.motors PARENT PHANTOM`, with descriptors of channels.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from time import monotonic
 
 from flexneedle.errors import RigError
 from flexneedle.lab.emulators.emulated_rig.axes import carriages_of, channels_of
-from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, note, obey, run, send
-from flexneedle.lab.emulators.emulated_rig.stream import Sink
+from flexneedle.lab.emulators.emulated_rig.child import Parent, run
+from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.stream import Record, send_record
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
 from flexneedle.lab.emulators.galil.controller import Device
 from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp, serve
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
 
@@ -23,18 +23,16 @@ _REST_S = 0.05  # between two records at rest
 _PORT, _LAST_PORT = 23, 65535
 
 
-def main(job: Job, descriptors: list[int]) -> None:
-    """Serve the controller at its address until the process that has started this one ends."""
-    (descriptor,) = descriptors
-    sink = Sink(descriptor, len(CHANNELS), "phantom")
+def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+    """Serve the controller at its address until the parent ends."""
+    (phantom,) = channels
     faults = [parse_fault(text, FAULTS) for text in job.faults_of("galil")]
-    lifeline = Lifeline(sys.stdin.fileno())
     with Tcp(*address_of(job.rig)) as tcp:
         set_realtime_priority()
         session = GalilSession(device_of(job), faults, monotonic())
-        session.observe = _Observer(session, sink)
-        send(ready="{}:{}".format(*tcp.address))
-        serve(session, tcp, lifeline, lambda order: obey(session.schedule, order), note)
+        session.observe = _Observer(session, parent, phantom)
+        parent.report(ready="{}:{}".format(*tcp.address))
+        serve(session, tcp, parent, lambda order: parent.obey(session.schedule, order), parent.note)
 
 
 def device_of(job: Job) -> Device:
@@ -64,18 +62,18 @@ def address_of(rig: RigFile) -> tuple[str, int]:
 class _Observer:
     """Sends the travel of the motors: every few samples while one moves, else now and then."""
 
-    def __init__(self, session: GalilSession, sink: Sink) -> None:
-        self._session, self._sink = session, sink
+    def __init__(self, session: GalilSession, parent: Parent, phantom: MessageChannel) -> None:
+        self._session, self._parent, self._phantom = session, parent, phantom
         self._sent, self._was_moving, self._announced = -1.0, False, False
 
     def __call__(self, time: float, travel: Sequence[float], moving: bool) -> None:
         due = time - self._sent >= _REST_S
         if (moving != self._was_moving) or (moving and time > self._sent) or due:
-            self._sink.write(time, travel, moving)
+            send_record(self._phantom, Record(time, tuple(travel), moving), "phantom")
             self._sent, self._was_moving = time, moving
         if not self._announced and self._session.moved_since is not None:
             self._announced = True
-            send(event="first motion", time_s=self._session.moved_since)
+            self._parent.report(event="first motion", time_s=self._session.moved_since)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,17 @@
 """The phantom of an emulated rig: the true needle follows the motors, as a process of its own.
 
-`python -m flexneedle.lab.emulators.emulated_rig.phantom SOURCE SINK`, with the descriptors of the pipes from the motors
-and to the tracker.
+`python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER`, with descriptors of channels.
 """
 
 import gc
 import select
-import sys
 from collections import deque
+from collections.abc import Callable
 from contextlib import ExitStack
 from time import monotonic, process_time
 
 import numpy as np
 
-from flexneedle.lab.emulators.emulated_rig import following
 from flexneedle.lab.emulators.emulated_rig.axes import (
     NAMES,
     carriages_of,
@@ -21,11 +19,13 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
     positions_after,
     starts,
 )
-from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, note, run, send
+from flexneedle.lab.emulators.emulated_rig.child import Parent, run
+from flexneedle.lab.emulators.emulated_rig.job import Job
 from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, SensorOfTip
-from flexneedle.lab.emulators.emulated_rig.stream import Record, Sink, Source, StreamEnded
+from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
 from flexneedle.lab.emulators.emulated_rig.truth import Row, TruthWriter
 from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.loop.virtual import Seeds, registration_error, to_stage
 from flexneedle.phantom.draw import Truth, draw
@@ -49,14 +49,20 @@ def sensor_of(job: Job, truth: Truth) -> SensorOfTip:
 
 
 class World:
-    """The true needle, moved by the records of the motors. truth: where its states are written, or None."""
+    """The true needle, moved by the records of the motors.
 
-    def __init__(self, job: Job, sink: Sink, truth: TruthWriter | None) -> None:
+    tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line.
+    """
+
+    def __init__(
+        self, job: Job, tracker: MessageChannel, truth: TruthWriter | None, note: Callable[[str], None]
+    ) -> None:
         self._carriages, self._channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
         self._positions = starts(self._carriages)
         drawn_truth = drawn(job)
         self._needle = DrivenNeedle(drawn_truth, self._positions)
-        self._sensor, self._sink, self._truth = sensor_of(job, drawn_truth), sink, truth
+        self._sensor, self._truth = sensor_of(job, drawn_truth), truth
+        self._tracker, self._note = tracker, note
         self._seen = self._sensor.at(self._needle.tip)
         self._lags: deque[float] = deque(maxlen=_KEPT)
         self._steps, self._warned, self._failed = 0, -_WARN_S, False
@@ -71,7 +77,7 @@ class World:
         if parts := self._needle.follow(self._positions, exactly=not record.moving):
             self._steps += parts
             self._seen = self._sensor.at(self._needle.tip)
-        self._sink.write(record.time, self._seen, record.moving)
+        send_record(self._tracker, record._replace(values=tuple(self._seen)), "tracker")
         lag = monotonic() - record.time
         if self._truth is not None:
             self._truth.write(self._row(record, lag))
@@ -96,10 +102,10 @@ class World:
         """Report a long lag, and once that the needle has no equilibrium."""
         if lag > _LATE_S and monotonic() - self._warned > _WARN_S:
             self._warned = monotonic()
-            note(f"the phantom is {1e3 * lag:.0f} ms behind the motors")
+            self._note(f"the phantom is {1e3 * lag:.0f} ms behind the motors")
         if not self._failed and not self._needle.converged:
             self._failed = True
-            note("the phantom did not converge: its tip is not to be trusted")
+            self._note("the phantom did not converge: its tip is not to be trusted")
 
     def summary(self) -> dict[str, float]:
         """Steps of the plant, lag behind the motors while they moved (ms), and processor time (s)."""
@@ -109,31 +115,30 @@ class World:
         return {"steps": self._steps, **figures, "cpu_s": process_time()}
 
 
-def main(job: Job, descriptors: list[int]) -> None:
-    """Follow the motors until they or the process that has started this one end."""
-    source, sink = Source(descriptors[0], len(CHANNELS)), Sink(descriptors[1], following.VALUES, "tracker")
-    lifeline = Lifeline(sys.stdin.fileno())
+def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+    """Follow the motors until they or the parent end."""
+    motors, tracker = channels
     with ExitStack() as stack:
         axes = [name for name, _ in job.rig.axes.items()]
         truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
         compile_kernels(job.scenario.setup.axes)  # not while the motors turn
-        world = World(job, sink, truth)
+        world = World(job, tracker, truth, parent.note)
         world.begin()
         gc.collect()
         gc.freeze()
         set_realtime_priority()  # a real needle does not wait for other processes on this machine
-        send(ready=True)
+        parent.report(ready=True)
         try:
-            _follow(world, source, lifeline)
-        except StreamEnded:
-            send(ended=world.summary())
+            _follow(world, motors, parent)
+        except ChannelEnded:
+            parent.report(ended=world.summary())
 
 
-def _follow(world: World, source: Source, lifeline: Lifeline) -> None:
+def _follow(world: World, motors: MessageChannel, parent: Parent) -> None:
     while True:
-        ready, _, _ = select.select([source.descriptor, *lifeline.sources], [], [])
-        lifeline.read(ready)
-        for record in source.read():
+        ready, _, _ = select.select([motors.fileno(), *parent.sources], [], [])
+        parent.read(ready)
+        for record in receive_records(motors):
             world.follow(record)
 
 

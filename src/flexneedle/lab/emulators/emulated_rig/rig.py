@@ -1,13 +1,8 @@
 """The process that starts the three of an emulated rig, passes orders on to them, and ends them."""
 
-import json
-import os
 import select
-import subprocess
-import sys
+import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
@@ -22,7 +17,7 @@ from flexneedle.lab.emulators.faults import FaultKind, parse_fault, parse_order
 from flexneedle.lab.emulators.galil import server as galil
 from flexneedle.lab.emulators.orders import Orders
 from flexneedle.lab.emulators.server import Serial
-from flexneedle.lab.processes import end_process
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.rig_file import RigFile
 
 DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "galil": galil.FAULTS}
@@ -54,39 +49,6 @@ def check_free(rig: RigFile) -> None:
         pass
 
 
-@dataclass
-class _Part:
-    """One of the processes, and what it has reported of a line."""
-
-    name: str
-    process: subprocess.Popen[bytes]
-    received: bytes = b""
-    ended: bool = False
-
-    @property
-    def output(self) -> int:
-        """Descriptor of its reports."""
-        return _descriptor(self.process.stdout)
-
-    def read(self) -> list[Mapping[str, Any]]:
-        """The reports that have arrived; waits for one. At their end `ended` is set."""
-        data = os.read(self.output, 65_536)
-        self.ended = not data
-        *lines, self.received = (self.received + data).split(b"\n")
-        return [json.loads(line) for line in lines]
-
-    def order(self, line: str) -> None:
-        """Send it a line. One that has ended is noticed by its reports."""
-        with suppress(BrokenPipeError):
-            os.write(_descriptor(self.process.stdin), f"{line}\n".encode())
-
-
-def _descriptor(stream: Any) -> int:
-    if stream is None:
-        raise RunError("a process of the rig has no pipe")
-    return int(stream.fileno())
-
-
 class EmulatedRig:
     """The processes of an emulated rig. Use it as a context manager; within, all three serve.
 
@@ -95,22 +57,22 @@ class EmulatedRig:
 
     def __init__(self, job: Job, say: Callable[[Mapping[str, Any]], None]) -> None:
         self._job, self._say = job, say
-        self._parts: dict[str, _Part] = {}
+        self._parts: dict[str, ChildProcess] = {}
 
     def __enter__(self) -> Self:
         check_free(self._job.rig)
-        from_motors, to_phantom = os.pipe()
-        from_phantom, to_tracker = os.pipe()
+        from_motors, to_phantom = socket.socketpair()
+        from_phantom, to_tracker = socket.socketpair()
         ends = {_PHANTOM: (from_motors, to_tracker), _GALIL: (to_phantom,), _AURORA: (from_phantom,)}
         try:
-            addresses = {name: self._started(name, mine) for name, mine in ends.items()}
+            addresses = {name: self._start(name, mine) for name, mine in ends.items()}
         except BaseException:
             self._end()
             raise
         finally:
             for end in (from_motors, to_phantom, from_phantom, to_tracker):
-                os.close(end)
-        pids = {name: part.process.pid for name, part in self._parts.items()}
+                end.close()
+        pids = {name: part.pid for name, part in self._parts.items()}
         ready = {name: addresses[name] for name in (_GALIL, _AURORA)}
         self._say({"ready": ready, "pids": pids, "time_s": monotonic()})
         return self
@@ -122,31 +84,23 @@ class EmulatedRig:
 
     def serve(self, orders: Orders) -> NoReturn:
         """Pass orders on until interrupted. Raises RunError if a process ends."""
+        channels = {part.channel.fileno(): name for name, part in self._parts.items()}
         while True:
-            outputs = [part.output for part in self._parts.values()]
-            ready, _, _ = select.select([*outputs, *orders.sources], [], [])
+            ready, _, _ = select.select([*channels, *orders.sources], [], [])
             for line in orders.read(ready):
                 self._order(line)
-            for part in self._parts.values():
-                if part.output in ready:
-                    self._take(part)
+            for descriptor, name in channels.items():
+                if descriptor in ready:
+                    for message in self._messages(name):
+                        self._say({"device": name, **message})
 
-    def _started(self, name: str, descriptors: tuple[int, ...]) -> Any:
+    def _start(self, name: str, ends: tuple[socket.socket, ...]) -> Any:
         """Start a process and wait until it is ready; return what it reports then."""
-        module = f"{__package__}.{_MODULES[name]}"
-        command = [sys.executable, "-m", module, *map(str, descriptors)]
-        # A session of its own, so that Ctrl-C reaches only this process, which then ends it.
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=descriptors,
-            start_new_session=True,
-        )
-        part = self._parts[name] = _Part(name, process)
-        part.order(self._job.to_line())
+        descriptors = tuple(end.fileno() for end in ends)
+        part = self._parts[name] = ChildProcess(f"{__package__}.{_MODULES[name]}", descriptors=descriptors)
+        part.channel.send(self._job)
         while True:
-            for message in self._messages(part):
+            for message in self._messages(name):
                 if "ready" in message:
                     return message["ready"]
 
@@ -154,60 +108,52 @@ class EmulatedRig:
         """Pass on `fault DEVICE:KIND…` to its device, `clear` to both."""
         if line.strip() == "clear":
             for name in DEVICES:
-                self._parts[name].order("clear")
+                self._parts[name].channel.send("clear")
             return
         try:
             device, order = _split_order(line)
         except InputError as error:
             self._say({"refused": line.strip(), "reason": str(error)})
             return
-        self._parts[device].order(order)
+        self._parts[device].channel.send(order)
 
-    def _take(self, part: _Part) -> None:
-        for message in self._messages(part):
-            self._say({"device": part.name, **message})
+    def _messages(self, name: str) -> Iterator[Mapping[str, Any]]:
+        """The reports of a process that have arrived; waits for one.
 
-    def _messages(self, part: _Part) -> Iterator[Mapping[str, Any]]:
-        """The reports of a process. Raises the error that it has reported, or RunError if it has ended."""
+        Raises the error that it has reported, or RunError if it has ended.
+        """
+        part = self._parts[name]
         yield from _without_failure(part)
-        if part.ended:
-            first = self._first_to_fail(part)
-            while not first.ended:
+        if part.channel.ended:
+            name = self._first_to_fail(name)
+            first = self._parts[name]
+            while not first.channel.ended:
                 yield from _without_failure(first)
-            code = first.process.returncode
-            raise RunError(f"the process of the {first.name} has ended with exit code {code}")
+            raise RunError(f"the process of the {name} has ended with exit code {first.wait()}")
 
-    def _first_to_fail(self, ended: _Part) -> _Part:
-        """The process that has failed: this one, or the one with which it has ended in good order."""
-        if ended.process.wait() != 0:
+    def _first_to_fail(self, ended: str) -> str:
+        """Return the process that has failed: this one, or the one with which it has ended in good order."""
+        if self._parts[ended].wait() != 0:
             return ended
-        for part in self._parts.values():
-            with suppress(subprocess.TimeoutExpired):
-                if part.process.wait(_FOLLOW_S) != 0:
-                    return part
-        return ended
+        failed = (name for name, part in self._parts.items() if part.wait(_FOLLOW_S) not in (0, None))
+        return next(failed, ended)
 
     def _end(self) -> None:
-        """End all processes by closing their inputs, and report what they report then."""
+        """End all processes by closing their channels, and report their last messages."""
         for part in self._parts.values():
-            if part.process.stdin is not None:
-                part.process.stdin.close()
-        for part in self._parts.values():
-            end_process(part.process, _END_S)
-            self._last_words(part)
-
-    def _last_words(self, part: _Part) -> None:
-        while not part.ended:
-            for message in part.read():
-                if "ended" in message:
-                    self._say({"device": part.name, **message})
-        if part.process.stdout is not None:
-            part.process.stdout.close()
+            part.channel.end_sending()
+        for name, part in self._parts.items():
+            part.end(_END_S)
+            while not part.channel.ended:
+                for message in part.channel.receive():
+                    if "ended" in message:
+                        self._say({"device": name, **message})
+            part.close()
 
 
-def _without_failure(part: _Part) -> Iterator[Mapping[str, Any]]:
+def _without_failure(part: ChildProcess) -> Iterator[Mapping[str, Any]]:
     """The reports of a process that have arrived; waits for one. Raises the error that it has reported."""
-    for message in part.read():
+    for message in part.channel.receive(None):
         if "failed" in message:
             kind = InputError if message["input"] else RunError
             raise kind(message["failed"])

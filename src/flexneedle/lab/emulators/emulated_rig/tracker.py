@@ -1,46 +1,47 @@
 """The tracker of an emulated rig: an Aurora that measures the tip of the phantom, as a process of its own.
 
-`python -m flexneedle.lab.emulators.emulated_rig.tracker SOURCE`, with the descriptor of the pipe from the phantom.
+`python -m flexneedle.lab.emulators.emulated_rig.tracker PARENT PHANTOM`, with descriptors of channels.
 """
 
 import select
 import signal
-import sys
 from pathlib import Path
 from time import monotonic
 
 from flexneedle.errors import RigError
 from flexneedle.lab.emulators.aurora import FAULTS, fresh
-from flexneedle.lab.emulators.emulated_rig.following import VALUES, Followed
-from flexneedle.lab.emulators.emulated_rig.job import Job, Lifeline, note, obey, run, send
-from flexneedle.lab.emulators.emulated_rig.stream import Record, Source
+from flexneedle.lab.emulators.emulated_rig.child import Parent, run
+from flexneedle.lab.emulators.emulated_rig.following import Followed
+from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.stream import Record, receive_records
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.motion import Noise
 from flexneedle.lab.emulators.server import EmulatorSession, Serial, serve
+from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.scenario.model import Scenario
 
 
-def main(job: Job, descriptors: list[int]) -> None:
-    """Serve the tracker at its port until the process that has started this one ends."""
-    source = Source(descriptors[0], VALUES)
+def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+    """Serve the tracker at its port until the parent ends."""
+    (phantom,) = channels
     faults = [parse_fault(text, FAULTS) for text in job.faults_of("aurora")]
-    followed = Followed(power_on := monotonic(), _first(source))
-    lifeline = Lifeline(sys.stdin.fileno(), [source.descriptor], lambda: followed.add(source.read()))
+    followed = Followed(power_on := monotonic(), _first(phantom))
+    parent.others, parent.take = channels, lambda: followed.add(receive_records(phantom))
     session = EmulatorSession(fresh(), faults, job.seed, power_on, tip=followed, noise=noise_of(job.scenario))
-    session.on_tracking = lambda: send(event="tracking", time_s=session.tracked_since)
+    session.on_tracking = lambda: parent.report(event="tracking", time_s=session.tracked_since)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then, too
     with Serial(Path(port_of(job.rig))) as serial:
         set_realtime_priority()
-        send(ready=str(serial.link))
-        serve(session, serial, lifeline, lambda order: obey(session.schedule, order), note)
+        parent.report(ready=str(serial.link))
+        serve(session, serial, parent, lambda order: parent.obey(session.schedule, order), parent.note)
 
 
-def _first(source: Source) -> Record:
-    """Wait for the first record."""
-    while not (records := source.read()):
-        select.select([source.descriptor], [], [])
+def _first(phantom: MessageChannel) -> Record:
+    """Wait for the first records, and return the newest."""
+    while not (records := receive_records(phantom)):
+        select.select([phantom], [], [])
     return records[-1]
 
 

@@ -20,7 +20,7 @@ from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, Schedule,
 from flexneedle.lab.emulators.galil import axis as one
 from flexneedle.lab.emulators.galil.axis import Axis
 from flexneedle.lab.emulators.galil.controller import AXES, ERRORS, SAMPLES_HZ, Device, advanced, reply
-from flexneedle.lab.emulators.orders import Orders
+from flexneedle.lab.emulators.orders import OrderSource
 
 _TICK_S = 0.004
 _SAMPLES = 5  # of the controller at once: 5 ms
@@ -289,7 +289,11 @@ class Tcp:
 
 
 def serve(
-    session: GalilSession, tcp: Tcp, orders: Orders, obey: Callable[[str], None], say: Callable[[str], None]
+    session: GalilSession,
+    tcp: Tcp,
+    orders: OrderSource,
+    obey: Callable[[str], None],
+    say: Callable[[str], None],
 ) -> NoReturn:
     """Answer commands until interrupted. obey: called with each line of the orders; say: called with a line when
     connections are closed or possible again.

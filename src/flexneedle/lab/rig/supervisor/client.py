@@ -1,14 +1,10 @@
 """The client of the supervisor, which it starts: motions with their ends, and what each tick found."""
 
-import socket
-import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from math import inf, isfinite
-from multiprocessing.connection import Connection
 from statistics import median
 from threading import Condition, Lock, Thread
 from time import monotonic
@@ -17,7 +13,7 @@ from typing import Any, Self
 from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.geometry.registration import identity
 from flexneedle.interrupts import uninterrupted
-from flexneedle.lab.processes import end_process
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import messages as say
@@ -35,7 +31,6 @@ _PATIENCE_S = 0.3  # for reports that have not been taken, after a time without 
 _OPEN_S = 60.0  # to find a tracker
 _END_S = 5.0
 _MOST_KEPT = 4000  # measurements: 100 s without a reader
-_STDERR = 2  # its descriptor: sys.stderr may be another object, without one
 _ENOUGH = 9  # measurements for a median
 
 
@@ -61,14 +56,10 @@ class Supervisor:
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
         self._sent = -1  # requests; the task, which is sent first, is none
-        ours, theirs = socket.socketpair()
         self._signals = SignalLine()
-        passed = (theirs.fileno(), *self._signals.descriptors)
-        command = [sys.executable, "-m", f"{__package__}.process", *map(str, passed)]
-        # What a user's own device prints must not get into what a command prints, such as JSON.
-        self._process = subprocess.Popen(command, pass_fds=passed, stdin=subprocess.DEVNULL, stdout=_STDERR)
-        theirs.close()
-        self._connection = Connection(ours.detach())
+        self._process = ChildProcess(
+            f"{__package__}.process", descriptors=self._signals.descriptors, own_session=False
+        )
         self._thread = Thread(target=self._receive, name="supervisor", daemon=True)
         self._thread.start()
         try:
@@ -95,10 +86,10 @@ class Supervisor:
         try:
             if self._ended is None:
                 self._send(say.Close(), lost=True)
-            end_process(self._process, _END_S)
-            self._thread.join()  # it ends with the supervisor's end of the line
+            self._process.end(_END_S)
+            self._thread.join()  # it ends with the supervisor's end of the channel
             with uninterrupted(), self._sending:
-                self._connection.close()
+                self._process.close()
         finally:
             self._signals.close()
             if self._failed is not None and not self._failure_raised:
@@ -302,13 +293,11 @@ class Supervisor:
 
     def _send(self, message: Any, *, lost: bool = False) -> int:
         """Send a message; return how many requests were sent with it."""
-        try:
-            with uninterrupted(), self._sending:
-                self._connection.send(message)
-                self._sent += 1
-        except OSError:
-            if not lost:
-                raise self._end() from None
+        with uninterrupted(), self._sending:
+            open_still = self._process.channel.send(message, keep=not isinstance(message, say.Heartbeat))
+            self._sent += 1
+        if not open_still and not lost:
+            raise self._end()
         return self._sent
 
     def _end(self) -> DriverError:
@@ -354,7 +343,7 @@ class Supervisor:
                     self._check(self._latest.state, self._latest.why)
             self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - monotonic())))
             if self._latest is not None:
-                self._send(say.Heartbeat())
+                self._send(say.Heartbeat(), lost=True)
         return False
 
     @contextmanager
@@ -385,16 +374,13 @@ class Supervisor:
 
     def _receive(self) -> None:
         why = "it was killed"
-        while True:
-            try:
-                message = self._connection.recv()
-            except (EOFError, OSError):
-                break
-            if isinstance(message, say.Ended):
-                why = message.why
-                self._unopened = why if self._latest is None else ""
-                break
-            self._take(message)
+        while not self._process.channel.ended:
+            for message in self._process.channel.receive(None):
+                if isinstance(message, say.Ended):
+                    why = message.why
+                    self._unopened = why if self._latest is None else ""
+                else:
+                    self._take(message)
         with self._changed:
             self._ended = why
             self._changed.notify_all()

@@ -10,13 +10,12 @@ import gc
 import socket
 import sys
 from contextlib import ExitStack, closing
-from multiprocessing.connection import Connection, wait
-from queue import SimpleQueue
-from threading import Thread
+from multiprocessing.connection import wait
 from time import monotonic
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, describe_error, one_line
+from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.devices.lock import held
 from flexneedle.lab.rig.devices.opening import address_of, open_motors, open_tracker
@@ -28,34 +27,10 @@ from flexneedle.lab.rig.supervisor.signals import listen, named
 from flexneedle.lab.rig.supervisor.suspension import LONGEST_S, Suspension
 from flexneedle.types import Frame
 
-_MOST_WAITING = 400  # reports that a client has not taken: 10 s
+_MOST_WAITING = 400  # messages that a client has not taken: 10 s of reports
 _REST_S = 2.0  # longest wait for motors to rest before the end
-
-
-class Outbox:
-    """Messages to the client, sent by a thread: a client that does not read delays nothing, and loses reports."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection, self._waiting = connection, SimpleQueue[Any]()
-        self._thread = Thread(target=self._send, name="outbox", daemon=True)
-        self._thread.start()
-
-    def put(self, message: Any) -> None:
-        """Send a message, later."""
-        if not isinstance(message, say.Report) or self._waiting.qsize() < _MOST_WAITING:
-            self._waiting.put(message)
-
-    def close(self) -> None:
-        """Send what waits, within a second."""
-        self._waiting.put(None)
-        self._thread.join(1.0)
-
-    def _send(self) -> None:
-        while (message := self._waiting.get()) is not None:
-            try:
-                self._connection.send(message)
-            except OSError:  # the client is gone, which the ticks notice
-                return
+_FLUSH_S = 1.0  # longest wait for a client that does not read, at the end
+_CLOSED = "closed"
 
 
 class Untracked:
@@ -73,23 +48,22 @@ class Untracked:
 
 def main(requests: int, received: int, sent: int) -> None:
     """Serve the client until it closes or ends. received, sent: the ends of the socket of signals."""
-    connection, signals = Connection(requests), listen(received, sent)
-    task = connection.recv()
-    outbox = Outbox(connection)
+    channel, signals = open_channel(requests, most_waiting=_MOST_WAITING), listen(received, sent)
+    task = channel.receive_first()
     why = "the supervisor failed"
     try:
-        why = _serve(connection, task, outbox, signals)
+        why = _serve(channel, task, signals)
     except FlexneedleError as error:
         why = one_line(error)
     except Exception as error:
         why = f"the supervisor failed: {describe_error(error)}"
         raise
     finally:
-        outbox.put(say.Ended(why))
-        outbox.close()
+        channel.send(say.Ended(why))
+        channel.flush(_FLUSH_S)
 
 
-def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: socket.socket) -> str:
+def _serve(channel: MessageChannel, task: say.Task, signals: socket.socket) -> str:
     """Open the devices, tick until the end, and return its reason."""
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
@@ -105,16 +79,15 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox, signals: sock
         gc.freeze()
         gc.disable()  # nothing here makes cycles; a collection would delay a tick
         try:
-            return _tick(connection, core, answers, outbox, signals, 1.0 / task.rig.loop.rate_hz)
+            return _tick(channel, core, answers, signals, 1.0 / task.rig.loop.rate_hz)
         finally:
             motors.stop()
 
 
 def _tick(
-    connection: Connection,
+    channel: MessageChannel,
     core: Supervisor,
     answers: list[Any],
-    outbox: Outbox,
     signals: socket.socket,
     period: float,
 ) -> str:
@@ -126,40 +99,34 @@ def _tick(
     due, missed, ending, why = monotonic(), 0, None, ""
     suspension = Suspension()
     while ending is None or (monotonic() < ending and not core.at_rest):
-        sources: list[Any] = [signals] if ending is not None else [signals, connection]
-        ready = wait(sources, max(0.0, due - monotonic()))
+        sources: list[Any] = [signals] if ending is not None else [signals, channel]
+        ready: list[Any] = wait(sources, max(0.0, due - monotonic()))
         if (seconds := suspension.since()) > LONGEST_S:  # before anything that was requested is done
             core.stop(f"the computer was suspended for {seconds:.1f} s")
         if signals in ready and (names := named(signals.recv(64))):
             core.stop(f"signal {names}")
-        if connection in ready:
-            try:
-                closed = _requested(connection, core)
-            except (EOFError, OSError):
-                closed, why = True, "the controller has ended"
-            if closed:
-                core.stop(why or "closed")
-                ending = monotonic() + _REST_S
+        if channel in ready and (closed := _act_on_requests(channel, core)):
+            core.stop(closed)
+            ending, why = monotonic() + _REST_S, "" if closed == _CLOSED else closed
         late = monotonic() - due
         if late >= 0.0:
             begun, skipped = monotonic(), int(late / period)
             missed += skipped
             due += period * (1 + skipped)
             core.tick()
-            outbox.put(core.report(late, monotonic() - begun, missed))
+            channel.send(core.report(late, monotonic() - begun, missed), keep=False)
         while answers:
-            outbox.put(answers.pop(0))
+            channel.send(answers.pop(0))
     return why
 
 
-def _requested(connection: Connection, core: Supervisor) -> bool:
-    """Act on what the client has sent; True at the request to end."""
-    while connection.poll():
-        request = connection.recv()
+def _act_on_requests(channel: MessageChannel, core: Supervisor) -> str:
+    """Act on what the client has sent; return why the supervisor shall end, "" if it shall continue."""
+    for request in channel.receive():
         if isinstance(request, say.Close):
-            return True
+            return _CLOSED
         core.request(request)
-    return False
+    return "the controller has ended" if channel.ended else ""
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Messages in place of a link's: what is not new, or not in order, ends the link and gives no frame."""
 
 import json
+import socket
 
 import pytest
 
 from flexneedle.lab.rig.devices.aurora.incoming import Incoming
-from flexneedle.lab.rig.devices.aurora.messages import LONGEST_LINE
+from flexneedle.lab.rig.devices.aurora.messages import LONGEST, message_channel, parse
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.types import VISIBLE
 
@@ -20,12 +21,12 @@ def incoming(*messages, now=NOW):
     found = Incoming(NAMES, 0.0, lambda: clock[0])
     clock[0] = now
     for message in messages:
-        found.feed(line(message))
+        found.take(parse(data(message)))
     return found
 
 
-def line(message):
-    return json.dumps(message).encode() + b"\n"
+def data(message):
+    return json.dumps(message).encode()
 
 
 def frame(number, requested=NOW, handles=("10",)):
@@ -64,7 +65,7 @@ def test_a_message_out_of_order_or_a_frame_that_is_not_new_is_refused(sent, wron
     found = incoming(*sent)
     before = len(found.read())
     with pytest.raises(ValueError, match=text):
-        found.feed(line(wrong))
+        found.take(parse(data(wrong)))
     assert found.read() == ()
     assert before == sum(one[0] == "frame" for one in sent)
 
@@ -73,23 +74,17 @@ def test_the_names_of_an_earlier_link_are_not_used_for_the_next():
     found = incoming(READY, frame(7, 99.9))
     found.begin()
     with pytest.raises(ValueError, match="out of order"):
-        found.feed(line(frame(8)))
+        found.take(parse(data(frame(8))))
 
 
-def test_a_line_without_end_does_not_grow_without_bound():
-    found = incoming(READY)
-    for _ in range(LONGEST_LINE // 1000):
-        assert not found.feed(b"x" * 1000)
-    with pytest.raises(ValueError, match="without the end of a line"):
-        found.feed(b"x" * 1000)
-
-
-def test_a_link_that_ends_in_the_middle_of_a_message_is_refused():
-    found = incoming(READY)
-    found.feed(line(frame(7))[:-1])
-    with pytest.raises(ValueError, match="incomplete message"):
-        found.finish()
-    assert found.read() == ()
+def test_a_message_that_is_too_long_is_refused_before_it_is_complete():
+    ours, theirs = socket.socketpair()
+    channel = message_channel(ours)
+    theirs.sendall((LONGEST + 1).to_bytes(4, "little"))
+    with pytest.raises(ValueError, match="must have at most"):
+        channel.receive(None)
+    channel.close()
+    theirs.close()
 
 
 def test_a_reason_is_one_printable_line():
@@ -100,7 +95,7 @@ def test_a_reason_is_one_printable_line():
 def test_the_status_is_that_of_the_newest_message():
     found = incoming(READY, frame(7))
     assert found.status == VISIBLE
-    found.feed(line(["error", "garbled", "replies are garbled"]))
+    found.take(parse(data(["error", "garbled", "replies are garbled"])))
     assert found.status == "replies are garbled"
     assert found.counts.errors == {"garbled": 1}
     found.crashed("the link failed: x")

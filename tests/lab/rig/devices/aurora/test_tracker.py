@@ -5,7 +5,6 @@ No test depends on durations, only on results.
 
 import os
 import signal
-import sys
 
 import numpy as np
 import psutil
@@ -13,6 +12,7 @@ import pytest
 
 from emulated import assert_true_and_new, emulated, read_until, until
 from flexneedle.errors import InputError, RunError
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.aurora import incoming, library, link, tracker
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
@@ -245,9 +245,11 @@ def test_a_link_that_crashes_or_hangs_is_replaced(kill, text, monkeypatch):
 
 
 BAD_LINK = """
-import os, signal, time
+import signal, socket, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
-os.write(1, b'["ready", {"10": ["01", "00"]}]\\n' + BYTES)
+channel = socket.socket(fileno=int(sys.argv[1]))
+for data in (b'["ready", {"10": ["01", "00"]}]', SENT):
+    channel.sendall(len(data).to_bytes(4, "little") + data)
 while True: time.sleep(60)
 """
 
@@ -255,20 +257,25 @@ while True: time.sleep(60)
 @pytest.mark.parametrize(
     ("sent", "text"),
     [
-        (b"no JSON\n", "not a message: b'no JSON'"),
-        (b"[]\n", "not a message: b'[]'"),
-        (b'["frame", 1, "now", {}]\n', "not a message"),
-        (b'["frame", 1, 0.0, {"10": 5}]\n', "not a message"),
-        (b'["frame", 1, 0.0, {"99": [0, 49, 1, [1, 0, 0, 0, 1, 2, 3, 0]]}]\n', "requested"),
-        (b"x" * 70000, "without the end of a line"),
+        (b"no JSON", "not a message: b'no JSON'"),
+        (b"[]", "not a message: b'[]'"),
+        (b'["frame", 1, "now", {}]', "not a message"),
+        (b'["frame", 1, 0.0, {"10": 5}]', "not a message"),
+        (b'["frame", 1, 0.0, {"99": [0, 49, 1, [1, 0, 0, 0, 1, 2, 3, 0]]}]', "requested"),
+        (b"x" * 70000, "must have at most"),
     ],
 )
-def test_a_link_that_sends_no_message_is_ended_and_counted_and_replaced(sent, text, monkeypatch):
+def test_a_link_that_sends_no_message_is_ended_and_counted_and_replaced(sent, text, monkeypatch, tmp_path):
     """Also if it would neither end nor obey; frames of the next link arrive."""
-    commands = [[sys.executable, "-c", BAD_LINK.replace("BYTES", repr(sent))]]
-    command = tracker._command
+    (tmp_path / "bad_link.py").write_text(BAD_LINK.replace("SENT", repr(sent)))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    modules = ["bad_link"]
+
+    def start(module, *arguments, **options):
+        return ChildProcess(modules.pop() if modules else module, *arguments, **options)
+
     monkeypatch.setattr(tracker, "_STOP_S", 0.1)
-    monkeypatch.setattr(tracker, "_command", lambda *given: commands.pop() if commands else command(*given))
+    monkeypatch.setattr(tracker, "ChildProcess", start)
     with emulated() as path, Aurora(path, WallClock()) as aurora:
         frames, statuses = read_until(aurora, at_least(3))
         counts = aurora.counts

@@ -7,7 +7,7 @@ from threading import Lock
 from time import monotonic
 from typing import Any
 
-from flexneedle.lab.rig.devices.aurora.messages import LONGEST_LINE, in_words, parse
+from flexneedle.lab.rig.devices.aurora.messages import Message, in_words
 from flexneedle.lab.rig.devices.aurora.readings import readings, sensor_name
 from flexneedle.lab.rig.devices.aurora.timing import Numbering, Timeline
 from flexneedle.types import VISIBLE, Frame
@@ -53,28 +53,28 @@ class Incoming:
 
     def begin(self) -> None:
         """A new link: it has sent nothing yet."""
-        self._rest = b""
         self._named: dict[str, str] = {}
         self._newest = -1, self._now()
         self._ended = False
         self._timeline = Timeline(RATE_HZ)
 
-    def feed(self, data: bytes) -> bool:
-        """Take data of the link; return whether a message was complete. Raises ValueError if they are no message.
-
-        The link is then not to be trusted again, since what follows may belong to anything.
-        """
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        for line in lines:
-            self._take(line)
-        if len(self._rest) > LONGEST_LINE:
-            raise ValueError(f"not a message: more than {LONGEST_LINE} bytes without the end of a line")
-        return bool(lines)
-
-    def finish(self) -> None:
-        """The link has ended. Raises ValueError if it was in the middle of a message."""
-        if self._rest:
-            raise ValueError(f"an incomplete message: {self._rest[:60]!r}")
+    def take(self, message: Message) -> None:
+        """Take a message of the link. Raises ValueError for one out of order, after which the link is not trusted."""
+        tracks = bool(self._named) and not self._ended
+        match message:
+            case ("ready", ports) if not (self._named or self._ended):
+                self._set_names(ports)
+            case ("frame", number, requested, found) if tracks:
+                self._add_frame(number, requested, found)
+            case ("error", kind, description) if tracks:
+                with self._lock:
+                    self._errors[kind] += 1
+                    self._reason = in_words(description)
+            case ("end", reason) if not self._ended:
+                self._ended = True
+                self.explain(reason)
+            case _:
+                raise ValueError(f"a message out of order: {str(message)[:60]}")
 
     def crashed(self, reason: str) -> None:
         """Count a link that ended without a reason of its own."""
@@ -122,24 +122,6 @@ class Incoming:
         with self._lock:
             again = max(0, self._connections - 1)
             return Counts(self._received, self._missed, self._dropped, again, dict(self._errors))
-
-    def _take(self, line: bytes) -> None:
-        message = parse(line)
-        tracks = bool(self._named) and not self._ended
-        match message:
-            case ("ready", ports) if not (self._named or self._ended):
-                self._set_names(ports)
-            case ("frame", number, requested, found) if tracks:
-                self._add_frame(number, requested, found)
-            case ("error", kind, description) if tracks:
-                with self._lock:
-                    self._errors[kind] += 1
-                    self._reason = in_words(description)
-            case ("end", reason) if not self._ended:
-                self._ended = True
-                self.explain(reason)
-            case _:
-                raise ValueError(f"a message out of order: {line[:60]!r}")
 
     def _set_names(self, ports: Mapping[str, tuple[str, str]]) -> None:
         named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}

@@ -1,6 +1,8 @@
-"""One connection to an Aurora, in a separate process: `python -m flexneedle.lab.rig.devices.aurora.link PORT [break]`.
+"""One connection to an Aurora, in a separate process.
 
-It finds the tracker, enables every sensor, and polls; each line on stdout is a JSON list:
+    python -m flexneedle.lab.rig.devices.aurora.link CHANNEL PORT [break]
+
+It finds the tracker, enables every sensor, and polls; each message is a JSON list:
 
     ["ready", {handle: [port, channel], …}]
     ["frame", number, time of the request (s, monotonic clock), {handle: [kind, port status, frame, pose]}]
@@ -11,19 +13,20 @@ It is a process because the C library blocks while a device does not reply, beca
 it, and because a planner that holds Python's lock for a frame or two would lose these.
 """
 
-import json
-import os
 import signal
 import sys
 from time import monotonic, sleep
-from typing import Any, NoReturn
+from typing import NoReturn
 
+from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.rig.devices.aurora.library import CHECKSUM, DISABLED, LOST, TIMEOUT, Device
+from flexneedle.lab.rig.devices.aurora.messages import to_json
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
 GIVE_UP_S = 1.0
 """Time (s) without a new frame after which the connection is closed."""
 
+_FLUSH_S = 1.0  # longest wait for a reader, at the end
 _SLOW, _FAST = 9600, 115200
 _TO_FAST, _TO_SLOW = "COMM:50000", "COMM:00000"  # 8N1, no handshake
 _POLL_S = 0.003  # between two requests; the reply on a real line takes longer
@@ -47,28 +50,25 @@ class _End(Exception):
     """The connection ends; with the reason."""
 
 
-def main(path: str, may_break: bool) -> None:
+def main(descriptor: int, path: str, may_break: bool) -> None:
     """Connect, and poll until stopped (SIGTERM) or until no new frames arrive."""
     signal.signal(signal.SIGTERM, _stop)
     set_realtime_priority()
+    channel = open_channel(descriptor, encode=to_json)
     try:
         device = Device(path)
         try:
             _connect(device, may_break)
-            _read(device)
+            _read(device, channel)
         finally:
             device.close()
     except (_End, OSError) as end:
-        _send("end", str(end))
+        channel.send(("end", str(end)))
+    channel.flush(_FLUSH_S)
 
 
 def _stop(*_: object) -> NoReturn:
     raise SystemExit
-
-
-def _send(*message: Any) -> None:
-    line = json.dumps(message) + "\n"
-    os.write(sys.stdout.fileno(), line.encode())  # unbuffered, in one piece
 
 
 def _connect(device: Device, may_break: bool) -> None:
@@ -98,15 +98,15 @@ def _require(device: Device, command: str | None, problem: str) -> None:
         raise _End(f"{problem}: {device.explain(code)}")
 
 
-def _read(device: Device) -> None:
+def _read(device: Device, channel: MessageChannel) -> None:
     """Enable the sensors and track; restore the tracker's state at the end if it still replies."""
     ports = set_up(device)
     _require(device, "TSTART:", "tracking cannot be started")
     replies = True
     try:
         command = _read_command(device)
-        _send("ready", ports)
-        replies = _poll(device, command, [int(handle) for handle in ports])
+        channel.send(("ready", ports))
+        replies = _poll(device, channel, command, [int(handle) for handle in ports])
     finally:
         if replies:
             device.set_timeout(_INIT_S)
@@ -162,7 +162,7 @@ def _read_command(device: Device) -> str:
     return "TX" if code == _UNKNOWN_COMMAND else "BX"
 
 
-def _poll(device: Device, read: str, handles: list[int]) -> bool:
+def _poll(device: Device, channel: MessageChannel, read: str, handles: list[int]) -> bool:
     """Send each new frame until there are none; return whether the tracker still replies. read: BX or TX.
 
     A frame is new if its number increased; the first one is only the reference for the next. Its time is that of the
@@ -173,12 +173,12 @@ def _poll(device: Device, read: str, handles: list[int]) -> bool:
         code = device.command(f"{read}:{_OPTIONS}")
         if code:
             kind, reason = _error(device, code)
-            _send("error", kind, reason)
+            channel.send(("error", kind, reason))
             if code in LOST or (code == TIMEOUT and not device.synchronised(_SYNCHRONISE_S)):
                 break
         elif fault := _SYSTEM.get(_lowest(device.system_status(read) & sum(_SYSTEM))):
             reason = f"the tracker reports: {fault}"
-            _send("error", "system", reason)
+            channel.send(("error", "system", reason))
         else:
             found = {handle: device.reading(read, handle) for handle in handles}
             number = max(frame for frame, *_ in found.values())
@@ -189,11 +189,12 @@ def _poll(device: Device, read: str, handles: list[int]) -> bool:
                 disabled = all(kind == DISABLED for _, kind, *_ in found.values())
                 reason = "all sensors are disabled" if disabled else "the frame number does not increase"
             else:
-                _send("frame", number, requested, {h: (k, s, n, p) for h, (n, k, s, p) in found.items()})
+                sensors = {h: (k, s, n, p) for h, (n, k, s, p) in found.items()}
+                channel.send(("frame", number, requested, sensors), keep=False)
                 last_new = monotonic()
             last = number
         sleep(_POLL_S)
-    _send("end", reason)
+    channel.send(("end", reason))
     return code not in (TIMEOUT, *LOST)
 
 
@@ -213,4 +214,4 @@ def _error(device: Device, code: int) -> tuple[str, str]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2:] == ["break"])
+    main(int(sys.argv[1]), sys.argv[2], sys.argv[3:] == ["break"])

@@ -1,8 +1,12 @@
-"""Messages of the link, one line of JSON each: checked before anything is done with them."""
+"""Messages of the link, as JSON: checked before anything is done with them."""
 
-from typing import Annotated, Literal
+import json
+import socket
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from flexneedle.lab.process import MessageChannel
 
 _Number = Annotated[int, Field(ge=0, lt=2**32)]
 _Handle = Annotated[str, Field(pattern="^[0-9]{1,3}$")]
@@ -18,18 +22,28 @@ End = tuple[Literal["end"], str]
 Message = Ready | Sample | Problem | End
 """As the link describes them. Numbers of a pose need not be finite: such a sensor has no position."""
 
-LONGEST_LINE = 65536
+LONGEST = 65536
 """Bytes of the longest message: 100 sensors."""
 
 _MESSAGE: TypeAdapter[Message] = TypeAdapter(Message, config=ConfigDict(strict=True))
 
 
-def parse(line: bytes) -> Message:
-    """Return the message in a line without its end. Raises ValueError if it is none."""
+def message_channel(end: socket.socket) -> MessageChannel:
+    """Return the tracker's end of the channel to a link."""
+    return MessageChannel(end, longest=LONGEST, decode=parse)
+
+
+def to_json(message: Any) -> bytes:
+    """Return the bytes of a message."""
+    return json.dumps(message).encode()
+
+
+def parse(data: bytes) -> Message:
+    """Return the message in data of a link. Raises ValueError if it is none."""
     try:
-        return _MESSAGE.validate_json(line)
+        return _MESSAGE.validate_json(data)
     except ValidationError:
-        raise ValueError(f"not a message: {line[:60]!r}") from None
+        raise ValueError(f"not a message: {data[:60]!r}") from None
 
 
 def in_words(reason: str) -> str:

@@ -1,28 +1,25 @@
 """`Aurora`: the port `Tracker` of an NDI Aurora, over a link process that is restarted when it ends."""
 
 import os
-import select
 import signal
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic
-from typing import IO, Self
+from typing import Self
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.processes import end_process, last_line
+from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.aurora.incoming import Counts, Incoming
 from flexneedle.lab.rig.devices.aurora.library import library_path
+from flexneedle.lab.rig.devices.aurora.messages import Message, message_channel
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.ports import Clock
 from flexneedle.types import Frame
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 5.0  # before a reconnection
 _CONNECT_S, _SILENT_S = 45.0, 3.0  # a link without messages for longer is killed
-_STOP_S = 2.0
+_STOP_S, _POLL_S = 2.0, 0.1
 _PORTS = ("ttyUSB*", "ttyACM*", "cu.usb*")
 _BREAK_EVERY = 3
 
@@ -105,45 +102,39 @@ class Aurora:
     def _connect_once(self, may_break: bool) -> bool:
         """Run one link to its end; return whether it was ready at any time."""
         before = self._incoming.connections
-        command = _command(self._path, may_break)
-        # In a separate session, so that Ctrl-C reaches only the run, which then stops the link.
-        with tempfile.TemporaryFile() as errors:
-            link = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, start_new_session=True)
-            with link:
-                try:
-                    self._listen(link)
-                finally:  # also if it sent what is no message, and would continue
-                    link.terminate()
-                    end_process(link, _STOP_S)
-            self._record_end(link.returncode, errors)
+        arguments = (self._path, *(["break"] if may_break else []))
+        link = ChildProcess(f"{__package__}.link", *arguments, keep_printed=True, channel=message_channel)
+        try:
+            try:
+                self._listen(link)
+            finally:  # also if it sent what is no message, and would continue
+                code = link.end(_STOP_S, terminate=not link.channel.ended)
+            self._record_end(code, link.last_line())
+        finally:
+            link.close()
         return self._incoming.connections > before
 
-    def _listen(self, link: subprocess.Popen[bytes]) -> None:
+    def _listen(self, link: ChildProcess) -> None:
         """Process the link's messages until it ends, hangs, or is stopped."""
-        out = _descriptor(link)
         self._incoming.begin()
         received_at, limit = monotonic(), _CONNECT_S
-        while not self._stop.is_set():
-            if select.select([out], [], [], 0.1)[0]:
-                data = os.read(out, 65536)
-                if not data:
-                    self._incoming.finish()
-                    return
-                if self._feed(data):
-                    received_at, limit = monotonic(), _SILENT_S
+        while not (self._stop.is_set() or link.channel.ended):
+            for message in link.channel.receive(_POLL_S):
+                self._take(message)
+                received_at, limit = monotonic(), _SILENT_S
             if monotonic() - received_at > limit:
                 self._incoming.explain("no reply: the link does not respond")
                 return
 
-    def _feed(self, data: bytes) -> bool:
-        """Take data of a link; return whether a message was complete. Raises ValueError."""
+    def _take(self, message: Message) -> None:
+        """Take a message of a link. Raises ValueError for one out of order."""
         try:
-            return self._incoming.feed(data)
+            self._incoming.take(message)
         finally:
             if self._incoming.connections:
                 self._first.set()
 
-    def _record_end(self, code: int, errors: IO[bytes]) -> None:
+    def _record_end(self, code: int, printed: str) -> None:
         """Record the reason why a link ended if it sent none: a crash, or it was killed."""
         if self._stop.is_set() or code == 0:
             return
@@ -152,12 +143,7 @@ class Aurora:
             if code == -signal.SIGKILL
             else f"the link ended with exit code {code}"
         )
-        self._incoming.crashed(last_line(errors) or problem)
-
-
-def _command(path: str, may_break: bool) -> list[str]:
-    """The command line of a link."""
-    return [sys.executable, "-m", f"{__package__}.link", path, *(["break"] if may_break else [])]
+        self._incoming.crashed(printed or problem)
 
 
 def _check_port(path: str) -> None:
@@ -171,9 +157,3 @@ def _check_port(path: str) -> None:
         raise InputError(
             f"{path}: no permission; on Linux add your user to the group of the port (dialout) and log in again"
         )
-
-
-def _descriptor(link: subprocess.Popen[bytes]) -> int:
-    if link.stdout is None:
-        raise RunError("the link has no output")
-    return link.stdout.fileno()
