@@ -343,7 +343,7 @@ ENDING = """
 import sys
 from threading import Condition, Thread, current_thread, main_thread
 sys.path.insert(0, {tests!r})
-from rig.supervisor.test_process import task
+from lab.rig.supervisor.test_process import task
 from flexneedle.errors import FlexneedleError
 from flexneedle.lab.rig.supervisor.client import Supervisor
 
