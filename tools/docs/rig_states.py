@@ -1,4 +1,4 @@
-"""Writes the table of states in docs/safety.md from the one that the supervisor runs from.
+"""Write the table of states in docs/safety.md from the table of the supervisor.
 
 python tools/docs/rig_states.py
 """
@@ -12,7 +12,7 @@ BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
 
 
 def table() -> str:
-    """Return the table, Markdown: the state after each event, empty where it is refused."""
+    """Return the table in Markdown: the state after each event, empty if it is refused."""
     heads = " | ".join(str(event) for event in Event)
     lines = [f"| state | {heads} |", "|---" * (1 + len(Event)) + "|"]
     for state in State:
@@ -22,7 +22,7 @@ def table() -> str:
 
 
 def page(text: str) -> str:
-    """Return the page with the present table in place of the one in `text`."""
+    """Return the page `text` with the present table."""
     before, _, rest = text.partition(BEGIN)
     _, _, after_it = rest.partition(END)
     return f"{before}{BEGIN}\n{table()}\n{END}{after_it}"
