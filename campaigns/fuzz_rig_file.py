@@ -25,7 +25,7 @@ from time import process_time
 from flexneedle.errors import RigError
 from flexneedle.lab.rig.devices.galil.settings import checked as galil_settings
 from flexneedle.lab.rig.devices.trackers import AuroraSettings, ReplaySettings
-from flexneedle.lab.rig.rig_file import RigFile, load_rig, settings_of
+from flexneedle.lab.rig.rig_file import RigFile, load_rig, check_settings
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings, profile_with
 from flexneedle.lab.ros.settings import checked as ros_settings
@@ -258,9 +258,9 @@ def _read_settings(rig: RigFile) -> None:
     elif driver.kind == "ros":
         profile_with(ros_settings(driver.settings, DriverSettings).profile, "publish.joint_targets")
     if tracker.kind == "aurora":
-        settings_of(AuroraSettings, tracker.settings)
+        check_settings(AuroraSettings, tracker.settings)
     elif tracker.kind == "replay":
-        settings_of(ReplaySettings, tracker.settings)
+        check_settings(ReplaySettings, tracker.settings)
     elif tracker.kind == "ros":
         given = ros_settings(tracker.settings, TrackerSettings)
         profile_with(given.profile, f"subscribe.{given.source}")

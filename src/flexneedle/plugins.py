@@ -163,6 +163,11 @@ def missing_parts(found: object, parts: Sequence[str]) -> str:
     return ", ".join(part for part in parts if not hasattr(found, part))
 
 
+def parts_of(port: type) -> tuple[str, ...]:
+    """Return the names of the methods and attributes of a port."""
+    return tuple(name for name in vars(port) if not name.startswith("_"))
+
+
 def name_kind(found: object) -> str:
     """Return the kind of an object for a message, such as "an int" or "the class Rig"."""
     if isinstance(found, type):

@@ -164,10 +164,10 @@ def _bridge(args: argparse.Namespace, choices: Choices, stack: ExitStack) -> Bri
 
 def _ros(args: argparse.Namespace, choices: Choices) -> RosSettings | None:
     """The settings of --ros or of the rig file. Raises InputError for both, RigError for a name that is none."""
-    from flexneedle.lab.rig.rig_file import RosSettings, settings_of
+    from flexneedle.lab.rig.rig_file import RosSettings, check_settings
 
     if choices.rig is None:
-        return None if args.ros is None else settings_of(RosSettings, {"profile": args.ros})
+        return None if args.ros is None else check_settings(RosSettings, {"profile": args.ros})
     if args.ros is not None:
         raise InputError("--ros: not with --rig, whose file has a section [ros] for it")
     return choices.rig.ros

@@ -12,6 +12,7 @@ from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.equilibrium import step
 from flexneedle.phantom.space import roll_about_x, tilt_of, turn, vector
+from flexneedle.plugins import missing_parts, parts_of
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import along_entry
@@ -237,7 +238,6 @@ PlantFactory = Callable[[Truth, float], Plant]
 
 PLANTS: dict[str, PlantFactory] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
-_PARTS = ("step", "tip", "roll", "strain_energy", "least_stretch", "converged")
 
 
 def plant(kind: str | PlantFactory, truth: Truth, roll: float) -> Plant:
@@ -254,10 +254,8 @@ def plant(kind: str | PlantFactory, truth: Truth, roll: float) -> Plant:
 
 def _made(factory: PlantFactory, truth: Truth, roll: float) -> Plant:
     made, name = factory(truth, roll), getattr(factory, "__name__", type(factory).__name__)
-    if missing := [part for part in _PARTS if not hasattr(made, part)]:
-        raise InputError(
-            f"phantom = {name}: {type(made).__name__} is not a plant, missing: {', '.join(missing)}"
-        )
+    if missing := missing_parts(made, parts_of(Plant)):
+        raise InputError(f"phantom = {name}: {type(made).__name__} is not a plant, missing: {missing}")
     if np.shape(made.tip) != (5,):
         raise InputError(f"phantom = {name}: tip must be five numbers x, y, z (mm), θ, ψ (rad)")
     return made

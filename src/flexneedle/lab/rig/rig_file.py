@@ -128,7 +128,7 @@ def _short_queue(rig: RigFile) -> Iterator[Problem]:
         yield Problem("loop.queue_mm", rig.loop.queue_mm, rule)
 
 
-def settings_of(model: type[Settings], settings: Mapping[str, Any]) -> Settings:
+def check_settings(model: type[Settings], settings: Mapping[str, Any]) -> Settings:
     """Return the settings of a driver or tracker, checked.
 
     Raises RigError with one line `key = value: rule` for each problem.

@@ -23,7 +23,14 @@ from flexneedle.arguments import shown
 from flexneedle.errors import DriverError, FlexneedleError, InputError, RigError, make_printable, one_line
 from flexneedle.lab.rig.rig_file import Part, RigFile
 from flexneedle.lab.rig.speeds import pace_problems
-from flexneedle.plugins import convert_exceptions, function_rule, load_part, missing_parts, name_kind
+from flexneedle.plugins import (
+    convert_exceptions,
+    function_rule,
+    load_part,
+    missing_parts,
+    name_kind,
+    parts_of,
+)
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState, Tracker
 from flexneedle.types import Frame, Point, Quaternion, SensorReading
 
@@ -101,11 +108,6 @@ def address_of(part: Part, motors: Motors) -> str:
     """Return a name of the motors on this machine: the driver's `address`, else its kind and settings."""
     given: str = getattr(motors, "address", "")
     return given or f"{part.kind} {json.dumps(part.settings, sort_keys=True, default=str)}"
-
-
-def parts_of(port: type) -> tuple[str, ...]:
-    """Return the names of the methods and attributes of a port."""
-    return tuple(name for name in vars(port) if not name.startswith("_"))
 
 
 def _load_factory(section: str, group: str, part: Part, arguments: tuple[str, ...]) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.devices.recording import read_frames
 from flexneedle.lab.rig.devices.replay import Replay
-from flexneedle.lab.rig.rig_file import settings_of
+from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import Clock
 from flexneedle.record.folder import TRACE_FILE
@@ -48,13 +48,13 @@ class ReplaySettings(Section):
 
 def aurora(settings: Mapping[str, Any], clock: Clock) -> Aurora:
     """Return an NDI Aurora, tracking. Raises RigError for invalid settings, and as `Aurora`."""
-    chosen = settings_of(AuroraSettings, settings)
+    chosen = check_settings(AuroraSettings, settings)
     return Aurora(chosen.port, clock, chosen.sensors)
 
 
 def replay(settings: Mapping[str, Any], clock: Clock) -> Replay:
     """Return a replay that starts now. Raises RigError for invalid settings, InputError for an invalid recording."""
-    chosen = settings_of(ReplaySettings, settings)
+    chosen = check_settings(ReplaySettings, settings)
     path = Path(chosen.file)
     frames = frames_of_run(path) if path.is_dir() else read_frames(path)
     return Replay(_faster(frames, chosen.speed), clock)
