@@ -25,7 +25,7 @@ from time import process_time
 from flexneedle.errors import RigError
 from flexneedle.lab.rig.devices.galil.settings import checked as galil_settings
 from flexneedle.lab.rig.devices.trackers import AuroraSettings, ReplaySettings
-from flexneedle.lab.rig.rig_file import RigFile, load_rig, check_settings
+from flexneedle.lab.rig.rig_file import RigFile, check_settings, load_rig
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings, profile_with
 from flexneedle.lab.ros.settings import checked as ros_settings

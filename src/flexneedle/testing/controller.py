@@ -1,7 +1,9 @@
 """Conformance kit of `Controller`."""
 
 import copy
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -167,7 +169,20 @@ def _planned(scenario: Scenario | None, strategy: str) -> Plan:
 
 
 def _insert(controller: Controller, scenario: Scenario, planned: Plan, seed: int) -> _Run:
+    planned = copy.deepcopy(planned)  # a controller may change it
+    arrays = {name: getattr(planned, name).copy() for name in _ARRAYS}
+    with _recorded(controller) as calls:
+        insertion = insert(
+            scenario, planned, seed, controller=controller, phantom="model", force=True, threads=1
+        )
+    return _Run(insertion, arrays, tuple(calls))
+
+
+@contextmanager
+def _recorded(controller: Controller) -> Iterator[list[_Call]]:
+    """Record the calls of `decide`, of the object itself: a copy would be another controller of this name."""
     calls: list[_Call] = []
+    original = controller.decide
 
     def decide(task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Any]:
         require(
@@ -175,11 +190,12 @@ def _insert(controller: Controller, scenario: Scenario, planned: Plan, seed: int
             f"the insertion must end: {_MOST_CALLS} decisions did not reach the target",
         )
         before = copy.deepcopy(rng)
-        decision, after = controller.decide(task, memory, estimate, rng)
+        decision, after = original(task, memory, estimate, rng)
         calls.append(_Call(task, memory, estimate, before, decision, after))
         return decision, after
 
-    arrays = {name: getattr(planned, name).copy() for name in _ARRAYS}
-    recorded = replace(controller, decide=decide)
-    insertion = insert(scenario, planned, seed, controller=recorded, phantom="model", force=True, threads=1)
-    return _Run(insertion, arrays, tuple(calls))
+    object.__setattr__(controller, "decide", decide)
+    try:
+        yield calls
+    finally:
+        object.__setattr__(controller, "decide", original)
