@@ -11,7 +11,6 @@ import pytest
 from flexneedle.cli.main import main
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.sections.environment import Environment
 
 DOCS = Path(__file__).resolve().parents[4] / "docs" / "tracking" / "simulate.md"
 
@@ -125,16 +124,3 @@ def test_the_documented_scenario_is_valid():
     scenario = load_scenario("phantom").with_values({f"tracker.{key}": values[key] for key in values})
     assert scenario.tracker.tip_offset_mm == 6.0
     assert scenario.tracker.environment.name == "noisy"
-
-
-def test_the_page_lists_every_setting_with_its_default():
-    """All keys of the tables, by name; defaults are those of an environment with only a name and a plate."""
-    page = DOCS.read_text()
-    settings = page.split("## Settings")[1].split("\n## ")[0]
-    flat = load_scenario("phantom").with_values({"tracker.environment": {"name": "a", "plate": {}}}).flat()
-    opening = "tracker.environment."
-    keys = [key.removeprefix(opening) for key in flat if key.startswith(opening)]
-    assert len(keys) > 20
-    message = set(re.findall(r"`([a-z0-9_.]+)`", settings))
-    assert [key for key in keys if key not in message and key.split(".")[-1] not in message] == []
-    assert Environment(name="a").length_mm == 60.0
