@@ -1,4 +1,4 @@
-"""Writes docs/reference/scenario.md from the JSON schema of scenarios and the advice in advice.toml.
+"""Write docs/reference/scenario.md from the JSON schema of scenarios and the advice in advice.toml.
 
 python tools/docs/scenario_reference.py
 """
@@ -35,11 +35,10 @@ class Key(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A section: dotted name, what it is, what its key is in the section above, and its keys."""
+    """A section: dotted name, description, and keys."""
 
     name: str
     about: str
-    key: str
     keys: tuple[Key, ...]
 
 
@@ -49,8 +48,8 @@ def schema() -> dict[str, Any]:
 
 
 def tables(root: dict[str, Any]) -> Iterator[Table]:
-    """Yield the sections, each before those inside of it."""
-    yield from _tables("", "", root, root.get("$defs", {}))
+    """Yield the sections, each before its inner sections."""
+    yield from _tables("", root, root.get("$defs", {}))
 
 
 def unit(name: str) -> str:
@@ -60,7 +59,8 @@ def unit(name: str) -> str:
 
 def page() -> str:
     """Return the page, Markdown."""
-    sections = "\n".join(section(table, heading(table), ADVICE) for table in tables(schema()))
+    shown = (table._replace(keys=()) if _repeats(table) else table for table in tables(schema()))
+    sections = "\n".join(section(table, heading(table), ADVICE) for table in shown)
     return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
 
 
@@ -70,7 +70,12 @@ def heading(table: Table) -> str:
     return f"## `{name}`" if table.name else "## Top level"
 
 
-def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
+def _repeats(table: Table) -> bool:
+    """Return whether `[[plan.own_terms]]` has the same keys."""
+    return table.name.startswith("control.") and table.name.endswith(".own_terms")
+
+
+def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
     keys, inner = [], []
     for short, value in node["properties"].items():
         full = f"{name}.{short}" if name else short
@@ -78,14 +83,14 @@ def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) ->
         if found is None:
             keys.append(Key(full, value, short in node.get("required", [])))
         else:
-            inner.append((full, value.get("description", ""), found))
-    yield Table(name, node.get("description", ""), key, tuple(keys))
-    for full, described, found in inner:
-        yield from _tables(full, described, found, known)
+            inner.append((full, found))
+    yield Table(name, node.get("description", ""), tuple(keys))
+    for full, found in inner:
+        yield from _tables(full, found, known)
 
 
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
-    """The schema of the table that a key holds (a list of tables too), None if it holds a value."""
+    """Return the schema of the table, or list of tables, of a key; None for a value."""
     items = value.get("items", {})
     either = value.get("anyOf", [])
     choices = [value, items, *items.get("anyOf", []), *either, *(each.get("items", {}) for each in either)]
@@ -95,8 +100,8 @@ def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | 
 
 def section(table: Table, title: str, advice: dict[str, Any]) -> str:
     """Return a section with a row for each key; advice: texts of sections and keys by name."""
-    texts = (_about(table), table.key, advice["sections"].get(table.name, ""))
-    lines = [f"{title}\n", *(f"{' '.join(text.split())}\n" for text in texts if text)]
+    text = f"{_about(table)} {advice['sections'].get(table.name, '')}"
+    lines = [f"{title}\n", *(f"{' '.join(line.split())}\n" for line in [text] if line.strip())]
     if table.keys:
         lines.append('<div class="scenario" markdown>\n')
         lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
@@ -106,7 +111,7 @@ def section(table: Table, title: str, advice: dict[str, Any]) -> str:
 
 
 def _about(table: Table) -> str:
-    """The docstring of the section without its opening, which repeats the name."""
+    """Return the docstring of the section without the name at its start."""
     if not table.name:
         return ""
     text = " ".join(table.about.split())
@@ -117,8 +122,9 @@ def _about(table: Table) -> str:
 
 
 def _row(key: Key, advice: dict[str, Any]) -> str:
-    meaning = " ".join(key.schema.get("description", "").split())
-    text = f"{meaning} *Choose:* {key.schema.get('choose') or advice['keys'][key.name]}"
+    text = " ".join(key.schema.get("description", "").split())
+    if choose := key.schema.get("choose") or advice["keys"].get(key.name):
+        text += f" *Choose:* {choose}"
     short = key.name.rsplit(".", 1)[-1]
     cells = (f"`{short}`", key.schema.get("unit") or unit(key.name), _default(key), allowed(key.schema), text)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
@@ -140,7 +146,7 @@ def _toml(value: Any) -> str:
 
 
 def allowed(node: dict[str, Any]) -> str:
-    """Return which values a schema allows, in a few words."""
+    """Return the allowed values of a schema in a few words."""
     node = next((one for one in node.get("anyOf", [node]) if one.get("type") != "null"), node)
     if "enum" in node:
         return ", ".join(f"`{name}`" for name in node["enum"])

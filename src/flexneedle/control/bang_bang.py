@@ -99,10 +99,10 @@ class BevelRule(Section):
     """Settings of the bang-bang rule, in the table of each controller that uses it."""
 
     curvature_per_m: NonNegative = 0.646
-    """κ, curvature of the two paths of the bang-bang rule."""
+    """κ, curvature of the rule's two paths."""
     flip_dead_band: Fraction = 0.875
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
-    than this off the tip's line the bevel is not rolled."""
+    """Dead band, as a share of half of the two paths' separation at the target: no roll while the target is
+    closer to the tip's line."""
 
     @property
     def curvature(self) -> float:

@@ -28,18 +28,18 @@ class CeMpc(BevelRule):
     """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule for the bevel."""
 
     samples: int = count(21, least=2, most=100_000)
-    """Number of control sequences in an iteration."""
+    """Control sequences per iteration."""
     iterations: int = count(4, least=1, most=1_000)
-    """Iterations of the search in a control period."""
+    """Iterations per control period."""
     horizon: int = count(7, least=1, most=1_000)
-    """Prediction horizon, in control steps."""
+    """Horizon, in control steps."""
     orientation_weight_mm: NonNegative = 11.8
-    """Weight of the angle to the planned path, as the distance that is equivalent to 1 rad."""
+    """Weight of the angle to the planned path, as the distance equivalent to 1 rad."""
     curvature_per_m: NonNegative = 0.232
-    """κ, curvature of the two paths of the bang-bang rule."""
+    """κ, curvature of the rule's two paths."""
     flip_dead_band: Fraction = 0.875
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
-    than this off the tip's line the bevel is not rolled."""
+    """Dead band, as a share of half of the two paths' separation at the target: no roll while the target is
+    closer to the tip's line."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,8 +42,8 @@ def past_target(trajectories: Trajectories, target: Point) -> Complexes:
     "mm",
     plan=Weight(
         "accuracy", "accuracy_weight_per_mm", "1/mm", 20.0,
-        "γ₁, weight of the distance between tip and target at the end.",
-        "raise it if the other terms keep a plan from its target (the plan names this key as its limit).",
+        "γ₁, weight of the final distance between tip and target.",
+        "larger if a plan names this key as its limit.",
     ),
     adaptive_mpc=Weight("miss"),
 )  # fmt: skip
@@ -72,17 +72,15 @@ def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float
     "mJ",
     plan=Weight(
         "energy", "energy_weight_per_mj", "1/mJ", 5.0,
-        "γ₂, weight of the tissue's strain energy W at the end.",
-        "raise it to spare the tissue.",
+        "γ₂, weight of the final strain energy W of the tissue.",
     ),
     adaptive_mpc=Weight(
         "energy", "energy_weight_mm", "mm", 0.7,
-        "Weight of the tissue energy, in units of the energy of all tissue down to the target displaced by 1 mm.",
-        "raise it to spare the tissue at the expense of accuracy.",
+        "Weight of the tissue energy, relative to all tissue down to the target displaced by 1 mm.",
+        "larger to spare the tissue at the expense of accuracy.",
         Weight(
             "energy", "unguided_energy_weight_mm", "mm", 1.0,
-            "`energy_weight_mm` where the guide may not move.",
-            "as `energy_weight_mm`, for needles without a guide and `steering` plans.",
+            "`energy_weight_mm` if the guide may not move.",
         ),
     ),
 )  # fmt: skip
@@ -96,7 +94,6 @@ def energy_at_end(trajectories: Trajectories) -> Floats:
     plan=Weight(
         "deflection", "deflection_weight", "1/mm²", 0.002,
         "Q, weight of the needle's mean square deflection (mm²), summed over the steps.",
-        "raise it for straighter needles.",
     ),
 )  # fmt: skip
 def deflection(trajectories: Trajectories) -> Floats:
@@ -110,7 +107,6 @@ def deflection(trajectories: Trajectories) -> Floats:
     plan=Weight(
         "guide", "guide_weight", "1/mm²", 1.0,
         "R, weight of the guide's squared travel (mm²), summed over the steps.",
-        "raise it for less motion of the guide.",
     ),
 )  # fmt: skip
 def guide_motion(trajectories: Trajectories) -> Floats:
@@ -123,12 +119,11 @@ def guide_motion(trajectories: Trajectories) -> Floats:
     "mm",
     adaptive_mpc=Weight(
         "line", "line_weight", "–", 0.4,
-        "Weight of the mean distance of the tip from the line to the target, times the share of the path that is left.",
-        "raise it to keep the tip nearer to the straight line to the target, at the expense of tissue energy.",
-        Weight(
+        "Weight of the tip's mean distance from the line to the target, times the remaining share of the path.",
+        unguided=Weight(
             "line", "unguided_line_weight", "–", 0.0,
-            "`line_weight` where the guide may not move.",
-            "0, unless the path matters: without a guide, rolls to keep the tip near the line consume bevel reach.",
+            "`line_weight` if the guide may not move.",
+            "0, unless the path matters: without a guide, rolls consume reach.",
         ),
     ),
 )  # fmt: skip
@@ -147,8 +142,8 @@ def distance_from_line(trajectories: Trajectories, start: Point, target: Point) 
     "1",
     adaptive_mpc=Weight(
         "slope", "slope_weight_mm", "mm", 0.5,
-        "Weight of the mean square slope of the guide's path, times the share of the path that is left.",
-        "raise it for a calmer guide; too large delays corrections.",
+        "Weight of the mean square slope of the guide's path, times the remaining share of the path.",
+        "larger for less guide motion and later corrections.",
     ),
 )  # fmt: skip
 def guide_slope(trajectories: Trajectories) -> Floats:
@@ -166,12 +161,10 @@ def guide_slope(trajectories: Trajectories) -> Floats:
     plan=Weight(
         "flips", "flip_weight", "–", 0.3,
         "R of the flip input, cost of a roll of the bevel.",
-        "raise it for fewer flips of the bevel.",
     ),
     adaptive_mpc=Weight(
         "flips", "roll_weight_mm", "mm", 0.03,
         "Cost of a roll of the bevel.",
-        "raise it for fewer flips of the bevel.",
     ),
 )  # fmt: skip
 def flips(trajectories: Trajectories, first: int = 0) -> Floats:
@@ -185,7 +178,7 @@ def flips(trajectories: Trajectories, first: int = 0) -> Floats:
     adaptive_mpc=Weight(
         "late", "late_roll_weight", "–", 1.0,
         "Weight of the standard deviation of the tip's motion in a roll just before the target.",
-        "raise it if late rolls make the tip jump, as with a bent needle; 0 allows them at no cost.",
+        "larger if late rolls move the tip, as with a bent needle.",
     ),
 )  # fmt: skip
 def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Floats:
@@ -201,11 +194,11 @@ def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Float
     adaptive_mpc=Weight(
         "reach", "reach_weight", "–", 1.0,
         "Weight of the expected distance of the target from the bevel's reach, with the guide fixed.",
-        "raise it where the guide hardly moves the tip, as for deep targets, so that the bevel can still reach them.",
+        "larger if the guide hardly moves the tip, as for deep targets.",
         Weight(
             "reach", "unguided_reach_weight", "–", 100.0,
-            "`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone.",
-            "large: without a guide, reach that is lost cannot be regained.",
+            "`reach_weight` on axes on which the guide may not move.",
+            "large: the bevel alone cannot regain lost reach.",
         ),
     ),
 )  # fmt: skip
@@ -235,8 +228,7 @@ def deviation(trajectories: Trajectories, reference: Floats, orientation: float)
     "mm²",
     ce_mpc=Weight(
         "guide", "guide_weight", "–", 0.075,
-        "Weight of the squared difference (mm²) between a guide step and the plan's.",
-        "larger keeps the guide nearer to the plan; 0 leaves it free.",
+        "Weight of the squared difference (mm²) between a guide step and the plan.",
     ),
 )  # fmt: skip
 def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
@@ -251,7 +243,7 @@ def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
     ce_mpc=Weight(
         "energy", "energy_weight_per_mj", "1/mJ", 2.74,
         "Weight of the tissue's strain energy after each step of the horizon, in mm² per mJ.",
-        "raise it to spare the tissue at the expense of accuracy.",
+        "larger to spare the tissue at the expense of accuracy.",
     ),
 )  # fmt: skip
 def energy_of_steps(trajectories: Trajectories) -> Floats:

@@ -60,35 +60,35 @@ class Priors(Section):
     """Settings of the observer, keys in the section of its controller."""
 
     bend_sd_mm: NonNegative = 0.5
-    """Prior of the natural bend of the needle (lateral offset of its tip): standard deviation."""
+    """Prior standard deviation of the natural bend (lateral offset of the tip)."""
     run_out_sd_mm: NonNegative = 0.1
-    """Prior of the distance of the measured tip from the needle's axis: standard deviation."""
+    """Prior standard deviation of the measured tip's distance from the needle's axis."""
     tilt_sd_mrad: NonNegative = 10.0
-    """Prior of the angle between the measured direction and the needle at the tip: standard deviation on each axis."""
+    """Prior standard deviation, per axis, of the angle between measured direction and needle."""
     clearance_mm: NonNegative = 0.05
-    """Prior of the clearance of the needle in the guide, to either side: mean."""
+    """Prior mean of the guide clearance, to either side."""
     clearance_sd_mm: NonNegative = 0.02
-    """Prior of the clearance of the needle in the guide, to either side: standard deviation."""
+    """Prior standard deviation of the guide clearance."""
     modulus_log_sd: NonNegative = 0.3
-    """Prior of the logarithm of the factor on each layer's modulus: standard deviation."""
+    """Prior standard deviation of the logarithm of each layer's modulus factor."""
     bevel_sd: NonNegative = 0.3
-    """Prior of the factor on the bevel offset: standard deviation."""
+    """Prior standard deviation of the factor on the bevel offset."""
     boundary_sd_mm: NonNegative = 1.5
-    """Prior of the depth of each boundary between layers: standard deviation."""
+    """Prior standard deviation of the depth of each layer boundary."""
     variation_sd: NonNegative = 0.2
-    """Prior of the logarithm of the modulus along the depth, about that of its layer: standard deviation."""
+    """Prior standard deviation of the logarithm of the modulus along the depth."""
     variation_length_mm: Positive = 10.0
-    """Correlation length of the variation of the modulus along the depth."""
+    """Correlation length of this variation."""
     cell_mm: Positive = 2.5
-    """Length along the depth of the cells in which the modulus is constant."""
+    """Length of the cells of constant modulus."""
     model_sd: NonNegative = 0.01
-    """Model error: standard deviation of the mean of a move's readings, relative to the bevel offset."""
+    """Model error: standard deviation of the mean reading of a move, relative to the bevel offset."""
     least_model_sd_mm: Positive = 0.0126
-    """Lower bound of the same standard deviation."""
+    """Lower bound of this standard deviation."""
     model_slope_sd_mrad: Positive = 1.0
-    """Model error: standard deviation of the mean of a move's measured directions."""
+    """Model error: standard deviation of the mean direction of a move."""
     residual_gain: Fraction = 0.4
-    """Gain of the low-pass filter on the residuals of the fit, per move."""
+    """Gain per move of the low-pass filter on the residuals of the fit."""
 
 
 @dataclass(frozen=True, eq=False)

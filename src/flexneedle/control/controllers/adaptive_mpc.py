@@ -52,17 +52,17 @@ class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
     samples: int = count(24, least=12, most=100_000)
-    """Number of paths in an iteration of the search."""
+    """Paths per iteration of the search."""
     iterations: int = count(2, least=1, most=1_000)
-    """Iterations of the search in a control period."""
+    """Iterations per control period."""
     effort: int = count(3, least=1, most=1_000)
-    """Factor on `samples` in the first period, and in a search again if none ends within `control.miss_limit_mm`."""
+    """Factor on `samples` in the first period, and in a repeated search if no path ends within
+    `control.miss_limit_mm`."""
     urgency: float = Field(default=1.5, ge=0.0, le=10.0)
-    """Exponent u of the factor r^(−u) on a predicted miss above its standard deviation; r is the share of the path that
-    is left, at least five control steps. 0: no factor."""
+    """Exponent u of the factor r^(−u) on a miss above its standard deviation; r: remaining share of the path,
+    at least five steps."""
     unguided_reach_margin: NonNegative = 3.0
-    """Factor on the standard deviation of the distance that `unguided_reach_weight` charges: reach is kept until as
-    much is to spare."""
+    """Factor on the standard deviation of the distance in `unguided_reach_weight`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,15 +31,15 @@ class BroydenMpc(Section):
     """Section `control.broyden_mpc`: a Jacobian estimated from readings, and linear MPC of the guide."""
 
     update_gain: Fraction = 0.65
-    """Share of Broyden's update of the Jacobian; 1: the Jacobian reproduces the newest motion exactly."""
+    """Share of Broyden's update of the Jacobian; 1: it reproduces the newest motion."""
     horizon: int = count(4, least=1, most=20)
-    """Prediction horizon of the linear MPC, in control steps."""
+    """Horizon, in control steps."""
     max_guide_travel_mm: Positive = 6.0
-    """Largest lateral distance of the guide from the insertion axis; not beyond `setup.max_guide_travel_mm`."""
+    """Largest lateral distance of the guide from the axis; at most `setup.max_guide_travel_mm`."""
     guide_weight: NonNegative = 0.000316
-    """Weight of the squared guide steps (mm²) against the squared deviation of the tip (mm²)."""
+    """Weight of squared guide steps (mm²) relative to the squared deviation of the tip (mm²)."""
     guide_effect: NonNegative = 0.982
-    """Initial Jacobian: lateral motion of the tip per that of the guide; without that it moves straight."""
+    """Initial Jacobian: lateral motion of the tip per motion of the guide."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,16 +34,16 @@ class ResolvedRate(bang_bang.BevelRule):
     """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
 
     curvature_per_m: NonNegative = 0.0834
-    """κ, curvature of the two paths of the bang-bang rule."""
+    """κ, curvature of the rule's two paths."""
     flip_dead_band: Fraction = 0.625
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
-    than this off the tip's line the bevel is not rolled."""
+    """Dead band, as a share of half of the two paths' separation at the target: no roll while the target is
+    closer to the tip's line."""
     gain: NonNegative = 1.38
-    """Share of the tip's predicted deviation that a control step corrects."""
+    """Share of the tip's predicted deviation that a step corrects."""
     damping: NonNegative = 0.0533
-    """λ of the damped least squares, in the unit of the Jacobian: lateral motion of the tip per that of the guide."""
+    """λ of the damped least squares, in the unit of the Jacobian."""
     lookahead_mm: Positive = 10.0
-    """Distance ahead of the tip at which its deviation is predicted, at most to the target depth."""
+    """Distance ahead of the tip at which its deviation is predicted."""
 
 
 def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:

@@ -28,22 +28,21 @@ class Setup(Section):
     """Section `setup`: positions at the start, travel and speed of the actuators."""
 
     axes: int = count(1, least=1, most=2)
-    """Lateral axes: 1, a needle in the plane, or 2, in space."""
+    """Lateral axes: 1 (needle in the plane) or 2 (in space)."""
     guide_axes: int = count(2, least=1, most=2)
-    """Lateral axes in which the guide of a needle in space moves: 1, along y only, or 2."""
+    """Lateral axes of the guide in space: 1 (y only) or 2."""
     rotation: Literal["half-turns", "free"] = "free"
-    """How the driver rotates the needle in space: between 0 and 180°, or to any angle. In the plane it rolls by half
-    turns."""
+    """Rotation of the needle in space: between 0 and 180°, or to any angle. In the plane: half turns."""
     max_rotation_deg: Positive | None = None
-    """Largest angle of the needle from its angle 0, to either side, with free rotation. Not set: no limit."""
+    """Largest angle to either side of angle 0, with free rotation. Not set: no limit."""
     guide_to_skin_mm: Positive | None = None
-    """G, distance from the guide to the skin. Not set: there is no guide."""
+    """G, distance from guide to skin. Not set: no guide."""
     tip_to_skin_mm: Positive
-    """Distance from the tip to the skin at the start."""
+    """Distance from tip to skin at the start."""
     stroke_mm: Positive
     """Largest travel of the base along the insertion axis."""
     max_advance_mm: Positive = 1.0
-    """Largest travel of the base along the insertion axis in a control step, forwards or backwards."""
+    """Largest advance or withdrawal in a control step."""
     max_guide_step_mm: GuideTravel = 0.5
     """Largest lateral travel of the guide in a control step."""
     max_guide_travel_mm: GuideTravel = 15.0
@@ -55,16 +54,16 @@ class Setup(Section):
     max_base_turn_step_mrad: Positive = 5.0
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
-    """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms. This and the other speeds are means of a step: the motors
-    of a rig accelerate and slow down in it, and are faster in between."""
+    """Mean speed of an advance; motors are faster within a step. A step of 1 mm at 5 mm/s lasts 200 ms."""
     guide_speed_mm_s: Positive | None = None
-    """Lateral speed of the guide on an axis. Not set: its largest step takes as long as the largest advance."""
+    """Mean lateral speed of the guide on an axis. Not set: its largest step lasts as long as the largest
+    advance."""
     base_speed_mm_s: Positive | None = None
-    """Lateral speed of the base on an axis. Not set: its largest step takes as long as the largest advance."""
+    """Mean lateral speed of the base on an axis. Not set: as `guide_speed_mm_s`."""
     base_turn_speed_mrad_s: Positive | None = None
-    """Speed of the base's rotation about an axis. Not set: its largest step takes as long as the largest advance."""
+    """Mean speed of the base's rotation. Not set: as `guide_speed_mm_s`."""
     rotation_speed_deg_s: Positive = 360.0
-    """Speed at which the needle rolls and spins; a half turn at 360°/s lasts 0.5 s. It does not advance in a roll."""
+    """Speed of rolls, without advance, and spins. A half turn at 360°/s lasts 0.5 s."""
 
     @property
     def half_turns(self) -> bool:
@@ -153,17 +152,17 @@ class Entry(Section):
     """Section `entry`: where and how the needle enters the skin. Base and guide are mounted on its axis."""
 
     lateral_mm: float = 0.0
-    """y of the point where the needle's axis meets the skin."""
+    """y of the entry point, where the needle's axis meets the skin."""
     lateral_z_mm: float = 0.0
-    """z of that point."""
+    """z of the entry point."""
     slope_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dy/dx of the axis."""
     slope_z_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dz/dx of the axis."""
     free_radius_mm: NonNegative = 0.0
-    """The planner may choose another point on the skin, at most this distance from it. 0: fixed."""
+    """Largest distance by which the planner may move the entry point. 0: fixed."""
     free_slope_mrad: float = Field(default=0.0, ge=0.0, le=STEEPEST_MRAD)
-    """The planner may change the slope by at most this. 0: fixed."""
+    """Largest change of the slope by the planner. 0: fixed."""
 
     @property
     def free(self) -> bool:
@@ -225,23 +224,23 @@ class TrackerSettings(Section):
     rate_hz: Positive = 40.0
     """Readings per second."""
     jitter_mm: NonNegative = 0.07
-    """RMS length of the 3D deviation of a reading from the mean. With `environment`, its sensors' values apply."""
+    """RMS length of the 3D deviation of a reading from the mean. `environment` replaces it."""
     direction_jitter_mrad: Positive | None = None
-    """Standard deviation of a coordinate of the tip's measured direction. Not set: the direction is not used."""
+    """Standard deviation of a coordinate of the measured direction. Not set: directions are not used."""
     tip_offset_mm: NonNegative = 0.0
-    """Calibrated distance from the sensor to the needle's tip, along the needle."""
+    """Calibrated distance from sensor to tip, along the needle."""
     workspace_center_mm: Vector = (20.0, 0.0, 0.0)
-    """Center x, y, z of the environment's workspace in the frame of the insertion."""
+    """Center x, y, z of the environment's workspace in the insertion frame."""
     field_seed: AnySeed | None = None
-    """Seed of the environment's error field. Not set: each insertion draws a field of its own from its seed."""
+    """Seed of the environment's error field. Not set: each insertion draws a field from its seed."""
     environment: Annotated[
         Environment | None,
         BeforeValidator(expanded, json_schema_input_type=Environment | Literal["ideal", "noisy"] | None),
     ] = None
-    """A shipped environment, "ideal" or "noisy", or a table with values of your own. "none" or not set: white noise."""
+    """"ideal", "noisy" or a table. "none" or not set: white noise."""
 
     registration: Registration | None = None
-    """Rigid map from the tracker's frame to the frame of the insertion. Not set: the two frames are the same."""
+    """Rigid map from the tracker's frame to the insertion frame. Not set: identity."""
 
     @property
     def period(self) -> float:

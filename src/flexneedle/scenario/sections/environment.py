@@ -44,19 +44,19 @@ class ReferenceSensor(Section):
     """Section `tracker.environment.reference`: a 6-DOF sensor, the mean of two coils along its z axis."""
 
     bias_mm: NonNegative = 0.61
-    """RMS length of the position error over the workspace, without a plate."""
+    """As `tip.bias_mm`."""
     jitter_mm: NonNegative = 0.08
-    """RMS length of the deviation of a sample from the mean at one position."""
+    """As `tip.jitter_mm`."""
     spacing_mm: Positive = 12.0
-    """Nominal distance of the two coils, with which the indicator compares the measured one."""
+    """Nominal distance of the two coils."""
     coils_mm: NonNegative = 0.5
-    """RMS length of the difference between the errors of the two coils at one position (they are mounted askew)."""
+    """RMS length of the difference between the two coils' errors at one position."""
     ref1_mm: Vector = (0.0, 50.0, 0.0)
-    """Position x, y, z of the first of the three reference sensors of an insertion."""
+    """Position x, y, z of the first reference sensor."""
     ref2_mm: Vector = (0.0, -50.0, 0.0)
-    """Position x, y, z of the second reference sensor."""
+    """Position of the second reference sensor."""
     ref3_mm: Vector = (50.0, 0.0, 0.0)
-    """Position x, y, z of the third reference sensor."""
+    """Position of the third reference sensor."""
 
 
 class Plate(Section):
@@ -67,19 +67,19 @@ class Plate(Section):
     distance_mm: Annotated[float, Field(ge=0, le=LARGEST)] = 100.0
     """Distance from the plate to the center of the workspace."""
     normal: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 0.0, 1.0)
-    """Direction x, y, z from the plate to the workspace; its length does not matter."""
+    """Direction x, y, z from the plate to the workspace, of any length."""
     decay_mm: Positive = 40.0
     """Distance over which the distortion falls to 1/e."""
     tip_mm: NonNegative = 0.0
-    """RMS distortion of the tip sensor's position."""
+    """RMS distortion of the tip sensor."""
     reference_mm: NonNegative = 0.0
-    """RMS distortion of a reference sensor's position."""
+    """RMS distortion of a reference sensor."""
     coils_mm: NonNegative = 0.0
-    """RMS difference between the distortions of a reference sensor's two coils."""
+    """RMS difference between the distortions of a reference's two coils."""
     coils_decay_mm: Positive = 60.0
-    """Distance over which that difference falls to 1/e."""
+    """Distance over which this difference falls to 1/e."""
     coils_pull: Fraction = 0.8
-    """Share of the squared difference that is along `normal` and, apart from the decay, uniform over the workspace."""
+    """Share of the squared difference that is along `normal` and uniform over the workspace."""
 
 
 class Environment(Section):
@@ -88,27 +88,28 @@ class Environment(Section):
     name: Annotated[Title, Field(examples=["own"])]
     """Name in tables."""
     field_seed: AnySeed = 0
-    """Seed of the error field that `flexneedle em simulate` measures."""
+    """Seed of the error field of `flexneedle em simulate`."""
     workspace_mm: Positive = 100.0
-    """Edge of the cubic workspace, over which the RMS lengths of the errors are taken."""
+    """Edge of the cubic workspace over which RMS lengths are taken."""
     length_mm: Positive = 60.0
-    """Correlation length ℓ of the errors: positions at a distance r have the correlation e^(-r²/2ℓ²)."""
+    """Correlation length ℓ of the errors: e^(-r²/2ℓ²) at a distance r."""
     shared: Fraction = 0.5
-    """Share of the squared error that is common to all sensors at one position."""
+    """Share of the squared error common to all sensors at one position."""
     generator_mm: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 700.0, 0.0)
-    """Position x, y, z of the field generator."""
+    """Position x, y, z of the field generator, from the center of the workspace."""
     growth: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Exponent with which the error without a plate grows over the distance to the field generator; 0: uniform."""
+    """Exponent of the growth of the error with the distance to the generator; 0: uniform."""
     tilt_mrad_per_mm: NonNegative = 8.0
-    """Rotation error of a sensor's axis for each mm of its position error."""
+    """Rotation error of a sensor's axis per mm of position error."""
     tilt_jitter_mrad: NonNegative = 3.0
-    """RMS angle of the deviation of a sample's orientation from the mean at one position."""
+    """RMS angle of the deviation of a sample from the mean orientation."""
     missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of samples without a position in `flexneedle em simulate`; insertions use `phantom.missing_fraction`."""
+    """Share of samples without a position in `flexneedle em simulate`; insertions use
+    `phantom.missing_fraction`."""
     tip: TipSensor = TipSensor()
     reference: ReferenceSensor = ReferenceSensor()
     plate: Plate | None = None
-    """Metal plate. Not set: there is none."""
+    """Metal plate. Not set: none."""
 
 
 def expanded(value: Any) -> Any:

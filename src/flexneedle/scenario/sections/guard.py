@@ -11,11 +11,11 @@ class GuardSettings(Section):
     """Section `guard`: limits of the predicted state after a command. One that would exceed them is not carried out."""
 
     least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Least stretch λ of the tissue along the needle. Not set: in each layer that at 19/20 of the compression at which
-    its law ends, 0.335 for `ogden`."""
+    """Least stretch λ of the tissue along the needle. Not set: at 19/20 of the compression limit of each
+    layer's law (0.335 for `ogden`)."""
     needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 1.0
-    """Largest strain of the needle's surface by bending."""
+    """Largest bending strain of the needle's surface."""
     guide_force_n: Positive | None = None
-    """Largest force between guide and needle. Not set: limited by `needle_strain_percent` alone."""
+    """Largest force between guide and needle. Not set: no separate limit."""
     past_target_mm: Positive = 2.0
-    """Largest distance of the tip past the target, along the insertion axis."""
+    """Largest axial distance of the tip past the target."""

@@ -11,26 +11,27 @@ class MonitorSettings(Section):
     """Section `monitor`: limits beyond which the needle is held (the first of them from paper section IV-B)."""
 
     enabled: bool = True
-    """Whether the checks below are made. Missing, stale or improbable readings are rejected in any case."""
+    """Whether the checks of this section run. Missing, stale and improbable readings are always rejected."""
     indicator_limit: Positive = 0.0547
-    """Limit of a reference's indicator (relative error of its coils' distance); above it the field is distorted."""
+    """Limit of a reference's indicator, the relative error of its coils' distance. Above it the field is
+    distorted."""
     indicator_window_s: Positive = 1.0
-    """Time over which the median of the indicator is compared with its limit; single clean readings may exceed it."""
+    """Time of the median that is compared with the limit."""
     doubt_window_s: Positive = 0.2
-    """Shorter time for the same median: while that is above the limit, no reading corrects the model."""
+    """Shorter time of the same median; while it is above the limit no reading corrects the model."""
     resume_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Share of the limit below which all indicators must fall before a held needle continues."""
     abort_after_s: Positive = 10.0
     """Time in a distorted field after which the insertion ends."""
     references: int = count(3, least=0, most=100)
-    """Number of reference sensors that must be measured within `indicator_window_s`; 0: none is required."""
+    """Reference sensors that must be measured within `indicator_window_s`; 0: none."""
     lost_after_s: NonNegative = 0.1
-    """Time without the tip after which the needle is held, with a tracker that sends frames; with others it is 0."""
+    """Time without a tip after which the needle is held, for a tracker that sends frames; otherwise 0."""
     speed_limit_mm_s: Positive = 20.0
-    """Largest speed of the tip: a reading further from the last one is a jump and is rejected."""
+    """Largest speed of the tip; a reading beyond it is rejected as a jump."""
     jump_margin_mm: NonNegative = 1.0
-    """Allowance for noise, added to the distance that `speed_limit_mm_s` permits."""
+    """Noise allowance, added to the distance of a jump."""
     frozen_travel_mm: Positive = 0.3
-    """Travel of the needle after which readings that repeat to the last digit are frozen and are rejected."""
+    """Travel of the needle after which identical readings are rejected as frozen."""
     out_of_plane_limit_mm: Positive = 5.0
-    """Largest distance of a measured tip from the plane of the insertion."""
+    """Largest distance of a measured tip from the insertion plane."""

@@ -32,28 +32,28 @@ class Bevel(Section):
     """Section `needle.bevel`: the bevel as a pre-compressed spring at the tip."""
 
     offset_mm: NonNegative = 4.0
-    """b, pre-compression of the tip spring; 0: symmetric tip."""
+    """b, compression of the tip spring; 0: symmetric tip."""
     length_mm: Positive = 3.0
-    """l_b, length behind the tip over which the spring acts."""
+    """ℓ_b, length behind the tip over which the spring acts."""
 
 
 class Needle(Section):
     """Section `needle`. The cross-section is given by `gauge` or by diameters."""
 
     gauge: Gauge | None = None
-    """Gauge of a regular-wall needle, in place of the diameters."""
+    """Gauge of a regular-wall needle; replaces the diameters."""
     stylet: bool = False
-    """Whether a stylet fills the tube, which then bends like a solid rod."""
+    """Whether a stylet, sensor or wire fills the tube, which then bends like a solid rod."""
     outer_diameter_mm: Positive | None = None
     """Outer diameter, required without `gauge`."""
     inner_diameter_mm: NonNegative | None = None
-    """Inner diameter, without `gauge`. Not set or 0: solid needle."""
+    """Inner diameter. Not set or 0: solid needle."""
     length_mm: Positive = 150.0
-    """Length from the base clamp to the tip."""
+    """Length from base clamp to tip."""
     youngs_modulus_gpa: Positive = 200.0
-    """E, Young's modulus of the needle."""
+    """E, Young's modulus."""
     nodes: int = count(61, least=2, most=10_000)
-    """n, number of nodes of the needle state X, at equal arc lengths."""
+    """n, nodes of recorded needle shapes, at equal arc lengths. No result depends on it."""
     bevel: Bevel = Bevel()
 
     @model_validator(mode="after")

@@ -43,11 +43,11 @@ class Registration(Section):
     """
 
     rotation: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
-    """Unit quaternion w, x, y, z that rotates vectors from the tracker's frame to the stage's."""
+    """Unit quaternion w, x, y, z from the tracker's to the stage's frame."""
     translation_mm: Vector = (0.0, 0.0, 0.0)
     """Position x, y, z of the tracker's origin in the stage's frame."""
     localisation_mm: NonNegative = 0.0
-    """RMS error of a measured fiducial, estimated from the residual of the fit."""
+    """RMS error of a measured fiducial, from the residual of the fit."""
     fiducials_mm: Annotated[
         tuple[Vector, ...],
         Field(

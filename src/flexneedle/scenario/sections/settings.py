@@ -27,7 +27,7 @@ class Target(Section):
     lateral_mm: float = 5.0
     """y of the target: lateral offset from the insertion axis."""
     lateral_z_mm: float = 0.0
-    """z of the target: lateral offset on the second axis."""
+    """z of the target; 0 with `setup.axes = 1`."""
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -40,27 +40,27 @@ class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
 
     samples: int = count(128, least=2, most=100_000)
-    """N, number of control sequences in an iteration."""
+    """N, control sequences per iteration."""
     iterations: int = count(25, least=1, most=10_000)
-    """Usual number of iterations; after these, the search ends once the cost has hardly fallen in ten iterations."""
+    """Iterations after which the search ends once the cost has hardly fallen in ten iterations."""
     max_iterations: int = count(200, least=1, most=10_000)
-    """Largest number of iterations; if `iterations` is larger, that applies."""
+    """Largest number of iterations (at least `iterations`)."""
     elite_fraction: Annotated[float, Field(gt=0, le=1)] = 0.125
-    """ρ, share of the samples (the elite) to which mean and covariance are fitted."""
+    """ρ, share of the samples to which mean and covariance are fitted."""
     smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.4
-    """Share of the previous mean and covariance that is kept in an iteration."""
+    """Weight of the previous mean and covariance."""
     primitives: int = count(6, least=1, most=1_000)
-    """Number of primitives of a control sequence, each constant over its share of the travel."""
+    """Primitives per control sequence, each constant over its share of the travel."""
     tolerance: Positive = 1e-3
-    """Spread of the elite's costs, relative to that of the first iteration, at which the search has converged."""
+    """Spread of the elite's costs at convergence, relative to the first iteration."""
     advance_sigma_mm: NonNegative = 0.03
-    """Initial standard deviation of the advance of a step; 0: fixed."""
+    """Initial standard deviation of the advance per step; 0: fixed."""
     guide_sigma_mm: NonNegative = 0.06
-    """Initial standard deviation of the guide's lateral travel in a step; 0: fixed."""
+    """Initial standard deviation of the guide's lateral travel per step; 0: fixed."""
     base_sigma_mm: NonNegative = 0.0
-    """Initial standard deviation of the base's lateral travel in a step; 0: fixed."""
+    """Initial standard deviation of the base's lateral travel per step; 0: fixed."""
     base_turn_sigma_mrad: NonNegative = 0.0
-    """Initial standard deviation of the base's rotation in a step; 0: fixed."""
+    """Initial standard deviation of the base's rotation per step; 0: fixed."""
 
     @property
     def base_turn_sigma(self) -> float:
@@ -77,27 +77,27 @@ class ControlSettings(Section):
     model_config = ConfigDict(extra="allow")
 
     load_gain: Fraction = 0.3
-    """Gain of the low-pass filter on the estimated tip load, per period. Not used by `adaptive-mpc`."""
+    """Gain per period of the low-pass filter on the estimated tip load. Not used by `adaptive-mpc`."""
     depth_tolerance_mm: Positive = 0.01
-    """Tolerance of the target depth at which the insertion ends."""
+    """Distance from the target depth at which the insertion ends."""
     start_offset_sd_mm: NonNegative = 0.5
-    """Prior of the base clamp's lateral position at the start: standard deviation."""
+    """Prior standard deviation of the base's lateral position at the start."""
     start_angle_sd_mrad: NonNegative = 3.0
-    """Prior of the base clamp's slope at the start: standard deviation."""
+    """Prior standard deviation of the base's slope at the start."""
     innovation_limit_mm: Positive = 2.0
-    """Innovation gate: a reading further from its prediction than this plus three standard deviations is rejected."""
+    """Innovation limit, plus three standard deviations of the prediction; readings beyond it are rejected."""
     start_axial_sd_mm: NonNegative = 1.0
-    """Prior of the tip's position along the axis at the start: standard deviation."""
+    """Prior standard deviation of the tip's axial position at the start."""
     miss_limit_mm: Positive = 2.0
-    """Largest predicted lateral miss at the target: the needle is held if no path with a smaller one is found."""
+    """Largest predicted lateral miss at the target. The needle is held if no better path is found."""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
     """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
     hold_limit_s: Positive = 1.0
-    """Time without a usable reading, or without a path to the target, after which the insertion ends."""
+    """Time without a valid reading, or without a path to the target, after which the insertion ends."""
     hold_total_s: Positive = 300.0
-    """Time for which the needle may be held in one insertion, all holds together; then it ends."""
+    """Total time of all holds after which the insertion ends."""
     stale_after_s: Positive = 0.3
-    """Age above which a reading is rejected as stale."""
+    """Age above which a reading is rejected."""
 
     @model_validator(mode="after")
     def _check_tables(self) -> Self:
@@ -128,59 +128,57 @@ class PhantomSettings(Section):
     """
 
     shear_modulus_factor: PositiveRange = (0.6, 1.6)
-    """Range [low, high] of the factor on each layer's μ, drawn uniformly and independently."""
+    """Range [low, high] of the factor on each layer's μ, drawn uniformly."""
     shear_modulus_variation: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """Standard deviation of μ along the depth, relative to the μ of the layer."""
+    """Relative standard deviation of μ along the depth."""
     variation_length_mm: Positive = 10.0
-    """Correlation length of the variation of μ along the depth."""
+    """Correlation length of this variation."""
     layer_shift_sd_mm: NonNegative = 1.5
     """Standard deviation of the depth of each layer boundary."""
     bevel_factor: NonNegativeRange = (0.5, 1.5)
-    """Range [low, high] of the factor on the bevel offset b, drawn uniformly; b is kept below 0.7 h."""
+    """Range [low, high] of the factor on the bevel offset b, drawn uniformly; b remains below 0.7 h."""
     start_offset_sd_mm: NonNegative = 0.5
-    """Standard deviation of the base clamp's lateral position at the start."""
+    """Standard deviation of the base's lateral position at the start."""
     start_angle_sd_mrad: NonNegative = 3.0
-    """Standard deviation of the base clamp's slope at the start."""
+    """Standard deviation of the base's slope at the start."""
     start_offset_z_sd_mm: NonNegative | None = None
-    """Standard deviation of the base clamp's position along z at the start. Not set: that along y with
-    `setup.axes = 2`, 0 in the plane."""
+    """Standard deviation of the base's position along z. Not set: as along y in space, 0 in the plane."""
     start_angle_z_sd_mrad: NonNegative | None = None
-    """Standard deviation of the base clamp's slope towards z at the start. Not set: that towards y with
-    `setup.axes = 2`, 0 in the plane."""
+    """Standard deviation of the base's slope dz/dx. Not set: as dy/dx in space, 0 in the plane."""
     start_axial_sd_mm: NonNegative = 1.0
-    """Standard deviation of the position of base and tip along the axis at the start, from errors of length, clamp
-    and skin; the error is at most half of the distance to the skin, to the guide, and of that left at full stroke."""
+    """Standard deviation of the axial position of base and tip at the start. The error is at most half of the
+    distance to the skin, to the guide, and to full stroke."""
     youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
-    """Largest deviation of the needle's Young's modulus, relative to the scenario's, drawn uniformly to either side."""
+    """Largest relative deviation of the needle's E, drawn uniformly."""
     initial_bend_mm: NonNegative = 0.5
-    """Lateral offset of the free needle's tip by its natural bend, which rolls with the bevel; its side is drawn."""
+    """Lateral offset of the free tip by the needle's natural bend, which rolls with the bevel; the side is
+    drawn."""
     run_out_mm: NonNegative = 0.2
-    """Lateral motion of the tip when the bevel rolls; its side is drawn."""
+    """Lateral motion of the tip in a half turn; the side is drawn."""
     direction_spread_deg: Annotated[float, Field(ge=0, le=90)] | None = None
-    """Largest angle of natural bend and run-out from the plane of the bevel, drawn uniformly to either side; 90: any
-    direction. Not set: 90 with `setup.axes = 2`, 0 in the plane."""
+    """Largest angle of bend and run-out from the plane of the bevel, drawn uniformly. Not set: 90 in space, 0
+    in the plane."""
     guide_clearance_mm: NonNegative = 0.05
-    """Clearance of the needle in the guide, to either side."""
+    """Clearance between needle and guide, to either side."""
     friction_mn_per_mm: NonNegative = 5.0
-    """Axial friction of the tissue on each mm of the inserted needle."""
+    """Axial friction per mm of inserted needle."""
     rotation_friction_mn: NonNegative | None = None
-    """Friction of the tissue against rotation: the largest couple (mN·mm) on each mm of the inserted needle. The tip's
-    roll lags behind that of the base, so that with it a half turn leaves the plane. Not set: with `setup.axes = 2` the
-    axial friction at the needle's outer radius, 0 in the plane."""
+    """Largest couple (mN·mm) against rotation per mm of inserted needle; the tip's roll lags behind the base.
+    Not set: in space the axial friction times the needle's radius, in the plane 0."""
     motor_resolution_mm: NonNegative = 0.01
-    """Resolution of the motors: base and guide are at multiples of it; 0: exact."""
+    """Resolution of base and guide motors; 0: exact."""
     delay_periods: NonNegative = 1.0
-    """Age of a reading on arrival, in control periods of a full step at insertion speed."""
+    """Age of a reading on arrival, in periods of a full step."""
     missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """Share of the tracker's readings without a tip position."""
+    """Share of readings without a tip position."""
     tracker_bias_mm: NonNegative = 0.0
-    """Constant error of the tracker, in the plane of the insertion with `setup.axes = 1`; its direction is drawn."""
+    """Constant error of the tracker; its direction is drawn."""
     contact_spacing_mm: Positive = 0.5
-    """Spacing of the phantom's contact points along the cut channel."""
+    """Spacing of contact points along the channel."""
     element_mm: Positive = 0.5
-    """Length of a needle element in the plant `exact`."""
+    """Length of a needle element of the plant `exact`."""
     step_mm: Positive = 0.25
-    """Largest travel in one step of the phantom's own simulation."""
+    """Largest travel per simulated step."""
     structure: Structure = Structure()
 
     @property

@@ -18,9 +18,9 @@ class HiddenLayer(Section):
     """Section `phantom.structure.hidden_layer`: a layer of another modulus that the scenario does not have."""
 
     top_mm: Annotated[NonNegative, Field(examples=[10.0])]
-    """Depth of the hidden layer's upper boundary."""
+    """Depth of the upper boundary."""
     thickness_mm: Annotated[Positive, Field(examples=[5.0])]
-    """Thickness of the hidden layer; it may cross layer boundaries."""
+    """Thickness; the layer may cross boundaries."""
     modulus_factor: Annotated[Positive, Field(examples=[2.0])]
     """Factor on the μ of the tissue that it replaces."""
 
@@ -29,15 +29,15 @@ class Structure(Section):
     """Section `phantom.structure`: differences of the phantom that no parameter of the model describes."""
 
     alpha: Alpha | None = None
-    """α of the phantom's Ogden law, in all layers. Not set: that of each layer."""
+    """α in all layers. Not set: each layer's value."""
     compression_length_factor: Positive = 1.0
-    """Factor on the compression length h of all layers."""
+    """Factor on h in all layers."""
     bevel_length_factor: Positive = 1.0
-    """Factor on the length ℓ_b of the bevel."""
+    """Factor on the bevel length ℓ_b."""
     guide_shift_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
-    """Shift of the guide along the insertion axis from its position in the scenario, positive towards the skin."""
+    """Axial shift of the guide, positive towards the skin."""
     hidden_layer: HiddenLayer | None = None
-    """A layer that the scenario does not have. Not set: there is none."""
+    """A further layer. Not set: none."""
 
 
 def structure_problems(needle: Needle, setup: Setup, structure: Structure) -> Iterator[Problem]:

@@ -48,7 +48,7 @@ def _choose(advice: str) -> Any:
 
 
 class OwnTerm(Section):
-    """One `[[own_terms]]`: a cost term of the user's own."""
+    """One `[[own_terms]]`: a custom cost term."""
 
     term: Annotated[
         str,

@@ -28,19 +28,19 @@ class Layer(Section):
     """Relative compression e, below 1, up to which the law is valid."""
 
     law: str
-    """Law of radial compression, by the name of its file."""
+    """`ogden`, `linear` (without `alpha`) or `module:NAME`."""
     name: Title = "tissue"
     """Name in tables and figures."""
     thickness_mm: Positive | None = None
-    """Thickness, required for every layer but the last, which has no lower end: a thickness given for it is ignored."""
+    """Thickness, required for every layer but the last, for which it is ignored."""
     shear_modulus_kpa: Positive
     """μ, shear modulus at small strain."""
     compression_length_mm: Positive
-    """h, length of tissue that a lateral displacement u of the needle compresses: stretch 1 − |u|/h."""
+    """h, length of tissue compressed by a lateral displacement u of the needle: stretch 1 − |u|/h."""
     engaged_width_mm: Positive
-    """w, width of the tissue that the needle displaces."""
+    """w, width of tissue displaced by the needle."""
     energy_weight: NonNegative = 1.0
-    """w_c, weight of this layer in the strain energy W."""
+    """w_c, weight of the layer in the strain energy."""
 
     @property
     def shear_modulus(self) -> float:
@@ -93,4 +93,4 @@ class Contact(Section):
     """Section `contact`: the contact points of the controller's model."""
 
     spacing_mm: Positive = 1.0
-    """Δ, spacing of the contact points along the depth."""
+    """Δ, spacing along the depth."""

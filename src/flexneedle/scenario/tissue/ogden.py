@@ -30,7 +30,7 @@ class Ogden(Layer):
     limit: ClassVar[float] = 0.7
 
     law: Literal["ogden"] = "ogden"
-    """Law of radial compression: `ogden`, `linear` (without `alpha`), or `module:NAME` of your own."""
+    """`ogden`, `linear` (without `alpha`) or `module:NAME`."""
     alpha: Annotated[Alpha, Field(examples=[8.74])]
     """α, exponent of the Ogden law."""
 
