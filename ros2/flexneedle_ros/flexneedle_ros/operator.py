@@ -1,8 +1,8 @@
 """Node `flexneedle_operator`: services `~/stop` and `~/arm` (std_srvs/srv/Trigger) of a flexneedle rig.
 
-The rig itself has topics, which are the same for every DDS vendor. A service call publishes on its topic and answers
-once the rig has reported after that, as it does at least once a second, a state that shows that it has been carried
-out, or that it has not within `answer_s`.
+The rig itself has topics, which are the same for every DDS vendor. A service call publishes on its topic. It succeeds
+when the rig, which reports its state at least once a second, then reports a state that shows the effect, and fails
+after `answer_s`.
 """
 
 import sys
@@ -10,10 +10,10 @@ import threading
 import time
 
 STOPPED = ("stopped", "fault")
-"""Not idle: that may have been reported before the stop, which an idle rig confirms by "stopped"."""
+"""Without idle, which may have been reported before the stop; an idle rig confirms a stop with "stopped"."""
 ARMED = ("armed",)
 UNDER_WAY = ("inserting", "holding")
-"""Of a rig that was idle, these show too that it was armed: "armed" lasts a moment, and the topic keeps one state."""
+"""States that also show the arming of an idle rig: "armed" is short, and the topic keeps one state."""
 REPEAT_S = 0.05
 
 DEFAULTS = {
@@ -25,7 +25,7 @@ DEFAULTS = {
 
 
 class States:
-    """The last reported state of the rig, and in which report each came last, for threads that wait for one."""
+    """Reported states of the rig, for threads that wait for one."""
 
     def __init__(self):
         self._changed = threading.Condition()
@@ -34,7 +34,7 @@ class States:
         self._newest = {}
 
     def report(self, state):
-        """Note a state that the rig reports."""
+        """Store a state that the rig reports."""
         with self._changed:
             self._state = state
             self._count += 1
@@ -52,9 +52,9 @@ class States:
         return self._count
 
     def wait(self, wanted, since, seconds):
-        """Whether a state among `wanted` is reported within some seconds, after the first `since` reports.
+        """Return whether a state among `wanted` follows the first `since` reports within `seconds`.
 
-        Also if another was reported after it.
+        Another state may have been reported after it.
         """
 
         def is_reported():
@@ -65,8 +65,9 @@ class States:
 
 
 def ask(publish, states, wanted, seconds, *, repeat):
-    """Publish, again and again if `repeat`, until the state is reported to be among `wanted`; return whether it is in
-    time. A report from before may be of a rig that has ended.
+    """Publish, repeatedly if `repeat`, until a state among `wanted` is reported; return whether it is in time.
+
+    Earlier reports do not count: their rig may have ended.
     """
     deadline, since = time.monotonic() + seconds, states.count
     publish()
@@ -79,7 +80,7 @@ def ask(publish, states, wanted, seconds, *, repeat):
 
 
 def answer(done, states, seconds):
-    """The text of an answer."""
+    """Return the text of an answer."""
     state = f"the rig reports {states.last!r}" if states.last else "the rig has not reported a state"
     return state if done else f"not done within {seconds:g} s: {state}"
 
@@ -87,10 +88,10 @@ def answer(done, states, seconds):
 def carry_out(publish, states, wanted, seconds, *, repeat, missing):
     """Carry out a service; return whether it is done, and the text of its answer.
 
-    missing: why no rig can report its state, or "".
+    missing: the reason why no rig can report its state, or "".
     """
     if missing:
-        if repeat:  # a rig that reports no state is stopped all the same
+        if repeat:  # stop a rig that reports no state, too
             publish()
         return False, missing
     shows = ARMED + UNDER_WAY if wanted is ARMED and states.last == "idle" else wanted

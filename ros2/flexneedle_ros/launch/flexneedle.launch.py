@@ -1,4 +1,4 @@
-"""The services to stop and arm a rig, and RViz: ros2 launch flexneedle_ros flexneedle.launch.py [rviz:=false]."""
+"""Services to stop and arm a rig, and RViz: ros2 launch flexneedle_ros flexneedle.launch.py [rviz:=false]."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ PACKAGE = "flexneedle_ros"
 
 
 def generate_launch_description():
-    """Return what is started."""
+    """Return the nodes: services and RViz."""
     config = Path(get_package_share_directory(PACKAGE)) / "config"
     operator = Node(
         package=PACKAGE,
