@@ -1,0 +1,526 @@
+"""Each kit fails on wrong parts, and each fault is found by the check of the rule that it breaks."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Controller, Decision, Motion, travel_left
+from flexneedle.errors import CommandError, DriverError
+from flexneedle.testing import (
+    ControllerConformance,
+    DriverConformance,
+    MotorsConformance,
+    PlantConformance,
+    TipTrackerConformance,
+    TrackerConformance,
+)
+from flexneedle.types import ROLL, VISIBLE, Frame, Measurement, SensorReading
+from rooms import ManualClock
+from stages import Stage
+
+
+class Unicycle:
+    """A plant: the tip cuts a circle, and base and guide move it."""
+
+    strain_energy, least_stretch, converged = 0.0, 1.0, True
+    metres, degrees, side, slips = 1.0, 1.0, 1.0, 0.0
+
+    def __init__(self, truth, roll):
+        self.truth, self.roll = truth, roll
+        self.at = np.array([truth.scenario.setup.start_tip_x, 0.0, 0.0, 0.0, 0.0])
+
+    @property
+    def tip(self):
+        return self.at.copy()
+
+    def step(self, row):
+        move = Control.of(row)
+        self.roll += self.degrees * move.roll
+        slope = self.at[3] + 1e-3 * self.side * math.cos(self.roll) * move.db_x
+        way = self.metres * move.db_x + self.slips
+        self.at = np.array(
+            [self.at[0] + way * math.cos(slope), self.at[1] + way * math.sin(slope), 0.0, slope, 0.0]
+        )
+
+
+class ChangesItsRow(Unicycle):
+    def step(self, row):
+        super().step(row)
+        row[:] = 0.0
+
+
+class SharesItsState(Unicycle):
+    shared = None
+
+    def __init__(self, truth, roll):
+        super().__init__(truth, roll)
+        SharesItsState.shared = self.at
+
+    @property
+    def tip(self):
+        return SharesItsState.shared.copy()
+
+    def step(self, row):
+        super().step(row)
+        SharesItsState.shared = self.at
+
+
+class MovesWhenRead(Unicycle):
+    @property
+    def tip(self):
+        self.at = self.at + 1e-3
+        return self.at.copy()
+
+
+class HandsOutItsState(Unicycle):
+    @property
+    def tip(self):
+        return self.at
+
+
+def with_values(part, **values):
+    return type(f"{part.__name__}With{'And'.join(values)}", (part,), values)
+
+
+def of_plant(plant):
+    return type("Kit", (PlantConformance,), {"make": lambda _, truth, roll: plant(truth, roll)})
+
+
+class Axes:
+    """A driver, and its clock."""
+
+    limit, unit, first, stops = 1.0, 1.0, 0.0, 0.0
+
+    def __init__(self):
+        self.time = 10.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def stop(self):
+        self.time += self.stops
+
+    def apply(self, command, duration):
+        if abs(command.db_x) > self.limit:
+            raise CommandError("db_x", command.db_x, self.limit, f"must be at most {self.limit} mm")
+        begun = self.time
+        self.time += abs(command.roll) + self.first + duration
+        turned = begun + abs(command.roll) + self.first if command.roll or self.first else None
+        return self.report(Motion(command, begun, self.time, turned))
+
+    def report(self, motion):
+        return motion
+
+
+def reporting(change):
+    return type("Reporting", (Axes,), {"report": lambda _, motion: change(motion)})
+
+
+def of_driver(driver):
+    def make(_):
+        made = driver()
+        return made, made
+
+    return type("Kit", (DriverConformance,), {"make": make})
+
+
+class Camera:
+    """A tracker of the tip: 20 images a second, with 0.01 mm noise."""
+
+    status, unit, lag, rate, order, late = VISIBLE, 1.0, 0.0, 20.0, 1, 0
+
+    def __init__(self, scenario, phantom, rng):
+        del scenario
+        self.phantom, self.rng, self.next = phantom, rng, 0
+
+    def read(self):
+        due = math.floor(self.phantom.now() * self.rate + 1e-6) + 1 - self.late
+        taken, self.next = range(self.next, due), due
+        return tuple(map(self.image, taken))[:: self.order]
+
+    def image(self, number):
+        time = number / self.rate
+        x, y = (self.unit * value + self.rng.normal(0.0, 0.01) for value in self.phantom.tip_at(time)[:2])
+        return Measurement(time + self.lag, x, y)
+
+
+class Repeats(Camera):
+    def read(self):
+        return (*super().read(), self.image(self.next - 1))
+
+
+class Waits(Camera):
+    def read(self):
+        self.phantom.wait(0.05)
+        return super().read()
+
+
+class DrawsFromTheGlobalGenerator(Camera):
+    def image(self, number):
+        one = super().image(number)
+        return replace(one, y=one.y + 0.01 * np.random.normal())  # noqa: NPY002
+
+
+def of_camera(camera):
+    def make(_, scenario, phantom, rng):
+        return camera(scenario, phantom, rng)
+
+    return type("Kit", (TipTrackerConformance,), {"make": make})
+
+
+class Device:
+    """A tracker device: 40 frames a second."""
+
+    status, number, ahead, sensor, position, length = VISIBLE, 1, 0.0, "tip", (1.0, 2.0, 3.0), 1.0
+    reason, takes = "", 0.0
+
+    def __init__(self, clock):
+        self.clock, self.start, self.next = clock, clock.now(), 0
+
+    def read(self):
+        self.clock.wait(self.takes)
+        due = int((self.clock.now() - self.start) * 40.0 + 1e-6) + 1
+        taken, self.next = range(self.next, due), due
+        return tuple(map(self.frame, taken))
+
+    def frame(self, number):
+        status = VISIBLE if self.position else self.reason
+        tip = SensorReading(self.position, (self.length, 0.0, 0.0, 0.0), status=status)
+        return Frame(self.start + number / 40.0 + self.ahead, self.number * number, {self.sensor: tip})
+
+    def close(self):
+        pass
+
+
+class ChangesItsFrames(Device):
+    readings = {}  # noqa: RUF012  this is the fault
+
+    def frame(self, number):
+        tip = SensorReading((float(number), 0.0, 0.0))
+        self.readings["tip"] = tip
+        return Frame(self.start + number / 40.0, number, self.readings)
+
+
+class HidesItsFailure(Device):
+    def read(self):
+        return () if getattr(self, "lost", False) else super().read()
+
+
+def of_device(device):
+    def disconnect(_, made):
+        made.lost = True
+        if device is not HidesItsFailure:
+            made.status = "no connection"
+
+    parts = {"make": lambda _, clock: device(clock), "make_clock": lambda _: ManualClock()}
+    return type("Kit", (TrackerConformance,), parts | {"disconnect": disconnect})
+
+
+class Motors(Stage):
+    """Motors that refuse what they do not know."""
+
+    def follow(self, positions):
+        for channel, position in positions.items():
+            if channel not in self.motors or not math.isfinite(position):
+                raise DriverError(f"{channel} = {position}: must be a position of {', '.join(self.motors)}")
+        super().follow(positions)
+
+    def set_speed(self, channel, speed, acceleration):
+        if channel not in self.motors:
+            raise DriverError(f"{channel}: no such channel")
+        super().set_speed(channel, speed, acceleration)
+
+
+class WaitsForTheEnd(Motors):
+    def follow(self, positions):
+        super().follow(positions)
+        while any(state.moving for state in self.read().values()):
+            self.clock.wait(0.01)
+
+
+class RepliesLate(Motors):
+    def read(self):
+        self.clock.wait(0.5)
+        return super().read()
+
+
+class IgnoresFurtherPositions(Motors):
+    def follow(self, positions):
+        if not any(call[0] == "follow" for call in self.calls):
+            super().follow(positions)
+
+
+class MovesWithoutPower(Motors):
+    def follow(self, positions):
+        super().follow(positions)
+        for channel, position in positions.items():
+            self.motors[channel].position = position
+
+
+class MovesToReconnect(Motors):
+    def reconnect(self):
+        self.motors["A"].position = 50.0
+
+
+class ClosesOnce(Motors):
+    closed = False
+
+    def close(self):
+        assert not self.closed
+        self.closed = True
+
+
+class MovesWhenOpened(Motors):
+    def __init__(self, clock):
+        super().__init__(clock)
+        self.motors["A"].target = 50.0
+
+
+class DoesNotStop(Motors):
+    deaf = True
+
+    def __init__(self, clock):
+        super().__init__(clock)
+        self.deaf = True
+
+
+class IgnoresTheSpeed(Motors):
+    def set_speed(self, channel, speed, acceleration):
+        super().set_speed(channel, 3.0 * speed, acceleration)
+
+
+class MovesToDefine(Motors):
+    def define(self, channel, position):
+        self._called("define", channel, position)
+        self.motors[channel].target = position
+
+
+class FailsByKeyError(Motors):
+    def follow(self, positions):
+        self._called("follow")
+        for channel, position in positions.items():
+            self.motors[channel].target = position
+
+
+class ReadsOneChannel(Motors):
+    def read(self):
+        return {"A": super().read()["A"]}
+
+
+class ReadsTuples(Motors):
+    def read(self):
+        return {name: (state.position, state.moving) for name, state in super().read().items()}
+
+
+class LeapsWhenSwitchedOn(Motors):
+    def power(self, channel, on):
+        super().power(channel, on)
+        self.motors[channel].target = self.motors[channel].position = 100.0 * on
+
+
+class FailsAsOSError(Motors):
+    def _called(self, *call):
+        if self.lost:
+            raise OSError("no such device")
+        super()._called(*call)
+
+
+class AddsToThePosition(Motors):
+    def follow(self, positions):
+        super().follow({name: self.motors[name].position + way for name, way in positions.items()})
+
+
+def of_motors(motors):
+    class Kit(MotorsConformance):
+        channels = ("A", "B", "C")
+
+        def make(self):
+            self.clock = ManualClock()
+            return motors(self.clock)
+
+        def now(self):
+            return self.clock.now()
+
+        def wait(self, seconds):
+            self.clock.wait(seconds)
+
+        def disconnect(self, made):
+            made.lost = True
+
+    return Kit
+
+
+def straight(task, memory, estimate, rng):
+    """Follow the plan: its flips, and a full step."""
+    del rng
+    plan, left = task.plan, travel_left(task.scenario, task.plan, estimate.state)
+    due = np.sum(plan.tips[:-1, 0][plan.controls[:, ROLL] != 0.0] <= estimate.tip[0])
+    command = Control(db_x=min(left, task.scenario.setup.max_advance_mm), flip=bool(due > memory))
+    return Decision(command, "straight"), memory + command.rolls
+
+
+@dataclass
+class Hidden:
+    """State outside the memory."""
+
+    calls: int = 0
+
+
+def changes_the_plan(task, memory, estimate, rng):
+    task.plan.tips.flags.writeable = True
+    task.plan.tips[-1] = 0.0
+    return straight(task, memory, estimate, rng)
+
+
+def exceeds_its_step(task, memory, estimate, rng):
+    decision, after = straight(task, memory, estimate, rng)
+    return replace(
+        decision, command=decision.command._replace(db_x=2.0 * task.scenario.setup.max_advance_mm)
+    ), after
+
+
+def draws_globally(task, memory, estimate, rng):
+    decision, after = straight(task, memory, estimate, rng)
+    advance = decision.command.db_x * np.random.uniform(0.5, 1.0)  # noqa: NPY002
+    return replace(decision, command=decision.command._replace(db_x=advance)), after
+
+
+HIDDEN = Hidden()
+
+
+def keeps_state(task, memory, estimate, rng):
+    HIDDEN.calls += 1
+    decision, after = straight(task, memory, estimate, rng)
+    return replace(decision, why=f"call {HIDDEN.calls}"), after
+
+
+def does_not_advance(task, memory, estimate, rng):
+    del task, estimate, rng
+    return Decision(Control(), "wait"), memory
+
+
+def appends_to_its_memory(task, memory, estimate, rng):
+    memory.append(0)
+    decision, _ = straight(task, 0, estimate, rng)
+    return decision, memory
+
+
+def is_silent(task, memory, estimate, rng):
+    decision, after = straight(task, memory, estimate, rng)
+    return replace(decision, why=""), after
+
+
+def of_controller(decide=straight, **options):
+    made = Controller("mutant", "a fault", **{"begin": lambda _: 0, "decide": decide, **options})
+    return type("Kit", (ControllerConformance,), {"make": lambda _: made, "error_mm": 3.0})
+
+
+SOUND = {
+    "plant": of_plant(Unicycle),
+    "driver": of_driver(Axes),
+    "tip tracker": of_camera(Camera),
+    "tracker": of_device(Device),
+    "motors": of_motors(Motors),
+    "controller": of_controller(),
+}
+MUTANTS = [
+    (of_plant(with_values(Unicycle, metres=1e-3)), "test_base_moves_the_tip_in_millimetres"),
+    (of_plant(with_values(Unicycle, degrees=180 / math.pi)), "test_roll_turns_the_bevel_in_radians"),
+    (of_plant(with_values(Unicycle, side=-1.0)), "test_path_bends_towards_the_bevel"),
+    (of_plant(with_values(Unicycle, slips=0.01)), "test_still_command_moves_nothing"),
+    (of_plant(with_values(Unicycle, strain_energy=math.nan)), "test_energy_and_stretch_are_physical"),
+    (of_plant(with_values(Unicycle, nodes=np.zeros((3, 3)))), "test_nodes_end_at_the_tip"),
+    (of_plant(with_values(Unicycle, tip=np.zeros(3))), "test_tip_is_a_pose"),
+    (of_plant(lambda truth, _: Unicycle(truth, 0.0)), "test_starts_where_the_scenario_does"),
+    (of_plant(lambda *_: object()), "test_has_the_parts_of_the_port"),
+    (of_plant(ChangesItsRow), "test_command_and_truth_are_not_changed"),
+    (of_plant(SharesItsState), "test_plants_are_independent"),
+    (of_plant(MovesWhenRead), "test_reading_changes_nothing"),
+    (of_plant(HandsOutItsState), "test_reading_changes_nothing"),
+    (of_driver(reporting(lambda motion: motion.control)), "test_motion_has_control_and_times"),
+    (of_driver(reporting(lambda m: m._replace(control=Control(1e-3)))), "test_motion_has_control_and_times"),
+    (of_driver(reporting(lambda m: m._replace(begun=0.0))), "test_motion_has_control_and_times"),
+    (of_driver(reporting(lambda m: m._replace(ended=m.ended + 1.0))), "test_motion_has_control_and_times"),
+    (of_driver(reporting(lambda m: m._replace(begun=m.begun - 0.1))), "test_motions_follow_each_other"),
+    (of_driver(reporting(lambda m: m._replace(turned=None))), "test_roll_precedes_the_travel"),
+    (of_driver(with_values(Axes, first=0.1)), "test_roll_precedes_the_travel"),
+    (of_driver(reporting(lambda m: m._replace(begun=m.ended))), "test_travel_takes_its_duration"),
+    (of_driver(with_values(Axes, limit=math.inf)), "test_command_beyond_a_limit_is_refused"),
+    (of_driver(with_values(Axes, stops=1.0)), "test_stop_at_rest_does_nothing"),
+    (of_camera(with_values(Camera, unit=0.1)), "test_positions_are_the_tip_at_their_times"),
+    (of_camera(with_values(Camera, lag=1.0)), "test_times_increase_and_are_past"),
+    (of_camera(with_values(Camera, order=-1)), "test_times_increase_and_are_past"),
+    (of_camera(with_values(Camera, rate=0.5)), "test_readings_arrive_before_they_are_stale"),
+    (of_camera(with_values(Camera, late=1)), "test_tip_is_measured_before_the_needle_moves"),
+    (of_camera(with_values(Camera, image=lambda *_: (0.0, 1.0))), "test_read_returns_measurements"),
+    (of_camera(with_values(Camera, status=None)), "test_has_the_parts_of_the_port"),
+    (of_camera(Repeats), "test_each_reading_is_returned_once"),
+    (of_camera(Waits), "test_read_neither_waits_nor_moves"),
+    (of_camera(DrawsFromTheGlobalGenerator), "test_same_seed_same_readings"),
+    (of_device(with_values(Device, length=2.0)), "test_frames_are_of_their_type"),
+    (of_device(with_values(Device, ahead=1.0)), "test_frames_are_in_their_order"),
+    (of_device(with_values(Device, number=0)), "test_frames_are_in_their_order"),
+    (of_device(with_values(Device, sensor="needle")), "test_needle_sensor_has_positions"),
+    (of_device(with_values(Device, position=None)), "test_needle_sensor_has_positions"),
+    (of_device(with_values(Device, status="starting")), "test_frames_arrive_at_their_rate"),
+    (of_device(with_values(Device, status=None)), "test_has_the_parts_of_the_port"),
+    (of_device(with_values(Device, takes=0.5)), "test_read_does_not_wait"),
+    (of_device(ChangesItsFrames), "test_frames_do_not_change"),
+    (of_device(HidesItsFailure), "test_failure_is_reported"),
+    (of_motors(WaitsForTheEnd), "test_follow_does_not_wait_for_the_end"),
+    (of_motors(RepliesLate), "test_calls_reply_in_time"),
+    (of_motors(IgnoresFurtherPositions), "test_follow_replaces_the_position_before"),
+    (of_motors(MovesWithoutPower), "test_motor_that_is_off_does_not_move"),
+    (of_motors(MovesToReconnect), "test_reconnect_moves_nothing"),
+    (of_motors(ClosesOnce), "test_close_can_be_repeated"),
+    (of_motors(MovesWhenOpened), "test_opening_and_reading_move_nothing"),
+    (of_motors(DoesNotStop), "test_stop_ends_a_motion"),
+    (of_motors(IgnoresTheSpeed), "test_speed_is_limited"),
+    (of_motors(MovesToDefine), "test_define_renames_the_position"),
+    (of_motors(FailsByKeyError), "test_invalid_commands_are_driver_errors"),
+    (of_motors(ReadsOneChannel), "test_read_returns_the_state_of_each_channel"),
+    (of_motors(ReadsTuples), "test_read_returns_the_state_of_each_channel"),
+    (of_motors(LeapsWhenSwitchedOn), "test_power_holds_the_motor_where_it_is"),
+    (of_motors(FailsAsOSError), "test_failures_are_driver_errors"),
+    (of_motors(AddsToThePosition), "test_follow_moves_to_a_position_and_stops_there"),
+    (of_motors(with_values(Motors, identity=3)), "test_has_the_parts_of_the_port"),
+    (of_controller(changes_the_plan), "test_plan_is_not_changed"),
+    (of_controller(exceeds_its_step), "test_commands_keep_the_limits"),
+    (of_controller(draws_globally), "test_same_seed_same_decisions"),
+    (of_controller(keeps_state), "test_decision_follows_from_its_arguments"),
+    (of_controller(appends_to_its_memory, begin=lambda _: []), "test_decision_follows_from_its_arguments"),
+    (of_controller(does_not_advance), "test_ends_at_the_target"),
+    (of_controller(arrived=lambda *_: True), "test_ends_at_the_target"),
+    (of_controller(is_silent), "test_decides_with_a_reason"),
+    (of_controller(predicts=True), "test_predictions_are_numbers"),
+    (type("Kit", (ControllerConformance,), {"make": lambda _: straight}), "test_is_a_controller"),
+]
+
+
+def checks_of(kit):
+    return [name for name in dir(kit) if name.startswith("test_")]
+
+
+@pytest.mark.parametrize("port", SOUND)
+def test_a_sound_part_passes(port):
+    kit = SOUND[port]
+    for name in checks_of(kit):
+        getattr(kit(), name)()
+
+
+@pytest.mark.parametrize(
+    ("kit", "check"), MUTANTS, ids=[f"{n}-{check}" for n, (_, check) in enumerate(MUTANTS)]
+)
+def test_a_fault_is_found_by_the_check_of_its_rule(kit, check):
+    with pytest.raises(AssertionError):
+        getattr(kit(), check)()
+
+
+def test_every_check_finds_a_fault():
+    found = {check for _, check in MUTANTS}
+    assert {name for kit in SOUND.values() for name in checks_of(kit)} == found
