@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fault_list import RESTED, Fault
-from flexneedle.lab.emulators.emulated_rig.truth import Truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.types import DB_X, DG_Y, Floats
 from rig_trials import moved_between, rests
@@ -53,7 +53,7 @@ class Evidence:
     axis: str
     ordered: float
     injected: float
-    truth: Truth
+    truth: TruthRecord
     run: Mapping[str, Any]
     errors: str
     left: int = 0

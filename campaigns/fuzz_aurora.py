@@ -260,7 +260,7 @@ MODES = {"off", "setup", "tracking"}
 def emulator_inputs(random: Random) -> Iterator[str]:
     """Send one command after another to trackers that last for some hundred each."""
     while True:
-        device = aurora.fresh(random.randint(0, 4), has_bx=random.random() < 0.8)
+        device = aurora.power_on(random.randint(0, 4), has_bx=random.random() < 0.8)
         for _ in range(random.randint(1, 600)):
             device = checked_command(device, random_command(random), random_frame(random))
             yield ""

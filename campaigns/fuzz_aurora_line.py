@@ -21,8 +21,8 @@ from time import monotonic
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators import aurora, codec
-from flexneedle.lab.emulators.motion import RATE_HZ, SENSORS, pose
-from flexneedle.lab.emulators.server import Serial
+from flexneedle.lab.emulators.motion import RATE_HZ, SENSORS, sensor_pose
+from flexneedle.lab.emulators.server import SerialPort
 from flexneedle.lab.rig.devices.aurora import tracker
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.types import VISIBLE, Frame
@@ -110,11 +110,11 @@ def _recomputed(random: Random, true: bytes) -> bytes:
             (b"\xff" * 4, b"\0" * 4, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", random.randbytes(4))
         )
         body[at : at + 4] = new
-    return codec.binary(bytes(body))
+    return codec.encode_binary(bytes(body))
 
 
 def _nonsense(random: Random, _true: bytes) -> bytes:
-    return codec.binary(random.randbytes(random.choice((0, 1, 3, 40, 200, 2000, 60000))))
+    return codec.encode_binary(random.randbytes(random.choice((0, 1, 3, 40, 200, 2000, 60000))))
 
 
 def _huge(random: Random, true: bytes) -> bytes:
@@ -125,7 +125,7 @@ def _huge(random: Random, true: bytes) -> bytes:
 
 
 def _error(random: Random, _true: bytes) -> bytes:
-    return codec.text(f"ERROR{random.randrange(256):02X}")
+    return codec.encode_text(f"ERROR{random.randrange(256):02X}")
 
 
 DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
@@ -156,7 +156,7 @@ class Line:
     """An emulated tracker on a pseudo-terminal, served by a thread, whose replies are damaged."""
 
     def __init__(self, folder: Path) -> None:
-        self.serial, self.sent, self.lock = Serial(folder / "aurora"), Sent(), Lock()
+        self.serial, self.sent, self.lock = SerialPort(folder / "aurora"), Sent(), Lock()
         self.damage: Damage | None = None
         self.delay, self.due = 0.0, list[tuple[float, bytes, bool]]()
         self.plugged, self.end = True, Event()
@@ -166,7 +166,7 @@ class Line:
 
     def power(self, has_bx: bool) -> None:
         """Switch the tracker off and on; frames are counted from then on."""
-        self.device, self.powered = aurora.fresh(has_bx=has_bx), monotonic()
+        self.device, self.powered = aurora.power_on(has_bx=has_bx), monotonic()
 
     def serve(self) -> None:
         """Answer until the end."""
@@ -185,12 +185,12 @@ class Line:
                     heard = monotonic()
                 elif monotonic() - heard > RESET_AFTER_S and self.damage is None:
                     self.device, heard = aurora.reply(self.device, b"RESET ", self._frame())[0], monotonic()
-                    self.serial.write(codec.text("RESET"))
+                    self.serial.write(codec.encode_text("RESET"))
 
     def _frame(self) -> aurora.EmulatedFrame:
         number = int((monotonic() - self.powered) * RATE_HZ)
         seed = int(self.powered * 1000) % 2**31  # other values after each start
-        return aurora.EmulatedFrame(number, {name: pose(name, number, seed) for name in SENSORS})
+        return aurora.EmulatedFrame(number, {name: sensor_pose(name, number, seed) for name in SENSORS})
 
     def _answer(self, line: bytes) -> None:
         self.device, true = aurora.reply(self.device, line, self._frame())

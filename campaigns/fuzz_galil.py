@@ -24,8 +24,8 @@ from random import Random
 from time import monotonic
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.emulators.galil.axis import Axis
-from flexneedle.lab.emulators.galil.controller import Device, advanced, reply
+from flexneedle.lab.emulators.galil.controller import ControllerState, advance_controller, reply
+from flexneedle.lab.emulators.galil.motor_axis import MotorAxis
 from flexneedle.lab.rig.devices.galil.motors import GalilMotors, factory
 from flexneedle.lab.rig.devices.galil.replies import GarbledError, numbers, parse, text
 from flexneedle.lab.rig.devices.galil.states import report
@@ -87,7 +87,7 @@ VALID_CODES = {0, 1, 2, 3, 4, 7, 8}
 def controller_inputs(random: Random) -> Iterator[str]:
     """Send one line after another to controllers that last for some hundred lines each."""
     while True:
-        device = Device()
+        device = ControllerState()
         for _ in range(random.randint(1, 300)):
             line = random_line(random)
             device = checked_line(device, line, random.randint(0, 8))
@@ -114,12 +114,15 @@ def random_command(random: Random) -> str:
 
 
 def checked_line(
-    device: Device, line: str, samples: int, answered: Callable[[Device, str], tuple[Device, str]] = reply
-) -> Device:
+    device: ControllerState,
+    line: str,
+    samples: int,
+    answered: Callable[[ControllerState, str], tuple[ControllerState, str]] = reply,
+) -> ControllerState:
     """Return the controller after a line and some samples. answered: the controller. Raises Failure."""
     try:
         after, answer = answered(device, line)
-        later = advanced(after, samples)
+        later = advance_controller(after, samples)
     except Exception as error:
         raise Failure(f"{line!r} on {device}: {error!r}") from error
     if answer.count(":") + answer.count("?") != line[:80].count(";") + 1:
@@ -134,7 +137,7 @@ def checked_line(
     return later
 
 
-def check_axis(axis: Axis, line: str) -> None:
+def check_axis(axis: MotorAxis, line: str) -> None:
     """Raise Failure if an axis is in a state that cannot be."""
     profile = axis.profile
     good = (
@@ -157,7 +160,7 @@ class Server:
     """A controller that answers as `damage` has it, from the line on at which it is set."""
 
     port: int
-    device: Device = field(default_factory=Device)
+    device: ControllerState = field(default_factory=ControllerState)
     damage: Callable[[bytes], bytes | None] | None = None
     sent: bytes = b""
     lines: list[str] = field(default_factory=list)
@@ -165,7 +168,7 @@ class Server:
     def answer(self, line: str) -> bytes | None:
         """Return what to send; None: nothing, b"": the connection is closed."""
         self.lines.append(line)
-        self.device, true = reply(advanced(self.device, 2), line)
+        self.device, true = reply(advance_controller(self.device, 2), line)
         complete = true.encode()
         found = complete if self.damage is None else self.damage(complete)
         self.sent = found or b""

@@ -40,7 +40,7 @@ import numpy as np
 import psutil
 
 import flexneedle
-from flexneedle.lab.emulators.emulated_rig.truth import Truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
 from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_between, rests, shipped_rig, witness
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -187,7 +187,7 @@ def _killed(pid: int) -> float:
     return now
 
 
-def _judged(truth: Truth, sent: float, run: Row) -> Row:
+def _judged(truth: TruthRecord, sent: float, run: Row) -> Row:
     """Speed of the base (mm/s) at an order; times (ms) from it to the report of the stop and to the end of all motion;
     how far the base moved (mm) after the order and after the report.
     """

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import psutil
 
-from flexneedle.lab.emulators.emulated_rig.truth import Truth, read_truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord, read_truth
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.types import Insertion
 
@@ -88,7 +88,7 @@ class EmulatedRig:
             self.lines.wait(0.1)
         raise RuntimeError(f"no motion: {ended(process, 0.0)}")
 
-    def read_truth(self) -> Truth:
+    def read_truth(self) -> TruthRecord:
         """The true states so far."""
         return read_truth(self.truth)
 
@@ -339,14 +339,16 @@ def watch() -> None:
         before = now
 
 
-def moved_between(truth: Truth, since: float, until: float = math.inf, axis: str = "insertion") -> float:
+def moved_between(
+    truth: TruthRecord, since: float, until: float = math.inf, axis: str = "insertion"
+) -> float:
     """How far an axis has moved (mm, rad) from where it was at a time (s, monotonic) until another."""
     places = truth.positions[axis]
     after = places[(truth.time >= since) & (truth.time <= until)]
     return float(np.abs(after - np.interp(since, truth.time, places)).max()) if len(after) else 0.0
 
 
-def rests(truth: Truth, seconds: float = 0.5, most: float = 0.005) -> bool:
+def rests(truth: TruthRecord, seconds: float = 0.5, most: float = 0.005) -> bool:
     """Whether no axis has moved by `most` (mm, rad) in the last `seconds`."""
     last = truth.time >= truth.time[-1] - seconds
     return all(np.ptp(place[last]) < most for place in truth.positions.values())

@@ -10,7 +10,7 @@ from time import monotonic
 
 import numpy as np
 
-from flexneedle.lab.emulators.motion import pose
+from flexneedle.lab.emulators.motion import sensor_pose
 
 DEADLINE_S = 20.0
 
@@ -70,7 +70,7 @@ def assert_true_and_new(frames, seed=0):
     for frame in frames:
         for name, reading in frame.readings.items():
             if reading.position is not None:
-                true = pose(name, frame.number, seed)
+                true = sensor_pose(name, frame.number, seed)
                 np.testing.assert_allclose(reading.position, true.position, atol=1e-4)
                 np.testing.assert_allclose(reading.orientation, true.orientation, atol=1e-6)
                 np.testing.assert_allclose(reading.indicator, true.indicator, atol=1e-6)

@@ -5,7 +5,7 @@ import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from flexneedle.lab.emulators.galil.controller import Device, advanced, reply
+from flexneedle.lab.emulators.galil.controller import ControllerState, advance_controller, reply
 
 CLOSE = object()
 """In place of a reply: the connection is closed."""
@@ -16,14 +16,14 @@ class Peer:
     """Answers lines; `damage` makes what is sent of a line and its true reply, None for nothing."""
 
     port: int
-    device: Device = field(default_factory=Device)
+    device: ControllerState = field(default_factory=ControllerState)
     damage: object = None
     lines: list = field(default_factory=list)
 
     def answer(self, line):
         """What is sent in reply to a line."""
         self.lines.append(line)
-        self.device, true = reply(advanced(self.device, 5), line)
+        self.device, true = reply(advance_controller(self.device, 5), line)
         return true.encode() if self.damage is None else self.damage(line, true.encode())
 
 
@@ -31,7 +31,7 @@ class Peer:
 def peer(device=None):
     """Give a controller that listens at `port` of 127.0.0.1; one connection after another."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
-        found = Peer(listening.getsockname()[1], device or Device())
+        found = Peer(listening.getsockname()[1], device or ControllerState())
         thread = threading.Thread(target=_serve, args=(listening, found), daemon=True)
         thread.start()
         yield found

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexneedle.lab.emulators.emulated_rig.truth import Truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
 from flexneedle.lab.rig.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 
@@ -52,7 +52,7 @@ def evidence(name, *states, outcome="done", reason=None, moves=(), left=0, axis=
     recorded = [{"time_s": at, "state": state, "why": why} for at, state, why in states]
     reason = REASONS.get(name, "") if reason is None else reason
     run = {"status": outcome, "reason": reason, "timing": {"ticks": {"states": recorded}}}
-    truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
+    truth = TruthRecord(time, {}, positions, *[np.zeros(len(time))] * 5)
     return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left, commands)
 
 

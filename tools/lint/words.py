@@ -33,6 +33,8 @@ CHECKED = (
     "src/flexneedle/errors.py",
     "src/flexneedle/files.py",
     "src/flexneedle/interrupts.py",
+    "src/flexneedle/lab/emulators",
+    "src/flexneedle/lab/process.py",
 )
 # Construction, pattern (a space matches any white space), what to write.
 SENTENCES = (

@@ -19,26 +19,26 @@ def test_checksums_are_those_that_ndicapi_sends(command, checksum):
 
 @pytest.mark.parametrize(("reply", "line"), [("OKAY", b"OKAYA896\r"), ("RESET", b"RESETBE6F\r")])
 def test_replies_are_those_expected_by_ndicapi(reply, line):
-    assert codec.text(reply) == line
+    assert codec.encode_text(reply) == line
 
 
 def test_a_command_has_a_checksum_after_a_colon_and_none_after_a_space():
-    assert codec.parse(b"INIT:E3A5") == codec.Request("INIT", "")
-    assert codec.parse(b"PENA 0AD") == codec.Request("PENA", "0AD")
-    assert codec.parse(b"BEEP") == codec.Request("BEEP", "")
+    assert codec.parse_command(b"INIT:E3A5") == codec.AuroraCommand("INIT", "")
+    assert codec.parse_command(b"PENA 0AD") == codec.AuroraCommand("PENA", "0AD")
+    assert codec.parse_command(b"BEEP") == codec.AuroraCommand("BEEP", "")
 
 
 @pytest.mark.parametrize("line", [b"INIT:E3A6", b"INIT:", b"INIT:E3", b"INITX:E3A5"])
 def test_a_wrong_checksum_is_detected(line):
-    assert not codec.parse(line).intact
+    assert not codec.parse_command(line).intact
 
 
 def test_bytes_outside_ascii_are_no_command_and_no_failure():
-    assert codec.parse(b"\xff\xfe\x00").name not in ("INIT", "BX")
+    assert codec.parse_command(b"\xff\xfe\x00").name not in ("INIT", "BX")
 
 
 def test_a_binary_reply_has_two_checksums_lowest_byte_first():
-    reply = codec.binary(b"abc")
+    reply = codec.encode_binary(b"abc")
     start, length, of_header = struct.unpack("<HHH", reply[:6])
     assert (start, length) == (0xA5C4, 3)
     assert of_header == codec.crc16(reply[:4])
@@ -47,25 +47,25 @@ def test_a_binary_reply_has_two_checksums_lowest_byte_first():
 
 def test_a_checksum_over_all_of_a_binary_reply_is_the_same():
     """ndicapi computes the checksum of header and body together: that of a header with its checksum is 0."""
-    reply = codec.binary(b"abc")
+    reply = codec.encode_binary(b"abc")
     assert codec.crc16(reply[:-2]) == codec.crc16(b"abc")
 
 
 def test_a_pose_in_text_is_fixed_point_with_signs():
     pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
-    assert codec.transform_text(pose) == "+05000-05000+05000-05000+000150-002025-020000+00239"
+    assert codec.encode_pose_text(pose) == "+05000-05000+05000-05000+000150-002025-020000+00239"
 
 
 def test_a_pose_in_binary_is_eight_singles():
     pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
-    values = struct.unpack("<8f", codec.transform_binary(pose))
+    values = struct.unpack("<8f", codec.encode_pose_binary(pose))
     np.testing.assert_allclose(values, (0.5, -0.5, 0.5, -0.5, 1.5, -20.25, -200.0, 0.0239), rtol=1e-6)
 
 
 def test_a_value_too_large_for_the_format_is_not_a_number_or_infinite():
     far = EmulatedPose((1e39, -1e39, 100_000.0), (1.0, 0.0, 0.0, 0.0), 100.0)
-    assert codec.transform_text(far)[24:] == "    nan    nan    nan   nan"
+    assert codec.encode_pose_text(far)[24:] == "    nan    nan    nan   nan"
     near = EmulatedPose((9999.99, -9999.99, 0.0), (1.0, 0.0, 0.0, 0.0), 9.9999)
-    assert codec.transform_text(near)[24:] == "+999999-999999+000000+99999"
-    values = struct.unpack("<8f", codec.transform_binary(far))
+    assert codec.encode_pose_text(near)[24:] == "+999999-999999+000000+99999"
+    values = struct.unpack("<8f", codec.encode_pose_binary(far))
     assert values[4:7] == (np.inf, -np.inf, 100_000.0)

@@ -5,10 +5,10 @@ import struct
 import pytest
 
 from flexneedle.lab.emulators import aurora, codec
-from flexneedle.lab.emulators.aurora import EmulatedFrame, fresh
-from flexneedle.lab.emulators.motion import SENSORS, pose
+from flexneedle.lab.emulators.aurora import EmulatedFrame, power_on
+from flexneedle.lab.emulators.motion import SENSORS, sensor_pose
 
-FRAME = EmulatedFrame(7, {name: pose(name, 7, 0) for name in SENSORS})
+FRAME = EmulatedFrame(7, {name: sensor_pose(name, 7, 0) for name in SENSORS})
 
 
 def send(device, *commands, frame=FRAME):
@@ -24,18 +24,18 @@ def set_up(sensors=4, **settings):
     """Return a device in set-up with enabled sensors."""
     handles = [f"{0x0A + n:02X}" for n in range(sensors)]
     pinit, pena = [f"PINIT:{h}" for h in handles], [f"PENA:{h}D" for h in handles]
-    return send(fresh(sensors, **settings), "INIT:", *pinit, *pena)[0]
+    return send(power_on(sensors, **settings), "INIT:", *pinit, *pena)[0]
 
 
 def test_before_init_only_queries_are_valid():
-    assert send(fresh(), "PHSR:00")[1] == "ERROR10"
-    assert send(fresh(), "BX:0001")[1] == "ERROR10"
-    assert "Freeze Tag: AURORA Rev 008" in send(fresh(), "VER:0")[1]
-    assert send(fresh(), "INIT:")[1] == "OKAY"
+    assert send(power_on(), "PHSR:00")[1] == "ERROR10"
+    assert send(power_on(), "BX:0001")[1] == "ERROR10"
+    assert "Freeze Tag: AURORA Rev 008" in send(power_on(), "VER:0")[1]
+    assert send(power_on(), "INIT:")[1] == "OKAY"
 
 
 def test_sensors_are_found_initialised_and_enabled_in_this_order():
-    device, _ = send(fresh(2), "INIT:")
+    device, _ = send(power_on(2), "INIT:")
     assert send(device, "PHSR:02")[1] == "020A0010B001"
     device, _ = send(device, "PINIT:0A")
     assert send(device, "PHSR:02")[1] == "010B001"
@@ -81,11 +81,11 @@ def test_an_invalid_command_returns_its_error_code(command, error):
 
 
 def test_a_sensor_must_be_initialised_before_it_is_enabled():
-    assert send(fresh(), "INIT:", "PENA:0AD")[1] == "ERROR0E"
+    assert send(power_on(), "INIT:", "PENA:0AD")[1] == "ERROR0E"
 
 
 def test_a_command_with_a_wrong_checksum_is_rejected():
-    assert aurora.reply(fresh(), b"INIT:0000", FRAME)[1] == codec.text("ERROR04")
+    assert aurora.reply(power_on(), b"INIT:0000", FRAME)[1] == codec.encode_text("ERROR04")
 
 
 def test_set_up_commands_are_invalid_while_tracking_until_init():
@@ -103,7 +103,7 @@ def test_old_firmware_does_not_support_bx():
 
 def test_a_reading_in_text_has_pose_status_and_frame_number():
     _, reply = send(set_up(1), "TSTART:", "TX:0001")
-    assert reply == f"010A{codec.transform_text(FRAME.poses['tip'])}0000003100000007\n0000"
+    assert reply == f"010A{codec.encode_pose_text(FRAME.poses['tip'])}0000003100000007\n0000"
 
 
 def faulty(fault, command):
@@ -145,8 +145,8 @@ def test_the_system_status_is_at_the_end_of_a_reading(read):
 
 
 def test_an_echo_is_ascii():
-    assert send(fresh(), "ECHO:Aurora 1")[1] == "Aurora 1"
-    assert send(fresh(), "ECHO:\u00e9")[1] == "ERROR23"
+    assert send(power_on(), "ECHO:Aurora 1")[1] == "Aurora 1"
+    assert send(power_on(), "ECHO:\u00e9")[1] == "ERROR23"
 
 
 def test_there_are_no_more_handles_than_two_digits_have():

@@ -7,9 +7,16 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import codec
-from flexneedle.lab.emulators.aurora import FAULTS, fresh
-from flexneedle.lab.emulators.faults import Fault, Schedule, active, is_order, parse_fault, parse_order
-from flexneedle.lab.emulators.motion import pose
+from flexneedle.lab.emulators.aurora import FAULTS, power_on
+from flexneedle.lab.emulators.faults import (
+    Fault,
+    FaultSchedule,
+    active_faults,
+    is_order,
+    parse_fault,
+    parse_order,
+)
+from flexneedle.lab.emulators.motion import sensor_pose
 from flexneedle.lab.emulators.server import EmulatorSession, execute
 from flexneedle.lab.rig.devices.aurora.readings import reading
 
@@ -47,7 +54,12 @@ def test_an_invalid_fault_is_rejected_in_one_line(spec, message):
 
 def test_a_fault_is_active_from_its_start_until_before_its_end():
     fault = Fault("silence", 1.0, 2.0)
-    assert [bool(active([fault], time)) for time in (0.99, 1.0, 1.99, 2.0)] == [False, True, True, False]
+    assert [bool(active_faults([fault], time)) for time in (0.99, 1.0, 1.99, 2.0)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 def command(text):
@@ -56,10 +68,10 @@ def command(text):
 
 def tracking(*specs, seed=0):
     """Return a session that began tracking at 10 s."""
-    session = EmulatorSession(fresh(1), [parse_fault(spec, FAULTS) for spec in specs], seed, 0.0)
+    session = EmulatorSession(power_on(1), [parse_fault(spec, FAULTS) for spec in specs], seed, 0.0)
     for text in ("INIT:", "PINIT:0A", "PENA:0AD", "TSTART:"):
         due, reply = session.reply(command(text), 10.0)
-        assert (due, reply) == (10.0, codec.text("OKAY")), "faults only begin with tracking"
+        assert (due, reply) == (10.0, codec.encode_text("OKAY")), "faults only begin with tracking"
     return session
 
 
@@ -88,7 +100,7 @@ def test_silence_delay_and_errors_come_and_go():
     intact = read(session, 10.5)[1]
     assert read(session, 11.5) == (11.5, b"")
     assert read(session, 12.5)[0] == pytest.approx(12.8)
-    assert read(session, 13.5) == (13.5, codec.text("ERROR1A"))
+    assert read(session, 13.5) == (13.5, codec.encode_text("ERROR1A"))
     assert len(read(session, 14.5)[1]) == len(intact)
 
 
@@ -186,7 +198,7 @@ def test_an_invalid_order_is_rejected_in_one_line(line, message):
 
 
 def test_orders_are_of_the_devices_time_and_scheduled_faults_of_its_work():
-    schedule = Schedule(FAULTS, (Fault("silence", 1.0, 2.0),))
+    schedule = FaultSchedule(FAULTS, (Fault("silence", 1.0, 2.0),))
     schedule.obey("fault cut:0.5", 100.0)
     assert schedule.at(100.2, None) == (Fault("cut", 100.0, 100.5),)
     assert schedule.at(101.5, 100.0) == (Fault("silence", 101.0, 102.0),)
@@ -207,4 +219,4 @@ def test_a_line_to_the_emulator_is_a_fault_or_a_position():
 
 def test_a_frozen_frame_is_the_same_frame():
     session = tracking("frozen@1")
-    assert values(session, 15.0)[4:7] == pytest.approx(pose("tip", 440, 0).position, abs=1e-4)
+    assert values(session, 15.0)[4:7] == pytest.approx(sensor_pose("tip", 440, 0).position, abs=1e-4)

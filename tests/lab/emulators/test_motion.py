@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from flexneedle.lab.emulators.motion import RATE_HZ, SENSORS, Rest, pose
+from flexneedle.lab.emulators.motion import RATE_HZ, SENSORS, RestingTip, sensor_pose
 
 
 def path(sensor, count=800):
-    return np.array([pose(sensor, n, 0).position for n in range(count)])
+    return np.array([sensor_pose(sensor, n, 0).position for n in range(count)])
 
 
 def test_frames_are_reproducible_and_depend_on_the_seed():
-    assert pose("tip", 123, 5) == pose("tip", 123, 5)
-    assert pose("tip", 123, 5) != pose("tip", 123, 6)
+    assert sensor_pose("tip", 123, 5) == sensor_pose("tip", 123, 5)
+    assert sensor_pose("tip", 123, 5) != sensor_pose("tip", 123, 6)
 
 
 def test_references_are_at_rest_except_for_jitter():
@@ -29,10 +29,10 @@ def test_the_tip_moves_on_a_circle_at_the_speed_of_a_needle():
 
 def test_a_resting_tip_is_at_its_position_with_the_same_jitter():
     rest = (10.0, 20.0, -300.0)
-    positions = np.array([pose("tip", n, 0, Rest(rest)).position for n in range(800)])
+    positions = np.array([sensor_pose("tip", n, 0, RestingTip(rest)).position for n in range(800)])
     np.testing.assert_allclose(positions.mean(axis=0), rest, atol=0.01)
     np.testing.assert_allclose(np.sqrt(((positions - rest) ** 2).sum(axis=1).mean()), 0.07, rtol=0.1)
-    assert pose("ref1", 5, 0, Rest(rest)) == pose("ref1", 5, 0)
+    assert sensor_pose("ref1", 5, 0, RestingTip(rest)) == sensor_pose("ref1", 5, 0)
 
 
 def test_the_tips_z_axis_is_along_its_motion():
@@ -40,7 +40,7 @@ def test_the_tips_z_axis_is_along_its_motion():
         return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
     for number in (0, 100, 333, 700):
-        orientation = pose("tip", number, 0).orientation
+        orientation = sensor_pose("tip", number, 0).orientation
         np.testing.assert_allclose(np.linalg.norm(orientation), 1, atol=1e-12)
         angle = 2 * np.pi * number / 800
         np.testing.assert_allclose(z_axis(*orientation), (-np.sin(angle), np.cos(angle), 0), atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from emulated import emulated
-from flexneedle.lab.emulators.motion import SENSORS, pose
+from flexneedle.lab.emulators.motion import SENSORS, sensor_pose
 
 ndicapy = pytest.importorskip("ndicapy")
 
@@ -34,7 +34,7 @@ def test_ndicapi_reads_poses_and_frame_numbers(command):
         ndicapy.ndiCommand(device, "TSTOP:")
         ndicapy.ndiClose(device)
     for name, (number, values) in zip(SENSORS, read, strict=False):
-        true = pose(name, number, 0)
+        true = sensor_pose(name, number, 0)
         np.testing.assert_allclose(values[4:7], true.position, atol=0.0051)
         np.testing.assert_allclose(values[:4], true.orientation, atol=5.1e-5)
         np.testing.assert_allclose(values[7], true.indicator, atol=5.1e-5)
@@ -65,6 +65,6 @@ def test_scikit_surgerynditracker_tracks(firmware, sensors):
         tracker.close()
     assert ports == [10, 11, 12, 13][:sensors]
     for name, number, measured, indicator in zip(SENSORS, numbers, poses, quality, strict=False):
-        true = pose(name, int(number), 0)
+        true = sensor_pose(name, int(number), 0)
         np.testing.assert_allclose(measured[0], (*true.orientation, *true.position), atol=0.0051)
         np.testing.assert_allclose(indicator, true.indicator, atol=5.1e-5)

@@ -1,15 +1,15 @@
-"""The emulated Aurora: its reply to a command in a state. Pure functions, without I/O or time.
+"""Replies of the emulated Aurora to commands, as a function of its state. Pure functions, without I/O or time.
 
 It has one wired port per sensor, with the port handles 0A, 0B, …, and supports the commands to find, set up, start and
 read sensors, with the modes of a real Aurora: only INIT first, no set-up while tracking, no readings before tracking.
-Names and numbers are those of NDI's Combined API.
+Names and numbers follow NDI's Combined API.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from flexneedle.lab.emulators import codec
-from flexneedle.lab.emulators.codec import Request
+from flexneedle.lab.emulators.codec import AuroraCommand
 from flexneedle.lab.emulators.faults import BYTE, MM, RATIO, SECONDS, FaultKind
 from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
 
@@ -17,16 +17,16 @@ FIRMWARE = "AURORA Rev 008"
 """Freeze tag of the firmware, by which clients choose BX or TX."""
 
 
-def _of_a_sensor(text: str) -> FaultKind:
+def _fault_of_sensor(text: str) -> FaultKind:
     return FaultKind(text, SENSORS[0], "sensor", SENSORS)
 
 
 FAULTS = {
-    "missing": _of_a_sensor("a sensor is not measured (tip, or missing=SENSOR)"),
-    "out-of-volume": _of_a_sensor("a sensor is outside the volume (tip, or out-of-volume=SENSOR)"),
-    "partly-out": _of_a_sensor("a sensor is partly outside the volume (tip, or partly-out=SENSOR)"),
-    "broken": _of_a_sensor("a coil of a sensor is broken (tip, or broken=SENSOR)"),
-    "disabled": _of_a_sensor("a sensor is disabled (tip, or disabled=SENSOR)"),
+    "missing": _fault_of_sensor("a sensor is not measured (tip, or missing=SENSOR)"),
+    "out-of-volume": _fault_of_sensor("a sensor is outside the volume (tip, or out-of-volume=SENSOR)"),
+    "partly-out": _fault_of_sensor("a sensor is partly outside the volume (tip, or partly-out=SENSOR)"),
+    "broken": _fault_of_sensor("a coil of a sensor is broken (tip, or broken=SENSOR)"),
+    "disabled": _fault_of_sensor("a sensor is disabled (tip, or disabled=SENSOR)"),
     "error": FaultKind("every command returns an error (0D, or error=CODE in hexadecimal)", "0D", BYTE),
     "system": FaultKind(
         "the field generator is disconnected (20, or system=BITS of the system status in hexadecimal)",
@@ -38,10 +38,10 @@ FAULTS = {
     "silence": FaultKind("no reply"),
     "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
     "frozen": FaultKind("the frame number does not increase"),
-    "stuck": _of_a_sensor(
+    "stuck": _fault_of_sensor(
         "a sensor's values repeat, while the frame number increases (tip, or stuck=SENSOR)"
     ),
-    "nan": _of_a_sensor("the values of a sensor are not numbers (tip, or nan=SENSOR)"),
+    "nan": _fault_of_sensor("the values of a sensor are not numbers (tip, or nan=SENSOR)"),
     "jump": FaultKind("the tip is reported 5 mm beside its position (along y, or jump=MM)", "5", MM),
     "indicator": FaultKind("all indicators are high (0.2, or indicator=VALUE)", "0.2", RATIO),
     "unplug": FaultKind("the cable is pulled, and plugged in again after the duration"),
@@ -58,7 +58,7 @@ _OFF, _SETUP, _TRACKING = "off", "setup", "tracking"
 
 
 @dataclass(frozen=True)
-class Port:
+class PortState:
     """A port handle; sensor is None for a requested handle (PHRQ) with nothing plugged in."""
 
     number: int
@@ -80,7 +80,7 @@ class Port:
 class AuroraState:
     """State of the device: mode, port handles, firmware, and whether it supports BX (old firmware does not)."""
 
-    ports: Mapping[int, Port]
+    ports: Mapping[int, PortState]
     mode: str = _OFF
     firmware: str = FIRMWARE
     has_bx: bool = True
@@ -100,24 +100,24 @@ class _Refusal(Exception):
     """An error reply with a code."""
 
 
-def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, has_bx: bool = True) -> AuroraState:
+def power_on(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, has_bx: bool = True) -> AuroraState:
     """Return the device after power-on, with this number of sensors plugged in."""
-    ports = {_FIRST_HANDLE + n: Port(n + 1, name) for n, name in enumerate(SENSORS[:sensors])}
+    ports = {_FIRST_HANDLE + n: PortState(n + 1, name) for n, name in enumerate(SENSORS[:sensors])}
     return AuroraState(ports, firmware=firmware, has_bx=has_bx)
 
 
 def reply(aurora: AuroraState, line: bytes, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     """Return the state after a command (a line without its end) and the complete reply."""
-    command = codec.parse(line)
+    command = codec.parse_command(line)
     try:
         if not command.intact:
             raise _Refusal("04")
         return _execute(aurora, command, frame)
     except _Refusal as refusal:
-        return aurora, codec.text(f"ERROR{refusal}")
+        return aurora, codec.encode_text(f"ERROR{refusal}")
 
 
-def _execute(aurora: AuroraState, command: Request, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
+def _execute(aurora: AuroraState, command: AuroraCommand, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     if command.name in _ANYWHERE:
         return _ANYWHERE[command.name](aurora, command.arguments)
     supported = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
@@ -130,24 +130,26 @@ def _execute(aurora: AuroraState, command: Request, frame: EmulatedFrame) -> tup
     if command.name in _SET_UP:
         return _SET_UP[command.name](aurora, command.arguments)
     if command.name == "TSTOP":
-        return replace(aurora, mode=_SETUP), codec.text("OKAY")
-    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), frame)
+        return replace(aurora, mode=_SETUP), codec.encode_text("OKAY")
+    return aurora, (_text_readings if command.name == "TX" else _binary_readings)(
+        aurora, _parse_options(command.arguments), frame
+    )
 
 
 def _is_bx(aurora: AuroraState, name: str) -> bool:
     return name == "BX" and aurora.has_bx
 
 
-def _options(arguments: str) -> int:
+def _parse_options(arguments: str) -> int:
     if not arguments:
         return _TRANSFORMS
-    options = _hexadecimal(arguments, 4)
+    options = _parse_hexadecimal(arguments, 4)
     if options & ~(_TRANSFORMS | _ALSO_OUT_OF_VOLUME):
         raise _Refusal("23")
     return options
 
 
-def _hexadecimal(digits: str, length: int) -> int:
+def _parse_hexadecimal(digits: str, length: int) -> int:
     if len(digits) < length:
         raise _Refusal("03")
     if not set(digits[:length]) <= _DIGITS:
@@ -158,82 +160,82 @@ def _hexadecimal(digits: str, length: int) -> int:
 # Commands in any mode
 
 
-def _init(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+def _initialize_system(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     """Enter set-up with all sensors uninitialised."""
-    ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
-    return replace(aurora, mode=_SETUP, ports=ports), codec.text("OKAY")
+    ports = {handle: PortState(port.number, port.sensor) for handle, port in aurora.ports.items()}
+    return replace(aurora, mode=_SETUP, ports=ports), codec.encode_text("OKAY")
 
 
 def _reset(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     """Reset by command: a pseudo-terminal has no serial break."""
-    ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
-    return replace(aurora, mode=_OFF, ports=ports), codec.text("RESET")
+    ports = {handle: PortState(port.number, port.sensor) for handle, port in aurora.ports.items()}
+    return replace(aurora, mode=_OFF, ports=ports), codec.encode_text("RESET")
 
 
-def _okay(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
-    return aurora, codec.text("OKAY")
+def _accept(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+    return aurora, codec.encode_text("OKAY")
 
 
 def _echo(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     if not arguments.isascii():
         raise _Refusal("23")
-    return aurora, codec.text(arguments)
+    return aurora, codec.encode_text(arguments)
 
 
 def _beep(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     if arguments not in list("123456789"):
         raise _Refusal("23")
-    return aurora, codec.text("1")
+    return aurora, codec.encode_text("1")
 
 
-def _comm(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+def _check_settings(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     """Check the requested settings; a pseudo-terminal has no baud rate."""
     if len(arguments) < 5:
         raise _Refusal("03")
     allowed = ("01234567A", "01", "012", "01", "01")  # baud rate, data bits, parity, stop bits, handshake
     if any(digit not in choices for digit, choices in zip(arguments, allowed, strict=False)):
         raise _Refusal("23")
-    return aurora, codec.text("OKAY")
+    return aurora, codec.encode_text("OKAY")
 
 
-def _version(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+def _report_version(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     lines = ("AURORA Control Firmware", "NDI S/N: EMULATOR", f"Freeze Tag: {aurora.firmware}", "Emulated")
-    return aurora, codec.text("\n".join(lines) + "\n")
+    return aurora, codec.encode_text("\n".join(lines) + "\n")
 
 
-def _revision(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
-    return aurora, codec.text("D.001.007")
+def _report_revision(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+    return aurora, codec.encode_text("D.001.007")
 
 
-def _information(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+def _report_information(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     values = {"Features.Firmware.Version": aurora.firmware, "Features.Hardware.Model": "Aurora emulator"}
     if arguments not in values:
         raise _Refusal("34")
-    return aurora, codec.text(f"{arguments}={values[arguments]}")
+    return aurora, codec.encode_text(f"{arguments}={values[arguments]}")
 
 
-def _features(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """Only the number of ports (option 02) is supported."""
-    if _hexadecimal(arguments, 2) != 0x02:
+def _count_ports(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    """Return the number of ports (option 02); no other feature is supported."""
+    if _parse_hexadecimal(arguments, 2) != 0x02:
         raise _Refusal("23")
-    return aurora, codec.text(f"{sum(port.sensor is not None for port in aurora.ports.values()):X}")
+    return aurora, codec.encode_text(f"{sum(port.sensor is not None for port in aurora.ports.values()):X}")
 
 
 # Commands in set-up
 
 
-def _port(aurora: AuroraState, arguments: str) -> tuple[int, Port]:
-    handle = _hexadecimal(arguments, 2)
+def _find_port(aurora: AuroraState, arguments: str) -> tuple[int, PortState]:
+    handle = _parse_hexadecimal(arguments, 2)
     if handle not in aurora.ports:
         raise _Refusal("08")
     return handle, aurora.ports[handle]
 
 
-def _with(aurora: AuroraState, handle: int, port: Port) -> tuple[AuroraState, bytes]:
-    return replace(aurora, ports={**aurora.ports, handle: port}), codec.text("OKAY")
+def _with_port(aurora: AuroraState, handle: int, port: PortState) -> tuple[AuroraState, bytes]:
+    return replace(aurora, ports={**aurora.ports, handle: port}), codec.encode_text("OKAY")
 
 
-_LISTED: dict[int, Callable[[Port], bool]] = {
+_LISTED: dict[int, Callable[[PortState], bool]] = {
     0x00: lambda _: True,
     0x01: lambda _: False,
     0x02: lambda port: port.sensor is not None and not port.initialized,
@@ -242,62 +244,62 @@ _LISTED: dict[int, Callable[[Port], bool]] = {
 }
 
 
-def _search(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    option = _hexadecimal(arguments, 2) if arguments else 0
+def _list_ports(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    option = _parse_hexadecimal(arguments, 2) if arguments else 0
     if option not in _LISTED:
         raise _Refusal("23")
     found = [(handle, port) for handle, port in aurora.ports.items() if _LISTED[option](port)]
     listed = "".join(f"{handle:02X}{port.status:03X}" for handle, port in found)
-    return aurora, codec.text(f"{len(found):02X}{listed}")
+    return aurora, codec.encode_text(f"{len(found):02X}{listed}")
 
 
-def _request(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+def _add_port(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     handle = max(aurora.ports, default=_FIRST_HANDLE - 1) + 1
     if handle > _LAST_HANDLE:
         raise _Refusal("2D")
-    port = Port(0, None)
-    return replace(aurora, ports={**aurora.ports, handle: port}), codec.text(f"{handle:02X}")
+    port = PortState(0, None)
+    return replace(aurora, ports={**aurora.ports, handle: port}), codec.encode_text(f"{handle:02X}")
 
 
-def _free(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    freed, _ = _port(aurora, arguments)
+def _free_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    freed, _ = _find_port(aurora, arguments)
     ports = {handle: port for handle, port in aurora.ports.items() if handle != freed}
-    return replace(aurora, ports=ports), codec.text("OKAY")
+    return replace(aurora, ports=ports), codec.encode_text("OKAY")
 
 
-def _write(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """Accept and ignore a tool definition: emulated sensors have their own."""
-    _port(aurora, arguments)
-    return aurora, codec.text("OKAY")
+def _accept_definition(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    """Accept and ignore a tool definition: emulated sensors have one."""
+    _find_port(aurora, arguments)
+    return aurora, codec.encode_text("OKAY")
 
 
-def _initialize(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    handle, port = _port(aurora, arguments)
+def _initialize_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    handle, port = _find_port(aurora, arguments)
     if port.sensor is None:
         raise _Refusal("0D")
-    return _with(aurora, handle, replace(port, initialized=True))
+    return _with_port(aurora, handle, replace(port, initialized=True))
 
 
-def _enable(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    handle, port = _port(aurora, arguments)
+def _enable_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    handle, port = _find_port(aurora, arguments)
     if not port.initialized:
         raise _Refusal("0E")
     if arguments[2:3] not in ("S", "D", "B"):
         raise _Refusal("09")
-    return _with(aurora, handle, replace(port, enabled=True))
+    return _with_port(aurora, handle, replace(port, enabled=True))
 
 
-def _disable(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    handle, port = _port(aurora, arguments)
-    return _with(aurora, handle, replace(port, enabled=False))
+def _disable_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    handle, port = _find_port(aurora, arguments)
+    return _with_port(aurora, handle, replace(port, enabled=False))
 
 
-def _describe(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """PHINF: the requested parts in the order of their bits."""
-    _, port = _port(aurora, arguments)
-    options = _hexadecimal(arguments[2:], 4) if len(arguments) > 2 else 0x0001
+def _describe_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    """Return the requested parts of PHINF in the order of their bits."""
+    _, port = _find_port(aurora, arguments)
+    options = _parse_hexadecimal(arguments[2:], 4) if len(arguments) > 2 else 0x0001
     if port.sensor is None:
-        return aurora, codec.text("UNOCCUPIED")
+        return aurora, codec.encode_text("UNOCCUPIED")
     parts = {
         0x0001: f"0200000{port.number}{'EMULATOR':<12}001{port.number:08X}{port.status & 0xFF:02X}",
         0x0002: "00000000",
@@ -307,70 +309,70 @@ def _describe(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
         0x0020: f"0000000010{port.number:02d}00",
         0x0040: "00",
     }
-    return aurora, codec.text("".join(part for bit, part in parts.items() if options & bit))
+    return aurora, codec.encode_text("".join(part for bit, part in parts.items() if options & bit))
 
 
-def _start(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
-    return replace(aurora, mode=_TRACKING), codec.text("OKAY")
+def _start_tracking(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
+    return replace(aurora, mode=_TRACKING), codec.encode_text("OKAY")
 
 
 _Handler = Callable[[AuroraState, str], tuple[AuroraState, bytes]]
 _ANYWHERE: dict[str, _Handler] = {
-    "INIT": _init,
+    "INIT": _initialize_system,
     "RESET": _reset,
     "ECHO": _echo,
     "BEEP": _beep,
-    "COMM": _comm,
-    "VER": _version,
-    "APIREV": _revision,
-    "GETINFO": _information,
-    "GET": _information,
-    "SFLIST": _features,
-    "LED": _okay,
+    "COMM": _check_settings,
+    "VER": _report_version,
+    "APIREV": _report_revision,
+    "GETINFO": _report_information,
+    "GET": _report_information,
+    "SFLIST": _count_ports,
+    "LED": _accept,
 }
 _SET_UP: dict[str, _Handler] = {
-    "PHSR": _search,
-    "PHRQ": _request,
-    "PHF": _free,
-    "PVWR": _write,
-    "PINIT": _initialize,
-    "PENA": _enable,
-    "PDIS": _disable,
-    "PHINF": _describe,
-    "TSTART": _start,
+    "PHSR": _list_ports,
+    "PHRQ": _add_port,
+    "PHF": _free_port,
+    "PVWR": _accept_definition,
+    "PINIT": _initialize_port,
+    "PENA": _enable_port,
+    "PDIS": _disable_port,
+    "PHINF": _describe_port,
+    "TSTART": _start_tracking,
 }
 
 
 # Readings
 
 
-def _tx(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
-    rows = [(handle, *_reading(port, options, frame)) for handle, port in _reported(aurora)]
+def _text_readings(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
+    rows = [(handle, *_read_port(port, options, frame)) for handle, port in _initialized_ports(aurora)]
     words = {_MISSING: "MISSING", _DISABLED: "DISABLED"}
     readings = "".join(
-        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{frame.number:08X}\n"
+        f"{handle:02X}{words[kind] if pose is None else codec.encode_pose_text(pose)}{bits:08X}{frame.number:08X}\n"
         for handle, kind, bits, pose in rows
     )
-    return codec.text(f"{len(rows):02X}{readings}{frame.system:04X}")
+    return codec.encode_text(f"{len(rows):02X}{readings}{frame.system:04X}")
 
 
-def _bx(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
-    body = bytearray([len(_reported(aurora))])
-    for handle, port in _reported(aurora):
-        kind, bits, pose = _reading(port, options, frame)
+def _binary_readings(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
+    body = bytearray([len(_initialized_ports(aurora))])
+    for handle, port in _initialized_ports(aurora):
+        kind, bits, pose = _read_port(port, options, frame)
         body += bytes((handle, kind))
         if kind == _DISABLED:
             continue  # no further data
-        body += b"" if pose is None else codec.transform_binary(pose)
+        body += b"" if pose is None else codec.encode_pose_binary(pose)
         body += bits.to_bytes(4, "little") + frame.number.to_bytes(4, "little")
-    return codec.binary(bytes(body) + frame.system.to_bytes(2, "little"))
+    return codec.encode_binary(bytes(body) + frame.system.to_bytes(2, "little"))
 
 
-def _reported(aurora: AuroraState) -> list[tuple[int, Port]]:
+def _initialized_ports(aurora: AuroraState) -> list[tuple[int, PortState]]:
     return [(handle, port) for handle, port in aurora.ports.items() if port.initialized]
 
 
-def _reading(port: Port, options: int, frame: EmulatedFrame) -> tuple[int, int, EmulatedPose | None]:
+def _read_port(port: PortState, options: int, frame: EmulatedFrame) -> tuple[int, int, EmulatedPose | None]:
     """Return handle status, port status and pose, None if there is none."""
     fault = frame.faults.get(port.sensor or "")
     bits = port.status | _FAULT_BITS.get(fault or "", 0)

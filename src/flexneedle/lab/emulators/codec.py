@@ -16,17 +16,17 @@ _CRC_DIGITS = 4
 _LARGEST = 3.4e38  # single precision
 
 
-def _divided(byte: int) -> int:
+def _divide(byte: int) -> int:
     for _ in range(8):
         byte = (byte >> 1) ^ (_POLYNOMIAL if byte & 1 else 0)
     return byte
 
 
-_TABLE = tuple(map(_divided, range(256)))  # per byte: a reply has about 200
+_TABLE = tuple(map(_divide, range(256)))  # per byte: a reply has about 200
 
 
 @dataclass(frozen=True)
-class Request:
+class AuroraCommand:
     """A received command; intact is False if its checksum is wrong."""
 
     name: str
@@ -42,49 +42,49 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def parse(line: bytes) -> Request:
+def parse_command(line: bytes) -> AuroraCommand:
     """Return the command in a line without its `\\r`; bytes outside ASCII are replaced."""
     name = line[: _name_length(line)].decode("ascii", "replace")
     rest = line[len(name) :]
     if not rest.startswith(b":"):
-        return Request(name, rest[1:].decode("ascii", "replace"))
+        return AuroraCommand(name, rest[1:].decode("ascii", "replace"))
     body, checksum = line[:-_CRC_DIGITS], line[-_CRC_DIGITS:]
     intact = len(rest) > _CRC_DIGITS and checksum.upper() == b"%04X" % crc16(body)
-    return Request(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
+    return AuroraCommand(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
 
 
 def _name_length(line: bytes) -> int:
     return next((at for at, byte in enumerate(line) if byte in b": "), len(line))
 
 
-def text(reply: str) -> bytes:
+def encode_text(reply: str) -> bytes:
     """Return a text reply with checksum and end."""
     body = reply.encode("ascii")
     return body + b"%04X\r" % crc16(body)
 
 
-def binary(body: bytes) -> bytes:
+def encode_binary(body: bytes) -> bytes:
     """Return a binary reply: start, length and their checksum, then body and its checksum, little endian."""
     header = struct.pack("<HH", _BINARY_START, len(body))
     return header + struct.pack("<H", crc16(header)) + body + struct.pack("<H", crc16(body))
 
 
-def transform_text(pose: EmulatedPose) -> str:
+def encode_pose_text(pose: EmulatedPose) -> str:
     """Return a pose in the format of `TX`: quaternion and indicator to 1e-4, position to 0.01 mm.
 
     A value that is not a number, or for which the format has too few digits, is `nan`.
     """
-    orientation = "".join(_digits(part, 10_000, 6) for part in pose.orientation)
-    position = "".join(_digits(part, 100, 7) for part in pose.position)
-    return f"{orientation}{position}{_digits(pose.indicator, 10_000, 6)}"
+    orientation = "".join(_format_digits(part, 10_000, 6) for part in pose.orientation)
+    position = "".join(_format_digits(part, 100, 7) for part in pose.position)
+    return f"{orientation}{position}{_format_digits(pose.indicator, 10_000, 6)}"
 
 
-def _digits(value: float, parts: int, width: int) -> str:
+def _format_digits(value: float, parts: int, width: int) -> str:
     fits = isfinite(value) and abs(round(value * parts)) < 10 ** (width - 1)
     return f"{round(value * parts):+0{width}d}" if fits else f"{'nan':>{width}}"
 
 
-def transform_binary(pose: EmulatedPose) -> bytes:
+def encode_pose_binary(pose: EmulatedPose) -> bytes:
     """Return a pose in the format of `BX`: eight single-precision numbers; a value too large for one is infinite."""
     values = (*pose.orientation, *pose.position, pose.indicator)
     return struct.pack(

@@ -14,7 +14,7 @@ from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed
 
 if TYPE_CHECKING:
-    from flexneedle.lab.emulators.emulated_rig.job import Job
+    from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
     from flexneedle.lab.emulators.orders import Orders
 
 _LAST_PORT = 65535
@@ -99,7 +99,7 @@ def _add_rig(commands: Commands) -> None:
     )
     rig.add_argument("rig", metavar="RIG", help="rig file: its path, or emulated for the one of the package")
     rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
-    add_seed(rig, "seed of phantom and noise: the phantom is that of flexneedle insert --seed N")
+    add_seed(rig, "seed of phantom and noise: the same phantom as flexneedle insert --seed N")
     rig.add_argument(
         "--plan",
         type=Path,
@@ -134,20 +134,20 @@ def _port(text: str) -> int:
 def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
-    from flexneedle.lab.emulators.aurora import FAULTS, FIRMWARE, fresh
+    from flexneedle.lab.emulators.aurora import FAULTS, FIRMWARE, power_on
     from flexneedle.lab.emulators.faults import parse_fault
-    from flexneedle.lab.emulators.motion import CENTRE, CIRCLE, Rest
-    from flexneedle.lab.emulators.server import EmulatorSession, Serial, execute, serve
+    from flexneedle.lab.emulators.motion import CENTRE, CIRCLE, RestingTip
+    from flexneedle.lab.emulators.server import EmulatorSession, SerialPort, execute, serve
     from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
-    device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
-    with Serial(args.link) as serial:
+    device = power_on(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
+    with SerialPort(args.link) as serial:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then too
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print(serial.link, flush=True)
-            tip = Rest(CENTRE) if args.still else CIRCLE
+            tip = RestingTip(CENTRE) if args.still else CIRCLE
             session = EmulatorSession(device, faults, args.seed, monotonic(), tip=tip)
             serve(session, serial, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
         except KeyboardInterrupt:
@@ -158,17 +158,17 @@ def _emulate_galil(args: argparse.Namespace) -> int:
     from time import monotonic
 
     from flexneedle.lab.emulators.faults import parse_fault
-    from flexneedle.lab.emulators.galil.controller import Device
-    from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp, execute, serve
+    from flexneedle.lab.emulators.galil.controller import ControllerState
+    from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer, execute, serve
     from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
-    with Tcp(args.host, args.port) as tcp:
+    with TcpServer(args.host, args.port) as tcp:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print("{}:{}".format(*tcp.address), flush=True)
-            session = GalilSession(Device(), faults, monotonic(), args.seed)
+            session = GalilSession(ControllerState(), faults, monotonic(), args.seed)
             serve(session, tcp, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
         except KeyboardInterrupt:
             return 0
@@ -187,16 +187,14 @@ def _emulate_rig(args: argparse.Namespace) -> int:
         return 0
 
 
-def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> Job:
-    from flexneedle.lab.emulators.emulated_rig.job import checked_job
+def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> EmulationJob:
+    from flexneedle.lab.emulators.emulated_rig.job import make_job
     from flexneedle.lab.rig.rig_file import load_rig
     from flexneedle.record.loading import load
     from flexneedle.scenario.files import load_scenario
 
     record = None if args.plan is None else load(args.plan)
-    return checked_job(
-        load_rig(args.rig), load_scenario(args.scenario), record, args.seed, args.truth, faults
-    )
+    return make_job(load_rig(args.rig), load_scenario(args.scenario), record, args.seed, args.truth, faults)
 
 
 def _print_message(message: Mapping[str, Any]) -> None:

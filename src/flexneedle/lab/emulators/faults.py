@@ -34,9 +34,10 @@ class FaultKind:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault from `start` to `end` (s); detail: as its kind has it, or "".
+    """A fault from `start` to `end` (s).
 
-    Times of a scheduled fault count from when the device began to work; those of an active one are the device's.
+    detail: value of its kind, or "". Times of a scheduled fault count from when the device began to work; times of an
+    active fault are the device's.
     """
 
     kind: str
@@ -48,18 +49,20 @@ class Fault:
 def parse_fault(spec: str, kinds: Mapping[str, FaultKind], device: str = "") -> Fault:
     """Return the fault of an option value, of one of these kinds by name. Raises InputError.
 
-    device: what precedes it in the option, for the message.
+    device: prefix of the fault in the option, for the message.
     """
     form, given = _FORM.fullmatch(spec), f"--fault {device}{spec}"
     if form is None:
-        raise InputError(f"{given}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {_example(kinds)}@5:2")
-    kind, detail = _kind(given, form, kinds)
-    start = _number(given, form["start"], SECONDS)
-    return Fault(kind, start, _end(given, start, form["duration"]), detail)
+        raise InputError(
+            f"{given}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {_example_of(kinds)}@5:2"
+        )
+    kind, detail = _parse_kind(given, form, kinds)
+    start = _parse_number(given, form["start"], SECONDS)
+    return Fault(kind, start, _parse_end(given, start, form["duration"]), detail)
 
 
 def is_order(line: str) -> bool:
-    """Whether a line orders a fault, or the end of all."""
+    """Return whether a line orders a fault, or the end of all."""
     return line.split()[:1] in (["fault"], [_CLEAR])
 
 
@@ -69,20 +72,20 @@ def parse_order(line: str, kinds: Mapping[str, FaultKind], now: float) -> Fault 
         return None
     form, given = _ORDER.fullmatch(line.strip()), line.strip()
     if form is None:
-        example = _example(kinds)
+        example = _example_of(kinds)
         raise InputError(
             f"{given}: must be fault KIND[=DETAIL][:DURATION], such as fault {example}:2, or clear"
         )
-    kind, detail = _kind(given, form, kinds)
-    return Fault(kind, now, _end(given, now, form["duration"]), detail)
+    kind, detail = _parse_kind(given, form, kinds)
+    return Fault(kind, now, _parse_end(given, now, form["duration"]), detail)
 
 
-def _example(kinds: Mapping[str, FaultKind]) -> str:
+def _example_of(kinds: Mapping[str, FaultKind]) -> str:
     return next(f"{name}={kind.choices[-1]}" for name, kind in kinds.items() if kind.choices)
 
 
-def _kind(given: str, form: re.Match[str], kinds: Mapping[str, FaultKind]) -> tuple[str, str]:
-    """Kind and detail of a fault. Raises InputError."""
+def _parse_kind(given: str, form: re.Match[str], kinds: Mapping[str, FaultKind]) -> tuple[str, str]:
+    """Return kind and detail of a fault. Raises InputError."""
     name = form["kind"]
     if name not in kinds:
         raise InputError(f"{given}: unknown kind; kinds: {', '.join(kinds)}")
@@ -96,18 +99,18 @@ def _check_detail(given: str, name: str, kind: FaultKind, detail: str) -> None:
         raise InputError(f"{given}: no such {kind.form}; choices: {', '.join(kind.choices)}")
     if kind.form == BYTE and not re.fullmatch(r"[0-9A-F]{2}", detail):
         raise InputError(f"{given}: must be two hexadecimal digits, such as {kind.default}")
-    if kind.form in _UNITS and not 0.0 < _number(given, detail, kind.form) < inf:
+    if kind.form in _UNITS and not 0.0 < _parse_number(given, detail, kind.form) < inf:
         unit = _UNITS[kind.form]
         raise InputError(f"{given}: the {name} must be above 0{unit}, such as {name}={kind.default}")
     if detail and not kind.form:
         raise InputError(f"{given}: {name} takes no detail")
 
 
-def _end(given: str, start: float, duration: str | None) -> float:
-    return inf if duration is None else start + _number(given, duration, SECONDS)
+def _parse_end(given: str, start: float, duration: str | None) -> float:
+    return inf if duration is None else start + _parse_number(given, duration, SECONDS)
 
 
-def _number(given: str, text: str, form: str) -> float:
+def _parse_number(given: str, text: str, form: str) -> float:
     try:
         return float(text)
     except ValueError:
@@ -115,15 +118,17 @@ def _number(given: str, text: str, form: str) -> float:
         raise InputError(f"{given}: {text} is not a number{of}") from None
 
 
-def active(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
-    """Return the faults that are active at a time (s, of the same origin as theirs)."""
+def active_faults(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
+    """Return the faults that are active at a time (s, with the origin of their times)."""
     return tuple(fault for fault in faults if fault.start <= time < fault.end)
 
 
 @dataclass
-class Schedule:
-    """The faults of a device: `scheduled` ones count from when it began to work (`since`, None: not yet), `ordered`
-    ones have its own times (s).
+class FaultSchedule:
+    """Faults of a device.
+
+    Times of `scheduled` faults count from when the device began to work (`since`, None: not yet); times of `ordered`
+    faults are the device's (s).
     """
 
     kinds: Mapping[str, FaultKind]
@@ -132,8 +137,8 @@ class Schedule:
 
     def at(self, now: float, since: float | None) -> tuple[Fault, ...]:
         """Return the active faults, with the device's times."""
-        begun = () if since is None else tuple(_later(fault, since) for fault in self.scheduled)
-        return active((*begun, *self.ordered), now)
+        begun = () if since is None else tuple(_shift(fault, since) for fault in self.scheduled)
+        return active_faults((*begun, *self.ordered), now)
 
     def obey(self, line: str, now: float) -> str:
         """Inject the fault of a line from `now` (s) on, or end all; return what was done. Raises InputError."""
@@ -141,14 +146,14 @@ class Schedule:
         if fault is None:
             self.scheduled = self.ordered = ()
             return "no fault"
-        kept = [one for one in self.ordered if one.end > now and not _same(one, fault)]
+        kept = [one for one in self.ordered if one.end > now and not _is_same(one, fault)]
         self.ordered = (*kept, fault)
         return f"{fault.kind}{fault.detail and '='}{fault.detail}"
 
 
-def _same(one: Fault, other: Fault) -> bool:
+def _is_same(one: Fault, other: Fault) -> bool:
     return (one.kind, one.detail) == (other.kind, other.detail)
 
 
-def _later(fault: Fault, since: float) -> Fault:
+def _shift(fault: Fault, since: float) -> Fault:
     return replace(fault, start=since + fault.start, end=since + fault.end)

@@ -1,4 +1,4 @@
-"""Poses of the emulated sensors in each frame: the tip moves as its source has it, the references rest around it.
+"""Poses of the emulated sensors in each frame: the tip moves with its source, the references rest around it.
 
 Poses are in the frame of an Aurora: the field generator at z = 0, the volume in front of it at z < 0 (mm). The noise
 depends only on seed, sensor and frame number, so that any frame can be reproduced.
@@ -42,27 +42,28 @@ class EmulatedPose:
 
 
 class TipSource(Protocol):
-    """Where the tip is in each frame, without noise. Frame 0 is taken at power-on, others at `RATE_HZ`."""
+    """True poses of the tip by frame. Frame 0 is taken at power-on, others at `RATE_HZ`."""
 
     def newest(self, number: int) -> int:
-        """Number of the newest frame, up to this one, in which the pose is known."""
+        """Return the number of the newest frame, up to this one, in which the pose is known."""
         ...
 
     def at(self, number: int) -> tuple[Point, Quaternion]:
-        """Position (mm) and orientation of the tip's sensor in a frame up to the newest, in the tracker's frame."""
+        """Return position (mm) and orientation of the tip's sensor in a frame up to the newest, in the tracker's
+        frame."""
         ...
 
 
 @dataclass(frozen=True)
-class Circle:
+class CirclingTip:
     """A tip that moves on a circle about z; the sensor's z axis is tangential, in the plane of x, y."""
 
     def newest(self, number: int) -> int:
-        """The frame itself: all are known."""
+        """Return the frame itself: all are known."""
         return number
 
     def at(self, number: int) -> tuple[Point, Quaternion]:
-        """Position (mm) and orientation in a frame."""
+        """Return position (mm) and orientation in a frame."""
         angle = 2 * pi * number / (RATE_HZ * _PERIOD_S)
         x, y, z = CENTRE
         position = (x + _RADIUS_MM * cos(angle), y + _RADIUS_MM * sin(angle), z)
@@ -73,27 +74,29 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestingTip:
     """A tip at rest at a position (mm), not rotated."""
 
     position: Point
 
     def newest(self, number: int) -> int:
-        """The frame itself: all are known."""
+        """Return the frame itself: all are known."""
         return number
 
     def at(self, _number: int) -> tuple[Point, Quaternion]:
-        """Position (mm) and orientation in any frame."""
+        """Return position (mm) and orientation in any frame."""
         return self.position, _UPRIGHT
 
 
-CIRCLE = Circle()
+CIRCLE = CirclingTip()
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Errors of the tip's sensor: RMS length of the deviation of its position (mm), standard deviation of a coordinate
-    of its direction (rad), share of the frames in which it is missing.
+class SensorNoise:
+    """Errors of the tip's sensor.
+
+    position: RMS length of the deviation (mm); direction: standard deviation of a coordinate (rad); missing: share of
+    the frames without a reading.
     """
 
     position: float = JITTER_MM
@@ -101,42 +104,41 @@ class Noise:
     missing: float = 0.0
 
 
-ORDINARY = Noise()
+ORDINARY = SensorNoise()
 
 
-def pose(
-    sensor: str, number: int, seed: int, source: TipSource = CIRCLE, noise: Noise = ORDINARY
+def sensor_pose(
+    sensor: str, number: int, seed: int, source: TipSource = CIRCLE, noise: SensorNoise = ORDINARY
 ) -> EmulatedPose:
-    """Return a sensor's pose in a frame, with noise: the tip where its source has it, the others at rest."""
-    drawn = _drawn(sensor, number, seed)
+    """Return a sensor's pose in a frame, with noise: the tip by its source, the others at rest."""
+    drawn = _draw_noise(sensor, number, seed)
     if sensor == SENSORS[0]:
         position, orientation = source.at(number)
-        size, orientation = noise.position, _tilted(orientation, noise.direction * drawn[4:6])
+        size, orientation = noise.position, _tilt(orientation, noise.direction * drawn[4:6])
     else:
         position, orientation, size = _REFERENCES[sensor], _UPRIGHT, JITTER_MM
     x, y, z = (float(c + n * size / sqrt(3)) for c, n in zip(position, drawn[:3], strict=True))
     return EmulatedPose((x, y, z), orientation, float(abs(_INDICATOR + _INDICATOR_SPREAD * drawn[3])))
 
 
-def is_missing(number: int, seed: int, noise: Noise) -> bool:
-    """Whether the tip is not measured in a frame."""
+def is_missing(number: int, seed: int, noise: SensorNoise) -> bool:
+    """Return whether the tip is not measured in a frame."""
     if noise.missing == 0.0:
         return False
-    return bool(_drawn(SENSORS[0], number, seed)[6] < NormalDist().inv_cdf(noise.missing))
+    return bool(_draw_noise(SENSORS[0], number, seed)[6] < NormalDist().inv_cdf(noise.missing))
 
 
 @lru_cache(maxsize=64)  # a frame is requested several times
-def _drawn(sensor: str, number: int, seed: int) -> Floats:
-    """Standard normal numbers (7,) of a sensor in a frame: three of its position, one of its indicator, two of its
-    axis, one of whether it is missing.
-    """
+def _draw_noise(sensor: str, number: int, seed: int) -> Floats:
+    """Return standard normal numbers (7,) of a sensor in a frame: three of its position, one of its indicator, two of
+    its axis, one that decides whether it is missing."""
     drawn = np.random.default_rng((seed, SENSORS.index(sensor), number)).standard_normal(7)
     drawn.setflags(write=False)
     return drawn
 
 
-def _tilted(orientation: Quaternion, angles: Floats) -> Quaternion:
-    """The orientation after small rotations (2,) in rad about the sensor's own x and y."""
+def _tilt(orientation: Quaternion, angles: Floats) -> Quaternion:
+    """Return the orientation after small rotations (2,) in rad about the sensor's x and y axes."""
     if not angles.any():
         return orientation
     small = from_vector(np.array([*angles, 0.0]))

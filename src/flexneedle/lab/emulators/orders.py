@@ -1,4 +1,4 @@
-"""Commands to rest the emulated tip at a position: lines `X Y Z` on a stream, in mm in the tracker's frame."""
+"""Orders to an emulator: positions at which the tip rests, as lines `X Y Z` in mm in the tracker's frame."""
 
 import os
 from collections.abc import Container, Sequence
@@ -24,7 +24,7 @@ class OrderSource(Protocol):
 
 
 class Orders:
-    """Lines of a stream (its descriptor, or None for none), read as they arrive until it ends.
+    """Lines of a stream (its descriptor, None: no stream), read as they arrive until it ends.
 
     A terminal is read only in the foreground: a background process that reads it would be stopped.
     """

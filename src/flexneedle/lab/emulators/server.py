@@ -1,4 +1,4 @@
-"""The emulated Aurora on a pseudo-terminal, with its cable and clock. Runs until interrupted."""
+"""Emulated Aurora on a pseudo-terminal, with its cable and clock. It runs until interrupted."""
 
 import os
 import pty
@@ -18,18 +18,18 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.emulators.aurora import AuroraState, EmulatedFrame
-from flexneedle.lab.emulators.faults import Fault, Schedule, is_order
+from flexneedle.lab.emulators.faults import Fault, FaultSchedule, is_order
 from flexneedle.lab.emulators.motion import (
     CIRCLE,
     ORDINARY,
     RATE_HZ,
     SENSORS,
     EmulatedPose,
-    Noise,
-    Rest,
+    RestingTip,
+    SensorNoise,
     TipSource,
     is_missing,
-    pose,
+    sensor_pose,
 )
 from flexneedle.lab.emulators.orders import OrderSource, parse_position
 
@@ -41,9 +41,9 @@ _LONGEST_LINE = 4096
 
 @dataclass
 class EmulatorSession:
-    """The device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
+    """Device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
 
-    faults: scheduled, from when tracking first begins; tip: where it is; noise: errors of the tip's sensor.
+    faults: scheduled, from when tracking first begins; tip: source of its pose; noise: errors of the tip's sensor;
     on_tracking: called when tracking first begins.
     """
 
@@ -53,19 +53,19 @@ class EmulatorSession:
     power_on: float
     tracked_since: float | None = None
     tip: TipSource = CIRCLE
-    noise: Noise = ORDINARY
+    noise: SensorNoise = ORDINARY
     on_tracking: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
         self._repeated: dict[Fault, EmulatedPose] = {}
-        self.schedule = Schedule(aurora.FAULTS, self.faults)
+        self.schedule = FaultSchedule(aurora.FAULTS, self.faults)
 
     def faults_at(self, now: float) -> dict[str, Fault]:
         """Return the active faults by kind; of the scheduled ones none before tracking first begins."""
-        return {fault.kind: fault for fault in self._present(now)}
+        return {fault.kind: fault for fault in self._active_faults(now)}
 
-    def _present(self, now: float) -> tuple[Fault, ...]:
+    def _active_faults(self, now: float) -> tuple[Fault, ...]:
         return self.schedule.at(now, self.tracked_since)
 
     def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
@@ -74,18 +74,18 @@ class EmulatorSession:
         if "silence" in faults:
             return now, b""
         if "error" in faults:
-            return now, codec.text(f"ERROR{faults['error'].detail}")
+            return now, codec.encode_text(f"ERROR{faults['error'].detail}")
         self.device, complete = aurora.reply(self.device, line, self._frame(now, faults))
         if self.device.mode == "tracking" and self.tracked_since is None:
             self.tracked_since = now
             self.on_tracking()
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + delay, self._damaged(complete, faults)
+        return now + delay, self._damage(complete, faults)
 
     def _frame(self, now: float, faults: dict[str, Fault]) -> EmulatedFrame:
         taken = faults["frozen"].start if "frozen" in faults else now
         number = self.tip.newest(int((taken - self.power_on) * RATE_HZ))
-        present = self._present(now)
+        present = self._active_faults(now)
         by_sensor = {fault.detail: fault.kind for fault in present if fault.kind in aurora.OF_STATUS}
         if is_missing(number, self.seed, self.noise):
             by_sensor.setdefault(SENSORS[0], "missing")
@@ -94,15 +94,15 @@ class EmulatorSession:
         return EmulatedFrame(number & 0xFFFF_FFFF, poses, by_sensor, system)
 
     def _pose(self, name: str, number: int, present: Sequence[Fault]) -> EmulatedPose:
-        """Pose of a sensor in a frame, with the faults that change its values."""
-        made = pose(name, number, self.seed, self.tip, self.noise)
+        """Return the pose of a sensor in a frame, with the faults that change its values."""
+        made = sensor_pose(name, number, self.seed, self.tip, self.noise)
         for fault in present:
             if fault.kind == "stuck" and fault.detail == name:
                 made = self._repeated.setdefault(fault, made)
-            made = changed(name, made, fault)
+            made = with_fault(name, made, fault)
         return made
 
-    def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
+    def _damage(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
         if "cut" in faults:
             return complete[: len(complete) // 2]
         if "garbled" not in faults:
@@ -111,8 +111,8 @@ class EmulatorSession:
         return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
 
 
-def changed(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
-    """The pose of a sensor with the values of a fault that reports wrong ones."""
+def with_fault(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
+    """Return the pose of a sensor with the wrong values of a fault."""
     if fault.kind == "nan" and fault.detail == name:
         return EmulatedPose((nan, nan, nan), (nan, nan, nan, nan), nan)
     if fault.kind == "jump" and name == SENSORS[0]:
@@ -124,16 +124,16 @@ def changed(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
 
 
 def _is_left_over(link: Path) -> bool:
-    """Whether it is a link to a terminal that no longer exists, left by an emulator that was killed."""
+    """Return whether a path is a link to a terminal that no longer exists, left by an emulator that was killed."""
     return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
 
 
-def _left(error: OSError) -> str:
+def _remedy_for(error: OSError) -> str:
     return ": remove it, unless another emulator uses it" if isinstance(error, FileExistsError) else ""
 
 
-class Serial:
-    """A pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
+class SerialPort:
+    """Pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
 
     link: path of the link, or None for one in a new folder. Raises InputError if the path exists.
     """
@@ -170,7 +170,7 @@ class Serial:
             self.link.symlink_to(os.ttyname(host))
         except OSError as error:
             raise InputError(
-                f"{self.link}: the link cannot be created: {error.strerror}{_left(error)}"
+                f"{self.link}: the link cannot be created: {error.strerror}{_remedy_for(error)}"
             ) from None
 
     def unplug(self) -> None:
@@ -202,7 +202,7 @@ class Serial:
 
 
 def device_time(before: float, served: float, now: float) -> float:
-    """Return the device's time (s) at `now`; before: that of the last call, at `served` (s).
+    """Return the device's time (s) at `now`, from its time `before` at the last call, at `served` (s).
 
     It follows real time, but does not jump when the process was not scheduled: it stops meanwhile and then runs 10 %
     faster until it has caught up. Otherwise a pause of the process by a frame period (virtual machines have pauses of
@@ -215,13 +215,14 @@ def device_time(before: float, served: float, now: float) -> float:
 
 def serve(
     session: EmulatorSession,
-    serial: Serial,
+    serial: SerialPort,
     orders: OrderSource,
     obey: Callable[[str], None],
     say: Callable[[str], None],
 ) -> NoReturn:
-    """Reply to commands until interrupted. obey: called with each line of the orders; say: called with a line when the
-    cable is unplugged or plugged in.
+    """Reply to commands until interrupted.
+
+    obey: called with each line of the orders; say: called with a line when the cable is unplugged or plugged in.
     """
     received, due = b"", list[tuple[float, bytes]]()
     now = served = monotonic()
@@ -244,11 +245,11 @@ def serve(
 
 
 def execute(session: EmulatorSession, order: str) -> str:
-    """Rest the tip at the position in a line, or inject the fault in it; return a message on that, or the error."""
+    """Rest the tip at the position in a line, or inject the fault in it; return a message about it, or the error."""
     try:
         if is_order(order):
             return f"{session.schedule.obey(order, monotonic())} from now on"
-        session.tip = Rest(parse_position(order))
+        session.tip = RestingTip(parse_position(order))
     except InputError as error:
         return str(error)
     return "the tip rests at {:g} {:g} {:g} mm".format(*session.tip.position)

@@ -14,9 +14,9 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
     Carriage,
     carriages_of,
     channels_of,
-    increments,
+    control_between,
     positions_after,
-    starts,
+    start_positions,
 )
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
@@ -38,7 +38,7 @@ def axes(**changes):
 
 def followed(carriage, path):
     """Positions after each travel of a path (counts)."""
-    places = itertools.accumulate(path, carriage.moved, initial=carriage.start)
+    places = itertools.accumulate(path, carriage.move, initial=carriage.start)
     return np.array(list(places))
 
 
@@ -86,7 +86,7 @@ def test_switches_and_stops_are_beyond_the_soft_limits():
     assert carriage.stops == (-2.0, 112.0)
     backwards = carriages_of(axes(direction=-1), PHANTOM)["insertion"]
     assert backwards.switches == (-222_000.0, 2000.0)
-    assert backwards.moved(0.0, -2000.0) == 1.0
+    assert backwards.move(0.0, -2000.0) == 1.0
 
 
 def test_the_insertion_ends_behind_the_stroke_of_the_scenario():
@@ -116,7 +116,7 @@ def test_an_axis_that_cannot_be_emulated_is_refused_in_one_line(changes, message
 def test_each_axis_follows_the_motor_of_its_channel():
     rig = load_rig("emulated")
     carriages, channels = carriages_of(rig.axes, PHANTOM), channels_of(rig.axes)
-    before = starts(carriages)
+    before = start_positions(carriages)
     np.testing.assert_array_equal(before, np.zeros(6))
     after = positions_after(carriages, channels, before, (2000.0, 9000.0, -1000.0, 500.0))
     wanted = {"insertion": 1.0, "rotation": math.pi / 2, "guide_y": -0.5, "guide_z": 0.25}
@@ -128,7 +128,7 @@ places = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6).map(np.array
 
 @given(st.lists(places, min_size=2, max_size=10))
 def test_increments_add_up_to_the_whole_way(path):
-    rows = np.array([increments(before, after) for before, after in itertools.pairwise(path)])
+    rows = np.array([control_between(before, after) for before, after in itertools.pairwise(path)])
     total = dict(zip(NAMES, path[-1] - path[0], strict=True))
     columns = {"insertion": DB_X, "guide_y": DG_Y, "guide_z": DG_Z, "base_y": DB_Y, "base_z": DB_Z}
     for name, column in columns.items():
@@ -140,5 +140,5 @@ def test_the_needle_turns_at_rest_or_during_the_advance():
     at_rest, moving = np.zeros(6), np.zeros(6)
     at_rest[NAMES.index("rotation")] = moving[NAMES.index("rotation")] = 0.3
     moving[NAMES.index("insertion")] = 0.1
-    assert increments(np.zeros(6), at_rest)[[ROLL, SPIN]].tolist() == [0.3, 0.0]
-    assert increments(np.zeros(6), moving)[[ROLL, SPIN]].tolist() == [0.0, 0.3]
+    assert control_between(np.zeros(6), at_rest)[[ROLL, SPIN]].tolist() == [0.3, 0.0]
+    assert control_between(np.zeros(6), moving)[[ROLL, SPIN]].tolist() == [0.0, 0.3]

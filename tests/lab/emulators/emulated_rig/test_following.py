@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flexneedle.geometry.quaternion import z_axis
-from flexneedle.lab.emulators.emulated_rig.following import Followed
+from flexneedle.lab.emulators.emulated_rig.following import TipHistory
 from flexneedle.lab.emulators.emulated_rig.stream import Record
-from flexneedle.lab.emulators.motion import Noise, is_missing, pose
+from flexneedle.lab.emulators.motion import SensorNoise, is_missing, sensor_pose
 
 POWER_ON = 100.0
 
@@ -16,13 +16,13 @@ def record(time, x, moving, axis=(0.0, 0.0, 1.0)):
 
 
 def test_at_rest_every_frame_is_known():
-    tip = Followed(POWER_ON, record(0.0, 1.0, False))
+    tip = TipHistory(POWER_ON, record(0.0, 1.0, False))
     assert tip.newest(400) == 400
     assert tip.at(400)[0] == (1.0, 2.0, -200.0)
 
 
 def test_in_motion_a_frame_is_there_when_the_needle_is_known_at_its_time():
-    tip = Followed(POWER_ON, record(0.0, 0.0, False))
+    tip = TipHistory(POWER_ON, record(0.0, 0.0, False))
     tip.add([record(0.1, 0.0, True), record(0.124, 0.5, True)])
     assert tip.newest(7) == 4
     tip.add([record(0.126, 0.6, True)])
@@ -35,7 +35,7 @@ def test_in_motion_a_frame_is_there_when_the_needle_is_known_at_its_time():
 
 def test_frame_numbers_never_decrease():
     """A motion that begins while a frame is taken at rest does not take it back."""
-    tip = Followed(POWER_ON, record(0.0, 0.0, False))
+    tip = TipHistory(POWER_ON, record(0.0, 0.0, False))
     assert tip.newest(4) == 4
     tip.add([record(0.099, 0.0, True)])
     assert tip.newest(4) == 4
@@ -44,7 +44,7 @@ def test_frame_numbers_never_decrease():
 
 def test_the_needles_direction_is_between_the_records_and_a_unit_vector():
     tilted = (0.6, 0.0, 0.8)
-    tip = Followed(POWER_ON, record(0.1, 0.0, True))
+    tip = TipHistory(POWER_ON, record(0.1, 0.0, True))
     tip.add([record(0.15, 1.0, True, tilted)])
     orientation = np.array(tip.at(5)[1])
     np.testing.assert_allclose(np.linalg.norm(orientation), 1.0)
@@ -52,8 +52,8 @@ def test_the_needles_direction_is_between_the_records_and_a_unit_vector():
 
 
 def test_noise_is_that_of_the_scenario():
-    tip = Followed(POWER_ON, record(0.0, 1.0, False))
-    made = [pose("tip", n, 0, tip, Noise(0.2, 0.01)) for n in range(2000)]
+    tip = TipHistory(POWER_ON, record(0.0, 1.0, False))
+    made = [sensor_pose("tip", n, 0, tip, SensorNoise(0.2, 0.01)) for n in range(2000)]
     off = np.array([one.position for one in made]) - (1.0, 2.0, -200.0)
     assert np.sqrt((off**2).sum(axis=1).mean()) == pytest.approx(0.2, rel=0.05)
     axes = np.array([z_axis(np.array(one.orientation)) for one in made])
@@ -61,6 +61,6 @@ def test_noise_is_that_of_the_scenario():
 
 
 def test_a_share_of_the_frames_has_no_tip():
-    missing = sum(is_missing(n, 0, Noise(missing=0.03)) for n in range(20_000))
+    missing = sum(is_missing(n, 0, SensorNoise(missing=0.03)) for n in range(20_000))
     assert missing == pytest.approx(600, rel=0.15)
-    assert not any(is_missing(n, 0, Noise()) for n in range(1000))
+    assert not any(is_missing(n, 0, SensorNoise()) for n in range(1000))

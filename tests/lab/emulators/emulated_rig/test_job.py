@@ -10,10 +10,10 @@ import pytest
 from flexneedle.cli.main import main
 from flexneedle.errors import InputError, RigError, RunError
 from flexneedle.lab.emulators.emulated_rig.child import Parent
-from flexneedle.lab.emulators.emulated_rig.job import Job, checked_job
-from flexneedle.lab.emulators.emulated_rig.motors import address_of, device_of
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob, make_job
+from flexneedle.lab.emulators.emulated_rig.motors import address_of, make_controller
 from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle
-from flexneedle.lab.emulators.emulated_rig.phantom import drawn, sensor_of
+from flexneedle.lab.emulators.emulated_rig.phantom import draw_phantom, make_sensor
 from flexneedle.lab.emulators.emulated_rig.rig import split_fault
 from flexneedle.lab.emulators.emulated_rig.stream import (
     ChannelEnded,
@@ -41,7 +41,7 @@ def test_the_rig_of_the_package_fits_both_presets():
     assert RIGS.names() == ["emulated"]
     for name in ("phantom", "phantom3d"):
         setup, axes = load_scenario(name).setup, RIG.axes
-        checked_job(RIG, load_scenario(name), None, 0, None, ())
+        make_job(RIG, load_scenario(name), None, 0, None, ())
         assert axes.insertion.limits == (0.0, setup.stroke_mm)
         assert axes.insertion.speed >= setup.insertion_speed_mm_s
         step = setup.max_advance_mm / setup.insertion_speed_mm_s
@@ -52,7 +52,9 @@ def test_the_rig_of_the_package_fits_both_presets():
 
 
 def test_a_job_is_the_same_in_another_process(tmp_path):
-    job = Job(RIG, load_scenario("world:100012"), 7, tmp_path / "truth.csv", (("galil", "stall=A@5"),))
+    job = EmulationJob(
+        RIG, load_scenario("world:100012"), 7, tmp_path / "truth.csv", (("galil", "stall=A@5"),)
+    )
     assert pickle.loads(pickle.dumps(job)) == job
 
 
@@ -65,7 +67,7 @@ def test_a_job_is_the_same_in_another_process(tmp_path):
 )
 def test_other_devices_are_refused(parts, message):
     with pytest.raises(RigError, match=message):
-        checked_job(rig_with(**parts), PHANTOM, None, 0, None, ())
+        make_job(rig_with(**parts), PHANTOM, None, 0, None, ())
 
 
 @pytest.mark.parametrize("address", [None, 2323, "", ":23", "host:", "host:x", "host:65536"])
@@ -89,22 +91,22 @@ def test_a_tracker_without_a_path_is_refused(port):
 
 def test_a_tracker_in_an_environment_is_refused():
     with pytest.raises(InputError, match="white noise only"):
-        checked_job(RIG, PHANTOM.with_values({"tracker.environment": "noisy"}), None, 0, None, ())
+        make_job(RIG, PHANTOM.with_values({"tracker.environment": "noisy"}), None, 0, None, ())
 
 
 def test_a_free_entry_needs_the_plan(quick_plan):
     free = PHANTOM.with_values({"entry.free_slope_mrad": 50.0})
     with pytest.raises(InputError, match="give the plan with --plan"):
-        checked_job(RIG, free, None, 0, None, ())
+        make_job(RIG, free, None, 0, None, ())
     plan = replace(quick_plan, scenario=PHANTOM.with_values({"entry.slope_mrad": 12.0}))
-    assert checked_job(RIG, free, plan, 0, None, ()).scenario.entry.slope_mrad == 12.0
+    assert make_job(RIG, free, plan, 0, None, ()).scenario.entry.slope_mrad == 12.0
 
 
 def test_a_plan_of_another_scenario_is_refused(quick_plan):
     with pytest.raises(InputError, match="the plan was made with"):
-        checked_job(RIG, PHANTOM.with_values({"needle.length_mm": 149.0}), quick_plan, 0, None, ())
+        make_job(RIG, PHANTOM.with_values({"needle.length_mm": 149.0}), quick_plan, 0, None, ())
     with pytest.raises(InputError, match="several plans"):
-        checked_job(RIG, PHANTOM, {"manipulation": quick_plan}, 0, None, ())
+        make_job(RIG, PHANTOM, {"manipulation": quick_plan}, 0, None, ())
 
 
 @pytest.mark.parametrize(
@@ -126,7 +128,7 @@ def test_an_invalid_fault_is_refused_in_one_line(given, message):
 def test_the_phantom_is_that_of_the_virtual_rig_of_the_same_seed():
     """Also its start: the tip before the first motion."""
     for seed in (0, 5):
-        needle = DrivenNeedle(drawn(Job(RIG, PHANTOM, seed)), np.zeros(6))
+        needle = DrivenNeedle(draw_phantom(EmulationJob(RIG, PHANTOM, seed)), np.zeros(6))
         virtual = virtual_rig(PHANTOM, 0.0, Seeds.of(seed))
         np.testing.assert_array_equal(needle.tip, virtual.truth().tip)
 
@@ -135,8 +137,8 @@ def test_the_sensor_has_the_errors_of_the_draw():
     """Bias, and the error of the rig's registration in place of the scenario's."""
     registration = RIG.registration.model_copy(update={"localisation_mm": 0.5})
     scenario = PHANTOM.with_values({"phantom.tracker_bias_mm": 0.4, "tracker.tip_offset_mm": 9.0})
-    job = Job(rig_with(registration=registration.model_dump()), scenario, 3)
-    sensor = sensor_of(job, truth := drawn(job))
+    job = EmulationJob(rig_with(registration=registration.model_dump()), scenario, 3)
+    sensor = make_sensor(job, truth := draw_phantom(job))
     assert np.linalg.norm(sensor.bias) == pytest.approx(0.4)
     assert (sensor.bias, sensor.offset) == (truth.bias, 9.0)
     error = registration_error(registration, Seeds.of(3).room)
@@ -149,12 +151,12 @@ def test_the_sensor_has_the_errors_of_the_draw():
 
 def test_without_a_registration_the_frames_are_the_same():
     values = {key: value for key, value in RIGS.shipped("emulated").items() if key != "registration"}
-    job = Job(RigFile.model_validate(values), PHANTOM)
-    x, y, z, *axis = sensor_of(job, drawn(job)).at(np.array([1.0, 2.0, 3.0, 0.0, 0.0]))
+    job = EmulationJob(RigFile.model_validate(values), PHANTOM)
+    x, y, z, *axis = make_sensor(job, draw_phantom(job)).at(np.array([1.0, 2.0, 3.0, 0.0, 0.0]))
     assert ((x, y, z), axis) == ((1.0, 2.0, 3.0), [1.0, 0.0, 0.0])
     own = Registration.model_validate(RIGS.shipped("emulated")["registration"])
     of_scenario = PHANTOM.with_values({"tracker.registration": own.model_dump(mode="json")})
-    mapped = sensor_of(replace(job, scenario=of_scenario), drawn(job)).at(
+    mapped = make_sensor(replace(job, scenario=of_scenario), draw_phantom(job)).at(
         np.array([20.0, 2.0, 3.0, 0.0, 0.0])
     )
     np.testing.assert_allclose(mapped[:3], (2.0, 3.0, -200.0))
@@ -171,7 +173,7 @@ def test_noise_and_missing_frames_are_those_of_the_scenario():
 
 
 def test_the_controller_has_the_switches_of_its_axes():
-    device = device_of(Job(rig_with(), PHANTOM))
+    device = make_controller(EmulationJob(rig_with(), PHANTOM))
     assert device.axes[0].switches == (-2000.0, 222_000.0)
     assert device.axes[2].switches == (-32_000.0, 32_000.0)
 

@@ -13,7 +13,7 @@ import pytest
 from emulated import DEADLINE_S, read_until, until
 from emulated_rig import emulated_rig, rig_file, started
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.emulators.motion import RATE_HZ
@@ -208,11 +208,11 @@ def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch, tmp_path):
         "    sys.exit(1)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    rig = EmulatedRig(Job(load_rig("emulated"), load_scenario("phantom")), print)
+    rig = EmulatedRig(EmulationJob(load_rig("emulated"), load_scenario("phantom")), print)
     parts = {"phantom": ChildProcess("ending"), "galil": ChildProcess("ending", "the disk is full")}
     monkeypatch.setattr(rig, "_parts", parts)
     with pytest.raises(RunError, match="the disk is full"):
-        list(rig._messages("phantom"))
+        list(rig._receive("phantom"))
     rig._end()
     assert [one.wait() for one in parts.values()] == [0, 1]
 
@@ -222,7 +222,7 @@ def test_an_address_that_is_taken_is_found_out_before_anything_is_started(tmp_pa
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = f"127.0.0.1:{other.getsockname()[1]}"
         path.write_text(path.read_text().replace("127.0.0.1:0", taken))
-        rig = EmulatedRig(Job(load_rig(path), load_scenario("phantom")), print)
+        rig = EmulatedRig(EmulationJob(load_rig(path), load_scenario("phantom")), print)
         with pytest.raises(InputError) as refused, rig:
             pass
     remedy = "cannot be listened on: Address already in use: end what uses it, or choose another port"

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.emulators.emulated_rig.truth import Row, TruthWriter, read_truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter, read_truth
 
 AXES = ("insertion", "rotation")
 TIP = np.array([1.0, 2.0, 3.0, 0.1, -0.2])
 
 
 def row(time, place=0.0, lag=0.0015):
-    return Row(time, (2000.0 * place, 9000.0), (place, math.pi / 2), TIP + place, 0.5, 0.9, True, lag)
+    return TruthRow(time, (2000.0 * place, 9000.0), (place, math.pi / 2), TIP + place, 0.5, 0.9, True, lag)
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from flexneedle.lab.emulators.emulated_rig import phantom
-from flexneedle.lab.emulators.emulated_rig.job import Job
-from flexneedle.lab.emulators.emulated_rig.phantom import World
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
+from flexneedle.lab.emulators.emulated_rig.phantom import EmulatedPhantom
 from flexneedle.lab.emulators.emulated_rig.stream import Record
 from flexneedle.lab.emulators.emulated_rig.truth import TruthWriter, read_truth
 from flexneedle.lab.process import MessageChannel
@@ -26,7 +26,7 @@ def world(tmp_path):
     path, notes = tmp_path / "truth.csv", []
     with TruthWriter(path, AXES) as writer:
         yield (
-            World(Job(RIG, load_scenario("phantom"), 3), sending, writer, notes.append),
+            EmulatedPhantom(EmulationJob(RIG, load_scenario("phantom"), 3), sending, writer, notes.append),
             reading,
             path,
             notes,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from emulated import until
 from flexneedle.errors import DriverError
-from flexneedle.lab.emulators.galil.controller import AXES, Device, advanced, reply
+from flexneedle.lab.emulators.galil.controller import AXES, ControllerState, advance_controller, reply
 from flexneedle.lab.rig.devices.galil.motors import factory
 from galil_peer import CLOSE, peer
 
@@ -35,7 +35,7 @@ LINE = st.lists(COMMAND, min_size=1, max_size=3).map(";".join)
 @settings(max_examples=150)
 @given(st.lists(st.tuples(LINE, st.integers(0, 20)), max_size=30))
 def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
-    device, _ = reply(Device(), "SHAB")
+    device, _ = reply(ControllerState(), "SHAB")
     for line, samples in lines:
         before, device = device, fuzz_galil.checked_line(device, line, samples)
         pairs = zip(before.axes, device.axes, strict=True)
@@ -45,9 +45,9 @@ def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
 
 
 def test_the_fuzz_notices_a_motion_that_nothing_began():
-    moving = advanced(reply(Device(), "SHA;JGA=5000;BGA")[0], 50)
+    moving = advance_controller(reply(ControllerState(), "SHA;JGA=5000;BGA")[0], 50)
     with pytest.raises(fuzz_galil.Failure, match="began to move"):
-        fuzz_galil.checked_line(Device(), "SPA=100", 0, answered=lambda *_: (moving, ":"))
+        fuzz_galil.checked_line(ControllerState(), "SPA=100", 0, answered=lambda *_: (moving, ":"))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from emulated import until
 from flexneedle.errors import DriverError
-from flexneedle.lab.emulators.galil.controller import Device, reply
+from flexneedle.lab.emulators.galil.controller import ControllerState, reply
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.ports import MotorSetup
 from galil_peer import CLOSE, peer
@@ -480,4 +480,4 @@ def test_every_position_is_sent_to_its_axis_in_lines_that_fit(positions):
 
 def test_the_emulated_controller_is_idle_unless_told():
     """The peer of these tests advances it with each line."""
-    assert all(axis.idle for axis in Device().axes)
+    assert all(axis.idle for axis in ControllerState().axes)

@@ -8,14 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.lab.emulators.galil.profile import SAMPLE_S, Profile, advanced, halted, stopped
+from flexneedle.lab.emulators.galil.profile import (
+    SAMPLE_S,
+    MotionProfile,
+    advance_profile,
+    halt,
+    slow_to_rest,
+)
 
 
 def moved(profile, most=200_000):
     """The profiles after each sample until it rests."""
     after = []
     while not profile.at_rest:
-        profile = advanced(profile)
+        profile = advance_profile(profile)
         after.append(profile)
         assert len(after) < most
     return after
@@ -25,7 +31,7 @@ def moved(profile, most=200_000):
 def test_a_move_takes_the_time_of_its_trapezoid(distance, speed):
     """Or of the triangle, if it is too short to reach its speed; to two samples."""
     acceleration, deceleration = 100_000.0, 50_000.0
-    start = Profile(goal=distance, speed=speed, acceleration=acceleration, deceleration=deceleration)
+    start = MotionProfile(goal=distance, speed=speed, acceleration=acceleration, deceleration=deceleration)
     after = moved(start)
     ramps = 0.5 * speed**2 * (1.0 / acceleration + 1.0 / deceleration)
     if abs(distance) > ramps:
@@ -47,12 +53,12 @@ def test_a_move_takes_the_time_of_its_trapezoid(distance, speed):
 )
 def test_speed_and_acceleration_are_never_exceeded(goals, waits, speed, acceleration, deceleration):
     """Also with a goal that changes on the way, and it ends there. The last sample may end up to half a count off."""
-    profile = Profile(speed=speed, acceleration=acceleration, deceleration=deceleration)
+    profile = MotionProfile(speed=speed, acceleration=acceleration, deceleration=deceleration)
     track = [profile]
     for goal, wait in zip(goals, waits, strict=False):
         profile = replace(profile, goal=goal)
         for _ in range(wait):
-            profile = advanced(profile)
+            profile = advance_profile(profile)
             track.append(profile)
     track += moved(profile)
     assert track[-1].position == pytest.approx(goals[-1])
@@ -68,7 +74,7 @@ def test_speed_and_acceleration_are_never_exceeded(goals, waits, speed, accelera
 
 @pytest.mark.parametrize("velocity", [3_000.0, -800.0])
 def test_a_stop_takes_the_distance_of_its_deceleration(velocity):
-    profile = stopped(Profile(velocity=velocity, goal=1e6, deceleration=40_000.0))
+    profile = slow_to_rest(MotionProfile(velocity=velocity, goal=1e6, deceleration=40_000.0))
     after = moved(profile)
     expected = math.copysign(0.5 * velocity**2 / 40_000.0, velocity)
     assert after[-1].position == pytest.approx(expected, rel=1e-9)
@@ -76,14 +82,14 @@ def test_a_stop_takes_the_distance_of_its_deceleration(velocity):
 
 
 def test_a_jog_goes_on_at_its_speed():
-    profile = Profile(goal=None, cruise=-2_000.0, acceleration=100_000.0)
+    profile = MotionProfile(goal=None, cruise=-2_000.0, acceleration=100_000.0)
     for _ in range(1_020):
-        profile = advanced(profile)
+        profile = advance_profile(profile)
     assert profile.velocity == -2_000.0
     assert profile.position == pytest.approx(-2_000.0 * (1.02 - 0.5 * 0.02))
 
 
 def test_a_halt_rests_at_once():
-    profile = halted(Profile(position=3.0, velocity=700.0, goal=1e6))
+    profile = halt(MotionProfile(position=3.0, velocity=700.0, goal=1e6))
     assert profile.at_rest
-    assert advanced(profile).position == 3.0
+    assert advance_profile(profile).position == 3.0

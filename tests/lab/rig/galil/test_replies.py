@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.lab.emulators.galil.controller import Device, advanced, reply
+from flexneedle.lab.emulators.galil.controller import ControllerState, advance_controller, reply
 from flexneedle.lab.rig.devices.galil.replies import (
     LONGEST_LINE,
     GarbledError,
@@ -43,9 +43,9 @@ def test_the_makers_examples_are_read(name, exchange):
 @pytest.mark.parametrize("name", TRANSCRIPTS)
 def test_the_emulated_controller_answers_like_the_makers_examples(name):
     """But for spaces, which the documents print in several ways."""
-    device = Device()
+    device = ControllerState()
     for exchange in TRANSCRIPTS[name]["exchange"]:
-        device, answer = reply(advanced(device, exchange.get("after_ms", 0)), exchange["command"])
+        device, answer = reply(advance_controller(device, exchange.get("after_ms", 0)), exchange["command"])
         if exchange.get("emulated", True):
             assert "".join(answer.split()) == "".join(exchange["reply"].split()), exchange["command"]
 

@@ -10,8 +10,8 @@ import pytest
 from emulated import DEADLINE_S, emulator, until
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.emulators.galil.controller import Device, reply
-from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp
+from flexneedle.lab.emulators.galil.controller import ControllerState, reply
+from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer
 
 PAGE = (Path(__file__).parents[4] / "docs" / "rig" / "galil.md").read_text()
 
@@ -84,15 +84,15 @@ def _works(address):
 
 def test_a_port_in_use_is_said_in_one_line():
     with (
-        Tcp("127.0.0.1", 0) as tcp,
+        TcpServer("127.0.0.1", 0) as tcp,
         pytest.raises(InputError, match="cannot be listened on: Address already"),
     ):
-        Tcp(*tcp.address).plug()
+        TcpServer(*tcp.address).plug()
 
 
 def session(*faults):
     """A session whose axis A has moved from 0 s on, with other motors on."""
-    made = GalilSession(Device(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
+    made = GalilSession(ControllerState(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
     for line in ("SH", "SP 1000,1000", "PR 100000,100000", "BGAB"):
         made.reply(line, 0.0)
     made.advance(0.0)

@@ -5,14 +5,14 @@ from itertools import pairwise
 import pytest
 
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.emulators.galil.controller import Device
+from flexneedle.lab.emulators.galil.controller import ControllerState
 from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession
 
 
 def observed(*faults):
     """A session with motors on at 0 s, and the list of what its observer gets."""
     seen = []
-    session = GalilSession(Device(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
+    session = GalilSession(ControllerState(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
     session.observe = lambda *record: seen.append(record)
     session.reply("SH", 0.0)
     session.reply("SP 2000,2000;AC 100000,100000;DC 100000,100000", 0.0)

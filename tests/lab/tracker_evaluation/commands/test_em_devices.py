@@ -9,7 +9,7 @@ import pytest
 from emulated import emulated
 from flexneedle.cli import main as cli
 from flexneedle.errors import InputError
-from flexneedle.lab.emulators.server import Serial
+from flexneedle.lab.emulators.server import SerialPort
 
 GRID = """\
 environment = "ideal"
@@ -49,20 +49,20 @@ def test_the_emulator_replaces_only_the_link_of_a_killed_emulator(tmp_path):
     target.write_text("mine")
     link.symlink_to(target)
     with pytest.raises(InputError, match="already exists"):
-        Serial(link)
+        SerialPort(link)
     assert link.readlink() == target
     link.unlink()
     link.symlink_to("/dev/pts/999999")
-    with Serial(link) as serial:
+    with SerialPort(link) as serial:
         with pytest.raises(InputError, match="already exists"):
-            Serial(link)
+            SerialPort(link)
         assert serial.link.exists()
     assert not link.is_symlink()
 
 
 def test_an_emulator_that_ends_leaves_the_link_of_another(tmp_path):
     link = tmp_path / "dev"
-    with Serial(link):
+    with SerialPort(link):
         link.unlink()
         link.symlink_to("/dev/null")
     assert link.readlink().name == "null"

@@ -27,7 +27,7 @@ _SWITCH_RAD, _STOP_RAD = radians(5.0), radians(10.0)
 
 @dataclass(frozen=True)
 class Carriage:
-    """What a motor moves: an axis of the needle. Positions in mm or rad.
+    """Axis of the needle, moved by a motor. Positions in mm or rad.
 
     scale: signed counts per mm or rad; start: position before the motor turns; stops: lowest and highest position;
     switches: motor travel (counts) at which the reverse and the forward limit switch are active; backlash: lost motion
@@ -40,8 +40,8 @@ class Carriage:
     switches: tuple[float, float]
     backlash: float = 0.0
 
-    def moved(self, position: float, travel: float) -> float:
-        """Position after the motor has turned to `travel` counts since the start, from `position`.
+    def move(self, position: float, travel: float) -> float:
+        """Return the position after the motor has turned to `travel` counts since the start, from `position`.
 
         In the positive direction the motor pushes the carriage; on reversal it turns by the lost motion until it pulls.
         """
@@ -85,32 +85,32 @@ def _check(name: str, axis: Axis, start: float) -> None:
         raise RigError(f"axes.{name}.{'home_deg' if turns else 'home_mm'}: {rule}")
 
 
-def starts(carriages: Mapping[str, Carriage]) -> Floats:
-    """Positions (6,) before a motor turns."""
+def start_positions(carriages: Mapping[str, Carriage]) -> Floats:
+    """Return the positions (6,) before a motor turns."""
     return np.array([carriages[name].start if name in carriages else 0.0 for name in NAMES])
 
 
 def positions_after(
     carriages: Mapping[str, Carriage], channels: Mapping[str, int], before: Floats, travel: Sequence[float]
 ) -> Floats:
-    """Positions (6,) after the motors have turned to `travel` (counts by channel), from those before.
+    """Return the positions (6,) after the motors have turned to `travel` (counts by channel), from earlier ones.
 
     channels: index in `travel` by name of the axis.
     """
     after = before.copy()
     for name, carriage in carriages.items():
         at = NAMES.index(name)
-        after[at] = carriage.moved(float(before[at]), travel[channels[name]])
+        after[at] = carriage.move(float(before[at]), travel[channels[name]])
     return after
 
 
 def channels_of(axes: Axes) -> Mapping[str, int]:
-    """Index of the controller's motor by name of the axis."""
+    """Return the index of the controller's motor by name of the axis."""
     return {name: CHANNELS.index(axis.channel) for name, axis in axes.items()}
 
 
-def increments(before: Floats, after: Floats) -> Floats:
-    """The columns of a control (9,) that moves base, guide and roll between two positions (6,).
+def control_between(before: Floats, after: Floats) -> Floats:
+    """Return the columns of a control (9,) that moves base, guide and roll between two positions (6,).
 
     With an advance the needle turns evenly during it, else where it is.
     """

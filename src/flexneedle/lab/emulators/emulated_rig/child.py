@@ -6,16 +6,16 @@ from time import monotonic
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, InputError, one_line
-from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded
-from flexneedle.lab.emulators.faults import Schedule
+from flexneedle.lab.emulators.faults import FaultSchedule
 from flexneedle.lab.process import MessageChannel, open_channel
 
 _FLUSH_S = 1.0
 
 
 class Parent:
-    """The process that has started this one: it sends orders and receives reports.
+    """Process that has started this one: it sends orders and receives reports.
 
     others: further channels to wait for; take: function that reads them.
     """
@@ -47,7 +47,7 @@ class Parent:
         """Report a line for a person."""
         self.report(note=line)
 
-    def obey(self, schedule: Schedule, order: str) -> None:
+    def obey(self, schedule: FaultSchedule, order: str) -> None:
         """Carry out a fault's order, and report when it took effect, or why it was refused."""
         try:
             self.report(done=schedule.obey(order, now := monotonic()), time_s=now)
@@ -55,7 +55,7 @@ class Parent:
             self.report(refused=order, reason=str(error))
 
 
-def run(part: Callable[[Job, Parent, list[MessageChannel]], None]) -> None:
+def run(part: Callable[[EmulationJob, Parent, list[MessageChannel]], None]) -> None:
     """Run a part of the rig: a function of its job, its parent, and the channels to other parts.
 
     The process ends with its parent, or with a part that it exchanges records with. Errors are reported.

@@ -1,4 +1,4 @@
-"""A tip that follows the records of the true needle: the source of an emulated tracker's frames."""
+"""Tip that follows the records of the true needle: the source of an emulated tracker's frames."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ from flexneedle.types import Point, Quaternion
 _LONGEST = 4000  # records: 16 s of motion
 
 
-class Followed:
-    """The tip's sensor between records, linear in time. Frame n is taken n periods after `power_on` (s).
+class TipHistory:
+    """Pose of the tip's sensor between records, linear in time. Frame n is taken n periods after `power_on` (s).
 
-    Its roll, which one coil does not measure, is that of the shortest rotation of the z axis to the needle's direction.
-    The numbers of a record are position x, y, z (mm) and direction of the needle, in the tracker's frame. A frame is
-    there when the needle is known at its time: none is extrapolated. While the needle moves, that is a few milliseconds
-    after it was taken.
+    The roll, which one coil does not measure, is the roll of the shortest rotation from the z axis to the needle's
+    direction. The numbers of a record are position x, y, z (mm) and direction of the needle, in the tracker's frame.
+    A frame exists once the needle is known at its time, without extrapolation: during a motion a few milliseconds
+    after the frame was taken.
     """
 
     def __init__(self, power_on: float, first: Record) -> None:
@@ -33,14 +33,14 @@ class Followed:
         self._records.extend(records)
 
     def newest(self, number: int) -> int:
-        """Number of the newest frame, up to this one, in which the pose is known; it never decreases."""
+        """Return the number of the newest frame, up to this one, in which the pose is known; it never decreases."""
         last = self._records[-1]
         known = floor((last.time - self._power_on) * RATE_HZ) if last.moving else number
         self._known = max(self._known, known)
         return int(min(number, self._known))
 
     def at(self, number: int) -> tuple[Point, Quaternion]:
-        """Position (mm) and orientation in a frame up to the newest, of the last 16 s of motion."""
+        """Return position (mm) and orientation in a frame up to the newest, of the last 16 s of motion."""
         if self._last is None or self._last[0] != number:
             self._last = number, self._between(self._power_on + number / RATE_HZ)
         return self._last[1]

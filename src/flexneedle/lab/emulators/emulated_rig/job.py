@@ -12,7 +12,7 @@ from flexneedle.types import Insertion, Plan
 
 
 @dataclass(frozen=True)
-class Job:
+class EmulationJob:
     """A rig, the scenario of its phantom, the seed of what is drawn, and the file of the true states or None.
 
     faults: texts of scheduled faults by device, "aurora" or "galil".
@@ -25,18 +25,18 @@ class Job:
     faults: tuple[tuple[str, str], ...] = ()
 
     def faults_of(self, device: str) -> list[str]:
-        """Texts of the scheduled faults of a device."""
+        """Return the texts of the scheduled faults of a device."""
         return [text for name, text in self.faults if name == device]
 
 
-def checked_job(
+def make_job(
     rig: RigFile,
     scenario: Scenario,
     record: object,
     seed: int,
     truth: Path | None,
     faults: tuple[tuple[str, str], ...],
-) -> Job:
+) -> EmulationJob:
     """Return the job of a rig, a scenario, and the record of a plan, of an insertion or None.
 
     Raises InputError if it cannot be emulated: devices of another kind, a tracker in an environment, an entry that is
@@ -60,4 +60,4 @@ def checked_job(
             "entry: the plan chooses it (free_radius_mm, free_slope_mrad); give the plan with --plan"
         )
     carriages_of(rig.axes, scenario)
-    return Job(rig, scenario, seed, truth, faults)
+    return EmulationJob(rig, scenario, seed, truth, faults)

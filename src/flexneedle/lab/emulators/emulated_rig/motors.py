@@ -1,4 +1,4 @@
-"""The motors of an emulated rig: a Galil whose travel is sent to the phantom, as a process of its own.
+"""Motors of an emulated rig: a process with a Galil whose travel is sent to the phantom.
 
 `python -m flexneedle.lab.emulators.emulated_rig.motors PARENT PHANTOM`, with descriptors of channels.
 """
@@ -10,11 +10,11 @@ from time import monotonic
 from flexneedle.errors import RigError
 from flexneedle.lab.emulators.emulated_rig.axes import carriages_of, channels_of
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
-from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.stream import Record, send_record
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.emulators.galil.controller import Device
-from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, Tcp, serve
+from flexneedle.lab.emulators.galil.controller import ControllerState
+from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer, serve
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
@@ -23,29 +23,29 @@ _REST_S = 0.05  # between two records at rest
 _PORT, _LAST_PORT = 23, 65535
 
 
-def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
     """Serve the controller at its address until the parent ends."""
     (phantom,) = channels
     faults = [parse_fault(text, FAULTS) for text in job.faults_of("galil")]
-    with Tcp(*address_of(job.rig)) as tcp:
+    with TcpServer(*address_of(job.rig)) as tcp:
         set_realtime_priority()
-        session = GalilSession(device_of(job), faults, monotonic())
+        session = GalilSession(make_controller(job), faults, monotonic())
         session.observe = _Observer(session, parent, phantom)
         parent.report(ready="{}:{}".format(*tcp.address))
         serve(session, tcp, parent, lambda order: parent.obey(session.schedule, order), parent.note)
 
 
-def device_of(job: Job) -> Device:
-    """The controller at power-on, with the limit switches of its axes."""
+def make_controller(job: EmulationJob) -> ControllerState:
+    """Return the controller at power-on, with the limit switches of its axes."""
     carriages, channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
-    axes = list(Device().axes)
+    axes = list(ControllerState().axes)
     for name, carriage in carriages.items():
         axes[channels[name]] = replace(axes[channels[name]], switches=carriage.switches)
-    return Device(tuple(axes))
+    return ControllerState(tuple(axes))
 
 
 def address_of(rig: RigFile) -> tuple[str, int]:
-    """Host and port of the controller in a rig file. Raises RigError."""
+    """Return host and port of the controller in a rig file. Raises RigError."""
     given = rig.driver.settings.get("address")
     rule = f'driver.address = {given!r}: must be "HOST:PORT", such as "127.0.0.1:2323"'
     if not isinstance(given, str):
@@ -60,7 +60,7 @@ def address_of(rig: RigFile) -> tuple[str, int]:
 
 
 class _Observer:
-    """Sends the travel of the motors: every few samples while one moves, else now and then."""
+    """Sender of the motors' travel: every few samples during a motion, less often at rest."""
 
     def __init__(self, session: GalilSession, parent: Parent, phantom: MessageChannel) -> None:
         self._session, self._parent, self._phantom = session, parent, phantom

@@ -1,4 +1,4 @@
-"""The true needle, which follows the axes of a rig in small parts, and the pose of its sensor as the tracker has it."""
+"""True needle, which follows the axes of a rig in small parts, and the pose of its sensor in the tracker's frame."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.geometry.registration import Rigid
-from flexneedle.lab.emulators.emulated_rig.axes import ROTATION, increments
+from flexneedle.lab.emulators.emulated_rig.axes import ROTATION, control_between
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import tip_of
 from flexneedle.phantom.plants import ExactPlant
@@ -40,7 +40,7 @@ class DrivenNeedle:
         if not (turn > 0.0 or way > 0.0) if exactly else (way < RESOLUTION_MM and turn < RESOLUTION_RAD):
             return 0
         parts = max(1, math.ceil(way / self._part - 1e-9), math.ceil(turn / _PART_RAD - 1e-9))
-        row = increments(self._positions, positions) / parts
+        row = control_between(self._positions, positions) / parts
         for _ in range(parts):
             self._plant.step(row)
             self.least_stretch = min(self.least_stretch, self._plant.least_stretch)
@@ -60,7 +60,7 @@ class DrivenNeedle:
 
 
 @dataclass(frozen=True)
-class SensorOfTip:
+class TipSensor:
     """The tip's sensor, `offset` mm behind the tip, in the tracker's frame without noise.
 
     to_tracker: map from the stage's frame, with the error of the registration; bias: constant error (mm).
@@ -71,7 +71,7 @@ class SensorOfTip:
     bias: Point = (0.0, 0.0, 0.0)
 
     def at(self, tip: Floats) -> tuple[float, ...]:
-        """Position x, y, z (mm) and direction of the needle, a unit vector, with the tip at a pose (5,)."""
+        """Return position x, y, z (mm) and direction of the needle, a unit vector, for a pose (5,) of the tip."""
         pose = Pose.of(tip)
         axis = np.array(pose.axis)
         place = np.array(pose.point) + self.bias - self.offset * axis

@@ -1,4 +1,4 @@
-"""The phantom of an emulated rig: the true needle follows the motors, as a process of its own.
+"""Phantom of an emulated rig: a process in which the true needle follows the motors.
 
 `python -m flexneedle.lab.emulators.emulated_rig.phantom PARENT MOTORS TRACKER`, with descriptors of channels.
 """
@@ -17,13 +17,13 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
     carriages_of,
     channels_of,
     positions_after,
-    starts,
+    start_positions,
 )
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
-from flexneedle.lab.emulators.emulated_rig.job import Job
-from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, SensorOfTip
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
+from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, TipSensor
 from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
-from flexneedle.lab.emulators.emulated_rig.truth import Row, TruthWriter
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter
 from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
@@ -35,33 +35,37 @@ _LATE_S, _WARN_S = 0.1, 5.0  # a longer lag is reported, at most this often
 _KEPT = 50_000  # lags: 200 s of motion
 
 
-def drawn(job: Job) -> Truth:
-    """The true phantom, that of `insert` with the seed of the job."""
+def draw_phantom(job: EmulationJob) -> Truth:
+    """Return the true phantom, the same as in `insert` with the seed of the job."""
     return draw(job.scenario, np.random.default_rng(Seeds.of(job.seed).phantom))
 
 
-def sensor_of(job: Job, truth: Truth) -> SensorOfTip:
-    """The tip's sensor with the errors of the draw. The rig file's registration takes the place of the scenario's."""
+def make_sensor(job: EmulationJob, truth: Truth) -> TipSensor:
+    """Return the tip's sensor with the errors of the draw. The rig file's registration replaces the scenario's."""
     registration = job.rig.registration or job.scenario.tracker.registration
     error = registration_error(registration, Seeds.of(job.seed).room)
     to_tracker = to_stage(registration).inverse().after(error)
-    return SensorOfTip(to_tracker, job.scenario.tracker.tip_offset_mm, truth.bias)
+    return TipSensor(to_tracker, job.scenario.tracker.tip_offset_mm, truth.bias)
 
 
-class World:
+class EmulatedPhantom:
     """The true needle, moved by the records of the motors.
 
     tracker: channel for the poses of the tip; truth: writer of the true states, or None; note: reports a line.
     """
 
     def __init__(
-        self, job: Job, tracker: MessageChannel, truth: TruthWriter | None, note: Callable[[str], None]
+        self,
+        job: EmulationJob,
+        tracker: MessageChannel,
+        truth: TruthWriter | None,
+        note: Callable[[str], None],
     ) -> None:
         self._carriages, self._channels = carriages_of(job.rig.axes, job.scenario), channels_of(job.rig.axes)
-        self._positions = starts(self._carriages)
-        drawn_truth = drawn(job)
+        self._positions = start_positions(self._carriages)
+        drawn_truth = draw_phantom(job)
         self._needle = DrivenNeedle(drawn_truth, self._positions)
-        self._sensor, self._truth = sensor_of(job, drawn_truth), truth
+        self._sensor, self._truth = make_sensor(job, drawn_truth), truth
         self._tracker, self._note = tracker, note
         self._seen = self._sensor.at(self._needle.tip)
         self._lags: deque[float] = deque(maxlen=_KEPT)
@@ -72,7 +76,7 @@ class World:
         self.follow(Record(monotonic(), (0.0,) * len(CHANNELS), False))
 
     def follow(self, record: Record) -> None:
-        """Follow the motors, and send where the tip is then."""
+        """Follow the motors, and send the pose of the tip."""
         self._positions = positions_after(self._carriages, self._channels, self._positions, record.values)
         if parts := self._needle.follow(self._positions, exactly=not record.moving):
             self._steps += parts
@@ -85,9 +89,9 @@ class World:
             self._lags.append(lag)
         self._report(lag)
 
-    def _row(self, record: Record, lag: float) -> Row:
+    def _row(self, record: Record, lag: float) -> TruthRow:
         needle = self._needle
-        return Row(
+        return TruthRow(
             record.time,
             [record.values[self._channels[name]] for name in self._carriages],
             [float(self._positions[NAMES.index(name)]) for name in self._carriages],
@@ -108,21 +112,21 @@ class World:
             self._note("the phantom did not converge: its tip is not to be trusted")
 
     def summary(self) -> dict[str, float]:
-        """Steps of the plant, lag behind the motors while they moved (ms), and processor time (s)."""
+        """Return steps of the plant, lag behind the motors while they moved (ms), and processor time (s)."""
         lags = 1e3 * np.array(self._lags or [0.0])
         median, most = np.percentile(lags, (50, 99)).tolist()
         figures = {"lag_median_ms": median, "lag_99_ms": most, "lag_max_ms": float(lags.max())}
         return {"steps": self._steps, **figures, "cpu_s": process_time()}
 
 
-def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
     """Follow the motors until they or the parent end."""
     motors, tracker = channels
     with ExitStack() as stack:
         axes = [name for name, _ in job.rig.axes.items()]
         truth = None if job.truth is None else stack.enter_context(TruthWriter(job.truth, axes))
         compile_kernels(job.scenario.setup.axes)  # not while the motors turn
-        world = World(job, tracker, truth, parent.note)
+        world = EmulatedPhantom(job, tracker, truth, parent.note)
         world.begin()
         gc.collect()
         gc.freeze()
@@ -134,7 +138,7 @@ def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
             parent.report(ended=world.summary())
 
 
-def _follow(world: World, motors: MessageChannel, parent: Parent) -> None:
+def _follow(world: EmulatedPhantom, motors: MessageChannel, parent: Parent) -> None:
     while True:
         ready, _, _ = select.select([motors.fileno(), *parent.sources], [], [])
         parent.read(ready)

@@ -1,4 +1,4 @@
-"""The process that starts the three of an emulated rig, passes orders on to them, and ends them."""
+"""Parent of the three processes of an emulated rig: it starts them, forwards orders to them, and ends them."""
 
 import select
 import socket
@@ -10,13 +10,13 @@ from typing import Any, NoReturn, Self
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators import aurora
-from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.motors import address_of
 from flexneedle.lab.emulators.emulated_rig.tracker import port_of
 from flexneedle.lab.emulators.faults import FaultKind, parse_fault, parse_order
 from flexneedle.lab.emulators.galil import server as galil
 from flexneedle.lab.emulators.orders import Orders
-from flexneedle.lab.emulators.server import Serial
+from flexneedle.lab.emulators.server import SerialPort
 from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.rig_file import RigFile
 
@@ -30,7 +30,7 @@ _FOLLOW_S = 0.5  # a process that has lost another may end before it
 
 
 def split_fault(given: str) -> tuple[str, str]:
-    """Return device and text of `DEVICE:KIND…@…`. Raises InputError, also for a fault that the device has not."""
+    """Return device and text of `DEVICE:KIND…@…`. Raises InputError, also for a fault that the device lacks."""
     device, _, text = given.partition(":")
     if device not in DEVICES or not text:
         example = "galil:stall=A@5:2"
@@ -42,20 +42,22 @@ def split_fault(given: str) -> tuple[str, str]:
 
 
 def check_free(rig: RigFile) -> None:
-    """Raise InputError if the address of the controller or the path of the tracker cannot be used, RigError for one
-    that is none: found out here, before the phantom is made, which takes long.
+    """Check that the controller's address and the tracker's path are free, before the phantom is made, which takes
+    long.
+
+    Raises InputError if one of them cannot be used, RigError if one of them is invalid.
     """
-    with galil.Tcp(*address_of(rig)), Serial(Path(port_of(rig))):
+    with galil.TcpServer(*address_of(rig)), SerialPort(Path(port_of(rig))):
         pass
 
 
 class EmulatedRig:
-    """The processes of an emulated rig. Use it as a context manager; within, all three serve.
+    """Processes of an emulated rig. Use it as a context manager; within, all three serve.
 
     say: called with each message, values by name. Raises InputError or RunError if a process cannot begin.
     """
 
-    def __init__(self, job: Job, say: Callable[[Mapping[str, Any]], None]) -> None:
+    def __init__(self, job: EmulationJob, say: Callable[[Mapping[str, Any]], None]) -> None:
         self._job, self._say = job, say
         self._parts: dict[str, ChildProcess] = {}
 
@@ -83,15 +85,15 @@ class EmulatedRig:
         self._end()
 
     def serve(self, orders: Orders) -> NoReturn:
-        """Pass orders on until interrupted. Raises RunError if a process ends."""
+        """Forward orders until interrupted. Raises RunError if a process ends."""
         channels = {part.channel.fileno(): name for name, part in self._parts.items()}
         while True:
             ready, _, _ = select.select([*channels, *orders.sources], [], [])
             for line in orders.read(ready):
-                self._order(line)
+                self._forward_order(line)
             for descriptor, name in channels.items():
                 if descriptor in ready:
-                    for message in self._messages(name):
+                    for message in self._receive(name):
                         self._say({"device": name, **message})
 
     def _start(self, name: str, ends: tuple[socket.socket, ...]) -> Any:
@@ -100,12 +102,12 @@ class EmulatedRig:
         part = self._parts[name] = ChildProcess(f"{__package__}.{_MODULES[name]}", descriptors=descriptors)
         part.channel.send(self._job)
         while True:
-            for message in self._messages(name):
+            for message in self._receive(name):
                 if "ready" in message:
                     return message["ready"]
 
-    def _order(self, line: str) -> None:
-        """Pass on `fault DEVICE:KIND…` to its device, `clear` to both."""
+    def _forward_order(self, line: str) -> None:
+        """Forward `fault DEVICE:KIND…` to its device, `clear` to both."""
         if line.strip() == "clear":
             for name in DEVICES:
                 self._parts[name].channel.send("clear")
@@ -117,18 +119,18 @@ class EmulatedRig:
             return
         self._parts[device].channel.send(order)
 
-    def _messages(self, name: str) -> Iterator[Mapping[str, Any]]:
-        """The reports of a process that have arrived; waits for one.
+    def _receive(self, name: str) -> Iterator[Mapping[str, Any]]:
+        """Yield the reports of a process that have arrived, or wait for one.
 
         Raises the error that it has reported, or RunError if it has ended.
         """
         part = self._parts[name]
-        yield from _without_failure(part)
+        yield from _raise_failures(part)
         if part.channel.ended:
             name = self._first_to_fail(name)
             first = self._parts[name]
             while not first.channel.ended:
-                yield from _without_failure(first)
+                yield from _raise_failures(first)
             raise RunError(f"the process of the {name} has ended with exit code {first.wait()}")
 
     def _first_to_fail(self, ended: str) -> str:
@@ -151,8 +153,8 @@ class EmulatedRig:
             part.close()
 
 
-def _without_failure(part: ChildProcess) -> Iterator[Mapping[str, Any]]:
-    """The reports of a process that have arrived; waits for one. Raises the error that it has reported."""
+def _raise_failures(part: ChildProcess) -> Iterator[Mapping[str, Any]]:
+    """Yield the reports of a process that have arrived, or wait for one. Raises the error that it has reported."""
     for message in part.channel.receive(None):
         if "failed" in message:
             kind = InputError if message["input"] else RunError
@@ -161,7 +163,7 @@ def _without_failure(part: ChildProcess) -> Iterator[Mapping[str, Any]]:
 
 
 def _split_order(line: str) -> tuple[str, str]:
-    """Device and order of `fault DEVICE:KIND…`. Raises InputError, also for a fault that the device has not."""
+    """Return device and order of `fault DEVICE:KIND…`. Raises InputError, also for a fault that the device lacks."""
     word, _, given = line.strip().partition(" ")
     device, _, text = given.strip().partition(":")
     if word != "fault" or device not in DEVICES:

@@ -1,4 +1,4 @@
-"""The tracker of an emulated rig: an Aurora that measures the tip of the phantom, as a process of its own.
+"""Tracker of an emulated rig: a process with an Aurora that measures the tip of the phantom.
 
 `python -m flexneedle.lab.emulators.emulated_rig.tracker PARENT PHANTOM`, with descriptors of channels.
 """
@@ -9,36 +9,36 @@ from pathlib import Path
 from time import monotonic
 
 from flexneedle.errors import RigError
-from flexneedle.lab.emulators.aurora import FAULTS, fresh
+from flexneedle.lab.emulators.aurora import FAULTS, power_on
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
-from flexneedle.lab.emulators.emulated_rig.following import Followed
-from flexneedle.lab.emulators.emulated_rig.job import Job
+from flexneedle.lab.emulators.emulated_rig.following import TipHistory
+from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.stream import Record, receive_records
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.emulators.motion import Noise
-from flexneedle.lab.emulators.server import EmulatorSession, Serial, serve
+from flexneedle.lab.emulators.motion import SensorNoise
+from flexneedle.lab.emulators.server import EmulatorSession, SerialPort, serve
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.scenario.model import Scenario
 
 
-def main(job: Job, parent: Parent, channels: list[MessageChannel]) -> None:
+def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
     """Serve the tracker at its port until the parent ends."""
     (phantom,) = channels
     faults = [parse_fault(text, FAULTS) for text in job.faults_of("aurora")]
-    followed = Followed(power_on := monotonic(), _first(phantom))
+    followed = TipHistory(begun := monotonic(), _receive_first(phantom))
     parent.others, parent.take = channels, lambda: followed.add(receive_records(phantom))
-    session = EmulatorSession(fresh(), faults, job.seed, power_on, tip=followed, noise=noise_of(job.scenario))
+    session = EmulatorSession(power_on(), faults, job.seed, begun, tip=followed, noise=noise_of(job.scenario))
     session.on_tracking = lambda: parent.report(event="tracking", time_s=session.tracked_since)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then, too
-    with Serial(Path(port_of(job.rig))) as serial:
+    with SerialPort(Path(port_of(job.rig))) as serial:
         set_realtime_priority()
         parent.report(ready=str(serial.link))
         serve(session, serial, parent, lambda order: parent.obey(session.schedule, order), parent.note)
 
 
-def _first(phantom: MessageChannel) -> Record:
+def _receive_first(phantom: MessageChannel) -> Record:
     """Wait for the first records, and return the newest."""
     while not (records := receive_records(phantom)):
         select.select([phantom], [], [])
@@ -46,17 +46,19 @@ def _first(phantom: MessageChannel) -> Record:
 
 
 def port_of(rig: RigFile) -> str:
-    """Path of the tracker in a rig file. Raises RigError."""
+    """Return the path of the tracker in a rig file. Raises RigError."""
     given = rig.tracker.settings.get("port")
     if not isinstance(given, str) or not given:
         raise RigError(f'tracker.port = {given!r}: must be a path, such as "/tmp/aurora"')
     return given
 
 
-def noise_of(scenario: Scenario) -> Noise:
-    """Errors of the tip's sensor: the scenario's."""
+def noise_of(scenario: Scenario) -> SensorNoise:
+    """Return the errors of the tip's sensor in a scenario."""
     settings = scenario.tracker
-    return Noise(settings.jitter_mm, settings.direction_jitter or 0.0, scenario.phantom.missing_fraction)
+    return SensorNoise(
+        settings.jitter_mm, settings.direction_jitter or 0.0, scenario.phantom.missing_fraction
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The record of what an emulated rig truly does: a CSV that is written as it goes, and its reader."""
+"""Record of the true states of an emulated rig: a CSV file that is written continuously, and its reader."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ _REST = ("strain_energy_mj", "least_stretch", "converged", "lag_ms")
 _ROTATION = "rotation"
 
 
-def columns(axes: Sequence[str]) -> tuple[str, ...]:
-    """Columns of a record of these axes."""
+def column_names(axes: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a record of these axes."""
     counts = (f"{name}_counts" for name in axes)
     positions = (f"{name}_{_unit(name)}" for name in axes)
     return ("time_s", *counts, *positions, *_TIP, *_REST)
@@ -29,11 +29,11 @@ def _unit(axis: str) -> str:
     return "deg" if axis == _ROTATION else "mm"
 
 
-class Row(NamedTuple):
-    """What is true at a time (s, monotonic clock).
+class TruthRow(NamedTuple):
+    """True state at a time (s, monotonic clock).
 
-    In the order of the axes the travel of the motors (counts) and the positions of the axes (mm, rad); pose of the tip
-    (5,); strain energy (mJ), least stretch and convergence so far; lag (s).
+    Travel of the motors (counts) and positions of the axes (mm, rad) in the order of the axes; pose of the tip (5,);
+    strain energy (mJ), least stretch and convergence until this row; lag (s).
     """
 
     time: float
@@ -47,7 +47,7 @@ class Row(NamedTuple):
 
 
 class TruthWriter:
-    """Writes a record of these axes to a new file, each row at once. Use it as a context manager.
+    """Writer of a record of these axes to a new file, each row at once. Use it as a context manager.
 
     Raises InputError if the file exists or cannot be created, RunError if a row cannot be written.
     """
@@ -60,7 +60,7 @@ class TruthWriter:
             raise InputError(f"{path}: already exists: choose another file, or remove it") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be created: {error.strerror}") from None
-        self._write(columns(axes))
+        self._write(column_names(axes))
 
     def __enter__(self) -> Self:
         return self
@@ -70,7 +70,7 @@ class TruthWriter:
     ) -> None:
         self._file.close()
 
-    def write(self, row: Row) -> None:
+    def write(self, row: TruthRow) -> None:
         """Write a row."""
         shown = [
             degrees(place) if name == _ROTATION else place
@@ -92,10 +92,12 @@ class TruthWriter:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """A record: times (n,) in s on the monotonic clock; by name of the axis the travel of its motor since power-on
-    (counts) and its position (mm, rad), each (n,); poses x, y, z, θ, ψ of the tip (n, 5); strain energy of the tissue
-    (mJ), least stretch so far, whether all steps converged, and lag of the phantom (s), each (n,).
+class TruthRecord:
+    """Columns of a record.
+
+    Times (n,) in s on the monotonic clock; by name of the axis the travel of its motor since power-on (counts) and
+    its position (mm, rad), each (n,); poses x, y, z, θ, ψ of the tip (n, 5); strain energy of the tissue (mJ), least
+    stretch until each row, convergence of all steps, and lag of the phantom (s), each (n,).
     """
 
     time: Floats
@@ -108,25 +110,26 @@ class Truth:
     lag: Floats
 
     def tip_at(self, times: Floats | float) -> Floats:
-        """Poses (…, 5) of the tip at times (s), linear between rows. Raises InputError for times outside of them."""
+        """Return the poses (…, 5) of the tip at times (s), linear between rows. Raises InputError for times outside
+        of them."""
         wanted = np.asarray(times, dtype=float)
         if wanted.size and not (self.time[0] <= wanted.min() and wanted.max() <= self.time[-1]):
             raise InputError(f"times must be from {self.time[0]:.3f} to {self.time[-1]:.3f} s")
         return np.stack([np.interp(wanted, self.time, column) for column in self.tips.T], axis=-1)
 
 
-def read_truth(path: Path) -> Truth:
+def read_truth(path: Path) -> TruthRecord:
     """Return the record in a file of `emulate rig --truth`, also while it is written: its last row may be incomplete.
 
     Raises InputError: file, rule.
     """
-    names, rows = _rows(path)
+    names, rows = _read_rows(path)
     table = dict(zip(names, np.array(rows, dtype=float).reshape(-1, len(names)).T, strict=True))
     axes = [name.removesuffix("_counts") for name in names if name.endswith("_counts")]
-    if names != columns(axes) or not rows:
+    if names != column_names(axes) or not rows:
         raise InputError(f"{path}: must have the columns of emulate rig --truth, and a row")
     positions = {name: table[f"{name}_{_unit(name)}"] for name in axes}
-    return Truth(
+    return TruthRecord(
         table["time_s"],
         {name: table[f"{name}_counts"] for name in axes},
         {name: np.radians(place) if name == _ROTATION else place for name, place in positions.items()},
@@ -138,8 +141,8 @@ def read_truth(path: Path) -> Truth:
     )
 
 
-def _rows(path: Path) -> tuple[tuple[str, ...], list[list[float]]]:
-    """Names of the columns, and the complete rows."""
+def _read_rows(path: Path) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Return the names of the columns, and the complete rows."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -1,9 +1,9 @@
-"""The emulated Galil DMC-4143: its reply to a line in a state. Pure functions, without I/O or time.
+"""Replies of the emulated Galil DMC-4143 to lines, as a function of its state. Pure functions, without I/O or time.
 
 It has the commands that drive axes A to D: motor on and off, speeds, relative and absolute moves, position tracking,
 jog, stop, abort, limits, and queries of positions, errors and reasons. A command is two capital letters, axes and
 values as `PRA=100`, `PR 100,,50` or `BGAC`; a line may have several with `;` between them. Each is answered by its data
-and `:`, or by `?`, after which `TC1` reports why. Facts are those of Galil's Command Reference for the DMC-4103, the
+and `:`, or by `?`, after which `TC1` reports why. Facts are from Galil's Command Reference for the DMC-4103, the
 series of the DMC-4143; it was not compared with a controller.
 """
 
@@ -12,9 +12,9 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from flexneedle.lab.emulators.galil import axis as one
-from flexneedle.lab.emulators.galil.axis import Axis
-from flexneedle.lab.emulators.galil.profile import SAMPLE_S, stopped
+from flexneedle.lab.emulators.galil import motor_axis as one
+from flexneedle.lab.emulators.galil.motor_axis import MotorAxis
+from flexneedle.lab.emulators.galil.profile import SAMPLE_S, slow_to_rest
 
 AXES = "ABCD"
 REVISION = "DMC4143 Rev 1.3d"
@@ -48,10 +48,10 @@ _GENERAL = {"_TM": 1000.0, "_CN0": -1.0, "_PF": 10.0, "_BV": float(len(AXES))}
 
 
 @dataclass(frozen=True)
-class Device:
+class ControllerState:
     """The state of the controller: its axes and the code of the last error."""
 
-    axes: tuple[Axis, ...] = (Axis(),) * len(AXES)
+    axes: tuple[MotorAxis, ...] = (MotorAxis(),) * len(AXES)
     error: int = 0
 
 
@@ -63,36 +63,36 @@ class _RefusalError(Exception):
         self.code = code
 
 
-def advanced(device: Device, samples: int = 1) -> Device:
-    """The controller after a number of its samples, 1 ms each."""
-    return replace(device, axes=tuple(_after(axis, samples) for axis in device.axes))
+def advance_controller(device: ControllerState, samples: int = 1) -> ControllerState:
+    """Return the controller after a number of its samples, 1 ms each."""
+    return replace(device, axes=tuple(_advance_axis(axis, samples) for axis in device.axes))
 
 
-def _after(axis: Axis, samples: int) -> Axis:
+def _advance_axis(axis: MotorAxis, samples: int) -> MotorAxis:
     for _ in range(samples):
         if axis.idle:
             break
-        axis = one.sampled(axis)
+        axis = one.advance_axis(axis)
     return axis
 
 
-def reply(device: Device, line: str) -> tuple[Device, str]:
+def reply(device: ControllerState, line: str) -> tuple[ControllerState, str]:
     """Return the state after a line, without its end, and the complete reply."""
     parts = []
     for command in line[:_LONGEST_LINE].split(";"):
         try:
-            device, data = _executed(device, command.strip())
+            device, data = _execute(device, command.strip())
         except _RefusalError as refusal:
             device, data = replace(device, error=refusal.code), None
         parts.append("?" if data is None else f"{data}:")
     return device, "".join(parts)
 
 
-def _executed(device: Device, command: str) -> tuple[Device, str]:
+def _execute(device: ControllerState, command: str) -> tuple[ControllerState, str]:
     if not command:
         return device, ""
     if command == "\x12\x16":
-        return device, _line(REVISION)
+        return device, _format_line(REVISION)
     form = _FORM.fullmatch(command)
     if form is None:
         raise _RefusalError(1)
@@ -100,31 +100,31 @@ def _executed(device: Device, command: str) -> tuple[Device, str]:
     if name in _WHOLE:
         return _WHOLE[name](device, rest)
     if name in _ACTIONS:
-        return _acted(device, name, rest), ""
+        return _act(device, name, rest), ""
     if name in _REPORTED:
-        which = _listed(rest)
-        return device, _line(", ".join(_number(_REPORTED[name](device.axes[k])) for k in which))
+        which = _parse_axes(rest)
+        return device, _format_line(", ".join(_format_number(_REPORTED[name](device.axes[k])) for k in which))
     if name in _SETTINGS:
-        return _set(device, name, rest)
+        return _apply_setting(device, name, rest)
     raise _RefusalError(1)
 
 
-def _line(text: str) -> str:
+def _format_line(text: str) -> str:
     return f" {text}\r\n" if text else ""
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.0f}" if value == round(value) else f"{value:.4f}"
 
 
-def _listed(rest: str) -> list[int]:
-    """The axes that a command names; all of them if none."""
+def _parse_axes(rest: str) -> list[int]:
+    """Return the axes that a command names; all of them if none."""
     if not all(letter in AXES for letter in rest):
         raise _RefusalError(4)
     return [AXES.index(letter) for letter in rest] or list(range(len(AXES)))
 
 
-def _value(text: str) -> float:
+def _parse_value(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -134,14 +134,14 @@ def _value(text: str) -> float:
     return value
 
 
-def _with(device: Device, changed: Mapping[int, Axis]) -> Device:
+def _with_axes(device: ControllerState, changed: Mapping[int, MotorAxis]) -> ControllerState:
     return replace(device, axes=tuple(changed.get(k, axis) for k, axis in enumerate(device.axes)))
 
 
 # Settings: NAME A=value, or NAME value,value; `?` in place of a value asks for it
 
 
-def _set(device: Device, name: str, rest: str) -> tuple[Device, str]:
+def _apply_setting(device: ControllerState, name: str, rest: str) -> tuple[ControllerState, str]:
     assigned = _ASSIGNED.fullmatch(rest)
     if assigned:
         fields = {AXES.index(assigned["axis"]): assigned["value"].strip()}
@@ -153,70 +153,74 @@ def _set(device: Device, name: str, rest: str) -> tuple[Device, str]:
     if any(text == "?" for text in fields.values()):
         if not all(text == "?" for text in fields.values()):
             raise _RefusalError(51)
-        return device, _line(", ".join(_number(reported(device.axes[k])) for k in sorted(fields)))
+        return device, _format_line(
+            ", ".join(_format_number(reported(device.axes[k])) for k in sorted(fields))
+        )
     # All values are checked before one is set.
-    return _with(device, {k: change(device.axes[k], _value(text)) for k, text in fields.items()}), ""
+    return _with_axes(
+        device, {k: change(device.axes[k], _parse_value(text)) for k, text in fields.items()}
+    ), ""
 
 
-def _within(value: float, least: float, most: float) -> float:
+def _require_within(value: float, least: float, most: float) -> float:
     if not least <= value <= most:
         raise _RefusalError(6)
     return value
 
 
-def _at_rest(axis: Axis) -> None:
+def _require_rest(axis: MotorAxis) -> None:
     if axis.running:
         raise _RefusalError(7)
 
 
-def _speed(axis: Axis, value: float) -> Axis:
-    speed = _rounded_down(_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP)
+def _set_speed(axis: MotorAxis, value: float) -> MotorAxis:
+    speed = _round_down(_require_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP)
     return replace(axis, profile=replace(axis.profile, speed=speed))
 
 
-def _rounded_down(value: float, step: float) -> float:
+def _round_down(value: float, step: float) -> float:
     return math.floor(value / step) * step
 
 
-def _rate(value: float) -> float:
-    return _rounded_down(_within(value, _LEAST_ACCELERATION, _MOST_ACCELERATION), _ACCELERATION_STEP)
+def _round_rate(value: float) -> float:
+    return _round_down(_require_within(value, _LEAST_ACCELERATION, _MOST_ACCELERATION), _ACCELERATION_STEP)
 
 
-def _acceleration(axis: Axis, value: float) -> Axis:
-    return replace(axis, profile=replace(axis.profile, acceleration=_rate(value)))
+def _set_acceleration(axis: MotorAxis, value: float) -> MotorAxis:
+    return replace(axis, profile=replace(axis.profile, acceleration=_round_rate(value)))
 
 
-def _deceleration(axis: Axis, value: float) -> Axis:
-    """DC, which may change in a jog and after a stop, but not on the way to a position."""
+def _set_deceleration(axis: MotorAxis, value: float) -> MotorAxis:
+    """Set DC, which may change in a jog and after a stop, but not on the way to a position."""
     stopping = axis.profile.stopping
     if axis.running and axis.jog is None and not stopping and not axis.profile.at_rest:
         raise _RefusalError(7)
-    rate = _rate(value)
+    rate = _round_rate(value)
     profile = replace(axis.profile, deceleration=rate) if axis.jog is not None or stopping else axis.profile
     return replace(axis, deceleration=rate, profile=profile)
 
 
-def _relative(axis: Axis, value: float) -> Axis:
-    _at_rest(axis)
-    return replace(axis, relative=_counts(value), jog=None)
+def _set_relative(axis: MotorAxis, value: float) -> MotorAxis:
+    _require_rest(axis)
+    return replace(axis, relative=_round_counts(value), jog=None)
 
 
-def _counts(value: float) -> float:
-    return float(int(_within(value, -_MOST - 1.0, _MOST)))
+def _round_counts(value: float) -> float:
+    return float(int(_require_within(value, -_MOST - 1.0, _MOST)))
 
 
-def _absolute(axis: Axis, value: float) -> Axis:
-    value = _counts(value)
+def _set_absolute(axis: MotorAxis, value: float) -> MotorAxis:
+    value = _round_counts(value)
     if axis.tracking:
-        if axis.blocked(value - axis.profile.position) is not None:
+        if axis.limit_in(value - axis.profile.position) is not None:
             raise _RefusalError(22)
-        return one.tracked(axis, value)
-    _at_rest(axis)
+        return one.follow_position(axis, value)
+    _require_rest(axis)
     return replace(axis, absolute=value, relative=None, jog=None)
 
 
-def _jogged(axis: Axis, value: float) -> Axis:
-    value = math.copysign(_rounded_down(_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP), value)
+def _set_jog(axis: MotorAxis, value: float) -> MotorAxis:
+    value = math.copysign(_round_down(_require_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP), value)
     if axis.running and axis.jog is not None:
         return replace(axis, jog=value, profile=replace(axis.profile, cruise=value))
     if axis.running:
@@ -224,58 +228,58 @@ def _jogged(axis: Axis, value: float) -> Axis:
     return replace(axis, jog=value, relative=None)
 
 
-def _position(axis: Axis, value: float) -> Axis:
-    _at_rest(axis)
-    return one.defined(axis, _counts(value))
+def _set_position(axis: MotorAxis, value: float) -> MotorAxis:
+    _require_rest(axis)
+    return one.define_position(axis, _round_counts(value))
 
 
-def _track(axis: Axis, value: float) -> Axis:
+def _set_tracking(axis: MotorAxis, value: float) -> MotorAxis:
     if value not in (0.0, 1.0):
         raise _RefusalError(6)
     if value == 0.0:
-        return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
+        return one.slow_down(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
     if not axis.servo:
         raise _RefusalError(20)
     if axis.tracking:
         return axis
     if axis.jog is not None and axis.running:
-        return replace(axis, tracking=True, jog=None, profile=stopped(axis.profile))
+        return replace(axis, tracking=True, jog=None, profile=slow_to_rest(axis.profile))
     goal = axis.profile.goal if axis.running else axis.profile.position
     return replace(axis, tracking=True, jog=None, relative=None, absolute=goal or 0.0)
 
 
-def _whole(value: float, least: float, most: float) -> float:
+def _require_whole(value: float, least: float, most: float) -> float:
     if value != int(value):
         raise _RefusalError(6)
-    return _within(value, least, most)
+    return _require_within(value, least, most)
 
 
-_SETTINGS: dict[str, tuple[Callable[[Axis], float], Callable[[Axis, float], Axis]]] = {
-    "SP": (lambda axis: axis.profile.speed, _speed),
-    "AC": (lambda axis: axis.profile.acceleration, _acceleration),
-    "DC": (lambda axis: axis.deceleration, _deceleration),
+_SETTINGS: dict[str, tuple[Callable[[MotorAxis], float], Callable[[MotorAxis, float], MotorAxis]]] = {
+    "SP": (lambda axis: axis.profile.speed, _set_speed),
+    "AC": (lambda axis: axis.profile.acceleration, _set_acceleration),
+    "DC": (lambda axis: axis.deceleration, _set_deceleration),
     "SD": (
         lambda axis: axis.limit_deceleration,
-        lambda axis, value: replace(axis, limit_deceleration=_rate(value)),
+        lambda axis, value: replace(axis, limit_deceleration=_round_rate(value)),
     ),
-    "PR": (lambda axis: axis.goal - axis.profile.position, _relative),
-    "PA": (lambda axis: axis.rested, _absolute),
-    "JG": (lambda axis: axis.jog or 0.0, _jogged),
-    "DP": (lambda axis: axis.encoder, _position),
-    "PT": (lambda axis: float(axis.tracking), _track),
-    "FL": (lambda axis: axis.forward, lambda axis, value: replace(axis, forward=_counts(value))),
-    "BL": (lambda axis: axis.reverse, lambda axis, value: replace(axis, reverse=_counts(value))),
+    "PR": (lambda axis: axis.goal - axis.profile.position, _set_relative),
+    "PA": (lambda axis: axis.rested, _set_absolute),
+    "JG": (lambda axis: axis.jog or 0.0, _set_jog),
+    "DP": (lambda axis: axis.encoder, _set_position),
+    "PT": (lambda axis: float(axis.tracking), _set_tracking),
+    "FL": (lambda axis: axis.forward, lambda axis, value: replace(axis, forward=_round_counts(value))),
+    "BL": (lambda axis: axis.reverse, lambda axis, value: replace(axis, reverse=_round_counts(value))),
     "LD": (
         lambda axis: float(axis.disabled),
-        lambda axis, value: replace(axis, disabled=int(_whole(value, 0.0, 3.0))),
+        lambda axis, value: replace(axis, disabled=int(_require_whole(value, 0.0, 3.0))),
     ),
     "ER": (
         lambda axis: axis.error_limit,
-        lambda axis, value: replace(axis, error_limit=_whole(value, -1.0, _MOST)),
+        lambda axis, value: replace(axis, error_limit=_require_whole(value, -1.0, _MOST)),
     ),
     "OE": (
         lambda axis: float(axis.off_on_error),
-        lambda axis, value: replace(axis, off_on_error=int(_whole(value, 0.0, 3.0))),
+        lambda axis, value: replace(axis, off_on_error=int(_require_whole(value, 0.0, 3.0))),
     ),
 }
 
@@ -283,36 +287,36 @@ _SETTINGS: dict[str, tuple[Callable[[Axis], float], Callable[[Axis, float], Axis
 # Actions: NAMEABC, or NAME for all axes
 
 
-def _acted(device: Device, name: str, rest: str) -> Device:
-    return _with(device, {k: _ACTIONS[name](device.axes[k]) for k in _listed(rest)})
+def _act(device: ControllerState, name: str, rest: str) -> ControllerState:
+    return _with_axes(device, {k: _ACTIONS[name](device.axes[k]) for k in _parse_axes(rest)})
 
 
-def _begin(axis: Axis) -> Axis:
+def _begin(axis: MotorAxis) -> MotorAxis:
     if not axis.servo:
         raise _RefusalError(20)
     if axis.running:
         raise _RefusalError(21)
     direction = axis.jog if axis.jog is not None else axis.goal - axis.profile.position
-    if axis.blocked(direction) is not None:
+    if axis.limit_in(direction) is not None:
         raise _RefusalError(22)
-    return one.begun(axis)
+    return one.begin_motion(axis)
 
 
-def _motor_off(axis: Axis) -> Axis:
-    _at_rest(axis)
-    return one.off(axis)
+def _motor_off(axis: MotorAxis) -> MotorAxis:
+    _require_rest(axis)
+    return one.switch_off(axis)
 
 
-def _stop(axis: Axis) -> Axis:
-    return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
+def _stop(axis: MotorAxis) -> MotorAxis:
+    return one.slow_down(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
 
 
-def _motor_on(axis: Axis) -> Axis:
-    _at_rest(axis)
-    return one.on(axis)
+def _motor_on(axis: MotorAxis) -> MotorAxis:
+    _require_rest(axis)
+    return one.switch_on(axis)
 
 
-_ACTIONS: dict[str, Callable[[Axis], Axis]] = {
+_ACTIONS: dict[str, Callable[[MotorAxis], MotorAxis]] = {
     "SH": _motor_on,
     "MO": _motor_off,
     "BG": _begin,
@@ -323,9 +327,9 @@ _ACTIONS: dict[str, Callable[[Axis], Axis]] = {
 # Queries
 
 
-def _switches(axis: Axis) -> float:
-    """Bits of TS: 7 in motion, 6 position error beyond its limit, 5 motor off, 3 and 2 forward and reverse limit not
-    active."""
+def _status_bits(axis: MotorAxis) -> float:
+    """Return the bits of TS: 7 in motion, 6 position error beyond its limit, 5 motor off, 3 and 2 forward and reverse
+    limit not active."""
     reverse, forward = axis.at_switches
     bits = (
         (7, axis.running),
@@ -337,15 +341,15 @@ def _switches(axis: Axis) -> float:
     return float(sum(1 << bit for bit, holds in bits if holds))
 
 
-_REPORTED: dict[str, Callable[[Axis], float]] = {
+_REPORTED: dict[str, Callable[[MotorAxis], float]] = {
     "TP": lambda axis: round(axis.encoder),
     "RP": lambda axis: round(axis.profile.position),
     "TE": lambda axis: round(axis.profile.position) - round(axis.encoder),
     "TV": lambda axis: round(axis.profile.velocity),
-    "TS": _switches,
+    "TS": _status_bits,
     "SC": lambda axis: axis.stop,
 }
-_OPERANDS: dict[str, Callable[[Axis], float]] = {
+_OPERANDS: dict[str, Callable[[MotorAxis], float]] = {
     **_REPORTED,
     **{name: reported for name, (reported, _) in _SETTINGS.items()},
     "BG": lambda axis: float(axis.running),
@@ -356,19 +360,19 @@ _OPERANDS: dict[str, Callable[[Axis], float]] = {
 }
 
 
-def _report_code(device: Device, rest: str) -> tuple[Device, str]:
+def _report_code(device: ControllerState, rest: str) -> tuple[ControllerState, str]:
     if rest not in ("", "0", "1", "?"):
         raise _RefusalError(4)
     text = f"{device.error} {ERRORS.get(device.error, '')}".strip() if rest == "1" else str(device.error)
-    return replace(device, error=0), _line(text)
+    return replace(device, error=0), _format_line(text)
 
 
-def _message(device: Device, rest: str) -> tuple[Device, str]:
-    values = (_operand(device, text.strip()) for text in rest.split(","))
-    return device, _line(" ".join(f"{value:.4f}" for value in values))
+def _report_values(device: ControllerState, rest: str) -> tuple[ControllerState, str]:
+    values = (_value_of(device, text.strip()) for text in rest.split(","))
+    return device, _format_line(" ".join(f"{value:.4f}" for value in values))
 
 
-def _operand(device: Device, text: str) -> float:
+def _value_of(device: ControllerState, text: str) -> float:
     if text in _GENERAL:
         return _GENERAL[text]
     operand = _OPERAND.fullmatch(text)
@@ -377,21 +381,21 @@ def _operand(device: Device, text: str) -> float:
     return _OPERANDS[operand["name"]](device.axes[AXES.index(operand["axis"])])
 
 
-def _abort(device: Device, rest: str) -> tuple[Device, str]:
+def _abort(device: ControllerState, rest: str) -> tuple[ControllerState, str]:
     if rest not in ("", "0", "1"):  # 1: not the programs, of which it has none
         raise _RefusalError(6)
-    return replace(device, axes=tuple(one.aborted(axis) for axis in device.axes)), ""
+    return replace(device, axes=tuple(one.abort_motion(axis) for axis in device.axes)), ""
 
 
-def _echo(device: Device, rest: str) -> tuple[Device, str]:
+def _echo(device: ControllerState, rest: str) -> tuple[ControllerState, str]:
     if rest not in ("0", "1"):
         raise _RefusalError(6)
     return device, ""
 
 
-_WHOLE: dict[str, Callable[[Device, str], tuple[Device, str]]] = {
+_WHOLE: dict[str, Callable[[ControllerState, str], tuple[ControllerState, str]]] = {
     "TC": _report_code,
-    "MG": _message,
+    "MG": _report_values,
     "AB": _abort,
     "EO": _echo,
 }

@@ -1,4 +1,4 @@
-"""The motion profile of one axis: speed in trapezoids, sampled like the controller's. Counts and seconds.
+"""Motion profile of one axis: speed in trapezoids, sampled like the controller's. Counts and seconds.
 
 The controller renews the commanded position once a sample, 1 ms. Within a sample the acceleration is constant, so that
 the position is exact for the speeds at its ends.
@@ -13,8 +13,8 @@ DECELERATION = 256_000.0
 
 
 @dataclass(frozen=True)
-class Profile:
-    """Commanded position and speed of an axis, and where it is going.
+class MotionProfile:
+    """Commanded position and speed of an axis, and its goal.
 
     goal: position at which the motion ends, None for one without end (jog); cruise: signed speed of that; speed,
     acceleration, deceleration: positive, counts/s and counts/s²; stopping: it slows down to rest wherever that is.
@@ -36,22 +36,22 @@ class Profile:
         return self.velocity == 0.0 and (arrived or (self.goal is None and self.cruise == 0.0))
 
 
-def stopped(profile: Profile) -> Profile:
-    """The profile slowing down to rest at once."""
+def slow_to_rest(profile: MotionProfile) -> MotionProfile:
+    """Return the profile at the begin of a deceleration to rest."""
     return replace(profile, stopping=True)
 
 
-def halted(profile: Profile) -> Profile:
-    """The profile at rest where it is, without slowing down."""
+def halt(profile: MotionProfile) -> MotionProfile:
+    """Return the profile at rest at its position, without deceleration."""
     return replace(profile, velocity=0.0, goal=profile.position, stopping=False)
 
 
-def advanced(profile: Profile) -> Profile:
-    """The profile after one sample."""
+def advance_profile(profile: MotionProfile) -> MotionProfile:
+    """Return the profile after one sample."""
     if profile.at_rest:
         return replace(profile, goal=profile.position, cruise=0.0, stopping=False)
-    wanted = _wanted(profile)
-    velocity = _towards(profile, wanted)
+    wanted = _wanted_velocity(profile)
+    velocity = _next_velocity(profile, wanted)
     position = profile.position + 0.5 * (profile.velocity + velocity) * SAMPLE_S
     goal = None if profile.stopping else profile.goal
     slow = abs(velocity) <= profile.deceleration * SAMPLE_S
@@ -60,8 +60,8 @@ def advanced(profile: Profile) -> Profile:
     return replace(profile, position=position, velocity=velocity)
 
 
-def _wanted(profile: Profile) -> float:
-    """Signed speed at the end of the sample from which the axis can still stop at its goal."""
+def _wanted_velocity(profile: MotionProfile) -> float:
+    """Return the signed speed at the end of the sample from which the axis can still stop at its goal."""
     if profile.stopping:
         return 0.0
     if profile.goal is None:
@@ -74,8 +74,8 @@ def _wanted(profile: Profile) -> float:
     return math.copysign(min(profile.speed, stops), left)
 
 
-def _towards(profile: Profile, wanted: float) -> float:
-    """Signed speed at the end of the sample, within acceleration and deceleration."""
+def _next_velocity(profile: MotionProfile, wanted: float) -> float:
+    """Return the signed speed at the end of the sample, within acceleration and deceleration."""
     now = profile.velocity
     slower = now * wanted < 0.0 or abs(wanted) < abs(now)
     most = (profile.deceleration if slower else profile.acceleration) * SAMPLE_S
@@ -85,5 +85,5 @@ def _towards(profile: Profile, wanted: float) -> float:
 
 
 def _is_at(goal: float, before: float, after: float) -> bool:
-    """Whether a sample ends as good as at the goal, or beyond it."""
+    """Return whether a sample ends within half a count of the goal, or beyond it."""
     return (goal - before) * (goal - after) <= 0.0 or abs(goal - after) < 0.5

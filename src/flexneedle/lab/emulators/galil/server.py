@@ -1,4 +1,4 @@
-"""The emulated controller on TCP, with its time and faults. Runs until interrupted.
+"""Emulated controller on TCP, with its time and faults. It runs until interrupted.
 
 Its motors run in real time, also while this process is not scheduled: before each command, and every few milliseconds,
 the samples are made up to the present.
@@ -16,10 +16,17 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, Schedule, is_order
-from flexneedle.lab.emulators.galil import axis as one
-from flexneedle.lab.emulators.galil.axis import Axis
-from flexneedle.lab.emulators.galil.controller import AXES, ERRORS, SAMPLES_HZ, Device, advanced, reply
+from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, is_order
+from flexneedle.lab.emulators.galil import motor_axis as one
+from flexneedle.lab.emulators.galil.controller import (
+    AXES,
+    ERRORS,
+    SAMPLES_HZ,
+    ControllerState,
+    advance_controller,
+    reply,
+)
+from flexneedle.lab.emulators.galil.motor_axis import MotorAxis
 from flexneedle.lab.emulators.orders import OrderSource
 
 _TICK_S = 0.004
@@ -28,18 +35,18 @@ _LONGEST_LINE = 4096
 _MOST_CLIENTS = 8
 
 
-def _of_an_axis(text: str) -> FaultKind:
+def _fault_of_axis(text: str) -> FaultKind:
     return FaultKind(text, AXES[0], "axis", tuple(AXES))
 
 
 FAULTS = {
-    "stall": _of_an_axis("a motor does not move (A, or stall=AXIS)"),
-    "lag": _of_an_axis("a motor follows late, by 0.15 s (A, or lag=AXIS)"),
-    "overshoot": _of_an_axis("a motor goes a fifth too far (A, or overshoot=AXIS)"),
-    "reversed": _of_an_axis("a motor turns the wrong way (A, or reversed=AXIS)"),
-    "limit": _of_an_axis("both limit switches of an axis are active (A, or limit=AXIS)"),
-    "off": _of_an_axis("a motor is switched off (A, or off=AXIS)"),
-    "reset": _of_an_axis("the position of an axis becomes 0 (A, or reset=AXIS)"),
+    "stall": _fault_of_axis("a motor does not move (A, or stall=AXIS)"),
+    "lag": _fault_of_axis("a motor follows late, by 0.15 s (A, or lag=AXIS)"),
+    "overshoot": _fault_of_axis("a motor goes a fifth too far (A, or overshoot=AXIS)"),
+    "reversed": _fault_of_axis("a motor turns the wrong way (A, or reversed=AXIS)"),
+    "limit": _fault_of_axis("both limit switches of an axis are active (A, or limit=AXIS)"),
+    "off": _fault_of_axis("a motor is switched off (A, or off=AXIS)"),
+    "reset": _fault_of_axis("the position of an axis becomes 0 (A, or reset=AXIS)"),
     "refuse": FaultKind(
         "every command but TC is answered by ? (7, or refuse=CODE)",
         "7",
@@ -67,13 +74,13 @@ and whether one moves, or has been commanded to, from then on."""
 
 @dataclass
 class GalilSession:
-    """The controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
+    """Controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
 
     seed: of garbled replies; moved_since: when an axis first moved, from which scheduled faults count; done: faults of
     one instant that have happened. observe: called after every few samples, and after every command.
     """
 
-    device: Device
+    device: ControllerState
     faults: Sequence[Fault]
     power_on: float
     seed: int = 0
@@ -84,23 +91,23 @@ class GalilSession:
     _travel: tuple[float, ...] = (0.0,) * len(AXES)
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(FAULTS, self.faults)
+        self.schedule = FaultSchedule(FAULTS, self.faults)
         self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
         """Return the active faults by kind; of the scheduled ones none before the first motion."""
-        return {fault.kind: fault for fault in self._present(now)}
+        return {fault.kind: fault for fault in self._active_faults(now)}
 
-    def _present(self, now: float) -> tuple[Fault, ...]:
+    def _active_faults(self, now: float) -> tuple[Fault, ...]:
         return self.schedule.at(now, self.moved_since)
 
     @property
-    def _time(self) -> float:
+    def _sample_time(self) -> float:
         """Time of the last sample."""
         return self.power_on + self._samples / SAMPLES_HZ
 
     def advance(self, now: float) -> None:
-        """Let the axes move until `now`, with their faults, a few samples at a time."""
+        """Advance the axes to `now`, with their faults, a few samples at a time."""
         due = int((now - self.power_on) * SAMPLES_HZ) - self._samples
         while due > _SAMPLES:
             self._advance(self.power_on + (self._samples + _SAMPLES) / SAMPLES_HZ, _SAMPLES)
@@ -109,23 +116,23 @@ class GalilSession:
 
     def _advance(self, now: float, samples: int) -> None:
         if self.moved_since is None and any(axis.running for axis in self.device.axes):
-            self.moved_since = self._time
-        present = self._present(now)
+            self.moved_since = self._sample_time
+        present = self._active_faults(now)
         before = tuple(self._with_faults(axis, AXES[k], present) for k, axis in enumerate(self.device.axes))
-        self.device = advanced(replace(self.device, axes=before), samples)
+        self.device = advance_controller(replace(self.device, axes=before), samples)
         self._samples += samples
-        self._report(
+        self._report_travel(
             [after.encoder - axis.encoder for axis, after in zip(before, self.device.axes, strict=True)]
         )
 
-    def _report(self, moved: Sequence[float]) -> None:
+    def _report_travel(self, moved: Sequence[float]) -> None:
         """Report the travel after a motion (counts) to the observer."""
         self._travel = tuple(travel + step for travel, step in zip(self._travel, moved, strict=True))
         if self.observe is not None:
             moving = any(axis.running and not axis.profile.at_rest for axis in self.device.axes)
-            self.observe(self._time, self._travel, moving or any(moved))
+            self.observe(self._sample_time, self._travel, moving or any(moved))
 
-    def _with_faults(self, axis: Axis, name: str, present: Sequence[Fault]) -> Axis:
+    def _with_faults(self, axis: MotorAxis, name: str, present: Sequence[Fault]) -> MotorAxis:
         of_this = {fault.kind: fault for fault in present if fault.detail == name}
         for kind, change in _ONCE.items():
             if kind in of_this and of_this[kind] not in self._done:
@@ -138,14 +145,14 @@ class GalilSession:
         self.advance(now)
         faults = self.faults_at(now)
         if "refuse" in faults:
-            self.device, answer = _refused(self.device, line, int(faults["refuse"].detail))
+            self.device, answer = _refuse(self.device, line, int(faults["refuse"].detail))
         else:
             self.device, answer = reply(self.device, line)
-        self._report([0.0] * len(AXES))
+        self._report_travel([0.0] * len(AXES))
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + delay, self._damaged(answer.encode("ascii", "replace"), faults)
+        return now + delay, self._damage(answer.encode("ascii", "replace"), faults)
 
-    def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
+    def _damage(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
         if "silence" in faults:
             return b""
         if "chatter" in faults:
@@ -158,8 +165,8 @@ class GalilSession:
         return complete
 
 
-def _refused(device: Device, line: str, code: int) -> tuple[Device, str]:
-    """A line of which every command but TC is refused for this reason."""
+def _refuse(device: ControllerState, line: str, code: int) -> tuple[ControllerState, str]:
+    """Return the state and the replies for a line of which every command but TC is refused with this code."""
     answers = []
     for command in line.split(";"):
         if command.strip().startswith("TC"):
@@ -170,24 +177,24 @@ def _refused(device: Device, line: str, code: int) -> tuple[Device, str]:
     return device, "".join(answers)
 
 
-_ONCE: dict[str, Callable[[Axis], Axis]] = {
-    "off": one.off,
-    "reset": lambda axis: one.defined(axis, 0.0),
+_ONCE: dict[str, Callable[[MotorAxis], MotorAxis]] = {
+    "off": one.switch_off,
+    "reset": lambda axis: one.define_position(axis, 0.0),
 }
 """Faults of one instant."""
 
 
 @dataclass
 class _Client:
-    """A connection: what it has sent of a line, and replies that are due."""
+    """A connection: the begin of a line, and replies that are due."""
 
     socket: socket.socket
     received: bytes = b""
     due: list[tuple[float, bytes]] = field(default_factory=list)
 
 
-class Tcp:
-    """The listening socket and its connections. Use it as a context manager.
+class TcpServer:
+    """Listening socket and its connections. Use it as a context manager.
 
     Raises InputError if the address cannot be used.
     """
@@ -210,7 +217,7 @@ class Tcp:
         return self._address
 
     @property
-    def plugged(self) -> bool:
+    def is_plugged(self) -> bool:
         """Whether it listens."""
         return self._listening is not None
 
@@ -235,7 +242,7 @@ class Tcp:
             self._listening.close()
         self._listening = None
 
-    def lines(self, idle: float, *, deaf: bool) -> list[tuple[_Client, str]]:
+    def receive_lines(self, idle: float, *, deaf: bool) -> list[tuple[_Client, str]]:
         """Wait for at most `idle` seconds; return the lines received, by connection. deaf: nothing is received."""
         sources = [] if self._listening is None else [self._listening]
         sources += [] if deaf else [client.socket for client in self.clients]
@@ -290,21 +297,22 @@ class Tcp:
 
 def serve(
     session: GalilSession,
-    tcp: Tcp,
+    tcp: TcpServer,
     orders: OrderSource,
     obey: Callable[[str], None],
     say: Callable[[str], None],
 ) -> NoReturn:
-    """Answer commands until interrupted. obey: called with each line of the orders; say: called with a line when
-    connections are closed or possible again.
+    """Answer commands until interrupted.
+
+    obey: called with each line of the orders; say: called with a line when connections are closed or possible again.
     """
     while True:
         now = monotonic()
         faults = session.faults_at(now)
-        if ("unplug" in faults) == tcp.plugged:
-            (tcp.unplug if tcp.plugged else tcp.plug)()
-            say("listens again" if tcp.plugged else "unplugged")
-        for client, line in tcp.lines(_TICK_S, deaf="half-open" in faults):
+        if ("unplug" in faults) == tcp.is_plugged:
+            (tcp.unplug if tcp.is_plugged else tcp.plug)()
+            say("listens again" if tcp.is_plugged else "unplugged")
+        for client, line in tcp.receive_lines(_TICK_S, deaf="half-open" in faults):
             client.due.append(session.reply(line, monotonic()))
         for order in orders.read(select.select(orders.sources, [], [], 0.0)[0]):
             obey(order)
@@ -314,7 +322,7 @@ def serve(
 
 
 def execute(session: GalilSession, order: str) -> str:
-    """Inject the fault in a line; return a message on that, or the error."""
+    """Inject the fault in a line; return a message about it, or the error."""
     try:
         if not is_order(order):
             raise InputError(f"{order.strip()!r}: must be fault KIND[=DETAIL][:DURATION], or clear")

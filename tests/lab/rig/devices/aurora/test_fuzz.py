@@ -71,9 +71,9 @@ def test_any_line_that_is_no_message_is_refused_and_counted(lines):
 @settings(max_examples=200)
 @given(st.lists(st.binary(max_size=40), max_size=10))
 def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
-    device = aurora.fresh()
+    device = aurora.power_on()
     for number, line in enumerate(lines):
-        checked = codec.parse(line).name.encode() + b":"
+        checked = codec.parse_command(line).name.encode() + b":"
         for sent in (line, checked + b"%04X" % codec.crc16(checked)):
             frame = fuzz_aurora.random_frame(Random(number))
             _, answer = aurora.reply(device, sent, frame)
@@ -103,10 +103,10 @@ def test_the_fuzz_notices_a_line_that_was_taken_for_a_message(line, monkeypatch)
 
 
 def test_the_fuzz_notices_tracking_that_nothing_began():
-    moving = replace(aurora.fresh(), mode="tracking")
+    moving = replace(aurora.power_on(), mode="tracking")
     with pytest.raises(fuzz_aurora.Failure):
         fuzz_aurora.checked_command(
-            aurora.fresh(), b"INIT:", None, answered=lambda *_: (moving, codec.text("OKAY"))
+            aurora.power_on(), b"INIT:", None, answered=lambda *_: (moving, codec.encode_text("OKAY"))
         )
 
 
@@ -119,8 +119,8 @@ def test_the_fuzz_notices_a_verdict_that_does_not_reject(monkeypatch):
 def test_the_line_notices_a_frame_that_was_not_sent_intact():
     sent = fuzz_aurora_line.Sent()
     pose = aurora.EmulatedPose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 0.02)
-    body = b"\x01\x0a\x01" + codec.transform_binary(pose) + bytes(8) + bytes(2)
-    good = codec.binary(body)
+    body = b"\x01\x0a\x01" + codec.encode_pose_binary(pose) + bytes(8) + bytes(2)
+    good = codec.encode_binary(body)
     assert not sent.add(good[:-1] + b"\x00", 5.0)
     assert not sent.add(good[:-1], 5.0)
     assert sent.add(good, 5.0)

@@ -3,12 +3,18 @@
 import math
 from dataclasses import dataclass, field, replace
 
-from flexneedle.lab.emulators.galil.profile import DECELERATION, SAMPLE_S, Profile, advanced, halted, stopped
+from flexneedle.lab.emulators.galil.profile import (
+    DECELERATION,
+    SAMPLE_S,
+    MotionProfile,
+    advance_profile,
+    halt,
+    slow_to_rest,
+)
 
 FOLLOWS = "follows"
 FAULTS = ("stall", "lag", "overshoot", "reversed", "limit")
-"""What a motor may do in place of its command: it does not move; follows late; goes too far; turns the wrong way; is at
-a limit switch."""
+"""Faults of a motor: it does not move; follows late; moves too far; turns the wrong way; is at a limit switch."""
 
 _LAG_S = 0.15
 _SERVO_S = 0.02  # in which the servo of a motor that is free again makes up for its position error
@@ -23,17 +29,18 @@ _ROUNDING = 1e-6  # counts; steps of the encoder are summed up
 
 
 @dataclass(frozen=True)
-class Axis:
-    """An axis. encoder: measured position; forward, reverse: software limits; switches: positions of the limit
-    switches; disabled: those that stop nothing (LD), 1 forward, 2 reverse, 3 both; deceleration, limit_deceleration: to
-    its goal or after a stop (DC), and at a limit (SD); error_limit: position error (ER), none if negative;
-    off_on_error: OE, 1 to switch the motor off beyond it and on an abort, 2 at a limit switch, 3 both.
+class MotorAxis:
+    """An axis of the controller.
 
-    relative, absolute: of the next motion, PR or PA; tracking: whether it follows PA at once (PT); rested: commanded
-    position at which the last motion ended; stop: why it rests; fault: what the motor does.
+    encoder: measured position; forward, reverse: software limits; switches: positions of the limit switches;
+    disabled: switches that stop nothing (LD), 1 forward, 2 reverse, 3 both; deceleration, limit_deceleration: to its
+    goal or after a stop (DC), and at a limit (SD); error_limit: position error (ER), none if negative; off_on_error:
+    OE, 1 to switch the motor off beyond it and on an abort, 2 at a limit switch, 3 both; relative, absolute: of the
+    next motion, PR or PA; tracking: it follows PA at once (PT); rested: commanded position at which the last motion
+    ended; stop: stop code; fault: kind of fault of the motor.
     """
 
-    profile: Profile = field(default_factory=Profile)
+    profile: MotionProfile = field(default_factory=MotionProfile)
     encoder: float = 0.0
     servo: bool = False
     running: bool = False
@@ -69,10 +76,10 @@ class Axis:
         """Position at which the motion that is set would end."""
         return self.absolute if self.relative is None else self.profile.position + self.relative
 
-    def blocked(self, direction: float) -> int | None:
-        """The stop code of a limit in this direction, if one is there. A software limit begins a count beyond."""
-        active, off = self.at_switches, self.disabled
-        reverse, forward = active[0] and not off & 2, active[1] and not off & 1
+    def limit_in(self, direction: float) -> int | None:
+        """Return the stop code of a limit in a direction, None without one. A software limit begins a count beyond."""
+        active, switch_off = self.at_switches, self.disabled
+        reverse, forward = active[0] and not switch_off & 2, active[1] and not switch_off & 1
         if direction > 0.0 and (forward or self.profile.position >= self.forward + 1.0):
             return FORWARD_LIMIT
         if direction < 0.0 and (reverse or self.profile.position <= self.reverse - 1.0):
@@ -86,31 +93,32 @@ class Axis:
         return not self.servo or (rests and self.running == self.tracking)
 
 
-def begun(axis: Axis) -> Axis:
-    """The axis on its way to what is set."""
+def begin_motion(axis: MotorAxis) -> MotorAxis:
+    """Return the axis at the begin of the motion that is set."""
     goal, cruise = (axis.goal, 0.0) if axis.jog is None else (None, axis.jog)
     profile = replace(axis.profile, goal=goal, cruise=cruise, stopping=False, deceleration=axis.deceleration)
     return replace(axis, profile=profile, running=True, stop=RUNNING, relative=None, absolute=axis.goal)
 
 
-def tracked(axis: Axis, position: float) -> Axis:
-    """The axis following a new position at once."""
+def follow_position(axis: MotorAxis, position: float) -> MotorAxis:
+    """Return the axis at the begin of its motion to a new position."""
     profile = replace(axis.profile, goal=position, stopping=False, deceleration=axis.deceleration)
     return replace(axis, profile=profile, absolute=position, running=True, stop=RUNNING)
 
 
-def slowed(axis: Axis, why: int) -> Axis:
-    """The axis slowing down to rest, with SD at a limit, else with DC."""
+def slow_down(axis: MotorAxis, why: int) -> MotorAxis:
+    """Return the axis at the begin of its deceleration to rest, with SD at a limit, else with DC."""
     at_limit = why in (FORWARD_LIMIT, REVERSE_LIMIT)
     rate = axis.limit_deceleration if at_limit else axis.deceleration
-    profile = replace(stopped(axis.profile), deceleration=rate)
+    profile = replace(slow_to_rest(axis.profile), deceleration=rate)
     return replace(axis, profile=profile, tracking=False, jog=None, stop=why)
 
 
-def off(axis: Axis, why: int | None = None) -> Axis:
-    """The axis with its motor off: the commanded position follows the encoder. why: stop code if it was in motion."""
+def switch_off(axis: MotorAxis, why: int | None = None) -> MotorAxis:
+    """Return the axis with its motor off: the commanded position follows the encoder. why: stop code if it was in
+    motion."""
     stop = why if why is not None and axis.running else axis.stop
-    profile = halted(replace(axis.profile, position=axis.encoder))
+    profile = halt(replace(axis.profile, position=axis.encoder))
     return replace(
         axis,
         profile=profile,
@@ -123,29 +131,29 @@ def off(axis: Axis, why: int | None = None) -> Axis:
     )
 
 
-def on(axis: Axis) -> Axis:
-    """The axis held where it is."""
+def switch_on(axis: MotorAxis) -> MotorAxis:
+    """Return the axis with its motor on, held at its position."""
     if axis.servo:
         return axis
-    profile = halted(replace(axis.profile, position=axis.encoder))
+    profile = halt(replace(axis.profile, position=axis.encoder))
     return replace(axis, profile=profile, servo=True, absolute=axis.encoder)
 
 
-def aborted(axis: Axis) -> Axis:
-    """The axis at rest at once; its motor off if it is to be switched off on errors."""
+def abort_motion(axis: MotorAxis) -> MotorAxis:
+    """Return the axis at rest at once, with its motor off if errors switch it off."""
     if axis.off_on_error:
-        return off(axis, ABORTED)
+        return switch_off(axis, ABORTED)
     stop = ABORTED if axis.running else axis.stop
-    profile = halted(axis.profile)
+    profile = halt(axis.profile)
     return replace(
         axis, profile=profile, running=False, tracking=False, jog=None, rested=profile.position, stop=stop
     )
 
 
-def defined(axis: Axis, position: float) -> Axis:
-    """The axis with its present position called so."""
+def define_position(axis: MotorAxis, position: float) -> MotorAxis:
+    """Return the axis with another value for its present position."""
     shift = position - axis.encoder
-    profile = halted(replace(axis.profile, position=axis.profile.position + shift))
+    profile = halt(replace(axis.profile, position=axis.profile.position + shift))
     low, high = axis.switches
     switches = (low + shift, high + shift)
     return replace(
@@ -153,39 +161,39 @@ def defined(axis: Axis, position: float) -> Axis:
     )
 
 
-def sampled(axis: Axis) -> Axis:
-    """The axis after one sample of the controller."""
+def advance_axis(axis: MotorAxis) -> MotorAxis:
+    """Return the axis after one sample of the controller."""
     if axis.idle:
         return axis
     before = axis.profile
-    limit = axis.blocked(_direction(axis)) if axis.running and not before.stopping else None
+    limit = axis.limit_in(_direction_of(axis)) if axis.running and not before.stopping else None
     if limit is not None:
         if axis.off_on_error & _OFF_ON_SWITCH and any(axis.at_switches):
-            return off(axis, limit)
-        axis = slowed(axis, limit)
-    profile = advanced(axis.profile) if axis.running else axis.profile
-    axis = replace(axis, profile=profile, encoder=_followed(axis, before, profile))
+            return switch_off(axis, limit)
+        axis = slow_down(axis, limit)
+    profile = advance_profile(axis.profile) if axis.running else axis.profile
+    axis = replace(axis, profile=profile, encoder=_next_encoder(axis, before, profile))
     if axis.off_on_error & _OFF_ON_ERROR and abs(axis.error) > axis.error_limit >= 0.0:
-        return off(axis, ERROR_OFF)
-    return _ended(axis) if axis.running and profile.at_rest else axis
+        return switch_off(axis, ERROR_OFF)
+    return _end_motion(axis) if axis.running and profile.at_rest else axis
 
 
-def _ended(axis: Axis) -> Axis:
-    """The axis at the end of its motion. In position tracking it waits for the next goal."""
+def _end_motion(axis: MotorAxis) -> MotorAxis:
+    """Return the axis at the end of its motion. In position tracking it waits for the next goal."""
     if axis.tracking:
         return replace(axis, rested=axis.profile.position, stop=RUNNING)
     stop = ARRIVED if axis.stop == RUNNING else axis.stop
     return replace(axis, running=False, rested=axis.profile.position, stop=stop)
 
 
-def _direction(axis: Axis) -> float:
+def _direction_of(axis: MotorAxis) -> float:
     if axis.profile.velocity:
         return axis.profile.velocity
     return axis.profile.cruise if axis.profile.goal is None else axis.profile.goal - axis.profile.position
 
 
-def _followed(axis: Axis, before: Profile, after: Profile) -> float:
-    """Measured position after a sample: that of the profile, or what a faulty motor does."""
+def _next_encoder(axis: MotorAxis, before: MotionProfile, after: MotionProfile) -> float:
+    """Return the measured position after a sample: the profile's, unless the motor has a fault."""
     moved = after.position - before.position
     if axis.fault == "stall":
         return axis.encoder
