@@ -20,15 +20,10 @@ from flexneedle.geometry.registration import (
     localisation_error,
     target_error,
 )
+from flexneedle.lab.tables.columns import map_columns
+from flexneedle.lab.tables.rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
+from flexneedle.lab.tables.table import Table, open_table
 from flexneedle.lab.tracker_evaluation.figures.registration import registration_figure
-from flexneedle.lab.tracker_evaluation.table.columns import column_map
-from flexneedle.lab.tracker_evaluation.table.rules import (
-    POSITIONS,
-    SAME_POSITION_MM,
-    TRUE_POSITIONS,
-    refuse_violations,
-)
-from flexneedle.lab.tracker_evaluation.table.source import LABELS, Table, open_table
 from flexneedle.phantom.tracking.table import REQUIRED
 from flexneedle.scenario.sections.registration import Registration
 
@@ -36,6 +31,7 @@ Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 _NUMBERS = REQUIRED[1:7]
+_LABELS = ("point_id", "sensor", "environment")
 _HEAD = """\
 # Registration of the tracker's frame to the stage's, by flexneedle em register. Paste the first table into a scenario,
 # or pass this file to flexneedle insert --registration.
@@ -116,7 +112,7 @@ def read_pairs(
     columns: as for `em evaluate`; sensor, environment: required if the table has several; unit: "mm" or "m", of all
     coordinates. Raises InputError.
     """
-    with open_table(data, column_map(columns), _NUMBERS, LABELS, unit=unit) as table:
+    with open_table(data, _NUMBERS, _LABELS, mapping=map_columns(columns), unit=unit) as table:
         return _pairs(table, {"sensor": sensor, "environment": environment})
 
 
@@ -188,8 +184,8 @@ def _pairs(table: Table, labels: Mapping[str, str | None]) -> PointPairs:
     for name, value in labels.items():
         _check_label(table, name, value)
     chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in given)])
-    refuse_violations(table, POSITIONS, chosen, **given)
-    refuse_violations(table, TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **given)
+    table.refuse(POSITIONS, chosen, **given)
+    table.refuse(TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **given)
     found = table.arrays(_POINTS.format(chosen=chosen), **given)
     known = found["n"] > 0
     if not known.any():

@@ -1,13 +1,14 @@
-"""A tracker's frames as a table, one row per sensor and frame, in CSV or Parquet."""
+"""A tracker's frames as a table, one row per sensor and frame."""
 
-import csv
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Sequence
 from itertools import groupby
-from math import isfinite
+from math import isnan
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
+from flexneedle.lab.tables.rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
+from flexneedle.lab.tables.table import Table, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
@@ -19,9 +20,12 @@ frame numbers can be read as a recording, too: `status` is optional."""
 
 _REQUIRED = ("time_s", "frame_number", "sensor", "x_mm", "y_mm", "z_mm")
 _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
+_RULES = (*require_numbers("time_s", "frame_number"), *require_text("sensor"), *POSITIONS, *ORIENTATIONS)
+
+_Row = dict[str, Any]
 
 
-def rows_of(frame: Frame) -> list[dict[str, Any]]:
+def rows_of(frame: Frame) -> list[_Row]:
     """Return the rows of a frame, with all digits; None for values that are not known."""
     return [
         {"time_s": frame.time, "frame_number": frame.number, "sensor": name, "status": reading.status}
@@ -34,111 +38,47 @@ def rows_of(frame: Frame) -> list[dict[str, Any]]:
 
 def read_frames(path: Path) -> tuple[Frame, ...]:
     """Return the frames of a recording in the order of their rows. Raises InputError: file, line, rule."""
-    rows = _parquet_rows(path) if path.suffix == ".parquet" else _csv_rows(path)
-    together = groupby(enumerate(rows, 2), key=lambda row: (row[1].get("time_s"), row[1].get("frame_number")))
-    frames = tuple(_frame(path, [*group]) for _, group in together)
+    optional = [name for name in COLUMNS if name not in _REQUIRED]
+    with open_table(path, _REQUIRED, optional) as table:
+        table.refuse(_RULES)
+        columns = table.arrays(f"SELECT {', '.join(COLUMNS)} FROM samples")
+        rows = [
+            dict(zip(columns, row, strict=True))
+            for row in zip(*(c.tolist() for c in columns.values()), strict=True)
+        ]
+        return _frames(table, rows)
+
+
+def _frames(table: Table, rows: Sequence[_Row]) -> tuple[Frame, ...]:
+    frames: list[Frame] = []
+    numbered = enumerate(rows, 1)
+    for (time, number), group in groupby(
+        numbered, key=lambda row: (row[1]["time_s"], row[1]["frame_number"])
+    ):
+        readings: dict[str, SensorReading] = {}
+        for position, row in group:
+            if row["sensor"] in readings:
+                place, _ = table.find_row(position)
+                raise InputError(f"{place}: duplicate sensor {row['sensor']} in frame {number:g}")
+            readings[row["sensor"]] = _reading(row)
+        if frames and time < frames[-1].time:
+            raise InputError(f"frame {number:g}: time_s must not decrease")
+        frames.append(Frame(time, int(number), readings))
     if not frames:
-        raise InputError(f"{path}: contains no frames")
-    backwards = next((n for n in range(1, len(frames)) if frames[n].time < frames[n - 1].time), None)
-    if backwards is not None:
-        raise InputError(f"{path}: frame {frames[backwards].number}: time_s must not decrease")
-    return frames
+        raise InputError("contains no frames")
+    return tuple(frames)
 
 
-def _csv_rows(path: Path) -> Iterator[Mapping[str, Any]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            _check_columns(path, reader.fieldnames or ())
-            yield from reader
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise _unreadable(path, error) from None
+def _reading(row: _Row) -> SensorReading:
+    position, orientation = _known(row, _POSITION), _known(row, _ORIENTATION)
+    indicator = None if isnan(row["indicator"]) else row["indicator"]
+    status = row["status"] or VISIBLE
+    if position is None and status == VISIBLE:
+        status = "missing"
+    return SensorReading(position if status == VISIBLE else None, orientation, indicator, status)
 
 
-def _parquet_rows(path: Path) -> Iterator[Mapping[str, Any]]:
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    try:
-        with path.open("rb") as file:
-            table = parquet.read_table(file)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
-    _check_columns(path, table.column_names)
-    yield from table.to_pylist()
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    reason = (
-        error.strerror if isinstance(error, OSError) and error.strerror else error
-    )  # without a repeated path
-    return InputError(f"{path}: cannot be read: {reason}")
-
-
-def _check_columns(path: Path, columns: Iterable[str]) -> None:
-    missing = [name for name in _REQUIRED if name not in set(columns)]
-    if missing:
-        raise InputError(
-            f"{path}: no column {', '.join(missing)}; columns of a recording: {', '.join(COLUMNS)}"
-        )
-
-
-def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
-    readings: dict[str, SensorReading] = {}
-    stamps = []
-    for line, row in rows:
-        try:
-            stamps.append((_known(row, "time_s"), _known(row, "frame_number")))
-            readings[_new_sensor(row, readings)] = _reading(row)
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{path}: line {line}: {error}") from None
-    time, number = stamps[0]
-    return Frame(time, int(number), readings)
-
-
-def _new_sensor(row: Mapping[str, Any], known: Iterable[str]) -> str:
-    """Return the name of a row's sensor. Raises ValueError if it is empty or a duplicate in this frame."""
-    name = str(row["sensor"] or "")
-    if not name:
-        raise ValueError("sensor is empty")
-    if name in known:
-        raise ValueError(f"duplicate sensor {name} in frame {row['frame_number']}")
-    return name
-
-
-def _known(row: Mapping[str, Any], column: str) -> float:
-    number = _number(row, column)
-    if number is None:
-        raise ValueError(f"{column} is empty")
-    return number
-
-
-def _reading(row: Mapping[str, Any]) -> SensorReading:
-    position_cells = [_number(row, name) for name in _POSITION]
-    orientation_cells = [_number(row, name) for name in _ORIENTATION]
-    indicator = _number(row, "indicator")
-    match position_cells:
-        case [float(x), float(y), float(z)]:
-            status = row.get("status") or VISIBLE
-            position = (x, y, z) if status == VISIBLE else None
-        case _:
-            status = row.get("status")
-            status, position = (status if status and status != VISIBLE else "missing"), None
-    match orientation_cells:
-        case [float(w), float(i), float(j), float(k)]:
-            return SensorReading(position, (w, i, j, k), indicator, status)
-    return SensorReading(position, None, indicator, status)
-
-
-def _number(row: Mapping[str, Any], column: str) -> float | None:
-    """Return a number, or None for an empty cell or a missing column. Raises ValueError."""
-    value = row.get(column)
-    if value is None or value == "":
-        return None
-    try:
-        number = float(value)
-    except ValueError:
-        raise ValueError(f"{column} = {value}: must be a number, with a decimal point") from None
-    if not isfinite(number):
-        raise ValueError(f"{column} = {value}: must be finite")
-    return number
+def _known(row: _Row, names: Iterable[str]) -> Any:
+    """Return the numbers, None if they are empty."""
+    numbers = tuple(row[name] for name in names)
+    return None if isnan(numbers[0]) else numbers

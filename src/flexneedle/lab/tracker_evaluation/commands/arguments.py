@@ -47,7 +47,8 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unit",
         choices=("mm", "m"),
-        help="unit of all lengths (default: mm, with a check that the lengths are not in metres)",
+        default="mm",
+        help="unit of all lengths (default: mm)",
     )
     for column in ("sensor", "environment"):
         parser.add_argument(

@@ -53,11 +53,13 @@ def add_parser(commands: Commands) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.evaluation.check import check
-    from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options
+    from flexneedle.lab.tracker_evaluation.evaluation.check import check_power
+    from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions
 
-    options = Options(tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment)
-    found = check(args.data, args.off, args.on, args.threshold, options)
+    options = EvaluationOptions(
+        tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment
+    )
+    found = check_power(args.data, args.off, args.on, args.threshold, options)
     if args.json:
         print_json(found.values())
     else:
@@ -81,8 +83,8 @@ def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
             f"{sensor.sensor}, power {name}",
             *(number(value, ".4f") for value in (level.mean, level.p95, level.max)),
             f"{level.n_points}",
-            f"{level.n_samples}",
-            f"{100.0 * level.samples_above:.2f} %",
+            f"{level.samples.n_samples}",
+            f"{100.0 * level.samples.above:.2f} %",
         )
         for name, level in (("off", sensor.off), ("on", sensor.on))
     ]

@@ -60,7 +60,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from flexneedle.lab.tracker_evaluation.commands.results import print_evaluation
     from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
         RESULT_FILES,
-        Options,
+        EvaluationOptions,
         evaluate,
         write_evaluation,
     )
@@ -68,7 +68,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from flexneedle.lab.tracker_evaluation.results_folder import results_folder
 
     names = ("register", "unit", "bin_mm", "limit_mm", "ideal", "noisy", "sensor", "environment")
-    options = Options(tuple(args.columns), **{name: getattr(args, name) for name in names})
+    options = EvaluationOptions(tuple(args.columns), **{name: getattr(args, name) for name in names})
     evaluation = evaluate(args.data, options)
     folder = results_folder(args.out, args.data.stem, RESULT_FILES)
     values = write_evaluation(evaluation, folder, draw_evaluation(evaluation, folder))

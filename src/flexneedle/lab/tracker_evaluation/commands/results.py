@@ -7,9 +7,9 @@ from pathlib import Path
 
 from flexneedle.lab.tracker_evaluation.commands.tables import number, print_notes, print_rows, span
 from flexneedle.lab.tracker_evaluation.evaluation import published
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, Result
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import SingleSamples, Summary
-from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, IndicatorSummary
+from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples
 from flexneedle.phantom.tracking.table import REFERENCE
 
 _PER_TABLE = 4
@@ -35,7 +35,7 @@ def _print_tables(evaluation: Evaluation) -> None:
             "Indicator (means at grid points)", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
         )
     pair = evaluation.options.pair
-    fits = [row for found in evaluation.separations for row in _separation_rows(found, *pair)]
+    fits = [row for found in evaluation.fits for row in _fit_rows(found, *pair)]
     if fits:
         print_rows("Error by indicator", ("", "", "95 % interval", "paper"), fits)
     for start in range(0, len(results), _PER_TABLE):
@@ -43,7 +43,7 @@ def _print_tables(evaluation: Evaluation) -> None:
         print_rows("Details (mm)", ("", *(result.grid.title for result in some)), _details(some))
 
 
-def _error_rows(result: Result) -> Iterator[tuple[str, ...]]:
+def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     found, values = result.accuracy, result.values()
     counts = f"{found.n_points}", f"{found.n_samples}"
     yield (result.grid.title, *(number(values[key]) for key in _ERRORS), *counts)
@@ -55,8 +55,8 @@ def _error_rows(result: Result) -> Iterator[tuple[str, ...]]:
             yield (f" {name}", *(number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
 
 
-def _indicator_rows(result: Result) -> Iterator[tuple[str, ...]]:
-    found = result.summary
+def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
+    found = result.indicator
     if found is None:
         return
     yield (result.grid.title, *_levels(found), f"{found.n_points}")
@@ -66,11 +66,11 @@ def _indicator_rows(result: Result) -> Iterator[tuple[str, ...]]:
         yield (" paper", *(number(paper.get(key), ".4f") for key in _INDICATOR), "")
 
 
-def _levels(found: Summary | SingleSamples) -> list[str]:
+def _levels(found: IndicatorSummary | IndicatorSamples) -> list[str]:
     return [number(getattr(found, key, None), ".4f") for key in _INDICATOR]
 
 
-def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
+def _fit_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
     """Rows with the paper's values where sensor and environments are those of the paper."""
     as_in_paper = published.paper_sensor(found.sensor) == REFERENCE
     as_in_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
@@ -86,7 +86,7 @@ def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tupl
         yield (*row, papers.get(quantity, "") if as_in_paper else "")
 
 
-def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, str, str]]:
+def _found_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, str, str]]:
     name = found.sensor
     if found.ideal:
         constant, intervals = found.ideal, found.ideal.intervals
@@ -102,16 +102,10 @@ def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str
         yield f"{name}, {noisy}: residual sd of the line (mm)", number(line.scatter_mm), ""
     if found.threshold is not None:
         yield f"{name}: threshold", number(found.threshold, ".4f"), span(found.threshold_interval, ".4f")
-        yield f"{name}: threshold of single samples", number(found.samples_threshold, ".4f"), ""
-    if found.confusion and found.auc is not None:
-        c = found.confusion
-        yield f"{name}, {ideal}: points below, above", f"{c.ideal_below}, {c.ideal_above}", ""
-        yield f"{name}, {noisy}: points below, above", f"{c.noisy_below}, {c.noisy_above}", ""
-        yield f"{name}: area under the ROC", number(found.auc, ".4f"), span(found.auc_interval, ".4f")
 
 
-def _details(results: list[Result]) -> Iterator[tuple[str, ...]]:
-    def row(name: str, text: Callable[[Result], str]) -> tuple[str, ...]:
+def _details(results: list[SensorResult]) -> Iterator[tuple[str, ...]]:
+    def row(name: str, text: Callable[[SensorResult], str]) -> tuple[str, ...]:
         return (name, *map(text, results))
 
     yield row("mean error ± sd", lambda r: f"{number(r.accuracy.mean_mm)} ± {number(r.accuracy.sd_mm)}")

@@ -21,7 +21,7 @@ from flexneedle.lab.tracker_evaluation.evaluation.intervals import (
     mean,
     quantile_interval,
 )
-from flexneedle.lab.tracker_evaluation.table.grid import Grid, Moments
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid, Moments
 
 P95 = 0.95
 """Quantiles interpolate linearly at rank (n − 1) q, counted from 0 (Hyndman and Fan 1996, type 7)."""
@@ -93,9 +93,9 @@ def jitter(moments: Moments) -> float:
     return float(np.sqrt(np.nansum(moments.scatter) / moments.count.sum()))
 
 
-def accuracy(grid: Grid) -> Accuracy:
+def compute_accuracy(grid: MeasuredGrid) -> Accuracy:
     """Return the errors of a grid. Raises InputError if no grid point has a sample."""
-    measured = grid.measured()
+    measured = grid.measured
     if not len(measured):
         raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: all samples are missing")
     error, count = errors(measured), measured.count
@@ -142,12 +142,12 @@ def _pooled(scatter: Floats, count: Floats, axis: int) -> Floats:
     return np.sqrt(squares)
 
 
-def register_grid(grid: Grid) -> tuple[Grid, RigidFit]:
+def register_grid(grid: MeasuredGrid) -> tuple[MeasuredGrid, RigidFit]:
     """Return the grid after a rigid least-squares fit of its mean to its true positions, and the fit.
 
     Raises InputError for fewer than three points or collinear points.
     """
-    measured = grid.measured()
+    measured = grid.measured
     try:
         rigid = fit_rigid(measured.position, measured.true)
     except InputError as error:
@@ -155,7 +155,7 @@ def register_grid(grid: Grid) -> tuple[Grid, RigidFit]:
             f"--register: sensor {grid.sensor!r}, environment {grid.environment!r}: {error}"
         ) from None
     residual = fiducial_error(rigid, measured.position, measured.true)
-    return grid.registered(rigid), _rigid_fit(rigid, residual, len(measured))
+    return grid.transform(rigid), _rigid_fit(rigid, residual, len(measured))
 
 
 def _rigid_fit(rigid: Rigid, residual: float, points: int) -> RigidFit:

@@ -14,29 +14,24 @@ from numpy.typing import NDArray
 from flexneedle.errors import InputError
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, read_table
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import means
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, read_table
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import indicator_means
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import Interval, bootstrap
-from flexneedle.lab.tracker_evaluation.evaluation.notes import differing_points, missing_sensors
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples, MeasuredGrid
+from flexneedle.lab.tracker_evaluation.evaluation.notes import find_differing_points, find_missing_sensors
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Level:
-    """The indicator with power off or on: over means at grid points, and of single samples.
-
-    samples_max: largest single sample; samples_above: share of single samples above the threshold.
-    """
+class PowerLevel:
+    """The indicator with power off or on: over means at grid points, and of single samples."""
 
     n_points: int
-    n_samples: int
     mean: float
     p95: float
     max: float
-    samples_max: float
-    samples_above: float
+    samples: IndicatorSamples
 
 
 @dataclass(frozen=True)
@@ -49,8 +44,8 @@ class PowerComparison:
 
     sensor: str
     threshold: float
-    off: Level
-    on: Level
+    off: PowerLevel
+    on: PowerLevel
     difference: float
     difference_interval: Interval
     paired: bool
@@ -85,12 +80,12 @@ class PowerCheck:
         }
 
 
-def check(data: Path, off: str, on: str, threshold: float, options: Options) -> PowerCheck:
+def check_power(data: Path, off: str, on: str, threshold: float, options: EvaluationOptions) -> PowerCheck:
     """Return the comparison of the environments `off` and `on` of a table.
 
     Raises InputError for an invalid table, or if no sensor has an indicator in both environments.
     """
-    grids, _ = read_table(data, options)
+    grids, _ = read_table(data, options, threshold)
     before, after = (_grids_of(data, grids, name) for name in (off, on))
     both = [name for name in before if name in after]
     if not both:
@@ -103,19 +98,19 @@ def check(data: Path, off: str, on: str, threshold: float, options: Options) -> 
         for power, own in (("off", before), ("on", after))
         for grid in own.values()
     ]
-    notes = [*missing_sensors(powered, "no indicator in"), *differing_points(powered)]
-    return PowerCheck([compare(before[name], after[name], threshold) for name in both], notes)
+    notes = [*find_missing_sensors(powered, "no indicator in"), *find_differing_points(powered)]
+    return PowerCheck([compare_power(before[name], after[name], threshold) for name in both], notes)
 
 
-def compare(off: Grid, on: Grid, threshold: float) -> PowerComparison:
+def compare_power(off: MeasuredGrid, on: MeasuredGrid, threshold: float) -> PowerComparison:
     """Return the comparison of two grids of one sensor, both with an indicator."""
-    low, high = means(off)[0], means(on)[0]
+    low, high = indicator_means(off)[0], indicator_means(on)[0]
     paired = _names(off) == _names(on)
     return PowerComparison(
         sensor=on.sensor,
         threshold=threshold,
-        off=_level(off, threshold),
-        on=_level(on, threshold),
+        off=_level(off),
+        on=_level(on),
         difference=float(high.mean() - low.mean()),
         difference_interval=bootstrap(_difference, low, high, paired=paired),
         paired=paired,
@@ -124,16 +119,18 @@ def compare(off: Grid, on: Grid, threshold: float) -> PowerComparison:
     )
 
 
-def _grids_of(data: Path, grids: Sequence[Grid], environment: str) -> dict[str, Grid]:
+def _grids_of(data: Path, grids: Sequence[MeasuredGrid], environment: str) -> dict[str, MeasuredGrid]:
     present = list(dict.fromkeys(grid.environment for grid in grids))
     if environment not in present:
         raise InputError(
             f"{data}: no environment {environment!r}: choose with --off and --on from {', '.join(present)}"
         )
-    return {grid.sensor: grid for grid in grids if grid.environment == environment and grid.histogram.count}
+    return {
+        grid.sensor: grid for grid in grids if grid.environment == environment and grid.samples is not None
+    }
 
 
-def _names(grid: Grid) -> list[str]:
+def _names(grid: MeasuredGrid) -> list[str]:
     return [grid.names[number] for number in np.flatnonzero(grid.points.indicators)]
 
 
@@ -142,14 +139,14 @@ def _difference(low: Floats, high: Floats, axis: int) -> Floats:
     return difference
 
 
-def _level(grid: Grid, threshold: float) -> Level:
-    values = means(grid)[0]
-    return Level(
+def _level(grid: MeasuredGrid) -> PowerLevel:
+    values = indicator_means(grid)[0]
+    if grid.samples is None:
+        raise ValueError(f"{grid.title}: no indicator")
+    return PowerLevel(
         n_points=len(values),
-        n_samples=grid.histogram.count,
         mean=float(values.mean()),
         p95=float(np.quantile(values, P95)),
         max=float(values.max()),
-        samples_max=grid.histogram.maximum,
-        samples_above=grid.histogram.above(threshold),
+        samples=grid.samples,
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95, errors, jitter, root_mean_square
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class DistanceErrors:
         return f"{start}, not at {', '.join(f'{distance:.0f}' for distance in self.exceeded_mm)} mm"
 
 
-def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> DistanceErrors | None:
+def bin_errors(grid: MeasuredGrid, bin_mm: float, limit_mm: float | None) -> DistanceErrors | None:
     """Return the errors by distance, None if the table has no distances."""
     cells = grid.cells[(grid.cells.count > 0) & (grid.cells.bins >= 0)]
     if not len(cells):
@@ -69,7 +69,7 @@ def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> DistanceErro
     return DistanceErrors(bin_mm, limit_mm, smallest, tuple(d for d in beyond if d not in meets), found)
 
 
-def _bin(grid: Grid, number: int, bin_mm: float) -> DistanceBin:
+def _bin(grid: MeasuredGrid, number: int, bin_mm: float) -> DistanceBin:
     cells = grid.cells[(grid.cells.bins == number) & (grid.cells.count > 0)]
     error, count = errors(cells), cells.count
     return DistanceBin(

@@ -7,26 +7,33 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
+from flexneedle.lab.tables.columns import map_columns
+from flexneedle.lab.tables.table import open_table
 from flexneedle.lab.tracker_evaluation.evaluation import published
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import Accuracy, RigidFit, accuracy, register_grid
-from flexneedle.lab.tracker_evaluation.evaluation.distance import DistanceErrors, distances
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import Summary, summary
-from flexneedle.lab.tracker_evaluation.evaluation.notes import notes
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
+    Accuracy,
+    RigidFit,
+    compute_accuracy,
+    register_grid,
+)
+from flexneedle.lab.tracker_evaluation.evaluation.distance import DistanceErrors, bin_errors
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
+    IndicatorFits,
+    IndicatorSummary,
+    fit_indicator,
+    summarize_indicator,
+)
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid, read_grids
+from flexneedle.lab.tracker_evaluation.evaluation.notes import find_notes
 from flexneedle.lab.tracker_evaluation.evaluation.points import POINTS_FILE, points_text
 from flexneedle.lab.tracker_evaluation.evaluation.repeatability import (
     Orientation,
     RelativeDistance,
     Repeatability,
-    orientation,
-    relative_distance,
-    repeatability,
+    compute_orientation,
+    compute_relative_distance,
+    compute_repeatability,
 )
-from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation, separation
-from flexneedle.lab.tracker_evaluation.evaluation.units import refuse_metres
-from flexneedle.lab.tracker_evaluation.table.columns import column_map
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
-from flexneedle.lab.tracker_evaluation.table.grids import read_grids
-from flexneedle.lab.tracker_evaluation.table.source import open_table
 from flexneedle.phantom.tracking.table import OPTIONAL, REFERENCE, REQUIRED
 from flexneedle.record.plain import to_text
 
@@ -36,18 +43,18 @@ _FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Options:
+class EvaluationOptions:
     """Options of reading and evaluating a table.
 
-    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm", "m", or None for millimetres with a
-    check that they are not metres; limit_mm: limit of the RMSE over distance (None: the manufacturer's RMSE for the
-    paper's sensors); ideal, noisy: names of the environments to be separated by the indicator (None: the paper's);
-    sensor, environment: of all rows, for a table without such a column.
+    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm" or "m", of all lengths; limit_mm:
+    limit of the RMSE over distance (None: the manufacturer's RMSE for the paper's sensors); ideal, noisy: names of the
+    environments of the fits to the indicator (None: the paper's); sensor, environment: of all rows, for a table without
+    such a column.
     """
 
     columns: tuple[str, ...] = ()
     register: bool = False
-    unit: str | None = None
+    unit: str = "mm"
     bin_mm: float = 50.0
     limit_mm: float | None = None
     ideal: str | None = None
@@ -57,18 +64,18 @@ class Options:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the environments to be separated by the indicator."""
+        """Names of the environments of the fits to the indicator."""
         return self.ideal or published.IDEAL, self.noisy or published.NOISY
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class SensorResult:
     """Results of one sensor in one environment."""
 
-    grid: Grid
+    grid: MeasuredGrid
     accuracy: Accuracy
     registration: RigidFit | None
-    summary: Summary | None
+    indicator: IndicatorSummary | None
     relative_distance: RelativeDistance
     repeatability: Repeatability
     orientation: Orientation | None
@@ -88,7 +95,7 @@ class Result:
             "repeatability": asdict(self.repeatability),
             "orientation": _values(self.orientation),
             "distance": _values(self.distances),
-            "indicator": _values(self.summary),
+            "indicator": _values(self.indicator),
         }
 
 
@@ -97,10 +104,10 @@ class Evaluation:
     """The evaluation of a table. notes: one line on each unusual property of the data."""
 
     data: Path
-    options: Options
+    options: EvaluationOptions
     rows: int
-    results: list[Result]
-    separations: list[Separation]
+    results: list[SensorResult]
+    fits: list[IndicatorFits]
     notes: list[str]
 
     def values(self) -> dict[str, Any]:
@@ -110,14 +117,14 @@ class Evaluation:
             "data": str(self.data),
             "rows": self.rows,
             "registered": self.options.register,
-            "unit": self.options.unit or "mm",
+            "unit": self.options.unit,
             "notes": self.notes,
             "results": [result.values() for result in self.results],
-            "indicator": [_separation_values(found, self.options) for found in self.separations],
+            "indicator": [_fit_values(found, self.options) for found in self.fits],
         }
 
 
-def evaluate(data: Path, options: Options) -> Evaluation:
+def evaluate(data: Path, options: EvaluationOptions) -> Evaluation:
     """Return the evaluation of a table. Raises InputError for an invalid table."""
     grids, rows = read_table(data, options)
     try:
@@ -126,27 +133,26 @@ def evaluate(data: Path, options: Options) -> Evaluation:
     except InputError as error:
         raise InputError(f"{data}: {error}") from None
     registered = [result.grid for result in results]
-    separations = [
-        found
-        for sensor in dict.fromkeys(grid.sensor for grid in registered)
-        if (found := separation(sensor, *_environments(registered, sensor, options))) is not None
-    ]
-    found_notes = notes(registered, options.pair, suggest_registration=not options.register)
-    return Evaluation(data, options, rows, results, separations, found_notes)
+    sensors = dict.fromkeys(grid.sensor for grid in registered)
+    fits = [fit_indicator(sensor, *_environments(registered, sensor, options)) for sensor in sensors]
+    notes = find_notes(registered, options.pair, suggest_registration=not options.register)
+    return Evaluation(data, options, rows, results, [fit for fit in fits if fit is not None], notes)
 
 
-def read_table(data: Path, options: Options) -> tuple[list[Grid], int]:
-    """Return the grids of a table and its number of rows. Raises InputError for an invalid table."""
-    mapping = column_map(options.columns)
+def read_table(
+    data: Path, options: EvaluationOptions, threshold: float = published.THRESHOLD
+) -> tuple[list[MeasuredGrid], int]:
+    """Return the grids of a table and its number of rows; threshold: of the indicator of single samples.
+
+    Raises InputError for an invalid table.
+    """
+    mapping = map_columns(options.columns)
     labels = {"sensor": options.sensor, "environment": options.environment}
     names = {column: name for column, name in labels.items() if name is not None}
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
-    with open_table(data, mapping, required, optional, names, options.unit or "mm") as table:
-        grids, rows = read_grids(table, options.bin_mm)
-        if options.unit is None:
-            refuse_metres(grids)
-    return grids, rows
+    with open_table(data, required, optional, mapping=mapping, labels=names, unit=options.unit) as table:
+        return read_grids(table, options.bin_mm, threshold)
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
@@ -159,7 +165,7 @@ def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Pat
     return values
 
 
-def _check_names(grids: Sequence[Grid], options: Options) -> None:
+def _check_names(grids: Sequence[MeasuredGrid], options: EvaluationOptions) -> None:
     present = list(dict.fromkeys(grid.environment for grid in grids))
     for option in ("ideal", "noisy"):
         name = getattr(options, option)
@@ -167,23 +173,25 @@ def _check_names(grids: Sequence[Grid], options: Options) -> None:
             raise InputError(f"--{option}: no environment {name!r}: choose from {', '.join(present)}")
 
 
-def _result(grid: Grid, options: Options) -> Result:
+def _result(grid: MeasuredGrid, options: EvaluationOptions) -> SensorResult:
     grid, registration = register_grid(grid) if options.register else (grid, None)
     official = published.OFFICIAL.get(published.paper_sensor(grid.sensor) or "", {})
     limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
-    return Result(
+    return SensorResult(
         grid,
-        accuracy(grid),
+        compute_accuracy(grid),
         registration,
-        summary(grid),
-        relative_distance(grid),
-        repeatability(grid),
-        orientation(grid),
-        distances(grid, options.bin_mm, limit),
+        summarize_indicator(grid),
+        compute_relative_distance(grid),
+        compute_repeatability(grid),
+        compute_orientation(grid),
+        bin_errors(grid, options.bin_mm, limit),
     )
 
 
-def _environments(grids: Sequence[Grid], sensor: str, options: Options) -> tuple[Grid | None, Grid | None]:
+def _environments(
+    grids: Sequence[MeasuredGrid], sensor: str, options: EvaluationOptions
+) -> tuple[MeasuredGrid | None, MeasuredGrid | None]:
     own = {grid.environment: grid for grid in grids if grid.sensor == sensor}
     ideal, noisy = options.pair
     return own.get(ideal), own.get(noisy)
@@ -193,24 +201,12 @@ def _values(part: Any) -> dict[str, Any] | None:
     return None if part is None else asdict(part)
 
 
-def _separation_values(found: Separation, options: Options) -> dict[str, Any]:
-    confusion = found.confusion
+def _fit_values(found: IndicatorFits, options: EvaluationOptions) -> dict[str, Any]:
     ideal, noisy = options.pair
     return {
-        "sensor": found.sensor,
+        **asdict(found),
         "ideal_environment": ideal,
         "noisy_environment": noisy,
-        "ideal": _values(found.ideal),
-        "noisy": _values(found.noisy),
-        "threshold": found.threshold,
-        "threshold_interval": found.threshold_interval,
-        "samples_threshold": found.samples_threshold,
-        "samples_above": dict(zip(("ideal", "noisy"), found.samples_above, strict=True)),
-        "confusion": confusion
-        and {**asdict(confusion), "false_alarms": confusion.false_alarms, "detected": confusion.detected},
-        "auc": found.auc,
-        "auc_interval": found.auc_interval,
-        "roc": {"false_alarms": found.false_alarms, "detected": found.detected},
         "paper": {"threshold": published.THRESHOLD, **published.FITS, "indicator": published.INDICATOR}
         if published.paper_sensor(found.sensor) == REFERENCE
         else None,

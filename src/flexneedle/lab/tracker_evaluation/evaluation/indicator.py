@@ -14,25 +14,14 @@ from flexneedle.lab.tracker_evaluation.evaluation.intervals import (
     mean,
     quantile_interval,
 )
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples, MeasuredGrid
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SingleSamples:
-    """Statistics of single samples of the indicator; p95 is taken from a histogram with bins of 0.0001."""
-
-    n_samples: int
-    mean: float
-    max: float
-    min: float
-    p95: float
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Statistics of the mean indicator at grid points (sd with n − 1); samples: those of single samples."""
+class IndicatorSummary:
+    """Statistics of the mean indicator at grid points (sd with n − 1), and of single samples."""
 
     n_points: int
     mean: float
@@ -41,7 +30,7 @@ class Summary:
     min: float
     p95: float
     intervals: dict[str, Interval]
-    samples: SingleSamples
+    samples: IndicatorSamples
 
 
 @dataclass(frozen=True)
@@ -69,18 +58,32 @@ class LineFit:
     intervals: dict[str, Interval]
 
 
-def means(grid: Grid) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class IndicatorFits:
+    """Error of a sensor as a function of its mean indicator in the environments `ideal` and `noisy`.
+
+    threshold: 95th percentile of the indicator in `ideal`. None for results of a missing environment.
+    """
+
+    sensor: str
+    ideal: ConstantFit | None
+    noisy: LineFit | None
+    threshold: float | None
+    threshold_interval: Interval
+
+
+def indicator_means(grid: MeasuredGrid) -> tuple[Floats, Floats]:
     """Return mean indicator and error (mm) (n,) of the grid points with an indicator."""
     known = grid.points[grid.points.indicators > 0]
     return known.indicator, errors(known)
 
 
-def summary(grid: Grid) -> Summary | None:
+def summarize_indicator(grid: MeasuredGrid) -> IndicatorSummary | None:
     """Return the summary of the indicator, None if the sensor has none."""
-    values, _ = means(grid)
-    if not len(values):
+    values, _ = indicator_means(grid)
+    if grid.samples is None:
         return None
-    return Summary(
+    return IndicatorSummary(
         n_points=len(values),
         mean=float(values.mean()),
         sd=float(values.std(ddof=1)) if len(values) > 1 else nan,
@@ -92,26 +95,35 @@ def summary(grid: Grid) -> Summary | None:
             "sd": bootstrap(deviation, values),
             "p95": quantile_interval(values, P95),
         },
-        samples=_single_samples(grid),
+        samples=grid.samples,
     )
 
 
-def _single_samples(grid: Grid) -> SingleSamples:
-    known, histogram = grid.points[grid.points.indicators > 0], grid.histogram
-    average = float(np.average(known.indicator, weights=known.indicators))
-    return SingleSamples(
-        histogram.count, average, histogram.maximum, histogram.minimum, histogram.quantile(P95)
+def fit_indicator(
+    sensor: str, ideal: MeasuredGrid | None, noisy: MeasuredGrid | None
+) -> IndicatorFits | None:
+    """Return the fits to the errors of a sensor in one or two environments, None without any indicator."""
+    low, low_error = indicator_means(ideal) if ideal else (np.empty(0), np.empty(0))
+    high, high_error = indicator_means(noisy) if noisy else (np.empty(0), np.empty(0))
+    if not len(low) and not len(high):
+        return None
+    return IndicatorFits(
+        sensor,
+        fit_constant(low_error) if len(low) else None,
+        fit_line(high, high_error) if len(high) else None,
+        float(np.quantile(low, P95)) if len(low) else None,
+        quantile_interval(low, P95),
     )
 
 
-def constant(error: Floats) -> ConstantFit:
+def fit_constant(error: Floats) -> ConstantFit:
     """Return the constant fit to errors (n,), n ≥ 1."""
     spread = float(error.std(ddof=1)) if len(error) > 1 else nan
     found = {"mean_mm": bootstrap(mean, error), "sd_mm": bootstrap(deviation, error)}
     return ConstantFit(len(error), float(error.mean()), spread, found)
 
 
-def line(indicator: Floats, error: Floats) -> LineFit:
+def fit_line(indicator: Floats, error: Floats) -> LineFit:
     """Return the least-squares line through errors (n,) over the indicator (n,); pairs are resampled."""
     slope, intercept = float(_slope(indicator, error)), float(_intercept(indicator, error))
     residual, freedom = error - slope * indicator - intercept, len(error) - 2

@@ -2,35 +2,32 @@
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from flexneedle.errors import InputError
 from flexneedle.geometry.registration import misfit
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import errors, register_grid, root_mean_square
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
-from flexneedle.lab.tracker_evaluation.table.rules import SAME_POSITION_MM
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 _UNREGISTERED = 5.0
 """If a rigid fit lowers the RMSE by more than this factor, tracker and stage most likely have different frames."""
 _FEWEST_POINTS = 6  # a rigid fit with its six parameters always fits fewer points well
 
 
-def notes(grids: Sequence[Grid], pair: tuple[str, str], suggest_registration: bool) -> list[str]:
+def find_notes(grids: Sequence[MeasuredGrid], pair: tuple[str, str], suggest_registration: bool) -> list[str]:
     """Return a line for each unusual property of the grids.
 
-    pair: environments to be separated by the indicator; suggest_registration: add a note if --register seems needed.
+    pair: environments of the fits to the indicator; suggest_registration: add a note if --register seems needed.
     """
     return [
-        *(f"{grid.title}: {unusual}" for grid in grids if (unusual := "; ".join(_unusual(grid)))),
-        *missing_sensors(grids),
-        *differing_points(grids),
-        *misfits(grids),
+        *(note for grid in grids for note in _count_missing(grid)),
+        *find_missing_sensors(grids),
+        *find_differing_points(grids),
+        *_misfits(grids),
         *(_unregistered(grids) if suggest_registration else ()),
         *_missing_environments(grids, pair),
     ]
 
 
-def missing_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[str]:
+def find_missing_sensors(grids: Sequence[MeasuredGrid], absent: str = "not in") -> Iterator[str]:
     """Yield a line, with the words `absent`, for each sensor that is missing in an environment."""
     environments = list(dict.fromkeys(grid.environment for grid in grids))
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
@@ -40,7 +37,7 @@ def missing_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[s
             yield f"{sensor}: {absent} {', '.join(missing)}, only in {', '.join(own)}"
 
 
-def differing_points(grids: Sequence[Grid]) -> Iterator[str]:
+def find_differing_points(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
     """Yield a line for each sensor whose grid points differ between environments."""
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
         own = {grid.environment: _measured_names(grid) for grid in grids if grid.sensor == sensor}
@@ -50,45 +47,29 @@ def differing_points(grids: Sequence[Grid]) -> Iterator[str]:
             yield f"{sensor}: grid points: {counts}, {len(shared)} in common: the compared positions differ"
 
 
-def _measured_names(grid: Grid) -> set[str]:
+def _measured_names(grid: MeasuredGrid) -> set[str]:
     return {name for name, known in zip(grid.names, grid.known.tolist(), strict=True) if known}
 
 
-def _points(count: int) -> str:
-    return f"{count} grid point{'s' if count != 1 else ''}"
-
-
-def _unusual(grid: Grid) -> Iterator[str]:
+def _count_missing(grid: MeasuredGrid) -> Iterator[str]:
     count, missing = grid.points.count, int(grid.points.missing.sum())
-    single, empty, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
-    distinct = np.unique(np.round(grid.points.true / SAME_POSITION_MM), axis=0)
-    if len(distinct) < len(count):
-        repeated = len(count) - len(distinct)
-        yield f"{repeated} of {_points(len(count))} repeat a position under another point_id (counted as points)"
     if missing:
-        yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
-    if empty:
-        yield f"no sample at {empty} of {_points(len(count))} (left out)"
-    if len(known) and single == len(known):
-        yield "one sample at each grid point (jitter and repeatability are unknown)"
-    elif single:
-        yield f"one sample at {_points(single)} (used for the errors, not for the jitter)"
-    if len(known) and known.min() != known.max():
-        weights = "errors weight points equally, jitter weights samples equally"
-        yield f"{known.min()} to {known.max()} samples per grid point ({weights})"
-    if (grid.cells.count > 0).sum() > len(known):
-        yield "points were measured at several distances (pooled except in the errors by distance)"
+        empty = int((count == 0).sum())
+        yield (
+            f"{grid.title}: {missing} of {missing + int(count.sum())} samples have no position (left out), "
+            f"all samples at {empty} of {len(count)} grid points"
+        )
 
 
-def misfits(grids: Sequence[Grid]) -> Iterator[str]:
+def _misfits(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
     """Yield a line for each registered grid that no rigid transform maps to the stage's."""
     for grid in grids:
-        measured = grid.measured()
+        measured = grid.measured
         if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
             yield f"{grid.title}: {wrong}"
 
 
-def _unregistered(grids: Sequence[Grid]) -> Iterator[str]:
+def _unregistered(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
     fits = [(grid, *fit) for grid in grids if (fit := _fit(grid)) is not None]
     if fits:
         grid, raw, residual = max(fits, key=lambda fit: fit[1])
@@ -99,9 +80,9 @@ def _unregistered(grids: Sequence[Grid]) -> Iterator[str]:
         )
 
 
-def _fit(grid: Grid) -> tuple[float, float] | None:
+def _fit(grid: MeasuredGrid) -> tuple[float, float] | None:
     """Return the RMSE before and after a rigid fit (mm), None if the fit does not reduce it much."""
-    measured = grid.measured()
+    measured = grid.measured
     if len(measured) < _FEWEST_POINTS:
         return None
     try:
@@ -112,7 +93,7 @@ def _fit(grid: Grid) -> tuple[float, float] | None:
     return (raw, residual) if raw > _UNREGISTERED * residual else None
 
 
-def _missing_environments(grids: Sequence[Grid], pair: tuple[str, str]) -> Iterator[str]:
+def _missing_environments(grids: Sequence[MeasuredGrid], pair: tuple[str, str]) -> Iterator[str]:
     present = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicators.any()))
     missing = [name for name in pair if name not in present]
     if len(present) > 1 and missing:

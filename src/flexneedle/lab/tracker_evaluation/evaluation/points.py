@@ -8,7 +8,7 @@ from math import isfinite
 import numpy as np
 
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import error_vectors, errors
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 POINTS_FILE = "points.csv"
 _COLUMNS = (
@@ -20,7 +20,7 @@ _COLUMNS = (
 )
 
 
-def points_text(grids: Iterable[Grid]) -> str:
+def points_text(grids: Iterable[MeasuredGrid]) -> str:
     """Return CSV with one row per grid point, with all digits; unknown values are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -30,7 +30,7 @@ def points_text(grids: Iterable[Grid]) -> str:
     return text.getvalue()
 
 
-def _rows(grid: Grid) -> Iterator[list[str]]:
+def _rows(grid: MeasuredGrid) -> Iterator[list[str]]:
     points = grid.points
     several = np.where(points.count > 1, points.count, np.nan)
     jitter = np.sqrt(points.scatter.sum(axis=1) / several)

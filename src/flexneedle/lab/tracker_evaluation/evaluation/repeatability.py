@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95, root_mean_square
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 MOST_PAIRS = 1_000_000
 """Largest number of compared pairs of grid points (all pairs of 1414 points); of more, a sample with a fixed seed."""
@@ -75,9 +75,9 @@ class Orientation:
     axis_jitter_deg: float
 
 
-def repeatability(grid: Grid) -> Repeatability:
+def compute_repeatability(grid: MeasuredGrid) -> Repeatability:
     """Return the repeatability of single points of a grid."""
-    measured = grid.measured()
+    measured = grid.measured
     several = measured.count > 1
     if not several.any():
         return Repeatability((nan, nan, nan), nan, nan, nan, "")
@@ -94,9 +94,9 @@ def repeatability(grid: Grid) -> Repeatability:
     )
 
 
-def relative_distance(grid: Grid, seed: int = 0) -> RelativeDistance:
+def compute_relative_distance(grid: MeasuredGrid, seed: int = 0) -> RelativeDistance:
     """Return the errors of the distances between grid points."""
-    measured = grid.measured()
+    measured = grid.measured
     count = len(measured)
     first, second = _pairs(count, seed)
     if not len(first):
@@ -128,7 +128,7 @@ def _pairs(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     return first, (first + step) % count
 
 
-def orientation(grid: Grid) -> Orientation | None:
+def compute_orientation(grid: MeasuredGrid) -> Orientation | None:
     """Return the orientation jitter, None if the table has no orientations."""
     known = grid.points.orientations > 0
     if not known.any():

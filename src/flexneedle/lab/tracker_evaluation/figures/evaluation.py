@@ -6,9 +6,9 @@ import numpy as np
 
 from flexneedle.figures.style import save, signed
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import error_vectors
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, Result
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import LineFit, means
-from flexneedle.lab.tracker_evaluation.evaluation.separation import Separation
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, LineFit, indicator_means
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, distance_figure
 from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, field_figure
 from flexneedle.lab.tracker_evaluation.figures.indicator import (
@@ -16,23 +16,16 @@ from flexneedle.lab.tracker_evaluation.figures.indicator import (
     PlottedPoints,
     indicator_figure,
 )
-from flexneedle.lab.tracker_evaluation.figures.roc import RocLine, roc_figure
-from flexneedle.lab.tracker_evaluation.table.grid import Grid
 
 MOST_PANELS = 3
 
 
 def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Draw `field`, `indicator`, `roc` and `distance` as PNG and SVG, omitting those without data."""
+    """Draw `field`, `indicator` and `distance` as PNG and SVG, omitting those without data."""
     paths = save(field_figure([_field(result) for result in evaluation.results]), folder, "field")
-    panels = [_indicator(evaluation, found) for found in evaluation.separations[:MOST_PANELS]]
+    panels = [_indicator(evaluation, found) for found in evaluation.fits[:MOST_PANELS]]
     if panels:
-        paths += save(
-            indicator_figure(panels, len(evaluation.separations) - len(panels)), folder, "indicator"
-        )
-    lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
-    if lines:
-        paths += save(roc_figure(lines), folder, "roc")
+        paths += save(indicator_figure(panels, len(evaluation.fits) - len(panels)), folder, "indicator")
     binned = [
         _distance(result)
         for result in evaluation.results
@@ -41,12 +34,12 @@ def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
     return paths + (save(distance_figure(binned), folder, "distance") if binned else [])
 
 
-def _field(result: Result) -> FieldRow:
-    measured = result.grid.measured()
+def _field(result: SensorResult) -> FieldRow:
+    measured = result.grid.measured
     return FieldRow(result.grid.title, measured.true, error_vectors(measured))
 
 
-def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
+def _indicator(evaluation: Evaluation, found: IndicatorFits) -> IndicatorPanel:
     own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
     ideal, noisy = (own.get(name) for name in evaluation.options.pair)
     constant, line = found.ideal, found.noisy
@@ -65,37 +58,15 @@ def _line_text(line: LineFit) -> str:
     return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
 
 
-def _is_of(result: Result, found: Separation) -> bool:
-    return result.grid.sensor == found.sensor and result.summary is not None
+def _is_of(result: SensorResult, found: IndicatorFits) -> bool:
+    return result.grid.sensor == found.sensor and result.indicator is not None
 
 
-def _points(grid: Grid, fit: str) -> PlottedPoints:
-    return PlottedPoints(grid.environment, *means(grid), fit)
+def _points(grid: MeasuredGrid, fit: str) -> PlottedPoints:
+    return PlottedPoints(grid.environment, *indicator_means(grid), fit)
 
 
-def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
-    confusion, threshold = found.confusion, found.threshold
-    if confusion is None or threshold is None:
-        raise ValueError("a ROC curve needs both environments")
-    own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
-    names = evaluation.options.pair
-    values = [means(own[name])[0] for name in names]
-    chosen = confusion.false_alarms, confusion.detected
-    shares = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
-    note = f"area {found.auc:.4f}\nat {threshold:.4f}: {shares}"
-    return RocLine(
-        found.sensor,
-        names,
-        found.false_alarms,
-        found.detected,
-        (values[0], values[1]),
-        threshold,
-        chosen,
-        note,
-    )
-
-
-def _distance(result: Result) -> DistanceLine:
+def _distance(result: SensorResult) -> DistanceLine:
     found = result.distances
     if found is None:
         raise ValueError("the result has no distances")

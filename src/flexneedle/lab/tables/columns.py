@@ -1,4 +1,4 @@
-"""Columns of a table: the names of flexneedle, or other names mapped to them."""
+"""Columns of a table: by the names of flexneedle, or by other names that are mapped to them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ _MAPS = Library("a column map")
 _OPTION = "--columns NAME=COLUMN"
 
 
-def column_map(given: Iterable[str]) -> dict[str, str]:
+def map_columns(given: Iterable[str]) -> dict[str, str]:
     """Return the names in the table by column, from pairs "NAME=COLUMN" and paths of TOML files with such pairs.
 
     Raises InputError for invalid pairs and files, and for a column that is unknown or given twice.
@@ -27,7 +27,7 @@ def column_map(given: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def chosen_columns(
+def choose_columns(
     header: Sequence[str],
     mapping: Mapping[str, str],
     required: Iterable[str],
@@ -35,7 +35,7 @@ def chosen_columns(
 ) -> dict[str, str]:
     """Return the columns to read with their names in the header; all others are ignored.
 
-    mapping: names in the header by column, see `column_map`. Raises InputError if a column that is required or mapped
+    mapping: names in the header by column, see `map_columns`. Raises InputError if a column that is required or mapped
     is not in the header, or occurs twice.
     """
     names = {column: mapping.get(column, column) for column in (*required, *optional)}

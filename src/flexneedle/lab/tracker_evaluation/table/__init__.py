@@ -1,1 +1,0 @@
-"""Tables of measurements: read and grouped by DuckDB."""
