@@ -17,14 +17,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy import stats
 
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import accuracy
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, read_table
-from flexneedle.lab.tracker_evaluation.evaluation.separation import separation
+from flexneedle.lab.tables.write import write_table
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import compute_accuracy
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, read_table
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import fit_indicator
 
+Columns = dict[str, np.ndarray]
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 POINTS, SAMPLES = len(GRID), 20
 SMOOTH_MM = 40.0
@@ -80,7 +80,7 @@ def field_factor() -> np.ndarray:
     return np.linalg.cholesky(np.exp(-squared_distance / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(points)))
 
 
-def field(rng: np.random.Generator, smooth: bool) -> np.ndarray:
+def draw_field(rng: np.random.Generator, smooth: bool) -> np.ndarray:
     """Unit normal errors (k, 3) at the grid points and VOLUME_POINTS: independent, or correlated over SMOOTH_MM."""
     drawn = rng.normal(size=(POINTS + len(VOLUME_POINTS), 3))
     return field_factor() @ drawn if smooth else drawn
@@ -97,42 +97,45 @@ def volume_statistics(error: np.ndarray) -> dict[str, float]:
     }
 
 
-def rows(
+def draw_rows(
     rng: np.random.Generator, drawn: TrueParameters, environment: str, error: np.ndarray, level: np.ndarray
-) -> pa.Table:
+) -> Columns:
     """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and jitter."""
     place = np.repeat(np.arange(POINTS), SAMPLES)
     noise = rng.normal(0.0, drawn.jitter / np.sqrt(3), (len(place), 3))
     measured = (GRID + error)[place] + noise
     columns = {"point_id": place, "indicator": level[place]}
-    columns |= {"sensor": ["reference"] * len(place), "environment": [environment] * len(place)}
+    columns |= {"sensor": np.full(len(place), "reference"), "environment": np.full(len(place), environment)}
     columns |= {f"true_{axis}_mm": GRID[place, k] for k, axis in enumerate("xyz")}
-    return pa.table(columns | {f"{axis}_mm": measured[:, k] for k, axis in enumerate("xyz")})
+    return columns | {f"{axis}_mm": measured[:, k] for k, axis in enumerate("xyz")}
 
 
-def table_of(
+def draw_table(
     rng: np.random.Generator, drawn: TrueParameters, smooth: bool
-) -> tuple[pa.Table, dict[str, float]]:
+) -> tuple[Columns, dict[str, float]]:
     """Both environments of a data set, and the statistics of the errors in `ideal` in the whole volume."""
     towards = rng.normal(size=3)
-    error = drawn.bias * towards / np.linalg.norm(towards) + drawn.spread * field(rng, smooth)
+    error = drawn.bias * towards / np.linalg.norm(towards) + drawn.spread * draw_field(rng, smooth)
     ideal = rng.gamma(drawn.shape, drawn.level / drawn.shape, POINTS)
     noisy = rng.uniform(0.2, 0.6, POINTS)
     scatter = np.clip(rng.normal(size=POINTS), -2.5, 2.5) * drawn.scatter * noisy  # grows with the indicator
     length = drawn.slope * noisy + drawn.intercept + np.maximum(scatter, -drawn.slope * noisy)
     along = rng.normal(size=(POINTS, 3))
     along *= (length / np.linalg.norm(along, axis=1))[:, None]
-    both = rows(rng, drawn, "ideal", error[:POINTS], ideal), rows(rng, drawn, "noisy", along, noisy)
-    return pa.concat_tables(both), volume_statistics(error[POINTS:])
+    one, other = (
+        draw_rows(rng, drawn, "ideal", error[:POINTS], ideal),
+        draw_rows(rng, drawn, "noisy", along, noisy),
+    )
+    return {name: np.concatenate([one[name], other[name]]) for name in one}, volume_statistics(error[POINTS:])
 
 
-def evaluated(table: pa.Table) -> dict[str, tuple[float, tuple[float, float]]]:
+def evaluate_table(table: Columns) -> dict[str, tuple[float, tuple[float, float]]]:
     """Estimate and interval of each parameter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "table.parquet"
-        pq.write_table(table, path)
-        ideal, noisy = read_table(path, Options())[0]
-    found, fitted = accuracy(ideal), separation("reference", ideal, noisy)
+        write_table(table, path)
+        ideal, noisy = read_table(path, EvaluationOptions())[0]
+    found, fitted = compute_accuracy(ideal), fit_indicator("reference", ideal, noisy)
     parts = ((found, ("rmse", "p95", "mean", "sd", "jitter")), (fitted.noisy, ("slope", "intercept")))
     return {
         **{
@@ -144,7 +147,7 @@ def evaluated(table: pa.Table) -> dict[str, tuple[float, tuple[float, float]]]:
     }
 
 
-def study(
+def evaluate_sets(
     sets: int, seed: int, smooth: bool
 ) -> list[tuple[dict[str, float], dict[str, tuple], dict[str, float]]]:
     """True values, estimates, and statistics of the whole volume, for each data set."""
@@ -152,12 +155,12 @@ def study(
     for own in np.random.SeedSequence(seed).spawn(sets):
         rng = np.random.default_rng(own)
         drawn = TrueParameters.draw(rng)
-        table, volume = table_of(rng, drawn, smooth)
-        done.append((drawn.values(), evaluated(table), volume))
+        table, volume = draw_table(rng, drawn, smooth)
+        done.append((drawn.values(), evaluate_table(table), volume))
     return done
 
 
-def coverage(done: list, name: str, truth: int) -> str:
+def format_coverage(done: list, name: str, truth: int) -> str:
     """Share of intervals that contain the true value: of the distribution (0), or of the volume (2)."""
     covered = [
         found[name][1][0] <= own[name] <= found[name][1][1] for own, found in ((d[truth], d[1]) for d in done)
@@ -173,7 +176,7 @@ def main() -> int:
     parser.add_argument("--sets", type=int, default=200, metavar="N", help="data sets (default: 200)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     args = parser.parse_args()
-    plain, smooth = (study(args.sets, args.seed, smooth) for smooth in (False, True))
+    plain, smooth = (evaluate_sets(args.sets, args.seed, smooth) for smooth in (False, True))
     heads = (
         "independent points",
         "estimate / true, median",
@@ -184,8 +187,10 @@ def main() -> int:
     shares = []
     for name in plain[0][0]:
         ratio = np.median([found[name][0] / true[name] for true, found, _ in plain])
-        shares.append(coverage(plain, name, 0))
-        smooth_shares = [coverage(smooth, name, truth) if name in smooth[0][2] else "" for truth in (2, 0)]
+        shares.append(format_coverage(plain, name, 0))
+        smooth_shares = [
+            format_coverage(smooth, name, truth) if name in smooth[0][2] else "" for truth in (2, 0)
+        ]
         label = name if name in ("threshold", "slope", "intercept") else f"`{name}_mm`"
         row = label, shares[-1], f"{ratio:.3f}", *smooth_shares
         print("|" + "".join(f" {cell} |" if cell else " |" for cell in row))

@@ -12,11 +12,9 @@ import sys
 from collections.abc import Sequence
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure
+from flexneedle.lab.tracker_evaluation.simulate import Columns, Experiment, measure
 from flexneedle.phantom.tracking.table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
 
@@ -40,7 +38,7 @@ PAPER = {
 """Tables I and II, the threshold and the fits of the paper; lengths in mm."""
 
 
-def statistics(table: pa.Table, environment: str) -> dict[str, float]:
+def summarize(table: Columns, environment: str) -> dict[str, float]:
     """Return the quantities of an environment by the names in `PAPER`, by the equations of the paper."""
     of = {sensor: _points(table, sensor, environment) for sensor in (TIP, REFERENCE)}
     found = {}
@@ -61,22 +59,20 @@ def statistics(table: pa.Table, environment: str) -> dict[str, float]:
     return {name: float(value) for name, value in found.items() if name in PAPER[environment]}
 
 
-def _points(table: pa.Table, sensor: str, environment: str) -> tuple[Floats, float, Floats]:
+def _points(table: Columns, sensor: str, environment: str) -> tuple[Floats, float, Floats]:
     """Error (mm) and mean indicator of each grid point, and the jitter (mm), without missing samples."""
-    rows = table.filter(
-        pc.and_(pc.equal(table["sensor"], sensor), pc.equal(table["environment"], environment))
-    )
-    rows = rows.filter(pc.is_valid(rows["x_mm"]))
-    ids = rows["point_id"].to_numpy()
+    own = (table["sensor"] == sensor) & (table["environment"] == environment) & ~np.isnan(table["x_mm"])
+    rows = {name: column[own] for name, column in table.items()}
+    ids = rows["point_id"]
     count = np.bincount(ids)
 
     def mean(values: Floats) -> Floats:
         return np.bincount(ids, values) / count
 
-    off = [rows[f"{axis}_mm"].to_numpy() - rows[f"true_{axis}_mm"].to_numpy() for axis in "xyz"]
+    off = [rows[f"{axis}_mm"] - rows[f"true_{axis}_mm"] for axis in "xyz"]
     bias = np.array([mean(values) for values in off])
     spread = sum(np.sum((values - middle[ids]) ** 2) for values, middle in zip(off, bias, strict=True))
-    indicator = mean(rows["indicator"].fill_null(np.nan).to_numpy())
+    indicator = mean(rows["indicator"])
     return np.linalg.norm(bias, axis=0), float(np.sqrt(spread / len(ids))), indicator
 
 
@@ -85,14 +81,16 @@ def tolerance(name: str) -> float:
     return WIDE if name.endswith(("max", "min")) else CLOSE
 
 
-def measured(names: Sequence[str], seeds: Sequence[int], other_rooms: bool) -> dict[str, dict[str, Floats]]:
+def measure_environments(
+    names: Sequence[str], seeds: Sequence[int], other_rooms: bool
+) -> dict[str, dict[str, Floats]]:
     """Return the quantities of each environment in each measurement."""
     environments = [load_environment(name) for name in names]
     found: dict[str, list[dict[str, float]]] = {environment.name: [] for environment in environments}
     for seed in seeds:
         table = measure(environments, Experiment(seed, seed if other_rooms else None))
         for name, rows in found.items():
-            rows.append(statistics(table, name))
+            rows.append(summarize(table, name))
     return {
         name: {key: np.array([row[key] for row in rows]) for key in rows[0]} for name, rows in found.items()
     }
@@ -133,7 +131,7 @@ def main() -> int:
     parser.add_argument("--environment", nargs="+", default=[IDEAL, NOISY], metavar="ENVIRONMENT")
     args = parser.parse_args()
     seeds = range(args.first, args.first + args.seeds)
-    return 0 if report(measured(args.environment, seeds, args.rooms)) else 1
+    return 0 if report(measure_environments(args.environment, seeds, args.rooms)) else 1
 
 
 if __name__ == "__main__":

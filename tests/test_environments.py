@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
@@ -16,7 +15,7 @@ CASES = [(name, figure) for name, figures in environments.PAPER.items() for figu
 @pytest.fixture(scope="module")
 def found():
     """Two measurements with seeds that were not used for tuning."""
-    return environments.measured(("ideal", "noisy"), (910_001, 910_002), other_rooms=False)
+    return environments.measure_environments(("ideal", "noisy"), (910_001, 910_002), other_rooms=False)
 
 
 @pytest.mark.parametrize(("name", "figure"), CASES)
@@ -43,22 +42,18 @@ def test_both_shipped_environments_are_one_room_with_and_without_a_plate():
 
 def by_hand(sensor, indicator):
     """Two points: error (3, 4, 0) mm with ±0.1 mm; error (0, 0, 2) mm without jitter and with a missing sample."""
-    x, y, z = [3.1, 2.9, 10.0, 10.0, None], [4.0, 4.0, 0.0, 0.0, None], [0.0, 0.0, 2.0, 2.0, None]
-    true = [0.0, 0.0, 10.0, 10.0, 10.0]
-    return pa.table(
-        {
-            "point_id": [0, 0, 1, 1, 1],
-            "true_x_mm": true, "true_y_mm": [0.0] * 5, "true_z_mm": [0.0] * 5,
-            "x_mm": x, "y_mm": y, "z_mm": z,
-            "indicator": pa.array(indicator, pa.float64()),
-            "sensor": [sensor] * 5, "environment": ["noisy"] * 5,
-        }
-    )  # fmt: skip
+    nan = np.nan
+    x, y, z = [3.1, 2.9, 10.0, 10.0, nan], [4.0, 4.0, 0.0, 0.0, nan], [0.0, 0.0, 2.0, 2.0, nan]
+    columns = {"true_x_mm": [0.0, 0.0, 10.0, 10.0, 10.0], "true_y_mm": [0.0] * 5, "true_z_mm": [0.0] * 5}
+    columns |= {"point_id": [0, 0, 1, 1, 1], "x_mm": x, "y_mm": y, "z_mm": z, "indicator": indicator}
+    columns |= {"sensor": [sensor] * 5, "environment": ["noisy"] * 5}
+    return {name: np.array(values) for name, values in columns.items()}
 
 
 def test_the_figures_of_two_points_by_hand():
-    table = pa.concat_tables([by_hand("tip", [None] * 5), by_hand("reference", [0.1, 0.3, 0.05, 0.05, None])])
-    found = environments.statistics(table, "noisy")
+    tip, reference = by_hand("tip", [np.nan] * 5), by_hand("reference", [0.1, 0.3, 0.05, 0.05, np.nan])
+    table = {name: np.concatenate([tip[name], reference[name]]) for name in tip}
+    found = environments.summarize(table, "noisy")
     assert found["reference RMSE"] == pytest.approx(np.sqrt((25 + 4) / 2))
     assert found["reference max"] == pytest.approx(5.0)
     assert found["reference 95 %"] == pytest.approx(2.0 + 0.95 * 3.0)

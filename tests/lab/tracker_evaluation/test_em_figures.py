@@ -14,7 +14,6 @@ from flexneedle.lab.tracker_evaluation.figures.indicator import (
     PlottedPoints,
     indicator_figure,
 )
-from flexneedle.lab.tracker_evaluation.figures.roc import RocLine, roc_figure
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -158,38 +157,13 @@ def test_the_figure_of_distances_shows_rmse_limit_and_note():
     assert_allclose(figure.axes[0].lines[0].get_xydata(), np.stack([far, rmse], axis=1))
 
 
-def test_the_roc_marks_the_threshold_in_use():
-    curve = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.9, 1.0])
-    values = np.linspace(0.01, 0.06, 20), np.linspace(0.05, 0.4, 20)
-    figure = roc_figure(
-        [RocLine("reference", ("lab", "with table"), *curve, values, 0.055, (0.05, 0.95), "area 0.9500")]
-    )
-    marked = [line.get_xydata()[0] for line in figure.axes[0].lines if len(line.get_xydata()) == 1]
-    assert_allclose(marked, [(0.05, 0.95)])
-    assert "area 0.9500" in words(figure)
-    for text in (
-        "points above (lab)",
-        "points above (with table)",
-        "reference, lab",
-        "reference, with table",
-    ):
-        assert text in words(figure)
-
-
 @pytest.mark.parametrize("count", [1, 7])
 def test_legends_stay_inside_the_figure_and_off_the_axes(count):
     names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
-    pair = "the laboratory after all the metal had been carried out", "the same with its table"
     values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)
     note = "within 1.4 mm up to 700 mm, and the first bin beyond is too far off"
-    roc = roc_figure(
-        [
-            RocLine(name, pair, *values, values, 0.5, (0.05, 0.95), "0.0547, 5.6 % false, 98.4 % detected")
-            for name in names
-        ]
-    )
     distance = distance_figure([DistanceLine(name, *values, 0.7, note) for name in names])
-    for figure in (roc, distance):
+    for figure in (distance,):
         figure.draw_without_rendering()
         legends = [legend for part in (figure, *figure.subfigs) for legend in part.legends]
         assert legends

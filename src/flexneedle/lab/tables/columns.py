@@ -29,25 +29,24 @@ def map_columns(given: Iterable[str]) -> dict[str, str]:
 
 def choose_columns(
     header: Sequence[str],
-    mapping: Mapping[str, str],
+    mapping: Mapping[str, str] | None,
     required: Iterable[str],
     optional: Iterable[str],
 ) -> dict[str, str]:
     """Return the columns to read with their names in the header; all others are ignored.
 
-    mapping: names in the header by column, see `map_columns`. Raises InputError if a column that is required or mapped
-    is not in the header, or occurs twice.
+    mapping: names in the header by column, see `map_columns`; None if names cannot be mapped.
+    Raises InputError if a column that is required or mapped is not in the header, or occurs twice.
     """
-    names = {column: mapping.get(column, column) for column in (*required, *optional)}
-    needed = {*required, *mapping}
+    mapped = mapping or {}
+    names = {column: mapped.get(column, column) for column in (*required, *optional)}
+    needed = {*required, *mapped}
     missing = [
-        _described(column, name) for column, name in names.items() if column in needed and name not in header
+        _describe(column, name) for column, name in names.items() if column in needed and name not in header
     ]
     if missing:
-        raise InputError(
-            f"no column {', '.join(missing)} (found: {_listed(header)}): map other names with {_OPTION}"
-            + _label_options(missing)
-        )
+        remedy = "" if mapping is None else f": map other names with {_OPTION}{_label_options(missing)}"
+        raise InputError(f"no column {', '.join(missing)} (found: {_list(header)}){remedy}")
     found = {column: name for column, name in names.items() if name in header}
     duplicates = [name for name in found.values() if header.count(name) > 1]
     if duplicates:
@@ -80,10 +79,10 @@ def _from_file(path: Path) -> list[tuple[str, str]]:
     return list(values.items())
 
 
-def _described(column: str, name: str) -> str:
+def _describe(column: str, name: str) -> str:
     return column if column == name else f"{name!r} (for {column})"
 
 
-def _listed(header: Sequence[str], most: int = 20) -> str:
+def _list(header: Sequence[str], most: int = 20) -> str:
     shown = ", ".join(header[:most])
     return f"{shown} and {len(header) - most} more" if len(header) > most else shown or "none"

@@ -1,6 +1,6 @@
 """Rules for the rows of a table: SQL conditions that invalid rows of `samples` meet, each with its message."""
 
-from flexneedle.lab.tables.table import Rule
+from flexneedle.lab.tables.table import EMPTY, Rule
 
 SAME_POSITION_MM = 1e-3
 """Largest difference between the true positions of a grid point (read-back of a stage, rounding)."""
@@ -13,7 +13,7 @@ _TRUE, _MEASURED, _QUATERNION = "true_x_mm, true_y_mm, true_z_mm", "x_mm, y_mm, 
 
 def require_text(*columns: str) -> tuple[Rule, ...]:
     """Return the rules that columns of text are not empty."""
-    return tuple((f"{name} = ''", f"{name} is empty") for name in columns)
+    return tuple((f"lower({name}) IN {EMPTY}", f"{name} is empty") for name in columns)
 
 
 def require_numbers(*columns: str) -> tuple[Rule, ...]:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 TEXT = ("point_id", "sensor", "environment", "status")
 """Columns of text; numbers in them are converted, so that 1 and "1" are the same. All other columns hold numbers."""
 EMPTY = ("", "nan", "-nan", "na", "n/a", "#n/a", "null", "none", "missing")
-"""Spellings of an empty value in a CSV file, in lower case."""
+"""Spellings of an empty value, in lower case."""
 MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
 Rule = tuple[str, str]
 """An SQL condition that invalid rows of `samples` meet, and the message."""
@@ -54,8 +54,8 @@ _SHORT, _SURPLUS = "fewer fields", "more fields"
 class Table:
     """An open table. Its view `samples` has the requested columns and a row for each row of the file.
 
-    Text is without surrounding blanks, '' if empty. Numbers are finite DOUBLE with lengths in mm, NULL if empty or if
-    the table lacks the column. `fault` is NULL, or the reason why the row is malformed.
+    Text is without surrounding blanks, empty in any of the spellings `EMPTY`. Numbers are finite DOUBLE with lengths in
+    mm, NULL if empty or if the table lacks the column. `fault` is NULL, or the reason why the row is malformed.
     columns: the requested columns that the table has; find_row: "line 5" and the text of a line, from its row.
     """
 
@@ -133,7 +133,7 @@ def open_table(
     requested, scale = (tuple(required), tuple(optional)), MILLIMETRES_IN[unit]
     try:
         with connect(config=settings) as connection:
-            yield _open(connection, path, requested, mapping or {}, labels or {}, scale)
+            yield _open(connection, path, requested, mapping, labels or {}, scale)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Error as error:
@@ -162,7 +162,7 @@ def _open(
     connection: "DuckDBPyConnection",
     path: Path,
     requested: tuple[tuple[str, ...], tuple[str, ...]],
-    mapping: Mapping[str, str],
+    mapping: Mapping[str, str] | None,
     labels: Mapping[str, str],
     scale: float,
 ) -> Table:
@@ -237,7 +237,8 @@ def _open_csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> 
         text = (
             f"CASE WHEN NOT contains({field}, '.') THEN replace({field}, ',', '.') END" if commas else field
         )
-        return f"TRY_CAST({text} AS DOUBLE)"
+        # A plain cast of a column is done by the reader of the file, which refuses ''.
+        return f"TRY_CAST(coalesce({text}, '') AS DOUBLE)"
 
     def find_row(row: int) -> tuple[str, str]:
         line, text = find_line(path, layout, row)
@@ -247,7 +248,7 @@ def _open_csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> 
         {name: f"c{layout.header.index(text)}" for name, text in chosen.items()},
         number=number,
         is_wrong=lambda field: f"NOT {_is_empty(field)}",
-        text=lambda field: f"CASE WHEN {_is_empty(field)} THEN '' ELSE trim({field}) END",
+        text=lambda field: f"trim(coalesce({field}, ''))",
         faults=[(f"c{count - 1} IS NULL", _SHORT), (f"c{count} IS NOT NULL", _SURPLUS)],
         find_row=find_row,
     )
@@ -303,4 +304,5 @@ def _literal(value: str) -> str:
 def _fill(column: NDArray[Any]) -> NDArray[Any]:
     if not isinstance(column, np.ma.MaskedArray):
         return column
-    return np.where(np.ma.getmaskarray(column), None if column.dtype == object else np.nan, column.data)
+    empty: Any = None if column.dtype == object else np.nan
+    return np.where(np.ma.getmaskarray(column), empty, column.data)

@@ -1,19 +1,14 @@
 """`flexneedle em simulate`: the paper's experiment with a tracker (section IV-B), in a simulated environment."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.files import replace_file
 from flexneedle.geometry.quaternion import along, z_axis
 from flexneedle.phantom.tracking.field.room import REFERENCES, Room, grid
 from flexneedle.phantom.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
@@ -21,7 +16,7 @@ from flexneedle.phantom.tracking.table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
 
 Floats = NDArray[np.float64]
-SUFFIXES = (".csv", ".parquet")
+Columns = dict[str, NDArray[Any]]
 _MOST_SAMPLES = 20_000_000
 _ALONG_X = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -41,8 +36,8 @@ class Experiment:
     repeats: int = 5
 
 
-def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.Table:
-    """Return the table of both sensors in all environments, with the columns `COLUMNS`.
+def measure(environments: Sequence[Environment], experiment: Experiment) -> Columns:
+    """Return the table of both sensors in all environments: the columns `COLUMNS`, NaN for missing values.
 
     The tip sensor points along x, the reference along z. The rows of an environment depend only on it and on the
     experiment. Raises InputError if two environments have the same name, or for more rows than `_MOST_SAMPLES`.
@@ -54,38 +49,15 @@ def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.T
     rows = 2 * len(names) * experiment.points**3 * experiment.samples * experiment.repeats
     if rows > _MOST_SAMPLES:
         raise InputError(f"{rows} samples: must be at most {_MOST_SAMPLES}")
-    return pa.concat_tables(
-        _measured(environment, sensor, experiment)
+    parts = [
+        _measure_sensor(environment, sensor, experiment)
         for environment in environments
         for sensor in (TIP, REFERENCE)
-    )
+    ]
+    return {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
 
 
-def write_measurements(table: pa.Table, path: Path) -> None:
-    """Write a table to a new file with one of the `SUFFIXES`, atomically. Raises InputError; see `check_new`."""
-    check_new(path)
-    sink = io.BytesIO()
-    if path.suffix == ".csv":
-        pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(quoting_style="needed"))
-    else:
-        pq.write_table(table, sink, compression="zstd")
-    try:
-        replace_file(path, sink.getvalue())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def check_new(path: Path) -> None:
-    """Raise InputError if the suffix is neither CSV nor Parquet, the file exists, or its folder does not."""
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
-    if path.exists():
-        raise InputError(f"{path}: already exists: choose another file with --out")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist")
-
-
-def _measured(environment: Environment, sensor: str, experiment: Experiment) -> pa.Table:
+def _measure_sensor(environment: Environment, sensor: str, experiment: Experiment) -> Columns:
     """Return the rows of one sensor in one environment."""
     seed = environment.field_seed if experiment.field_seed is None else experiment.field_seed
     room = Room(environment, seed)
@@ -101,33 +73,27 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
     distance = np.linalg.norm(positions - np.array(environment.generator_mm), axis=-1)
     columns = {
         "point_id": order,
-        **_named(("true_x_mm", "true_y_mm", "true_z_mm"), positions[order]),
-        **_reported(readings, missing, is_tip),
-        "sensor": [sensor] * len(order),
-        "environment": [environment.name] * len(order),
+        **_split(("true_x_mm", "true_y_mm", "true_z_mm"), positions[order]),
+        **_report(readings, missing, is_tip),
+        "sensor": np.full(len(order), sensor),
+        "environment": np.full(len(order), environment.name),
         "distance_mm": distance[order],
     }
-    return pa.table({name: pa.array(columns[name]) for name in COLUMNS}, _SCHEMA)
+    return {name: columns[name] for name in COLUMNS}
 
 
-def _reported(readings: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
-    """Return the reported values of each sample, null for missing samples."""
+def _report(readings: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> Columns:
+    """Return the reported values of each sample, NaN for missing samples."""
     # A single coil does not measure roll.
     orientations = along(z_axis(readings.orientations)) if is_tip else readings.orientations
-    values = _named(("x_mm", "y_mm", "z_mm"), readings.positions) | _named(
-        ("qw", "qx", "qy", "qz"), orientations
-    )
-    columns = {name: pa.array(column, mask=missing) for name, column in values.items()}
-    if readings.indicators is None:
-        return columns | {
-            "indicator": pa.array(np.zeros(len(missing)), mask=np.ones(len(missing), dtype=bool))
-        }
-    return columns | {"indicator": pa.array(readings.indicators, mask=missing)}
+    no_indicator = np.full(len(missing), np.nan)
+    values = {
+        **_split(("x_mm", "y_mm", "z_mm"), readings.positions),
+        **_split(("qw", "qx", "qy", "qz"), orientations),
+        "indicator": no_indicator if readings.indicators is None else readings.indicators,
+    }
+    return {name: np.where(missing, np.nan, column) for name, column in values.items()}
 
 
-def _named(names: Sequence[str], values: Floats) -> dict[str, Floats]:
+def _split(names: Sequence[str], values: Floats) -> Columns:
     return dict(zip(names, values.T, strict=True))
-
-
-_KINDS = {"point_id": pa.int64(), "sensor": pa.string(), "environment": pa.string()}
-_SCHEMA = pa.schema([(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])

@@ -65,7 +65,6 @@ def test_tables_show_the_papers_and_the_manufacturers_values(evaluated):
         " manufacturer",
         "0.48",
         "threshold",
-        "area under the ROC",
         "reference, noisy: slope (mm)",
         " met",
     ):
@@ -92,7 +91,7 @@ def test_json_is_one_object_in_full_precision_and_is_written_as_well(evaluated):
     assert values["indicator"][0]["sensor"] == "tip"
     names = [path.rsplit("/", 1)[-1] for path in values["figures"]]
     assert names == [
-        f"{name}.{kind}" for name in ("field", "indicator", "roc", "distance") for kind in ("png", "svg")
+        f"{name}.{kind}" for name in ("field", "indicator", "distance") for kind in ("png", "svg")
     ]
 
 
@@ -120,7 +119,7 @@ def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, m
     monkeypatch.setitem(sys.modules, "duckdb", None)
     status, out, err = run(capsys, "em", command, table)
     assert (status, out) == (2, "")
-    assert err == "flexneedle: tables of measurements need duckdb: pip install 'flexneedle[em]'\n"
+    assert err == "flexneedle: duckdb: not installed: pip install 'flexneedle[em]'\n"
 
 
 def test_an_invalid_table_gives_one_line_and_status_2(capsys, tmp_path):
@@ -218,7 +217,7 @@ def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
         tmp_path / "out",
     )
     _, out, _ = run(capsys, *argv)
-    for text in ("reference, lab empty: error", "reference, with table: slope", "lab empty: points below"):
+    for text in ("reference, lab empty: error", "reference, with table: slope"):
         assert text in out
     assert " ideal" not in out
     assert " noisy" not in out

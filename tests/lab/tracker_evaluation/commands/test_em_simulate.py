@@ -4,12 +4,14 @@ import re
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.cli.main import main
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import indicator_means
 from flexneedle.scenario.files import load_scenario
 
 DOCS = Path(__file__).resolve().parents[4] / "docs" / "tracking" / "simulate.md"
@@ -115,8 +117,9 @@ def test_the_indicator_detects_the_documented_plate(tmp_path):
     (tmp_path / "room.toml").write_text(examples()[1])
     arguments = ("--points", 4, "--samples", 10, "--repeats", 1, "--out", tmp_path / "out.csv")
     assert simulate(*arguments, "--environment", tmp_path / "room.toml", "ideal") == 0
-    (found,) = evaluate(tmp_path / "out.csv", Options(noisy="operating room")).separations
-    assert found.auc > 0.9
+    results = evaluate(tmp_path / "out.csv", EvaluationOptions()).results
+    means = {grid.environment: indicator_means(grid)[0] for grid in (r.grid for r in results) if grid.samples}
+    assert np.mean(means["operating room"][:, None] > means["ideal"]) > 0.9  # the area under the ROC curve
 
 
 def test_the_documented_scenario_is_valid():

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
-from flexneedle.lab.tracker_evaluation.table.columns import column_map
+from flexneedle.lab.tables.columns import map_columns
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
 
 LAWS = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
@@ -29,7 +29,8 @@ BY_HAND = rows_of(
 
 def results(path, **options):
     return {
-        (r["sensor"], r["environment"]): r for r in evaluate(path, Options(**options)).values()["results"]
+        (r["sensor"], r["environment"]): r
+        for r in evaluate(path, EvaluationOptions(**options)).values()["results"]
     }
 
 
@@ -54,12 +55,11 @@ def test_the_papers_equations_on_a_table_worked_out_by_hand(tmp_path):
 
 def test_points_weigh_equally_in_the_errors_and_samples_in_the_jitter(tmp_path):
     rows = rows_of([(0, 0, 0), (10, 0, 0)], [[(1, 0, 0)], [(12, 1, 0), (12, -1, 0), (12, 0, 0)]])
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
     found = evaluation.values()["results"][0]
     assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
     assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
     assert (found["n_single"], found["samples_least"], found["samples_most"]) == (1, 1, 3)
-    assert any("one sample at 1 grid point (used for the errors" in note for note in evaluation.notes)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0, -2500.0])
@@ -134,7 +134,7 @@ def assert_same(one, other):
     for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm", "mean_mm", "sd_mm"):
         assert one[name] == pytest.approx(other[name], abs=1e-12)
     assert_allclose(one["intervals"]["rmse_mm"], other["intervals"]["rmse_mm"], atol=1e-12)
-    assert one["indicator"]["samples"]["p95"] == other["indicator"]["samples"]["p95"]
+    assert one["indicator"]["samples"] == pytest.approx(other["indicator"]["samples"])
     assert one["max_at"] == other["max_at"]
 
 
@@ -158,7 +158,7 @@ def test_points_on_a_line_cannot_be_registered(tmp_path):
     with pytest.raises(
         InputError, match=r"t\.csv: --register: sensor 'tip', environment 'ideal'.*at least 3"
     ):
-        evaluate(path, Options(register=True))
+        evaluate(path, EvaluationOptions(register=True))
 
 
 def test_sensors_and_environments_are_evaluated_separately_in_the_papers_order(tmp_path):
@@ -191,7 +191,9 @@ def test_errors_over_distance_are_those_after_registration(tmp_path):
             {**row, "distance_mm": 612.0}
             | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, position), strict=True))
         )
-    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), Options(register=True)).values()["results"]
+    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(register=True)).values()[
+        "results"
+    ]
     (bin_,) = found["distance"]["bins"]
     assert bin_["rmse_mm"] == pytest.approx(found["rmse_mm"])
     assert bin_["rmse_mm"] < 1.5
@@ -204,8 +206,7 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         around = np.array([(off, 0.01, 0.0), (off, -0.01, 0.0)])
         own = rows_of(GRID, GRID[:, None] + around)
         rows += [{**row, "distance_mm": distance} for row in own]
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
-    assert evaluation.notes[0].startswith("tip, ideal: points were measured at several distances")
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
     found = evaluation.values()["results"][0]["distance"]
     assert [b["distance_mm"] for b in found["bins"]] == pytest.approx(list(error))
     assert [b["rmse_mm"] for b in found["bins"]] == pytest.approx(list(error.values()))
@@ -273,4 +274,4 @@ def test_the_documented_mapping_file_is_valid(tmp_path):
     text = (Path(__file__).parents[4] / "docs/tracking/evaluate.md").read_text(encoding="utf-8")
     mapping = tmp_path / "map.toml"
     mapping.write_text(text.split("```toml\n")[1].split("```")[0])
-    assert column_map([str(mapping)]) == {"x_mm": "X [mm]", "point_id": "id"}
+    assert map_columns([str(mapping)]) == {"x_mm": "X [mm]", "point_id": "id"}

@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
 
 
 def notes(path, rows, **options):
-    return evaluate(write_csv(path / "t.csv", rows), Options(**options)).notes
+    return evaluate(write_csv(path / "t.csv", rows), EvaluationOptions(**options)).notes
 
 
 def rotated(rows):
@@ -23,7 +23,7 @@ def rotated(rows):
 def test_a_note_suggests_register_for_a_tracker_with_another_frame(tmp_path):
     rows = rotated(random_rows(0)) + rotated(random_rows(1, sensor="reference"))
     (found,) = notes(tmp_path, rows)
-    fit = evaluate(tmp_path / "t.csv", Options(register=True)).results
+    fit = evaluate(tmp_path / "t.csv", EvaluationOptions(register=True)).results
     assert "add --register" in found
     assert ", and 1 more)" in found
     assert any(f"to {result.accuracy.rmse_mm:.2g} mm (" in found for result in fit)
@@ -42,16 +42,6 @@ def test_no_note_if_a_rigid_fit_would_not_help_or_was_made(tmp_path, case):
     if case == "wrong, but not rigidly":
         rows = rows_of(GRID, np.repeat(2.0 * (GRID - 25.0)[:, None] + 25.0, 2, axis=1))
     assert notes(tmp_path, rows, register=case == "registered") == []
-
-
-def test_a_note_reports_a_position_with_two_ids(tmp_path):
-    rows = random_rows(0)
-    assert notes(tmp_path, rows) == []
-    for row in rows[3:6]:
-        row["point_id"] = "first again"
-    assert notes(tmp_path, rows)[0].startswith(
-        "tip, ideal: 1 of 28 grid points repeat a position under another point_id (counted as"
-    )
 
 
 @pytest.mark.parametrize(("times", "expected"), [(4.5, False), (5.5, True)])

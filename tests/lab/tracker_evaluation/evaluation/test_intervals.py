@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import line
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import fit_line
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import bootstrap, quantile_interval
 
 
@@ -23,7 +23,7 @@ def test_the_interval_of_a_slope_covers_if_the_scatter_grows_with_the_indicator(
     covered = 0
     for _ in range(60):
         x = rng.uniform(0.07, 0.45, 125)
-        found = line(x, 9.6 * x + 0.05 + rng.normal(0.0, 4.0 * x))
+        found = fit_line(x, 9.6 * x + 0.05 + rng.normal(0.0, 4.0 * x))
         low, high = found.intervals["slope_mm"]
         covered += low <= 9.6 <= high
     assert 52 <= covered <= 60

@@ -8,7 +8,7 @@ from em_tables import random_rows, write_csv
 from flexneedle import load_scenario
 from flexneedle.lab.tracker_evaluation.commands import check
 from flexneedle.lab.tracker_evaluation.evaluation import published
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Options, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
 
 
 def errors(*values):
@@ -56,6 +56,6 @@ def test_no_other_name_is_one_of_the_papers_sensors(name):
 
 
 def test_a_sensor_named_1_is_not_compared_with_the_paper(tmp_path):
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", random_rows(0, sensor="1")), Options())
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", random_rows(0, sensor="1")), EvaluationOptions())
     (result,), (found,) = (evaluation.values()[key] for key in ("results", "indicator"))
     assert (result["official"], result["paper"], found["paper"]) == (None, None, None)

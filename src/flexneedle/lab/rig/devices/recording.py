@@ -8,7 +8,7 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.lab.tables.rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.table import Table, open_table
+from flexneedle.lab.tables.table import EMPTY, Table, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
@@ -42,11 +42,8 @@ def read_frames(path: Path) -> tuple[Frame, ...]:
     with open_table(path, _REQUIRED, optional) as table:
         table.refuse(_RULES)
         columns = table.arrays(f"SELECT {', '.join(COLUMNS)} FROM samples")
-        rows = [
-            dict(zip(columns, row, strict=True))
-            for row in zip(*(c.tolist() for c in columns.values()), strict=True)
-        ]
-        return _frames(table, rows)
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        return _frames(table, [dict(zip(columns, row, strict=True)) for row in rows])
 
 
 def _frames(table: Table, rows: Sequence[_Row]) -> tuple[Frame, ...]:
@@ -72,7 +69,7 @@ def _frames(table: Table, rows: Sequence[_Row]) -> tuple[Frame, ...]:
 def _reading(row: _Row) -> SensorReading:
     position, orientation = _known(row, _POSITION), _known(row, _ORIENTATION)
     indicator = None if isnan(row["indicator"]) else row["indicator"]
-    status = row["status"] or VISIBLE
+    status = VISIBLE if row["status"].lower() in EMPTY else row["status"]
     if position is None and status == VISIBLE:
         status = "missing"
     return SensorReading(position if status == VISIBLE else None, orientation, indicator, status)

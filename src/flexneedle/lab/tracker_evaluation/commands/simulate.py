@@ -60,12 +60,15 @@ def add_parser(commands: Commands) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.simulate import Experiment, check_new, measure, write_measurements
+    from flexneedle.arguments import require_extra
+    from flexneedle.lab.tables.write import check_new, write_table
+    from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure
     from flexneedle.scenario.files import load_environment
 
+    require_extra("em", "duckdb")
     check_new(args.out)
     experiment = Experiment(args.seed, args.field_seed, args.points, args.samples, args.repeats)
     table = measure([load_environment(source) for source in args.environment], experiment)
-    write_measurements(table, args.out)
+    write_table(table, args.out)
     print(args.out)
     return 0

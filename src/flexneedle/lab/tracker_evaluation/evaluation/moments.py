@@ -22,7 +22,7 @@ from flexneedle.lab.tables.rules import (
     TRUE_POSITIONS,
     require_text,
 )
-from flexneedle.lab.tables.table import Rule, Table, first_violation
+from flexneedle.lab.tables.table import EMPTY, Rule, Table, first_violation
 from flexneedle.phantom.tracking.table import REFERENCE, TIP
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,8 @@ _AXES = ("x", "y", "z")
 _PAIRS = list(combinations_with_replacement("wxyz", 2))
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ORDER = (TIP, REFERENCE, "ideal", "noisy")
-_KEY = "sensor, environment, point_id"
+_LABELS = ("sensor", "environment", "point_id")
+_KEY = ", ".join(_LABELS)
 _POSITIONS = ", ".join(
     f"favg({a}_mm) AS mean_{a}, var_pop({a}_mm) * count({a}_mm) AS scatter_{a}, "
     f"(min(true_{a}_mm) + max(true_{a}_mm)) / 2 AS true_{a}, max(true_{a}_mm) - min(true_{a}_mm) AS moved_{a}"
@@ -148,8 +149,9 @@ def read_grids(table: Table, bin_mm: float, threshold: float) -> tuple[list[Meas
     cells = table.arrays(_cells_query(table, rules), bin_mm=bin_mm)
     if not len(cells["n"]):
         raise InputError("has no rows")
-    if cells["n_invalid"].any():
-        table.refuse(rules)
+    labels = {name.lower() for column in _LABELS for name in cells[column]}
+    if cells["n_invalid"].any() or not labels.isdisjoint(EMPTY):
+        table.refuse([*require_text(*_LABELS), *rules])
     _refuse_moved(table, cells)
     indicators = table.arrays(_INDICATORS, threshold=threshold) if cells["n_indicator"].any() else {}
     pairs = sorted({*zip(cells["sensor"], cells["environment"], strict=True)}, key=lambda p: [*map(_rank, p)])
@@ -160,7 +162,7 @@ def read_grids(table: Table, bin_mm: float, threshold: float) -> tuple[list[Meas
 def _choose_rules(table: Table) -> tuple[Rule, ...]:
     optional = {"indicator": INDICATORS, "distance_mm": DISTANCES, "qw": ORIENTATIONS}
     others = (rule for column, rules in optional.items() if column in table.columns for rule in rules)
-    return (*require_text("point_id", "sensor", "environment"), *TRUE_POSITIONS, *POSITIONS, *others)
+    return (*TRUE_POSITIONS, *POSITIONS, *others)
 
 
 def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:

@@ -1,0 +1,148 @@
+"""The reader of tables: separators, decimal marks, empty values, and malformed rows by line number."""
+
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.lab.tables.rules import POSITIONS, require_text
+from flexneedle.lab.tables.table import open_table
+from flexneedle.lab.tables.write import write_table
+
+COMMAS, SEMICOLONS = "sensor,x_mm,y_mm\n", "sensor;x_mm;y_mm\n"
+ONE = [("a", 1.0, 2.0)]
+
+
+def read(path, rules=()):
+    with open_table(path, ("sensor", "x_mm", "y_mm"), ("z_mm",)) as table:
+        table.refuse(rules)
+        found = table.arrays("SELECT sensor, x_mm, y_mm, z_mm FROM samples")
+    assert np.isnan(found.pop("z_mm").astype(float)).all()
+    return [
+        tuple(None if value != value else value for value in row) for row in zip(*found.values(), strict=True)
+    ]
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Return a function that writes a file from text or bytes."""
+
+    def write(text):
+        path = tmp_path / "table.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        (COMMAS + "a,1,2\n", ONE),
+        (COMMAS + "a,1,2", ONE),
+        (SEMICOLONS + "a;1;2\n", ONE),
+        ("sensor\tx_mm\ty_mm\na\t1\t2\n", ONE),
+        ("\ufeff" + COMMAS + "a,1,2\n", ONE),
+        ("\ufeffsep=;\r\nsensor;x_mm;y_mm\r\na;1;2\r\n", ONE),
+        ("# a, comment\n\n#another\n" + COMMAS + "a,1,2\n", ONE),
+        ("other,y_mm, sensor ,x_mm\n!,2,a,1\n", ONE),
+        (COMMAS + '"a","1","2"\n', ONE),
+        (COMMAS + " a , 1 ,+2e0\n\n\n", ONE),
+        (SEMICOLONS + "a;1,5;-2,5e-1\n", [("a", 1.5, -0.25)]),
+        (SEMICOLONS + "a;1.5;2\n", [("a", 1.5, 2.0)]),
+        (SEMICOLONS + '"a;b";"1,5";2\n', [("a;b", 1.5, 2.0)]),
+        ("sensor\tx_mm\ty_mm\na\t,5\t2\n", [("a", 0.5, 2.0)]),
+        (COMMAS + "a,,NaN\na,na, \na,null,None\na,N/A,#N/A\na,MISSING,-nan\n", [("a", None, None)] * 5),
+    ],
+)
+def test_a_csv_file_is_read(written, text, rows):
+    assert read(written(text)) == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        (COMMAS + "a,1\n", "line 2"),
+        (COMMAS + "a,1,2,3\n", "line 2"),
+        (COMMAS + "a,1,2,\n", "line 2"),
+        (COMMAS + "a,1,2\na,1,2,,\n", "line 3"),
+        (COMMAS + "a,1,5,2\n", "line 2"),
+        (COMMAS + "a,1,2\n# end\n", "line 3"),
+        (COMMAS + "a,1,2\n   \n", "line 3"),
+        (COMMAS + "a,1,2\n\n\nb,1,y\n", "line 5: y_mm: 'y'"),
+        ("# 1\n# 2\n" + COMMAS + "a,x,2\n", "line 4: x_mm: 'x'"),
+        (COMMAS + 'a,"1,5",2\n', "line 2: x_mm: '1,5'"),
+        (COMMAS + "a,1 000,2\n", "line 2: x_mm"),
+        (COMMAS + "a,0x10,2\n", "line 2: x_mm"),
+        (COMMAS + "a,−1,2\n", "line 2: x_mm"),
+        (COMMAS + "a,1__0,2\n", "line 2: x_mm"),
+        (COMMAS + "a,inf,2\n", "line 2: x_mm: 'inf'"),
+        (COMMAS + "a,1,1e400\n", "line 2: y_mm: '1e400'"),
+        (SEMICOLONS + "a;1,5;2.5\n", "line 2: y_mm: '2.5'"),
+        (SEMICOLONS + "a;1.5;2\nb;2,5;1\n", "line 3: x_mm: '2,5'"),
+        (SEMICOLONS + "a;1.000,5;2\n", "line 2: x_mm: '1.000,5'"),
+        (COMMAS + 'a,1,"2\nb,1,2\n', "line 2"),
+        (COMMAS + '"a\nb",1,2\n', "line 2"),
+        (COMMAS + "a,1,2\r\nb,1,2\n", "line 2"),
+        (COMMAS.encode() + b"a,1,2\n\xff,1,2\n", "line 3"),
+        ("sensor,x_mm\na,2\n", "no column y_mm"),
+        ("sensor,x_mm,y_mm,x_mm\na,1,2,3\n", "'x_mm'"),
+        (COMMAS, "has no rows"),
+        ("", "is empty"),
+        ("# x\n\n", "column names"),
+        ("\0\1\n2", "neither CSV nor Parquet"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_line_with_its_place(written, text, place):
+    path = written(text)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert place in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_first_row_that_violates_a_rule_is_named(written):
+    path = written(SEMICOLONS + "a;1;2\n\nnan;1;2\na;x;2\n")
+    with pytest.raises(InputError, match="line 4: sensor is empty"):
+        read(path, require_text("sensor"))
+    with pytest.raises(InputError, match="line 5: x_mm"):
+        read(path)
+
+
+def test_a_malformed_row_is_refused_also_if_it_is_not_chosen(written):
+    path = written("sensor,x_mm,y_mm,z_mm\na,1,2,3\nb,1,2\n")
+    with (
+        pytest.raises(InputError, match="line 3: has fewer fields"),
+        open_table(path, ("sensor", "x_mm", "y_mm", "z_mm"), ()) as table,
+    ):
+        table.refuse(POSITIONS, "sensor = $name", name="a")
+
+
+def test_parquet_rows_follow_the_same_rules(tmp_path):
+    path = tmp_path / "table"
+    table = {"sensor": ["a", None], "x_mm": [1.0, float("nan")], "y_mm": [2, None]}
+    pq.write_table(pa.table(table), path)
+    assert read(path) == [("a", 1.0, 2.0), ("", None, None)]
+    pq.write_table(pa.table(table | {"x_mm": [1.0, float("inf")]}), path)
+    with pytest.raises(InputError, match="row 2: x_mm"):
+        read(path)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_written_table_is_read_to_the_last_digit(tmp_path, suffix):
+    x = np.array([0.1 + 0.2, np.nan, -1e-300])
+    path = tmp_path / f"it's{suffix}"
+    write_table({"sensor": np.array(["a", "b, c", "d"]), "x_mm": x, "y_mm": np.arange(3)}, path)
+    assert read(path) == [("a", x[0], 0.0), ("b, c", None, 1.0), ("d", x[2], 2.0)]
+    with pytest.raises(InputError, match="already exists"):
+        write_table({"x_mm": x}, path)
+
+
+def test_without_duckdb_the_extra_is_named(written, monkeypatch):
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    with pytest.raises(InputError, match=r"duckdb: .*pip install 'flexneedle\[em\]'"):
+        read(written(COMMAS + "a,1,2\n"))
