@@ -94,5 +94,5 @@ def test_a_file_that_is_not_a_recording_is_rejected(table, tmp_path):
             read_frames(tmp_path / name)
         assert str(refusal.value) == f"{tmp_path / name}: cannot be read: No such file or directory"
     (tmp_path / "no.parquet").write_text("no parquet")
-    with pytest.raises(InputError, match="no.parquet: has no rows"):
+    with pytest.raises(InputError, match=r"no\.parquet: has no rows"):
         read_frames(tmp_path / "no.parquet")

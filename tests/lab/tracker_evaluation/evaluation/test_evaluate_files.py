@@ -70,12 +70,10 @@ def test_a_truncated_line_followed_by_others_is_refused(tmp_path, rows):
     lines = path.read_text().splitlines()
     lines[40] = lines[40][:30]
     path.write_text("\n".join(lines) + "\n")
-    assert f"line 41: has {lines[40].count(',') + 1} fields, the header has 10: '{lines[40]}'" in refusal(
-        path
-    )
+    assert f"line 41: has fewer fields than the header: '{lines[40]}'" in refusal(path)
     lines[40] = lines[39] + ",7"
     path.write_text("\n".join(lines) + "\n")
-    assert "line 41: has 11 fields, the header has 10" in refusal(path)
+    assert "line 41: has more fields than the header" in refusal(path)
 
 
 def test_a_truncated_parquet_file_is_refused(tmp_path, rows):
