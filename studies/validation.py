@@ -214,8 +214,8 @@ def energy(found: problems.Found) -> list[str]:
     return [
         "## Energy",
         "Without cutting, energy is conserved: when base and guide move a bent needle at a depth of 28 mm without"
-        " insertion, their work (trapezoidal rule, 40 steps) equals the change of the stored energy within"
-        f" {small(moved)}.",
+        " insertion, their work (trapezoidal rule, 40 steps) differs from the change of the stored energy by at most"
+        f" {small(moved)} of it.",
         "In an insertion to 40 mm with guide motion and a flip, the work of base, guide and the tissue on the bevel is"
         " compared with the stored energy and the energy dissipated by friction. The relative error decreases with the"
         f" step, without friction with the power {power(problems.STEPS, gaps)}:",
@@ -234,11 +234,12 @@ def solver(found: problems.Found) -> list[str]:
         "## A second solver",
         "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, with"
         " equilibrium of forces instead of minimal energy. The test has 48 steps of all inputs with a retraction, two"
-        " flips, two layers, varying stiffness, start errors, bend and guide clearance. Differences of the tips:",
+        " flips, two layers, varying stiffness, start errors, bend and guide clearance. Largest differences of the"
+        " tips:",
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
         "θ converges with first order: the slope of the last segment is the slope half a segment before the tip. With"
-        f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm, with half the step by"
-        f" {small(found.rubbed[1])} mm, since friction acts along the needle as it was before the step.",
+        f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm; with half the step they"
+        f" differ by {small(found.rubbed[1])} mm, since friction acts along the needle as it was before the step.",
     ]
 
 
@@ -272,7 +273,7 @@ def space(found: in_space.Space) -> list[str]:
         ),
     ]
     buckling = " and ".join(
-        f"{factor:.3f} times the moment with {share:g} of Euler's load"
+        f"{factor:.3f} times this moment with {share:g} times Euler's load"
         for share, factor in found.twist.items()
     )
     counts = [f"{n}, {m} segments" for n, m in zip(in_space.SEGMENTS, in_space.HELIX_SEGMENTS, strict=True)]
@@ -283,8 +284,8 @@ def space(found: in_space.Space) -> list[str]:
         " (`tests/reference/kirchhoff.py`). For a twisted helix under its wrench it has the largest unbalanced moment"
         " per mm over EIκ².",
         table(("problem", *counts, "order"), rows),
-        "A straight rod between two clamps, twisted by its base under an axial load, buckles at Greenhill's moment:"
-        f" found at {buckling}. The second clamp is stiff tissue, which gives by about half a millimetre.",
+        "A straight rod between two clamps, twisted by its base under an axial load, buckles at Greenhill's moment. The"
+        f" plant buckles at {buckling}; its second clamp is stiff tissue, which moves by about half a millimetre.",
         "The roll of the tip lags behind the roll of the base by c l²/2GJ over the inserted length l, for a couple c"
         f" per mm of friction, and by c l/GJ per mm of the free length: relative error {small(abs(found.lag))}.",
     ]
