@@ -11,7 +11,7 @@ import pytest
 # digit on, so that the figures that the pages print would be those of another insertion.
 os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
-from fake_engine import draw_nothing
+from fake_engine import draw_nothing, install
 
 # The same examples each time, as slow as the machine may be.
 hypothesis.settings.register_profile("flexneedle", deadline=None, derandomize=True)
@@ -72,3 +72,30 @@ def scenario_file(tmp_path):
         return path
 
     return write
+
+
+# ---- what the tests of commands that plan or insert share
+
+
+@pytest.fixture
+def in_tmp(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def drawing(request):
+    """Save empty figures in tests that are not about figures."""
+    if "real_figures" not in request.fixturenames:
+        request.getfixturevalue("empty_figures")
+
+
+@pytest.fixture
+def real_figures():
+    """For tests of what is drawn."""
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """Return a function that installs the fake planner and loop."""
+    return lambda **options: install(monkeypatch.setattr, **options)

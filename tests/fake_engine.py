@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.errors import RunError
+from flexneedle.loop.events import PeriodEnded
 from flexneedle.types import Insertion, Outcome
 from synthetic import make_periods, make_plan
 
@@ -23,43 +23,27 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
     return replace(made, tips=made.tips + np.array([0.0, miss, 0.0, 0.0, 0.0]), limit=limit)
 
 
-def insert(
-    _scenario,
-    plan,
-    seed=0,
-    *,
-    controller="adaptive-mpc",
-    phantom="exact",
-    tracker="scenario",
-    force=False,
-    on_period=None,
-    miss=0.06,
-    stop=None,
-    outcome="done",
-    **_of_a_rig,
-):
-    """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
-    del tracker  # nothing is measured
-    if not (plan.reached or force or CONTROLLERS[controller].predicts):
+def carry_out(_scenario, plan, choices, stream, *, miss=0.06, stop=None, outcome="done"):
+    """Insert as `flexneedle.loop.insert.carry_out` does; stop: after so many periods, call that."""
+    if not (plan.reached or choices.force or choices.controller.predicts):
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, limited by {plan.limit}")
     periods = []
-    for period in make_periods(plan, miss, seed):
+    for period in make_periods(plan, miss, choices.seed):
         periods.append(period)
-        on_period(period)
+        stream.send(PeriodEnded(period))
         if stop is not None and len(periods) == stop[0]:
             stop[1]()
     reason = "" if outcome == "done" else "no sample for 1.00 s"
-    return Insertion(plan, seed, tuple(periods), Outcome(outcome), reason, controller, phantom)
+    ended = Insertion(plan, choices.seed, tuple(periods), Outcome(outcome), reason)
+    return replace(ended, **choices.parts)
 
 
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
-    from flexneedle.loop import insert as insertion
-    from flexneedle.planning import planner
+    from flexneedle.record import recording
 
-    plan_options = {"miss": options.pop("plan_miss", 0.0)}
-    setattr_(planner, "plan", partial(plan, **plan_options))
-    setattr_(insertion, "insert", partial(insert, **options))
+    setattr_(recording, "make_plan", partial(plan, miss=options.pop("plan_miss", 0.0)))
+    setattr_(recording, "carry_out", partial(carry_out, **options))
 
 
 def draw_nothing(setattr_):

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.loop import closed_loop as insertion
-from flexneedle.loop.virtual import Rig
+from flexneedle.loop import closed_loop
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.events import Gate, PeriodEnded, Stream
+from flexneedle.loop.insert import prepare
+from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.tracking.simulated import NoisyTracker
+from flexneedle.planning.origin import placed
 from flexneedle.types import STILL, VISIBLE, Measurement, Motion
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -83,7 +87,20 @@ class Stage:
 
 
 def run(plan, rig, scenario=PHANTOM, seed=5, **options):
-    return insertion.run(scenario, plan, rig, np.random.default_rng(seed), **options)
+    """Carry out a plan on the ports of a rig."""
+    return carry_out(flexneedle.load_scenario(scenario), plan, rig, seed, **options)
+
+
+def carry_out(scenario, plan, rig, seed, listeners=(), gate=None, **choices):
+    """Carry out a plan with the randomness of `default_rng(seed)` for the controller."""
+    stream = Stream(tuple(listeners), gate or Gate())
+    steering = prepare(placed(scenario, plan), plan, Choices.of(seed, rig=rig, **choices), stream)
+    return closed_loop.run(replace(steering, rng=np.random.default_rng(seed)), rig)
+
+
+def on_period(listener):
+    """Return a listener that is called with the periods alone."""
+    return lambda event: listener(event.period) if isinstance(event, PeriodEnded) else None
 
 
 def of_any_scenario(plan):
@@ -105,7 +122,7 @@ def first_periods(count, plan, rig, scenario=PHANTOM, **options):
             raise Enough
 
     with pytest.raises(Enough):
-        run(plan, rig, scenario, on_period=watch, **options)
+        run(plan, rig, scenario, listeners=[on_period(watch)], **options)
     return periods
 
 

@@ -63,8 +63,9 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tup
             "changes = 'x': must be values by key; such as {\"target.depth_mm\": 35.0}",
         ),
         (
-            lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
-            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.ports",
+            lambda: flexneedle.insert("phantom", PLAN, rig="arm"),
+            "rig = 'arm': must be a VirtualRig, a Rig with its ports, or the rig of a rig file; "
+            "see flexneedle.devices.open_rig",
         ),
         (
             lambda: flexneedle.Rig(1, 2, 3),
@@ -88,11 +89,11 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tup
             "truth = 0.0: must be a function of () that returns a Condition, or None",
         ),
         (
-            lambda: flexneedle.insert("phantom", PLAN, tracker=3),
+            lambda: flexneedle.VirtualRig(tracker=3),
             f"tracker = 3: must be one of scenario, {OWN}, or a function of (scenario, phantom, rng)",
         ),
         (
-            lambda: flexneedle.insert("phantom", PLAN, phantom={"exact": 1}),
+            lambda: flexneedle.VirtualRig(phantom={"exact": 1}),
             f"phantom = {{'exact': 1}}: must be one of exact, model, {OWN}, or a function of (truth, roll)",
         ),
         (
@@ -126,14 +127,6 @@ def test_a_file_in_a_run_folder_is_rejected_with_the_folder(tmp_path):
         assert str(caught.value) == line
 
 
-def test_a_seed_in_place_of_a_generator_is_rejected(quick_plan):
-    rig = flexneedle.Rig(BENCH, BENCH, BENCH)
-    with pytest.raises(
-        InputError, match=r"^rng = 3: must be a Generator; such as numpy\.random\.default_rng\(0\)$"
-    ):
-        flexneedle.run("phantom", quick_plan, rig, 3)
-
-
 @pytest.mark.parametrize("value", [np.arange(3000.0), "x" * 900, [[1] * 99] * 99, {"a": "b\nc"}, object()])
 def test_the_error_for_any_value_is_one_short_line(value):
     with pytest.raises(FlexneedleError) as caught:
@@ -157,21 +150,23 @@ def test_a_scenario_may_be_given_by_name_or_path(tmp_path):
         assert again.controls.tobytes() == plan.controls.tobytes()
         assert flexneedle.Simulator(source).scenario == scenario
     one, other = (
-        flexneedle.insert(source, plan, 1, controller="open-loop", phantom="model", threads=1)
+        flexneedle.insert(
+            source, plan, 1, controller="open-loop", rig=flexneedle.VirtualRig("model"), threads=1
+        )
         for source in ("phantom", scenario)
     )
     assert [period.true_tip for period in one.periods] == [period.true_tip for period in other.periods]
 
 
-def test_run_executes_a_plan_on_any_rig(quick_plan):
+def test_insert_executes_a_plan_on_the_ports_of_any_rig(quick_plan):
     """On the virtual phantom it gives the same result as `insert`."""
     from flexneedle.loop.virtual import Seeds, virtual_rig
 
-    phantom, tracker, control, room = np.random.SeedSequence(4).spawn(4)
+    phantom, tracker, _, room = np.random.SeedSequence(4).spawn(4)
     scenario = flexneedle.load_scenario("phantom")
     rig = virtual_rig(scenario, quick_plan.roll, Seeds(phantom, tracker, room))
     assert isinstance(rig, flexneedle.Rig)
-    done = flexneedle.run(scenario, quick_plan, rig, np.random.default_rng(control), controller="open-loop")
+    done = flexneedle.insert(scenario, quick_plan, 4, rig=rig, controller="open-loop")
     same = flexneedle.insert(scenario, quick_plan, 4, controller="open-loop")
     assert [period.true_tip for period in done.periods] == [period.true_tip for period in same.periods]
     assert (done.phantom, done.tracker, same.phantom, same.tracker) == ("", "", "exact", "scenario")

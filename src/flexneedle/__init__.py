@@ -21,9 +21,18 @@ if TYPE_CHECKING:
     from flexneedle.estimation.task import Task
     from flexneedle.figures.record import plot
     from flexneedle.lab.study.runner import run_study
-    from flexneedle.loop.closed_loop import run
+    from flexneedle.loop.events import (
+        Decided,
+        Ended,
+        Event,
+        Gate,
+        Iterated,
+        PeriodEnded,
+        Planned,
+    )
     from flexneedle.loop.insert import insert
-    from flexneedle.loop.virtual import Rig
+    from flexneedle.loop.rig import Rig
+    from flexneedle.loop.virtual import VirtualRig
     from flexneedle.phantom.draw import Truth
     from flexneedle.phantom.plants import Plant
     from flexneedle.planning.planner import plan
@@ -46,15 +55,22 @@ __all__ = [
     "CommandError",
     "Control",
     "Controller",
+    "Decided",
     "Decision",
+    "Ended",
     "Estimate",
+    "Event",
     "FlexneedleError",
+    "Gate",
     "InputError",
     "Insertion",
+    "Iterated",
     "Layer",
     "Measurement",
     "Motion",
+    "PeriodEnded",
     "Plan",
+    "Planned",
     "Plant",
     "Pose",
     "Rig",
@@ -69,6 +85,7 @@ __all__ = [
     "Task",
     "TipTracker",
     "Truth",
+    "VirtualRig",
     "__version__",
     "controls",
     "insert",
@@ -76,7 +93,6 @@ __all__ = [
     "load_scenario",
     "plan",
     "plot",
-    "run",
     "run_study",
     "save",
     "to_dataframe",
@@ -94,11 +110,12 @@ _HOMES = {
     "figures.record": ("plot",),
     "planning.planner": ("plan",),
     "loop.insert": ("insert",),
-    "loop.closed_loop": ("run",),
     "phantom.draw": ("Truth",),
     "phantom.plants": ("Plant",),
     "ports": ("TipTracker",),
-    "loop.virtual": ("Rig",),
+    "loop.rig": ("Rig",),
+    "loop.virtual": ("VirtualRig",),
+    "loop.events": ("Decided", "Ended", "Event", "Gate", "Iterated", "PeriodEnded", "Planned"),
     "record.frame": ("to_dataframe",),
     "record.loading": ("load",),
     "record.saving": ("save",),

@@ -360,7 +360,9 @@ def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number)
     """There the tip moves by millimetres within a step, and a reading is not on the chord of its move."""
     scenario = world(number, "perfect")
     plan = flexneedle.plan(scenario, seed=0)
-    assert flexneedle.insert(scenario, plan, seed=number, phantom="model").true_error_mm < 0.2
+    assert (
+        flexneedle.insert(scenario, plan, seed=number, rig=flexneedle.VirtualRig("model")).true_error_mm < 0.2
+    )
 
 
 def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monkeypatch):

@@ -65,7 +65,13 @@ def test_the_base_goes_to_its_planned_pose(plan):
 def test_each_period_of_each_controller_has_a_predicted_shape(plan, controller):
     """At the target, less sure ahead of the tip than where it was measured."""
     done = flexneedle.insert(
-        plan.scenario, plan, 1, controller=controller, phantom="model", force=True, threads=1
+        plan.scenario,
+        plan,
+        1,
+        controller=controller,
+        rig=flexneedle.VirtualRig("model"),
+        force=True,
+        threads=1,
     )
     periods = done.periods
     assert all(period.predicted is not None for period in periods)

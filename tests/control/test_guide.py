@@ -9,8 +9,9 @@ from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.guide import check_guide, guide_may_move, most_guide_step
 from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
+from flexneedle.loop.choices import Choices
 from flexneedle.record.folder import Folder
-from flexneedle.record.recording import Choices, record_insertion
+from flexneedle.record.recording import record_insertion
 from flexneedle.simulator.simulator import Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -57,13 +58,13 @@ def test_a_steering_plan_is_refused_before_anything_moves(name, steered):
 
 def test_the_refusal_comes_before_the_plan(tmp_path):
     folder = Folder.claim(tmp_path / "run", "run", "insertion", PHANTOM, 0)
-    choices = Choices(0, "steering", controller="resolved-rate")
+    choices = Choices.of(0, "resolved-rate")
 
     def never(*_):
         raise AssertionError("planned")
 
     with pytest.raises(InputError, match="needs a guide that moves"):
-        record_insertion(folder, PHANTOM, choices, on_iteration=never, on_period=never)
+        record_insertion(folder, PHANTOM, "steering", choices, listeners=[never])
 
 
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):

@@ -178,7 +178,9 @@ def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(
     few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}
     few |= {f"control.adaptive_mpc.{key}": value for key, value in (("samples", 12), ("iterations", 1))}
     scenario = PHANTOM.with_values(few)
-    done = flexneedle.insert(scenario, quick_plan, 5001, controller=name, phantom=plant, threads=1)
+    done = flexneedle.insert(
+        scenario, quick_plan, 5001, controller=name, rig=flexneedle.VirtualRig(plant), threads=1
+    )
     assert (done.outcome, done.controller, done.phantom) == ("done", name, plant)
     left_out = np.subtract(
         [period.command for period in done.periods], [period.applied for period in done.periods]

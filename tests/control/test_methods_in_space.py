@@ -34,7 +34,13 @@ def scenario_of(direction=0.6, off=OFF, **changes):
 def inserted(scenario, controller, seed=0, force=True, plan=None):
     plan = plan or flexneedle.plan(scenario, threads=1)
     return flexneedle.insert(
-        scenario, plan, seed, controller=controller, phantom="model", force=force, threads=1
+        scenario,
+        plan,
+        seed,
+        controller=controller,
+        rig=flexneedle.VirtualRig("model"),
+        force=force,
+        threads=1,
     )
 
 

@@ -58,7 +58,7 @@ def inserted(plan):
     def insert(seed, phantom="exact", controller="adaptive-mpc", threads=None, **values):
         scenario = PHANTOM.with_values({key.replace("__", "."): value for key, value in values.items()})
         return flexneedle.insert(
-            scenario, plan, seed, phantom=phantom, controller=controller, threads=threads
+            scenario, plan, seed, rig=flexneedle.VirtualRig(phantom), controller=controller, threads=threads
         )
 
     return insert

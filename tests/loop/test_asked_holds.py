@@ -6,30 +6,31 @@ from itertools import count
 import pytest
 
 from flexneedle.control.interface import Controller, Decision
+from flexneedle.loop.events import Gate
 from insertions import PHANTOM, READING, Tank, run
 from tanks import STRAIGHT
 
 WHY = "nobody is in control"
 
 
-class Asked:
+class Asked(Gate):
     """A hold that is asked for at these calls, the first is 0."""
 
     def __init__(self, *calls):
         self.calls, self.count = calls, 0
 
-    def __call__(self):
+    def hold(self):
         number, self.count = self.count, self.count + 1
         return WHY if number in self.calls else ""
 
 
-def inserted(plan, hold, scenario=PHANTOM, depth=-20.0):
+def inserted(plan, gate, scenario=PHANTOM, depth=-20.0):
     tank, numbers = Tank(plan.roll), count()
     method = Controller(
         "numbered", "advances", decide=lambda *_: (Decision(STRAIGHT, f"number {next(numbers)}"), None)
     )
     target = replace(plan, target=(depth, 0.0, 0.0))
-    return run(target, replace(tank.rig(), hold=hold), scenario, controller=method, force=True), tank
+    return run(target, tank.rig(), scenario, controller=method, force=True, gate=gate), tank
 
 
 def test_it_rests_while_it_is_asked_and_then_goes_on(plan):

@@ -11,7 +11,7 @@ import flexneedle
 import flexneedle.control
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT, adaptive_mpc
 from flexneedle.errors import RunError
-from flexneedle.loop.virtual import Rig
+from flexneedle.loop.rig import Rig
 from flexneedle.simulator.state import State
 from flexneedle.types import Measurement
 from insertions import (

@@ -167,7 +167,7 @@ def test_with_a_perfect_model_it_ends_at_the_target(number):
     """Worlds whose plant is the model, with the tracker's noise, and no warning."""
     scenario = world(number, "perfect")
     plan = flexneedle.plan(scenario, seed=0, threads=1)
-    done = flexneedle.insert(scenario, plan, 0, phantom="model", threads=1)
+    done = flexneedle.insert(scenario, plan, 0, rig=flexneedle.VirtualRig("model"), threads=1)
     assert done.outcome == "done"
     assert done.true_error_mm < 0.15
     assert done.warning == ""

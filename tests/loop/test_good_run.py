@@ -16,7 +16,8 @@ import flexneedle
 import flexneedle.control
 from flexneedle.errors import InputError
 from flexneedle.loop import insert as insertion
-from flexneedle.loop.virtual import Rig
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.plants import PLANTS
 from flexneedle.types import Insertion, Outcome
 from insertions import (
@@ -29,6 +30,7 @@ from insertions import (
     facts,
     loop,
     moving,
+    on_period,
     run,
 )
 
@@ -127,7 +129,7 @@ def test_both_plants_have_the_same_start(inserted):
 
 def test_unknown_names_of_plant_and_controller_are_rejected_with_the_choices(plan):
     with pytest.raises(InputError, match="phantom = 'gel': must be one of exact, model"):
-        flexneedle.insert(PHANTOM, plan, 0, phantom="gel")
+        flexneedle.insert(PHANTOM, plan, 0, rig=flexneedle.VirtualRig("gel"))
     with pytest.raises(InputError, match="controller = 'pid': must be one of adaptive-mpc, "):
         flexneedle.insert(PHANTOM, plan, 0, controller="pid")
 
@@ -139,14 +141,14 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
         drawn.extend(np.random.default_rng(seed).random() for seed in dataclasses.astuple(seeds))
         plants.append(phantom)
 
-    def no_run(_scenario, plan, _rig, rng, *_args, **_options):
-        drawn.append(rng.random())
+    def no_run(steering, _rig):
+        drawn.append(steering.rng.random())
         return Insertion(plan, 0, (), Outcome("done"), "")
 
-    monkeypatch.setattr(insertion, "virtual_rig", virtual_rig)
+    monkeypatch.setattr("flexneedle.loop.virtual.virtual_rig", virtual_rig)
     monkeypatch.setattr(insertion, "run", no_run)
     for seed, phantom in ((0, "exact"), (1, "exact"), (0, "model")):
-        insertion.insert(PHANTOM, plan, seed, phantom=phantom)
+        insertion.insert(PHANTOM, plan, seed, rig=VirtualRig(phantom))
     assert len(set(drawn)) == 8
     assert drawn[:4] == drawn[8:]
     assert plants == [PLANTS["exact"], PLANTS["exact"], PLANTS["model"]]
@@ -162,7 +164,7 @@ def test_on_period_gets_each_period_as_it_ends(plan):
         moved = [one for one in periods if one.command != STILL]
         assert len(tank.moves) == len(moved)  # before the next one moves
 
-    done = run(part, tank.rig(), on_period=watch, force=True)
+    done = run(part, tank.rig(), listeners=[on_period(watch)], force=True)
     assert done.periods == tuple(periods)
     assert len(periods) > 5
 

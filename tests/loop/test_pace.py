@@ -12,7 +12,7 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.pace import roll_time, travel_time
 from flexneedle.types import COLUMNS, Control
-from insertions import PHANTOM, READING, Tank, run
+from insertions import PHANTOM, READING, Tank, on_period, run
 from tanks import STRAIGHT, TURN, tank, tip
 
 SPACE = PHANTOM.with_values({"setup.axes": 2})
@@ -89,7 +89,13 @@ def test_a_period_lasts_as_long_as_its_motion(plan, command, seconds):
     """Travel in whole readings of the tracker; a roll before it."""
     rig, ends = Tank(plan.roll), []
     straight = scripted([STRAIGHT, command, STRAIGHT])
-    run(plan, rig.rig(), controller=straight, force=True, on_period=lambda one: ends.append(one.time))
+    run(
+        plan,
+        rig.rig(),
+        controller=straight,
+        force=True,
+        listeners=[on_period(lambda one: ends.append(one.time))],
+    )
     durations = [after - before for before, after in itertools.pairwise(ends)]
     assert durations[:2] == pytest.approx([seconds, 0.2])
 

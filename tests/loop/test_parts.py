@@ -155,7 +155,9 @@ def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
     with pytest.raises(
         InputError, match="controller odd: decide must return a Decision and the memory after it"
     ):
-        flexneedle.insert(PHANTOM, make_plan(), controller=own, phantom="model", force=True)
+        flexneedle.insert(
+            PHANTOM, make_plan(), controller=own, rig=flexneedle.VirtualRig("model"), force=True
+        )
 
 
 @pytest.mark.parametrize("command", [(1.0, 0.0), (1.0, 0.0, 0.0, 0.0, -1), (*STILL, 0.0), 1.0, "forward"])

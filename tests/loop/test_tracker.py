@@ -8,7 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.loop.closed_loop import run
-from flexneedle.loop.virtual import Rig, Seeds, to_stage, virtual_rig, virtual_room
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig, virtual_room
 from flexneedle.phantom.tracking.field.poses import reference_poses
 from flexneedle.phantom.tracking.field.room import Room
 from flexneedle.phantom.tracking.field.sensors import indicator, noiseless

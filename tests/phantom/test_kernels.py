@@ -39,7 +39,7 @@ scenario = flexneedle.load_scenario(preset).with_values({
 plans = [flexneedle.plan(scenario, strategy=strategy) for strategy in ("manipulation", "steering")]
 for name in CONTROLLERS:
     for kind in PLANTS:
-        flexneedle.insert(scenario, plans[0], controller=name, phantom=kind, force=True)
+        flexneedle.insert(scenario, plans[0], controller=name, rig=flexneedle.VirtualRig(kind), force=True)
 assert signatures() == before, (signatures(), before)
 """
 

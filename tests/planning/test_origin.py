@@ -81,10 +81,10 @@ def test_the_planner_notes_the_scenario(quick_plan):
 def test_insert_and_run_refuse_before_anything_moves(quick_plan):
     other = PHANTOM.with_values({"tissue.0.shear_modulus_kpa": 3.0})
     seeds = Seeds(*np.random.SeedSequence(0).spawn(3))
-    rig, rng = virtual_rig(other, quick_plan.roll, seeds, DEFAULT_PLANT), np.random.default_rng(0)
+    rig = virtual_rig(other, quick_plan.roll, seeds, DEFAULT_PLANT)
     for carry_out in (
         lambda: flexneedle.insert(other, quick_plan),
-        lambda: flexneedle.run(other, quick_plan, rig, rng),
+        lambda: flexneedle.insert(other, quick_plan, rig=rig),
     ):
         with pytest.raises(
             InputError, match=r"^tissue\[0\]\.shear_modulus_kpa = 3\.0: the plan was made with 1\.82"

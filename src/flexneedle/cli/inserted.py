@@ -5,18 +5,13 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from flexneedle.cli.common import STILL_IN, entry_rows, print_json, print_table, target_row
+from flexneedle.cli.common import entry_rows, print_json, print_table, target_row
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from flexneedle.scenario.model import Scenario
     from flexneedle.types import Insertion
-
-
-def print_still_in(rig: str) -> None:
-    """Print how a needle that was left in is withdrawn. rig: as the user gave it."""
-    print(f"flexneedle: {STILL_IN.format(rig=rig)}", file=sys.stderr)
 
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:

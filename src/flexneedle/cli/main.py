@@ -10,21 +10,17 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module
+from importlib.metadata import entry_points
 from typing import Any
 
 from flexneedle import __version__
 from flexneedle.cli import export, insert, plan, scenario, view
-from flexneedle.cli.commands import help_texts
+from flexneedle.cli.commands import Commands, help_texts
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
-from flexneedle.lab.emulators import commands as emulate
-from flexneedle.lab.page import commands as serve
-from flexneedle.lab.rig import commands as rig
-from flexneedle.lab.study import commands as study
-from flexneedle.lab.study import report_command as report
 
-_EM = import_module("flexneedle.lab.tracker_evaluation.commands.group")  # by name: no other layer imports em
-_COMMANDS = (plan, insert, serve, study, report, view, export, scenario, _EM, rig, emulate)
+_CORE = {"plan": plan, "insert": insert, "view": view, "export": export, "scenario": scenario}
+_ORDER = ("plan", "insert", "serve", "study", "report", "view", "export", "scenario", "em", "rig", "emulate")
+"""Order in the help; commands of other packages, and options that a package adds to a command here, come last."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -49,9 +45,21 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"flexneedle {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in _COMMANDS:
-        command.add_parser(subparsers)
+    for add in _adders():
+        add(subparsers)
     return parser
+
+
+def _adders() -> Iterator[Callable[[Commands], None]]:
+    """Yield the functions that add commands, or options to them: those of the core and of `flexneedle.commands`."""
+    installed = {point.name: point for point in entry_points(group="flexneedle.commands")}
+    for name in sorted({*_CORE, *installed}, key=_place):
+        yield _CORE[name].add_parser if name in _CORE else installed[name].load()
+
+
+def _place(name: str) -> tuple[int, str]:
+    """Return the place of a command in the help."""
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER), name
 
 
 def main(argv: Sequence[str] | None = None) -> int:

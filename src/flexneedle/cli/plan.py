@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from math import degrees, isnan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import (
@@ -44,6 +44,7 @@ def add_parser(commands: Commands) -> None:
 
 def _plan(args: argparse.Namespace) -> int:
     from flexneedle.cli.progress import Progress
+    from flexneedle.loop.events import Event, Iterated
     from flexneedle.record.folder import Folder
     from flexneedle.record.recording import record_plans
 
@@ -53,11 +54,12 @@ def _plan(args: argparse.Namespace) -> int:
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with problems_printed(folder), Progress() as progress:
 
-        def show(strategy: str, info: dict[str, Any]) -> None:
-            note = f"best cost {info['best']:.4g}"
-            progress.show(f"Planning ({strategy})", info["iteration"], info["iterations"], note)
+        def show(event: Event) -> None:
+            if isinstance(event, Iterated):
+                info, note = event.info, f"best cost {event.info['best']:.4g}"
+                progress.show(f"Planning ({event.strategy})", info["iteration"], info["iterations"], note)
 
-        plans = record_plans(folder, scenario, strategies, args.seed, show)
+        plans = record_plans(folder, scenario, strategies, args.seed, [show])
     _report(scenario, plans, args.json, folder.path)
     return 0 if all(plan.reached for plan in plans.values()) else 1
 

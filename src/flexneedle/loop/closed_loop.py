@@ -3,36 +3,26 @@
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from flexneedle.arguments import instance, whole
-from flexneedle.control import tables
-from flexneedle.control.controllers import DEFAULT, used
+from flexneedle.arguments import instance
 from flexneedle.control.forecast import missed, warning
-from flexneedle.control.guide import check_guide
-from flexneedle.control.interface import Controller, Decision, at_depth
-from flexneedle.errors import CommandError, DriverError, RefusedError, RunError, StoppedError, one_line
+from flexneedle.control.interface import Decision, at_depth
+from flexneedle.errors import CommandError, DriverError, RefusedError, StoppedError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.loop.guard import Guard
+from flexneedle.loop.events import PeriodEnded
 from flexneedle.loop.measuring import Observation, observe, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.loop.parts import controller_of
 from flexneedle.loop.progress import Progress, hold_after
 from flexneedle.loop.record import record
-from flexneedle.loop.step import OnDecision, Steering, Step
-from flexneedle.loop.virtual import Rig
-from flexneedle.planning.origin import check_origin, placed
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
-from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.pace import ROUNDING_S, travel_time
-from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import (
     STILL,
     Action,
@@ -40,7 +30,6 @@ from flexneedle.types import (
     Motion,
     Outcome,
     Period,
-    Plan,
     X,
 )
 
@@ -48,55 +37,23 @@ _MOST_MOVES = 4  # times the planned steps; then the insertion fails
 _Ending = tuple[Outcome, str]
 
 
-def run(
-    scenario: str | Path | Scenario,
-    plan: Plan,
-    rig: Rig,
-    rng: np.random.Generator,
-    seed: int = 0,
-    *,
-    controller: str | Controller = DEFAULT,
-    force: bool = False,
-    threads: int | None = None,
-    on_period: Callable[[Period], None] | None = None,
-    on_decision: OnDecision | None = None,
-) -> Insertion:
-    """Execute `plan` in closed loop on any rig; return the complete record.
+def run(steering: Steering, rig: Rig) -> Insertion:
+    """Execute the plan of `steering` on the ports of a rig: see `flexneedle.insert`.
 
-    scenario, controller, force, threads, on_period, on_decision: as for `insert`. rng: randomness of the controller;
-    seed: only recorded.
-
-    The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
-    exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
-    stopped at the rig, with the outcome "interrupted", and one with a command that the rig refuses, with the outcome
-    "held". A DriverError is raised only if the driver cannot be stopped after another error or an interrupt.
+    A DriverError is raised only if the driver cannot be stopped after another error or an interrupt.
     """
-    scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
-    rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.ports")
-    rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
-    scenario = placed(scenario, plan)
-    check_origin(plan, scenario)
-    name, chosen = controller_of(controller)
-    check_guide(chosen, scenario.setup, plan.strategy)
-    if not (plan.reached or force or chosen.predicts):
-        raise RunError(
-            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
-            "to insert anyway: flexneedle insert --force (force=True)"
-        )
-    scenario = used(scenario, chosen)
-    task = tables.task(chosen, Simulator(scenario, threads), plan)
-    steering = Steering(task, chosen, Guard.of(scenario, plan), rng, force, on_decision)
-    periods, ending = _run_to_end(steering, rig, on_period)
-    insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
+    task, choices = steering.task, steering.choices
+    periods, ending = _run_to_end(steering, rig)
+    insertion = Insertion(
+        task.plan, choices.seed, tuple(periods), *ending, choices.name, scenario=task.scenario
+    )
     if insertion.outcome is Outcome.DONE:
-        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
+        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, task.plan.target))
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
 
 
-def _run_to_end(
-    steering: Steering, rig: Rig, on_period: Callable[[Period], None] | None
-) -> tuple[list[Period], _Ending]:
+def _run_to_end(steering: Steering, rig: Rig) -> tuple[list[Period], _Ending]:
     """All periods, and (outcome, reason), once the driver is stopped.
 
     Raises DriverError if the driver cannot be stopped after another error or an interrupt.
@@ -107,8 +64,7 @@ def _run_to_end(
         for period, ended in _periods(steering, rig):
             periods.append(period)
             ending = ended or ending
-            if on_period is not None:
-                on_period(period)
+            steering.stream.send(PeriodEnded(period))
     except DriverError as error:
         ending = Outcome.FAILED, one_line(error)
     except RefusedError as error:
@@ -134,10 +90,6 @@ def _stopped(driver: Driver, ending: _Ending) -> _Ending:
     return ending
 
 
-def planned(plan: object) -> Plan:
-    return instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)")
-
-
 def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | None]]:
     """Yield each period with (outcome, reason) of the insertion, None while it continues.
 
@@ -145,7 +97,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
     """
     task = steering.task
     start, indices = time.perf_counter(), itertools.count()
-    memory, estimate = steering.method.begin(task), steering.method.observer.begin(task)
+    memory, estimate = steering.controller.begin(task), steering.controller.observer.begin(task)
     progress = _before_start(task.scenario, memory, estimate, rig)
     if (first := _first_step(progress)) is not None:
         clocks, observation = [start, start, start, time.perf_counter()], progress.observation
@@ -197,7 +149,7 @@ def _progress_after(
     decided: Progress, step: Step, observation: Observation, steering: Steering, begun: float, now: float
 ) -> Progress:
     """The progress after a period from `begun` to `now` (s)."""
-    arrived_at, arrived = decided.arrived_at, steering.method.arrived
+    arrived_at, arrived = decided.arrived_at, steering.controller.arrived
     if (
         arrived_at is None
         and observation.verdict.ok

@@ -1,26 +1,27 @@
-"""Insertions on the virtual phantom, or on the rig of a rig file."""
+"""Insertions: on the virtual phantom, on the rig of a rig file, or on ports of the caller."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-from flexneedle.arguments import whole
-from flexneedle.control.controllers import DEFAULT
+from flexneedle.arguments import instance
+from flexneedle.control import tables
+from flexneedle.control.controllers import DEFAULT, used
+from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
-from flexneedle.errors import InputError, RigError
-from flexneedle.lab.rig.dry_run import in_memory
-from flexneedle.lab.rig.rig_file import RigFile, load_rig
-from flexneedle.lab.rig.supervised import Watchers, check_fit, supervised
-from flexneedle.loop.closed_loop import planned, run
-from flexneedle.loop.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
-from flexneedle.loop.step import OnDecision
-from flexneedle.loop.virtual import Seeds, virtual_rig
-from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
-from flexneedle.planning.origin import placed
+from flexneedle.errors import RunError
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.closed_loop import run
+from flexneedle.loop.events import Ended, Gate, Listener, Stream
+from flexneedle.loop.guard import Guard
+from flexneedle.loop.rig import RigSource
+from flexneedle.loop.step import Steering
+from flexneedle.loop.virtual import Seeds
+from flexneedle.planning.origin import check_origin, placed
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Period, Plan
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Insertion, Plan
 
 
 def insert(
@@ -29,72 +30,75 @@ def insert(
     seed: int = 0,
     *,
     controller: str | Controller = DEFAULT,
-    phantom: str | PlantFactory = DEFAULT_PLANT,
-    tracker: str | TrackerFactory = SCENARIO_TRACKER,
+    rig: RigSource | None = None,
     force: bool = False,
     threads: int | None = None,
-    on_period: Callable[[Period], None] | None = None,
-    on_decision: OnDecision | None = None,
-    rig: str | Path | RigFile | None = None,
-    dry_run: bool = False,
-    watchers: Watchers | None = None,
+    listeners: Sequence[Listener] = (),
+    gate: Gate | None = None,
 ) -> Insertion:
-    """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
+    """Execute a plan in closed loop and return the complete record.
 
-    rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
-    motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
-    watchers: are given the rig before it is armed, which they may refuse, and each of its ticks (default: only the
-    record is).
+    The record is the same for the same seed, except for wall-clock durations. A DriverError of driver or tracker is no
+    exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
+    stopped at the rig, with the outcome "interrupted", and one with a command that the rig refuses, with the outcome
+    "held". The driver is stopped at the end, after an error and after an interrupt.
 
-    scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
-    in controller, tracker, monitor and phantom.
-    controller: one of `control.controllers.CONTROLLERS`; phantom: "exact" or "model", the kind of plant; tracker:
-    "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
-    (docs/extend.md).
-    threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
-    period when it ends; on_decision: with each decision of the controller, before anything moves, and the estimate that
-    it was made on.
+    Args:
+        scenario: Scenario, or its name or path as for `load_scenario`. It may differ from the plan's own only in
+            controller, tracker, monitor and phantom.
+        plan: Plan to execute.
+        seed: Seed of phantom, tracker and controller.
+        controller: Name from `flexneedle insert --list`, `module:NAME`, or a Controller.
+        rig: Where the needle is (default: `VirtualRig()`, the scenario's phantom and tracker). A `Rig` has ports of
+            your own; `flexneedle.devices.open_rig` gives the rig of a rig file, from where its motors are.
+        force: Insert even if the plan misses its target, and do not hold if a miss is predicted.
+        threads: Threads of rollouts (default: all cores), without effect on the result.
+        listeners: Functions that receive each event (`flexneedle.loop.events`).
+        gate: Confirms that motors may be armed, and may hold the needle (default: neither).
 
-    The record is the same for the same seed, except for wall-clock durations.
-
-    Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
-    the guide where it may not move; RigError for a rig that breaks a rule, does not fit the scenario, or has a section
-    `ros` that nothing follows; DriverError if one of its devices cannot be opened, StoppedError if it is stopped before
-    the first motion; ScenarioError for a setting that the controllers reject; RunError if the plan misses its target by
-    more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the default one does.
+    Raises:
+        InputError: For an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
+            the guide where it may not move.
+        RigError: For a rig that breaks a rule or does not fit the scenario.
+        DriverError: If a device cannot be opened, or not stopped after another error.
+        StoppedError: If the insertion is stopped before the first motion.
+        ScenarioError: For a setting that the controller rejects.
+        RunError: If the plan misses its target by more than 1 mm, unless `force` is set or the controller predicts the
+            miss itself, as the default does.
     """
-    scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
-    plant_name, plant = plant_of(phantom)
-    tracker_name, own_tracker = tracker_of(tracker)
-    scenario = placed(scenario, plan)
-    virtual = virtual_rig(scenario, plan.roll, Seeds.of(seed), plant, tracker=own_tracker)
-    executed = partial(
-        run,
-        scenario,
-        plan,
-        rng=Seeds.controller(seed),
-        seed=seed,
-        controller=controller,
-        force=force,
-        threads=threads,
-        on_period=on_period,
-        on_decision=on_decision,
+    scenario, plan = (
+        load_scenario(scenario),
+        instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)"),
     )
-    if rig is None:
-        return replace(executed(virtual), phantom=plant_name, tracker=tracker_name)
-    if (plant_name, tracker_name) != (DEFAULT_PLANT, SCENARIO_TRACKER):
-        raise InputError("phantom and tracker are those of the rig: give neither with a rig")
-    file = rig if isinstance(rig, RigFile) else load_rig(rig)
-    check_fit(file, scenario, plan.strategy)
-    watchers = _checked(watchers or Watchers(), file)
-    with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
-        insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary(), dry_run=dry_run)
+    choices = Choices.of(seed, controller, rig, force=force, threads=threads)
+    return carry_out(placed(scenario, plan), plan, choices, Stream(tuple(listeners), gate or Gate()))
 
 
-def _checked(watchers: Watchers, rig: RigFile) -> Watchers:
-    """The watchers of a rig. Raises RigError if none of them follows the stop of its section `ros`."""
-    if rig.ros is not None and not watchers.followers:
-        rule = "give watchers=Watchers(followers=(Bridge(rig.ros),)), see flexneedle.lab.ros.bridge"
-        raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
-    return watchers
+def check_choices(scenario: Scenario, strategy: str, choices: Choices) -> None:
+    """Raise InputError for a controller whose guide may not move, RigError for a rig that does not fit."""
+    check_guide(choices.controller, scenario.setup, strategy)
+    choices.rig.check(scenario, strategy)
+
+
+def carry_out(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) -> Insertion:
+    """Execute a plan in its scenario, which has the plan's entry; otherwise as `insert`."""
+    steering = prepare(scenario, plan, choices, stream)
+    with choices.rig.open(scenario, plan, choices.seed, stream) as ports:
+        insertion = run(steering, ports)
+    insertion = replace(insertion, **choices.rig.names, **choices.rig.results())
+    stream.send(Ended(insertion))
+    return insertion
+
+
+def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) -> Steering:
+    """Return what the steps of an insertion follow from. Raises as `insert`, before any rig is opened."""
+    check_origin(plan, scenario)
+    chosen = choices.controller
+    check_choices(scenario, plan.strategy, choices)
+    if not (plan.reached or choices.force or chosen.predicts):
+        raise RunError(
+            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
+            "to insert anyway: flexneedle insert --force (force=True)"
+        )
+    task = tables.task(chosen, Simulator(used(scenario, chosen), choices.threads), plan)
+    return Steering(task, choices, Guard.of(task.scenario, plan), Seeds.controller(choices.seed), stream)

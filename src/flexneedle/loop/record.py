@@ -5,8 +5,8 @@ import cmath
 import numpy as np
 
 from flexneedle.loop.measuring import Observation
+from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Step
-from flexneedle.loop.virtual import Rig
 from flexneedle.types import UNKNOWN, Control, Lateral, Period, Plan, Pose, X
 
 

@@ -1,6 +1,5 @@
 """What the needle does in a control period: it moves as decided, rests, or is held."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +11,12 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import InputError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.events import Decided, Stream
 from flexneedle.loop.guard import Guard
 from flexneedle.loop.progress import Late, Progress
-from flexneedle.loop.virtual import Rig
+from flexneedle.loop.rig import Rig
 from flexneedle.types import STILL, Action
-
-OnDecision = Callable[[Decision, Estimate], None]
-"""Called with a decision, and the estimate that it was made on."""
 
 
 @dataclass(frozen=True)
@@ -40,17 +38,22 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """What the steps of an insertion follow from. force: whether it continues although a miss is predicted; the guard's
-    limits hold in any case. on_decision: called with each decision of the controller, before anything moves, and the
-    estimate that it was made on.
+    """What the steps of an insertion follow from.
+
+    With `choices.force` it continues although a miss is predicted; the guard's limits hold in any case. Each decision
+    of the controller, and the estimate that it is based on, goes to the stream before anything moves.
     """
 
     task: Task
-    method: Controller
+    choices: Choices
     guard: Guard
     rng: np.random.Generator
-    force: bool = False
-    on_decision: OnDecision | None = None
+    stream: Stream
+
+    @property
+    def controller(self) -> Controller:
+        """Controller that decides."""
+        return self.choices.controller
 
     def next_step(self, progress: Progress, rig: Rig, begun: float) -> tuple[Step, Progress]:
         """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
@@ -63,10 +66,10 @@ class Steering:
             delay = begun - progress.observation.measurement.time
             waiting = Decision(STILL, "waiting for the last reading", predicted=progress.predicted)
             return Step(Action.REST, waiting, max(reading, delay)), progress
-        asked = rig.hold()
+        asked = self.stream.gate.hold()
         if not asked:
             step, decided = self._decided(replace(progress, asked=""), rig, begun)
-            asked = rig.hold()  # which may have come up while the controller decided
+            asked = self.stream.gate.hold()  # which may have come up while the controller decided
             if not asked:
                 return step, decided
         held = Decision(STILL, f"held: {asked}", predicted=progress.predicted)
@@ -81,9 +84,8 @@ class Steering:
         estimate, late = progress.observation.estimate, progress.late
         if late is not None and late.holds_for(estimate):
             return self._carried_out(replace(progress, late=None), late.decision, late.memory)
-        decision, memory = _decision(self.method, self.task, progress.memory, estimate, self.rng)
-        if self.on_decision is not None:
-            self.on_decision(decision, estimate)
+        decision, memory = _decision(self.controller, self.task, progress.memory, estimate, self.rng)
+        self.stream.send(Decided(decision, estimate))
         counted, taken = replace(progress, late=None, moves=progress.moves + 1), rig.clock.now() - begun
         if rig.deadline is None or taken <= rig.deadline:
             return self._carried_out(counted, decision, memory)
@@ -112,7 +114,7 @@ class Steering:
 
     def _refusal(self, estimate: Estimate, decision: Decision) -> str:
         """Why a decision must not be carried out, or ""."""
-        reason = "" if self.force else hopeless(decision, self.task.scenario.control)
+        reason = "" if self.choices.force else hopeless(decision, self.task.scenario.control)
         if reason or decision.rest > 0.0:
             return reason
         return self.guard.refusal(estimate, decision.command)

@@ -1,18 +1,20 @@
-"""A rig: clock, driver and tracker of the closed loop; and the virtual one of a scenario and its seeds."""
+"""Virtual rigs: a phantom with the ports of a rig, from a scenario and its seeds."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from flexneedle.arguments import refusal
-from flexneedle.estimation.estimate import Estimate
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.registration import Rigid, fit_rigid, identity
-from flexneedle.loop.parts import TrackerFactory
+from flexneedle.loop.events import Stream
+from flexneedle.loop.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
+from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
-from flexneedle.phantom.phantom import Condition, Phantom
+from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
@@ -21,55 +23,12 @@ from flexneedle.phantom.tracking.placement import placed_references
 from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage, tilt_of
 from flexneedle.phantom.tracking.table import TIP
-from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.ports import TipTracker
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import Control, Lateral, Point
+from flexneedle.types import Lateral, Plan, Point
 
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
-
-
-def never() -> str:
-    """No reason to hold the needle: ""."""
-    return ""
-
-
-@dataclass(frozen=True)
-class Rig:
-    """Ports of the closed loop; `truth` is only recorded, None on hardware.
-
-    expect: called with the estimate and the command before each motion, so that readings during it can be checked; None
-    where they are not. deadline: time (s) of a decision after which it counts as late; the tracker is then read again
-    before it is used. None: no decision is late. hold: asked before each decision and each move why the needle is to be
-    held, "" if it is not.
-
-    Raises InputError if one has not the functions of its port, and for a deadline that is not above 0.
-    """
-
-    clock: Clock
-    driver: Driver
-    tracker: TipTracker
-    truth: Callable[[], Condition] | None = None
-    expect: Callable[[Estimate, Control], None] | None = None
-    deadline: float | None = None
-    hold: Callable[[], str] = never
-
-    def __post_init__(self) -> None:
-        _check_port("clock", self.clock, Clock, ("now", "wait"))
-        _check_port("driver", self.driver, Driver, ("apply", "stop"))
-        _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
-        if not (self.truth is None or callable(self.truth)):
-            raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
-        if not (self.deadline is None or 0.0 < self.deadline < math.inf):
-            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
-
-
-def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:
-    """Raise InputError unless an object has the parts of a port; a class has them, but no object that they act on."""
-    missing = [part for part in parts if isinstance(given, type) or not hasattr(given, part)]
-    if missing:
-        wanted = f"must be an object with {', '.join(parts)}"
-        raise refusal(name, given, wanted, f"see flexneedle.ports.{port.__name__}")
 
 
 @dataclass(frozen=True)
@@ -95,6 +54,49 @@ class Seeds:
 def _spawned(seed: int) -> list[np.random.SeedSequence]:
     """Seeds of phantom, tracker, controller and room."""
     return np.random.SeedSequence(seed).spawn(4)
+
+
+class VirtualRig:
+    """The virtual phantom of a scenario, drawn with the seed of the insertion, and a simulated tracker.
+
+    Args:
+        phantom: "exact" or "model", the kind of plant; or `module:NAME`, or a factory (docs/extend.md).
+        tracker: "scenario", the tracker that the scenario describes; or `module:NAME`, or a factory.
+
+    Raises:
+        InputError: For an unknown name or an unsuitable object.
+    """
+
+    moves = False
+
+    def __init__(
+        self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TrackerFactory = SCENARIO_TRACKER
+    ) -> None:
+        self._phantom, self._plant = plant_of(phantom)
+        self._tracker, self._factory = tracker_of(tracker)
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """Names of phantom and tracker in the record."""
+        return {"phantom": self._phantom, "tracker": self._tracker}
+
+    def check(self, scenario: Scenario, strategy: str) -> None:
+        """Accept any scenario."""
+
+    @contextmanager
+    def open(
+        self,
+        scenario: Scenario,
+        plan: Plan,
+        seed: int,
+        stream: Stream,
+    ) -> Iterator[Rig]:
+        """Yield the ports of a new phantom."""
+        yield virtual_rig(scenario, plan.roll, Seeds.of(seed), self._plant, tracker=self._factory)
+
+    def results(self) -> dict[str, Any]:
+        """No results beyond the record."""
+        return {}
 
 
 def virtual_rig(

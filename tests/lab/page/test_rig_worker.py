@@ -18,7 +18,6 @@ from flexneedle.lab.page.worker.rig import Follower, check
 from flexneedle.lab.page.worker.signals import Cancelled, Signals
 from flexneedle.lab.rig.supervisor.machine import State
 from flexneedle.lab.rig.supervisor.messages import Report
-from flexneedle.loop import insert as insertion
 from flexneedle.scenario.files import load_scenario
 from page_tasks import Reported, task
 
@@ -67,19 +66,19 @@ def calls(monkeypatch):
     found = []
     fake_engine.install(monkeypatch.setattr)
 
-    def inserted(*given, watchers=None, on_period, **options):
-        found.append((given, options))
+    def inserted(scenario, plan, choices, stream):
+        found.append((scenario, choices))
 
-        def held_or(period):
-            while watchers.hold():
+        def wait_while_held(_event):
+            while stream.gate.hold():
                 supervisor.wait(0.0)
-            on_period(period)
 
-        watchers.opened(supervisor)
-        return fake_engine.insert(*given, on_period=held_or, **options)
+        stream.gate.confirm(supervisor)
+        held = Stream((wait_while_held, *stream.listeners))
+        return fake_engine.carry_out(scenario, plan, choices, held)
 
     supervisor = inserted.supervisor = Supervisor()
-    monkeypatch.setattr(insertion, "insert", inserted)
+    monkeypatch.setattr(recording, "carry_out", inserted)
     return SimpleNamespace(found=found, supervisor=supervisor)
 
 
@@ -146,13 +145,11 @@ def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
     assert sorted(file.name for file in (in_tmp / "command").iterdir()) == sorted(
         file.name for file in (in_tmp / "runs" / last.folder).iterdir()
     )
-    (ours, our_options), (theirs, their_options) = calls.found
-    assert our_options.pop("on_decision") is not None
-    assert their_options.pop("on_decision") is None
-    assert our_options == their_options
-    assert our_options["rig"].name == "Bench"
-    assert ours[0].values() == theirs[0].values()
-    assert ours[2] == theirs[2] == 3
+    (ours, our_choices), (theirs, their_choices) = calls.found
+    assert our_choices.parts == their_choices.parts
+    assert our_choices.parts["rig"] == "Bench"
+    assert ours.values() == theirs.values()
+    assert our_choices.seed == their_choices.seed == 3
 
 
 def test_it_is_held_between_two_periods_and_goes_on_when_it_may(calls, in_tmp):
@@ -229,8 +226,8 @@ def test_a_needle_at_its_target_is_left_in_too(calls, in_tmp):
 
 def follower(**more):
     one = order("", **more)
-    made = Follower(SimpleNamespace(task=one), None, None)
-    made.opened(Supervisor())
+    made = Follower(SimpleNamespace(task=one, announce=lambda *_: None), None)
+    made._supervisor = Supervisor()
     return made, one
 
 

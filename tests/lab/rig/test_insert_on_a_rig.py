@@ -12,10 +12,10 @@ import tomli_w
 import fake_engine
 from bench_rig import values
 from commands import run
-from flexneedle.cli.insert import _interrupted_by_signals
 from flexneedle.errors import RunError
 from flexneedle.interrupts import SIGNALS
-from flexneedle.loop import insert as insertion
+from flexneedle.lab.commands.insert import interrupt_on_signals
+from flexneedle.record import recording
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 
@@ -31,14 +31,15 @@ def events(monkeypatch, in_tmp, engine, ends):
     engine()
     (in_tmp / "rig.toml").write_text(tomli_w.dumps(values(KINDS)))
 
-    def inserted(*given, watchers, **options):
+    def inserted(scenario, plan, choices, stream):
         found.append("opened")
         taken = partial(found.append, "signals taken")
-        watchers.opened(SimpleNamespace(positions=POSITIONS, rig=options["rig"], take_signals=taken))
+        rig = SimpleNamespace(positions=POSITIONS, rig=choices.rig.file, take_signals=taken)
+        stream.gate.confirm(rig)
         found.append("inserted")
-        return fake_engine.insert(*given, **(options | ends))
+        return fake_engine.carry_out(scenario, plan, choices, stream, **ends)
 
-    monkeypatch.setattr(insertion, "insert", inserted)
+    monkeypatch.setattr(recording, "carry_out", inserted)
     return found
 
 
@@ -46,7 +47,7 @@ def events(monkeypatch, in_tmp, engine, ends):
 def test_a_signal_to_the_command_interrupts_it(number):
     before = [signal.getsignal(each) for each in SIGNALS]
     with ExitStack() as stack:
-        _interrupted_by_signals(stack)
+        interrupt_on_signals(stack)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
     assert [signal.getsignal(each) for each in SIGNALS] == before

@@ -11,7 +11,8 @@ from emulated import emulated, read_until, until
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.loop.closed_loop import run
-from flexneedle.loop.virtual import Rig, to_stage
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import to_stage
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import STILL, Motion
 

@@ -19,11 +19,12 @@ from flexneedle.control.interface import Decision
 from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import load_rig
-from flexneedle.lab.rig.supervised import Columns, SupervisedDriver, Watchers, supervised
+from flexneedle.lab.rig.supervised import Columns, SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import Supervisor
 from flexneedle.lab.rig.supervisor.machine import State
 from flexneedle.lab.rig.supervisor.messages import Done, Report, Step
 from flexneedle.loop.closed_loop import _carry_out
+from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
 from flexneedle.record.topics import READINGS
 from flexneedle.simulator.pace import travel_time
@@ -198,39 +199,30 @@ class Resting:
         return 0.0
 
 
+def opened_rig(rest, scenario, plan, dry_run=False, stream=None):
+    return SupervisedRig(rest.rig, dry_run=dry_run).open(scenario, plan, 0, stream or Stream())
+
+
 @pytest.fixture
 def opened(monkeypatch):
     """Return a function that opens a rig at rest for a plan 40 mm deep; return what was done, asked included."""
 
     def open_rig(rest, dry=False, scenario=PHANTOM):
         monkeypatch.setattr("flexneedle.lab.rig.supervised.Supervisor", rest)
-        watchers = Watchers(confirm=lambda _supervisor: rest.calls.append("asked"))
-        plan = make_plan("manipulation", (40.0, 5.0, 0.0), 0)
-        with supervised(rest.rig, scenario, plan, watchers, dry=dry):
+        plan, gate = make_plan("manipulation", (40.0, 5.0, 0.0), 0), Gate()
+        gate.confirm = lambda _supervisor: rest.calls.append("asked")
+        with opened_rig(rest, scenario, plan, dry_run=dry, stream=Stream(gate=gate)):
             pass
         return rest.calls
 
     return open_rig
 
 
-def test_the_loop_asks_its_watchers_for_holds(monkeypatch):
-    rest = Resting()
-    monkeypatch.setattr("flexneedle.lab.rig.supervised.Supervisor", rest)
-    plan, watchers = (
-        make_plan("manipulation", (40.0, 5.0, 0.0), 0),
-        Watchers(hold=lambda: "nobody is in control"),
-    )
-    with supervised(rest.rig, PHANTOM, plan, watchers) as ports:
-        assert ports.hold() == "nobody is in control"
-    with supervised(rest.rig, PHANTOM, plan, Watchers()) as ports:
-        assert ports.hold() == ""
-
-
 def test_the_loop_has_the_time_of_a_decision_and_tells_where_the_tip_will_be(monkeypatch):
     rest = Resting()
     rest.rig = rest.rig.model_copy(update={"loop": rest.rig.loop.model_copy(update={"decision_ms": 70.0})})
     monkeypatch.setattr("flexneedle.lab.rig.supervised.Supervisor", rest)
-    with supervised(rest.rig, PHANTOM, make_plan("manipulation", (40.0, 5.0, 0.0), 0), Watchers()) as ports:
+    with opened_rig(rest, PHANTOM, make_plan("manipulation", (40.0, 5.0, 0.0), 0)) as ports:
         assert ports.deadline == pytest.approx(0.07)
         assert ports.expect == ports.driver.expect
 
@@ -345,8 +337,8 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     """Also if the rig is checked meanwhile, which the tracker's port refuses."""
     checks = []
 
-    def check(period):
-        if period.index == 3:
+    def check(event):
+        if isinstance(event, PeriodEnded) and event.period.index == 3:
             command = [sys.executable, "-m", "flexneedle", "rig", "check", path]
             checks.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
 
@@ -357,7 +349,9 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     with emulated_rig(path, "phantom", "--seed", str(seed), "--truth", truth) as rig:
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
-        done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry, on_period=check)
+        done = flexneedle.insert(
+            scenario, plan, seed, rig=SupervisedRig(path, dry_run=dry), listeners=[check]
+        )
         printed = checks[0].communicate()[0]
         counts = float(rig.ask("TPA").strip(" \r\n:"))
     assert "ok       driver     reply" in printed
@@ -389,22 +383,16 @@ def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monk
     scenario = PHANTOM.with_values({"setup.tip_to_skin_mm": PHANTOM.setup.tip_to_skin_mm + 9.0})
     plan = make_plan("manipulation", (25.0, 1.0, 0.0), 4)
     with pytest.raises(RigError, match=r"tip = -28\.\d.* must be within"):
-        flexneedle.insert(scenario, plan, 0, rig=path)
+        flexneedle.insert(scenario, plan, 0, rig=SupervisedRig(path))
     assert {json.loads(line)[0] for line in notes.read_text().splitlines()} <= {"stop", "close"}
 
 
-def test_a_follower_that_fails_keeps_no_report_from_the_others():
-    class Follower:
-        def __init__(self, error=None):
-            self.error, self.seen = error, []
+def test_a_listener_that_fails_keeps_no_event_from_the_others():
+    seen, event = [], Tick(Report(0.0, State.IDLE))
 
-        def report(self, report):
-            self.seen.append(report)
-            if self.error is not None:
-                raise self.error
+    def fail(_event):
+        raise OSError("no space left")
 
-    first, second, report = Follower(OSError("no space left")), Follower(), Report(0.0, State.IDLE)
-    watchers = Watchers(followers=(first, second))
     with pytest.raises(OSError, match="no space left"):
-        watchers.report(report)
-    assert first.seen == second.seen == [report]
+        Stream((seen.append, fail, seen.append)).send(event)
+    assert seen == [event, event]

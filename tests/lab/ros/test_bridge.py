@@ -298,7 +298,7 @@ def test_a_connection_that_fails_is_a_stop(monkeypatch, rig):
     with followed(monkeypatch, node) as bridge_:
         if rig:
             supervisor = SimpleNamespace(now=lambda: 0.0, request_stop=stops.append, ended=None)
-            bridge_.opened(supervisor)
+            bridge_.confirm(supervisor)
             node.error = ValueError("a bug")
         until(lambda: bridge_.record["events"])
         why = "the connection to ROS has failed: ValueError: a bug"

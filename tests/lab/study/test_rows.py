@@ -35,7 +35,12 @@ def only_row(job):
 
 def test_a_row_has_the_results_of_the_insertion(point, plan):
     insertion = flexneedle.insert(
-        point.scenario, plan, 11, controller=point.controller, phantom=point.plant, threads=1
+        point.scenario,
+        plan,
+        11,
+        controller=point.controller,
+        rig=flexneedle.VirtualRig(point.plant),
+        threads=1,
     )
     row = only_row(Job(point, plan, "", ((3, 11),)))
     last = insertion.periods[-1]

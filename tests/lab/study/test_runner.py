@@ -68,7 +68,11 @@ def test_a_row_agrees_with_insert_for_its_settings(quick, uninterrupted):
     row = runs(uninterrupted)[7]
     plan = flexneedle.plan(point.scenario, seed=row["plan_seed"])
     insertion = flexneedle.insert(
-        point.scenario, plan, row["seed"], controller=row["controller"], phantom=row["plant"]
+        point.scenario,
+        plan,
+        row["seed"],
+        controller=row["controller"],
+        rig=flexneedle.VirtualRig(row)["plant"],
     )
     assert row["true_error_mm"] == insertion.true_error_mm
     assert row["residual_mm"] == insertion.residual_mm

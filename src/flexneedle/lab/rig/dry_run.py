@@ -1,7 +1,7 @@
 """The ports of a dry run: the supervisor goes through all motions in memory, and the needle is a virtual one."""
 
 from flexneedle.errors import InputError
-from flexneedle.loop.virtual import Rig
+from flexneedle.loop.rig import Rig
 from flexneedle.phantom.phantom import Condition, Phantom
 from flexneedle.types import Control, Measurement, Motion
 
@@ -62,4 +62,4 @@ def in_memory(supervised: Rig, virtual: Rig) -> Rig:
     if not isinstance(virtual.driver, Phantom):
         raise InputError("a dry run needs a virtual phantom")
     ports = Imagined(supervised, virtual, virtual.driver)
-    return Rig(ports, ports, ports, ports.condition, hold=supervised.hold)
+    return Rig(ports, ports, ports, ports.condition)

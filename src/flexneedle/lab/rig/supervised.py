@@ -2,22 +2,26 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.estimate import Estimate, after
+from flexneedle.lab.rig.dry_run import in_memory
 from flexneedle.lab.rig.fit import fit_problems, start_problems
-from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.rig_file import RigFile, load_rig
 from flexneedle.lab.rig.start import checked_start, deepest, needed
 from flexneedle.lab.rig.supervisor.client import Supervisor
 from flexneedle.lab.rig.supervisor.messages import Done, Expectation, Report, Task
-from flexneedle.loop.virtual import Rig, never, to_stage
+from flexneedle.loop.events import Event, Stream
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import MOVES, Limits, half_turned
 from flexneedle.simulator.pace import ROUNDING_S, roll_time, travel_time
@@ -130,49 +134,11 @@ def _with_unit(axis: str, way: float) -> tuple[str, float]:
     return (f"{axis}_deg", math.degrees(way)) if axis == "rotation" else (f"{axis}_mm", way)
 
 
-class Follower(Protocol):
-    """What follows the insertion on a rig, such as a connection to other programs."""
+@dataclass(frozen=True, eq=False)
+class Tick(Event):
+    """A tick of the supervisor; sent in a thread of its client, so that a listener must return at once."""
 
-    def opened(self, supervisor: Supervisor) -> None:
-        """Take the supervisor of a rig that is connected and not armed; the rig is armed when this returns."""
-        ...
-
-    def report(self, report: Report) -> None:
-        """Take what a tick found; called in a thread, and shall return at once."""
-        ...
-
-
-@dataclass(frozen=True)
-class Watchers:
-    """What is given each tick of a rig: the record of ticks, and what follows the insertion.
-
-    confirm: called with the supervisor before the rig is armed; what it raises ends the insertion before anything has
-    moved. hold: as for `Rig`.
-    """
-
-    ticks: Ticks = field(default_factory=Ticks)
-    followers: tuple[Follower, ...] = ()
-    confirm: Callable[[Supervisor], None] | None = None
-    hold: Callable[[], str] = never
-
-    def opened(self, supervisor: Supervisor) -> None:
-        """Hand out the supervisor before the rig is armed, and have the motions confirmed."""
-        for follower in self.followers:
-            follower.opened(supervisor)
-        if self.confirm is not None:
-            self.confirm(supervisor)
-
-    def report(self, report: Report) -> None:
-        """Hand out what a tick found, to all also where one of them fails; raises the first error."""
-        self.ticks.add(report)
-        errors = []
-        for follower in self.followers:
-            try:
-                follower.report(report)
-            except Exception as error:  # noqa: BLE001  raised below
-                errors.append(error)
-        if errors:
-            raise errors[0]
+    report: Report
 
 
 class SupervisedDriver:
@@ -251,12 +217,6 @@ def start_advance(supervisor: Supervisor, scenario: Scenario, plan: Plan, *, dry
     return deepest(scenario, depth, tip)
 
 
-def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
-    """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
-    if problems := fit_problems(rig, scenario, strategy):
-        raise RigError(*problems)
-
-
 def registered(rig: RigFile, scenario: Scenario) -> Scenario:
     """The scenario with the registration of the rig file, if that has one."""
     if rig.registration is None:
@@ -264,38 +224,83 @@ def registered(rig: RigFile, scenario: Scenario) -> Scenario:
     return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
 
 
-@contextmanager
-def supervised(
-    rig: RigFile, scenario: Scenario, plan: Plan, watchers: Watchers, *, dry: bool = False
-) -> Iterator[Rig]:
-    """Open a rig, arm it, roll the needle as the plan begins, and give its ports. watchers: are given its ticks.
+class SupervisedRig:
+    """The rig of a rig file: a `RigSource` of one insertion, from where the motors are.
 
-    Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
-    Raises RigError if the rig does not fit the scenario or has no room for the insertion from where its axes are,
-    DriverError or RunError if a device fails, StoppedError if it is stopped.
+    Args:
+        file: Rig file, or its name or path.
+        dry_run: Whether motors and tracker are only read: motors never move, and the needle is the virtual phantom's.
     """
-    settings, scenario = scenario.tracker, registered(rig, scenario)
-    task = Task(
-        rig,
-        monotonic(),
-        scenario.setup.axes,
-        scenario.monitor,
-        to_stage(scenario.tracker.registration),
-        settings.tip_offset_mm,
-        scenario.control.stale_after_s,
-        dry,
-    )
-    watchers.ticks.started = task.started
-    with Supervisor(task, watchers.report) as supervisor:
-        # What cannot begin is refused before anybody is asked.
-        start_advance(supervisor, scenario, plan, dry=dry)
-        watchers.opened(supervisor)
-        supervisor.arm(start_advance(supervisor, scenario, plan, dry=dry))
-        if rig.axes.rotation is not None:
-            speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
-            supervisor.move_to("rotation", plan.roll, speed)
-        if scenario.monitor.enabled and scenario.monitor.references:
-            supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
-        driver = SupervisedDriver(supervisor, scenario, plan.roll)
-        deadline = 1e-3 * rig.loop.decision_ms
-        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline, hold=watchers.hold)
+
+    def __init__(self, file: str | Path | RigFile, *, dry_run: bool = False) -> None:
+        self.file, self.dry_run = file if isinstance(file, RigFile) else load_rig(file), dry_run
+        self.ticks = Ticks()
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """Name of the rig, and whether it only goes through the motions."""
+        return {"phantom": "", "tracker": "", "rig": self.file.name, "dry_run": self.dry_run}
+
+    @property
+    def moves(self) -> bool:
+        """Whether motors move."""
+        return not self.dry_run
+
+    def check(self, scenario: Scenario, strategy: str) -> None:
+        """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
+        if problems := fit_problems(self.file, scenario, strategy):
+            raise RigError(*problems)
+
+    def results(self) -> dict[str, Any]:
+        """Summary of the ticks."""
+        return {"ticks": self.ticks.summary()}
+
+    @contextmanager
+    def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
+        """Connect the rig, have its motions confirmed, arm it, roll the needle as the plan begins, and yield its ports.
+
+        Positions of the axes at this moment are those at the start of the plan. Raises RigError if the rig has no room
+        for the insertion from where its axes are, DriverError or RunError if a device fails, StoppedError after a stop.
+        """
+        rig, settings, virtual = self.file, scenario.tracker, scenario
+        if rig.ros is not None and not any(
+            getattr(one, "hears_ros_stops", False) for one in stream.listeners
+        ):
+            raise RigError(
+                "ros: nothing listens to the stop of this section: add a Bridge(rig.ros) to the listeners"
+            )
+        scenario = registered(rig, scenario)
+        task = Task(
+            rig,
+            monotonic(),
+            scenario.setup.axes,
+            scenario.monitor,
+            to_stage(scenario.tracker.registration),
+            settings.tip_offset_mm,
+            scenario.control.stale_after_s,
+            self.dry_run,
+        )
+        self.ticks.started = task.started
+
+        def report(found: Report) -> None:
+            self.ticks.add(found)
+            stream.send(Tick(found))
+
+        with Supervisor(task, report) as supervisor:
+            # What cannot begin is refused before anybody is asked.
+            start_advance(supervisor, scenario, plan, dry=self.dry_run)
+            stream.gate.confirm(supervisor)
+            supervisor.arm(start_advance(supervisor, scenario, plan, dry=self.dry_run))
+            if rig.axes.rotation is not None:
+                speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
+                supervisor.move_to("rotation", plan.roll, speed)
+            if scenario.monitor.enabled and scenario.monitor.references:
+                supervisor.wait(
+                    scenario.monitor.indicator_window_s
+                )  # the field must be known before the start
+            driver = SupervisedDriver(supervisor, scenario, plan.roll)
+            deadline = 1e-3 * rig.loop.decision_ms
+            ports = Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
+            if self.dry_run:
+                ports = in_memory(ports, virtual_rig(virtual, plan.roll, Seeds.of(seed)))
+            yield ports

@@ -1,23 +1,26 @@
 """An insertion and its ROS node: what it publishes, and the stops, arms and targets that it takes from there."""
 
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
-from threading import Event, Lock, Thread
+from threading import Lock, Thread
 from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import RigError, RunError, StoppedError, describe_error
 from flexneedle.interrupts import uninterrupted
 from flexneedle.lab.rig.rig_file import RosSettings
+from flexneedle.lab.rig.supervised import Tick
 from flexneedle.lab.rig.supervisor.client import Supervisor
 from flexneedle.lab.rig.supervisor.machine import State
 from flexneedle.lab.rig.supervisor.messages import Report
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import Profile, load_profile
 from flexneedle.lab.ros.records import Arm, Lost, Refused, Request, RigState, Stop, Target
+from flexneedle.loop.events import Ended, Event, Gate, PeriodEnded, Planned
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.types import Period, Plan, Point
 
@@ -39,16 +42,18 @@ def profile_of(settings: RosSettings) -> Profile:
     return profile
 
 
-class Bridge:
+class Bridge(Gate):
     """The connection of one insertion to ROS, from before its planning to after its end. Use it as a context manager.
 
-    A thread polls the node; a stop goes at once to the supervisor, in whatever the insertion is busy. It is the
-    `Follower` of an insertion on a rig. Without a rig a stop ends the insertion at its next period, by `check`.
+    A thread polls the node; a stop goes at once to the supervisor, whatever the insertion is doing. Give it to an
+    insertion as a listener, the last one, and as a gate. Without a rig a stop ends the insertion at its next event.
 
     settings: the section `ros` of a rig file. show: prints a line for the user; no thread of this calls it.
     record: for `run.json`, with each stop, arm, target, refused message and loss of the node as it happened.
     Raises RigError for the profile, InputError or RunError if the node does not start.
     """
+
+    hears_ros_stops = True
 
     def __init__(self, settings: RosSettings, show: Callable[[str], None] = lambda _line: None) -> None:
         profile = profile_of(settings)
@@ -57,7 +62,7 @@ class Bridge:
         self._topics = {
             key.partition(".")[2]: topic.topic for key, topic in profile.topics() if key[0] == "s"
         }
-        self._lock, self._ended, self._armed = Lock(), Event(), Event()
+        self._lock, self._ended, self._armed = Lock(), threading.Event(), threading.Event()
         self._unprinted = SimpleQueue[str]()
         self._supervisor: Supervisor | None = None
         self._stopped = self._lost = self._awaited = ""
@@ -87,7 +92,21 @@ class Bridge:
 
     # The insertion
 
-    def publish(self, record: Plan | Period) -> None:
+    def __call__(self, event: Event) -> None:
+        """Publish an event. Raises StoppedError after a stop, at each event of the insertion's own thread."""
+        match event:
+            case Tick(report):
+                self._publish_state(report)
+                return
+            case Planned(plan):
+                self._publish(plan)
+            case PeriodEnded(period):
+                self._publish(period)
+            case Ended():
+                return
+        self.check()
+
+    def _publish(self, record: Plan | Period) -> None:
         """Publish a plan, with tissue and target, or a period. Returns at once."""
         if isinstance(record, Plan):
             self._node.publish(record)
@@ -119,27 +138,27 @@ class Bridge:
         self._set("idle")
         return self._target
 
-    # The rig, as its `Follower`
+    # The rig
 
-    def opened(self, supervisor: Supervisor) -> None:
-        """Forward stops to a supervisor from here on; with `settings.arm`, wait until the rig may be armed.
+    def confirm(self, rig: Any) -> None:
+        """Forward stops to the supervisor of a rig from here on; with `settings.arm`, wait until it may be armed.
 
         An arm that came before does not count. Raises StoppedError after a stop.
         """
-        self._shift = self._now() - supervisor.now()
+        self._shift = self._now() - rig.now()
         with uninterrupted(), self._lock:
-            self._supervisor, stopped = supervisor, self._stopped
+            self._supervisor, stopped = rig, self._stopped
         if stopped:
-            supervisor.request_stop(stopped)
+            rig.request_stop(stopped)
         if not self.settings.arm:
             return
         self._wait_for("arm", f"an arm on {self._topics['arm']}; nothing moves before")
         while not self._armed.is_set():
-            supervisor.wait(_CHECK_S)
+            rig.wait(_CHECK_S)
             self.check()
         self._awaited = ""
 
-    def report(self, report: Report) -> None:
+    def _publish_state(self, report: Report) -> None:
         """Publish the state of the rig when it changes, and once a second."""
         waiting = f"waits for {self._awaited}" if self._awaited and report.state is State.IDLE else ""
         values = {"tracker": report.tracker, "ticks missed": str(report.missed)}

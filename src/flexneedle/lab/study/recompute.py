@@ -9,10 +9,11 @@ from flexneedle.errors import InputError
 from flexneedle.lab.study.folder import PLANS_FOLDER, Recorded, read_folder
 from flexneedle.lab.study.plans import Plans, plan_key
 from flexneedle.lab.study.rows import insertion_at
+from flexneedle.loop.events import Event, PeriodEnded
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain
 from flexneedle.record.results import insertion_row
-from flexneedle.types import Insertion, Period
+from flexneedle.types import Insertion
 
 WITHOUT = ("refused", "error")
 """Outcomes of rows that have no insertion."""
@@ -51,11 +52,13 @@ def recompute(
         raise InputError(f"{folder}: row {index}: its plan {PLANS_FOLDER}/{key}.json is missing{why}")
     start = scenario.setup.start_tip_x
 
-    def on_period(period: Period) -> None:
-        reached = (period.estimate.x - start) / (scenario.target.depth_mm - start)
+    def share_reached(event: Event) -> None:
+        if not isinstance(event, PeriodEnded):
+            return
+        reached = (event.period.estimate.x - start) / (scenario.target.depth_mm - start)
         on_share(min(max(reached, 0.0), 1.0))
 
-    insertion = insertion_at(one.point, plan, one.seed, on_period=on_period)
+    insertion = insertion_at(one.point, plan, one.seed, listeners=(share_reached,))
     return Recomputed(insertion, _note(made_by, _difference(insertion, row)))
 
 

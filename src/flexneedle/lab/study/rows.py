@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -10,13 +10,15 @@ from typing import Any
 from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.lab.study.grid import GridPoint
 from flexneedle.lab.study.reach import reach
+from flexneedle.loop.events import Listener
 from flexneedle.loop.insert import insert
+from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.planning.planner import plan
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain, plan_values
 from flexneedle.record.results import RESULT_COLUMNS, insertion_row, plan_row
-from flexneedle.types import Insertion, Period, Plan
+from flexneedle.types import Insertion, Plan
 
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""
@@ -107,9 +109,9 @@ def insertion_at(
     seed: int,
     *,
     threads: int | None = None,
-    on_period: Callable[[Period], None] | None = None,
+    listeners: Sequence[Listener] = (),
 ) -> Insertion:
-    """Return an insertion of a point, as `flexneedle.insert` does; threads and on_period are as there."""
+    """Return an insertion of a point, as `flexneedle.insert` does; threads and listeners are as there."""
     with warnings.catch_warnings():
         # The study has checked all tables; a table of another of its controllers is not unused.
         warnings.simplefilter("ignore", ScenarioWarning)
@@ -118,10 +120,9 @@ def insertion_at(
             made,
             seed,
             controller=point.controller,
-            phantom=point.plant,
-            tracker=point.tracker,
+            rig=VirtualRig(point.plant, point.tracker),
             threads=threads,
-            on_period=on_period,
+            listeners=listeners,
         )
 
 

@@ -19,7 +19,6 @@ from flexneedle.errors import DriverError, RefusedError, RigError, RunError, Sto
 from flexneedle.geometry.registration import identity
 from flexneedle.interrupts import SIGNALS
 from flexneedle.lab.rig.rig_file import Part
-from flexneedle.lab.rig.supervised import Watchers
 from flexneedle.lab.rig.supervisor import messages as say
 from flexneedle.lab.rig.supervisor.client import Supervisor
 from flexneedle.lab.rig.supervisor.machine import State
@@ -127,12 +126,12 @@ def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
         raise RunError("not confirmed")
 
     with pytest.raises(RunError, match="not confirmed"):
-        Watchers(confirm=refuse).opened(supervisor)
+        refuse(supervisor)
     assert shown == [{"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}]
     assert supervisor.report.state is State.IDLE
     supervisor.stop("the test")
     with pytest.raises(StoppedError, match="stopped: the test"):
-        Watchers(confirm=refuse).opened(supervisor)
+        refuse(supervisor)
     assert len(shown) == 1
 
 

@@ -1,19 +1,24 @@
 """What disturbs a virtual insertion: its true needle, its true tissue and its tracker. The controller does not know."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from flexneedle.lab.page.messages import Disturb, Disturbances
+from flexneedle.loop.events import Stream
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import Seeds, VirtualRig, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import ExactPlant
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import TipTracker
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Frame, Measurement, Plan, SensorReading
 
 _MISSING = "missing"
 _METAL = "noisy"
@@ -30,6 +35,32 @@ def with_plate(scenario: Scenario) -> Scenario:
     if environment is None or environment.plate is not None:
         return scenario
     return scenario.with_values({"tracker.environment.plate": ENVIRONMENTS.shipped(_METAL)["plate"]})
+
+
+class DisturbedRig(VirtualRig):
+    """The virtual rig of an insertion that can be disturbed."""
+
+    def __init__(self, disturber: "Disturber") -> None:
+        super().__init__()
+        self._disturber = disturber
+
+    @contextmanager
+    def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
+        """Yield the ports of a new phantom."""
+        disturber = self._disturber
+        rig = virtual_rig(
+            with_plate(scenario),
+            plan.roll,
+            Seeds.of(seed),
+            disturber.plant,
+            plate_distance_at=disturber.plate_distance_at,
+        )
+        disturber.now = rig.clock.now
+        yield replace(rig, tracker=disturber.watch(rig.tracker))
+
+    def results(self) -> dict[str, Any]:
+        """Return what was disturbed, and when."""
+        return {"disturbed": self._disturber.summary}
 
 
 class DisturbedPlant(ExactPlant):
@@ -87,11 +118,12 @@ class Disturber:
     plant, plate_distance_at: for `virtual_rig`; its tracker is given by `watch`.
     """
 
-    def __init__(
-        self, scenario: Scenario, now: Callable[[], float], say: Callable[[Disturbances], None]
-    ) -> None:
-        """now: the time (s) of the run; say: is called when something else disturbs it than before."""
-        self._scenario, self._now, self._say = scenario, now, say
+    now: Callable[[], float]
+    """Time (s) of the run, once there is a rig."""
+
+    def __init__(self, scenario: Scenario, say: Callable[[Disturbances], None]) -> None:
+        """say: is called when something else disturbs it than before."""
+        self._scenario, self._say = scenario, say
         self._plant: DisturbedPlant | None = None
         self._layers: tuple[float, ...] = ()
         self._tracker: DisturbedTracker | None = None
@@ -150,13 +182,13 @@ class Disturber:
 
     def _note(self, text: str) -> None:
         if len(self._taken) < _LISTED:
-            self._taken.append(f"{text} at {self._now():.1f} s")
+            self._taken.append(f"{text} at {self.now():.1f} s")
         else:
             self._unlisted += 1
 
     def expire(self) -> None:
         """Report the end of what has ended by itself."""
-        if "drop" in self._active and self._now() >= self._dropped_until:
+        if "drop" in self._active and self.now() >= self._dropped_until:
             del self._active["drop"]
             self._report()
 
@@ -171,8 +203,8 @@ class Disturber:
                 top, bottom = self._layers[disturb.layer : disturb.layer + 2]
                 self._plant.stiffen(top, bottom, disturb.size)
             case "drop":
-                self._dropped_until = self._now() + disturb.size
-                self._tracker.drop(self._now(), self._dropped_until)
+                self._dropped_until = self.now() + disturb.size
+                self._tracker.drop(self.now(), self._dropped_until)
             case "plate":
                 self._plate = disturb.size or _FAR_MM
 

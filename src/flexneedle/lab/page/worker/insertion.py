@@ -1,24 +1,20 @@
 """Insertions: on the virtual rig at any pace, and on the connected rig; each period is reported when it ends."""
 
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
-from flexneedle.lab.page.worker.disturbances import Disturber, with_plate
+from flexneedle.lab.page.worker.disturbances import DisturbedRig, Disturber
 from flexneedle.lab.page.worker.live import Live
 from flexneedle.lab.page.worker.pace import Pacer
 from flexneedle.lab.page.worker.rig import insert_on_rig
 from flexneedle.lab.page.worker.saving import save_whole
 from flexneedle.lab.page.worker.signals import Cancelled
 from flexneedle.lab.page.worker.task import Task
-from flexneedle.loop.closed_loop import run
-from flexneedle.loop.parts import SCENARIO_TRACKER
-from flexneedle.loop.virtual import Seeds, virtual_rig
-from flexneedle.phantom.plants import DEFAULT_PLANT
+from flexneedle.loop.events import Event, Iterated, PeriodEnded
+from flexneedle.loop.insert import insert
 from flexneedle.planning.origin import placed
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.types import Insertion, Period
+from flexneedle.types import Insertion
 
 
 class Insertions:
@@ -55,25 +51,11 @@ def _insert_virtually(live: Live) -> Insertion:
     task, seed = live.task, live.task.work.seed
 
     def planning(info: dict[str, Any]) -> None:
-        task.signals.check()
-        if task.signals.stopped:
-            raise StoppedError(f"stopped: {task.signals.stopped}")
-        live.planning(info)
+        live.take(Iterated(task.work.strategy, info))
 
     plan = make_plan(task.scenario, strategy=task.work.strategy, seed=seed, progress=planning)
     live.planned(plan)
-    scenario = placed(task.scenario, plan)
-    clock: list[Callable[[], float]] = []
-    disturber = Disturber(scenario, lambda: clock[0](), task.say)
-    rig = virtual_rig(
-        with_plate(scenario),
-        plan.roll,
-        Seeds.of(seed),
-        disturber.plant,
-        plate_distance_at=disturber.plate_distance_at,
-    )
-    clock.append(rig.clock.now)
-    rig = replace(rig, tracker=disturber.watch(rig.tracker))
+    disturber = Disturber(placed(task.scenario, plan), task.say)
 
     def react() -> None:
         for disturb in task.signals.disturbs():
@@ -83,21 +65,12 @@ def _insert_virtually(live: Live) -> Insertion:
     pacer = Pacer(task.signals, task.signals.wait, react, live.paused)
     before = 0.0
 
-    def on_period(period: Period) -> None:
+    def keep_pace(event: Event) -> None:
         nonlocal before
-        live.show(period)
-        lasted, before = period.time - before, period.time
-        pacer.after(lasted)
+        if isinstance(event, PeriodEnded):
+            lasted, before = event.period.time - before, event.period.time
+            pacer.after(lasted)
 
     pacer.start()
-    insertion = run(
-        scenario,
-        plan,
-        rig,
-        Seeds.controller(seed),
-        seed,
-        controller=task.controller,
-        on_period=on_period,
-        on_decision=live.decided,
-    )
-    return replace(insertion, phantom=DEFAULT_PLANT, tracker=SCENARIO_TRACKER, disturbed=disturber.summary)
+    rig, listeners = DisturbedRig(disturber), (live.take, keep_pace)
+    return insert(task.scenario, plan, seed, controller=task.controller, rig=rig, listeners=listeners)

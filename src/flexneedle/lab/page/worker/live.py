@@ -1,10 +1,12 @@
 """The insertion at work: what it reports of its plan, its periods and its end."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from flexneedle.cli.common import STILL_IN
 from flexneedle.control.interface import Decision
+from flexneedle.errors import StoppedError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.lab.page import messages as m
 from flexneedle.lab.page.frames import Source
@@ -12,6 +14,7 @@ from flexneedle.lab.page.scene import scene_of
 from flexneedle.lab.page.worker.plans import samples_of, shapes_of
 from flexneedle.lab.page.worker.rows import channel_of, frames_of, row_of
 from flexneedle.lab.page.worker.task import Task
+from flexneedle.loop.events import Decided, Event, Iterated, PeriodEnded, Planned
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
 _ENDED = (Outcome.DONE, Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
@@ -58,7 +61,22 @@ class Live:
         """Report whether it is paused."""
         self.announce("paused" if paused else "running")
 
-    def planning(self, info: dict[str, Any]) -> None:
+    def take(self, event: Event) -> None:
+        """Report an event of the insertion. While it plans, raises Cancelled or StoppedError after a cancel or stop."""
+        match event:
+            case Iterated(info=info):
+                self.task.signals.check()
+                if self.task.signals.stopped:
+                    raise StoppedError(f"stopped: {self.task.signals.stopped}")
+                self.planning(info)
+            case Planned(plan):
+                self.planned(plan)
+            case Decided(decision, estimate):
+                self.decided(decision, estimate)
+            case PeriodEnded(period):
+                self.show(period)
+
+    def planning(self, info: Mapping[str, Any]) -> None:
         """Report an iteration of the search."""
         done, usual = info["iteration"], info["iterations"]
         self.task.tell("running", done / usual, f"plan: iteration {done} of {usual}")

@@ -21,14 +21,17 @@ from flexneedle.lab.page.worker.task import Task
 from flexneedle.lab.rig.check import Wanted, check_rig
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.start import announced
-from flexneedle.lab.rig.supervised import Watchers
+from flexneedle.lab.rig.supervised import SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import CONTROLLER, Supervisor
 from flexneedle.lab.rig.supervisor.machine import State
 from flexneedle.lab.rig.supervisor.messages import Report
 from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.check import check_ros
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.events import AllGates, Event, Gate, Listener
+from flexneedle.loop.insert import check_choices
 from flexneedle.record.folder import Folder
-from flexneedle.record.recording import Choices, check_choices, record_insertion
+from flexneedle.record.recording import record_insertion
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Insertion
 
@@ -54,44 +57,34 @@ def insert_on_rig(live: Live) -> Insertion:
     task, work = live.task, live.task.work
     rig, scenario = usable_rig(work.rig), used(task.scenario)
     live.rig = rig.name
-    choices = Choices(work.seed, work.strategy, controller=task.controller, rig=rig)
-    check_choices(scenario, choices)
+    choices = Choices.of(work.seed, task.controller, SupervisedRig(rig))
+    check_choices(scenario, work.strategy, choices)
     path = new_folder(Path(work.name).stem, str(work.seed), root=Path(work.folder))
     folder = Folder.claim(path, "", "insertion", scenario, work.seed)
     live.folder = path.name
-    follower = Follower(live, scenario, folder)
-
-    def on_iteration(_strategy: str, info: dict[str, Any]) -> None:
-        if task.signals.stopped:
-            raise StoppedError(f"stopped: {task.signals.stopped}")
-        live.planning(info)
+    follower = Follower(live, scenario)
 
     with ExitStack() as stack:
-        bridge = None
+        listeners: list[Listener] = [live.take, follower]
+        gates: list[Gate] = [follower]
         if rig.ros is not None:
             bridge = stack.enter_context(Bridge(rig.ros, partial(print, file=sys.stderr, flush=True)))
+            listeners, gates = [*listeners, bridge], [bridge, follower]
         insertion = record_insertion(
-            folder,
-            scenario,
-            choices,
-            on_iteration=on_iteration,
-            on_period=live.show,
-            on_decision=live.decided,
-            bridge=bridge,
-            watchers=follower.watchers,
+            folder, scenario, work.strategy, choices, listeners=listeners, gate=AllGates(*gates)
         )
     live.notes += [*folder.problems, *folder.undrawn]
     return insertion
 
 
-class Follower:
-    """Lets an insertion begin, and go on after a hold, when the server says so; reports the rig's state; stops it.
+class Follower(Gate):
+    """Starts, holds and stops an insertion as the server asks, and reports the rig's state; also a listener.
 
-    A `rig.supervised.Follower`, with the hooks of `Watchers`. `report` and `stop` are called in other threads.
+    Ticks and `stop` come in other threads.
     """
 
-    def __init__(self, live: Live, scenario: Scenario, folder: Folder) -> None:
-        self._live, self._scenario, self._folder = live, scenario, folder
+    def __init__(self, live: Live, scenario: Scenario) -> None:
+        self._live, self._scenario = live, scenario
         self._signals = live.task.signals
         self._supervisor: Supervisor | None = None
         self._lock = Lock()
@@ -100,21 +93,18 @@ class Follower:
         self._count = 0
         self._signals.on_stop = self.stop
 
-    @property
-    def watchers(self) -> Watchers:
-        """What `insert` calls."""
-        return Watchers(followers=(self,), confirm=self.confirm, hold=self.hold)
+    def __call__(self, event: Event) -> None:
+        """Report a tick."""
+        if isinstance(event, Tick):
+            self.report(event.report)
 
-    def opened(self, supervisor: Supervisor) -> None:
-        """Take the supervisor of the rig, which is not armed. Raises StoppedError after a stop."""
+    def confirm(self, rig: Any) -> None:
+        """Report what will move, and wait until it may. Raises StoppedError after a stop, DriverError after a fault."""
+        supervisor: Supervisor = rig
         self._supervisor = supervisor
         if self._signals.stopped:
             raise StoppedError(f"stopped: {self._signals.stopped}")
-
-    def confirm(self, supervisor: Supervisor) -> None:
-        """Report what will move, and wait until it may. Raises StoppedError after a stop, DriverError after a fault."""
         live = self._live
-        live.planned(self._folder.plans[live.task.work.strategy])
         self._wait([*announced(supervisor.rig, self._scenario, supervisor.positions), SWITCHED_ON])
         live.announce("ready")
         while self._signals.held:

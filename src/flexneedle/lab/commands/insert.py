@@ -1,0 +1,178 @@
+"""Options of `flexneedle insert` for a rig and for ROS 2."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from contextlib import ExitStack
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from flexneedle.cli.commands import Commands
+from flexneedle.cli.common import ARMS, STILL_IN, confirm_motions, require_terminal, with_target
+from flexneedle.cli.insert import Connection
+from flexneedle.errors import InputError
+from flexneedle.interrupts import SIGNALS
+from flexneedle.loop.events import AllGates, Gate
+
+if TYPE_CHECKING:
+    from flexneedle.cli.progress import Progress
+    from flexneedle.lab.rig.rig_file import RigFile, RosSettings
+    from flexneedle.lab.ros.bridge import Bridge
+    from flexneedle.loop.events import Listener
+    from flexneedle.scenario.model import Scenario
+
+
+def add_options(commands: Commands) -> None:
+    """Add the options to the command `insert`."""
+    parser = commands.choices["insert"]
+    parser.set_defaults(connection=_connection)
+    parser.add_argument(
+        "--rig",
+        metavar="FILE",
+        help="rig file (its path, or emulated for the one of the package), on whose motors and tracker the plan is "
+        "executed, from where the motors are (default: the virtual phantom)",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="with --rig: read motors and tracker, go through all motions, and send none; the needle is the virtual "
+        "phantom's",
+    )
+    parser.add_argument(
+        "--ros",
+        metavar="PROFILE",
+        help="publish an insertion without --rig to ROS 2, and let its topic stop it: name or path of a profile of "
+        "topics (with --rig: section [ros] of the rig file)",
+    )
+    parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
+
+
+def _connection(args: argparse.Namespace) -> Connection:
+    """Return the connection for the arguments. Raises InputError for options that contradict each other."""
+    if args.rig is not None:
+        return RigConnection(args)
+    if args.dry_run:
+        raise InputError("--dry-run: needs --rig FILE; without a rig every insertion is virtual")
+    return Connection(args) if args.ros is None else RosConnection(args)
+
+
+class RosConnection(Connection):
+    """The virtual rig, with an insertion that is published to ROS 2 and can be stopped there."""
+
+    _bridge: Bridge | None = None
+
+    def _ros(self) -> RosSettings | None:
+        from flexneedle.lab.rig.rig_file import RosSettings, check_settings
+
+        return check_settings(RosSettings, {"profile": self.args.ros})
+
+    def start(self, stack: ExitStack, scenario: Scenario) -> Scenario:
+        """Open the connection to ROS, and wait for the target if it comes from there."""
+        settings = self._ros()
+        if settings is None:
+            return scenario
+        if settings.target and self.args.target is not None:
+            raise InputError(
+                "--target: not with target = true in [ros] of the rig file, which takes it from ROS"
+            )
+        from flexneedle.lab.ros.bridge import Bridge
+
+        self._bridge = stack.enter_context(Bridge(settings, partial(print, file=sys.stderr, flush=True)))
+        return with_target(scenario, self._bridge.await_target()) if settings.target else scenario
+
+    def listeners(self, progress: Progress) -> tuple[Listener, ...]:
+        """Return the connection to ROS, whose lines are printed above the progress from now on."""
+        if self._bridge is None:
+            return ()
+        self._bridge.show = progress.print_line
+        return (self._bridge,)
+
+    def gate(self, progress: Progress, scenario: Scenario) -> Gate | None:
+        """Return the connection to ROS."""
+        return self._bridge
+
+
+class RigConnection(RosConnection):
+    """The rig of a rig file, which the user confirms before motors move."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        from flexneedle.lab.rig.supervised import SupervisedRig
+
+        if virtual := [f"--{name}" for name in ("phantom", "tracker") if getattr(args, name) is not None]:
+            raise InputError(
+                f"{' and '.join(virtual)}: not with --rig, which has a needle and a tracker of its own"
+            )
+        self.args = args
+        self.source = self._rig = SupervisedRig(args.rig, dry_run=args.dry_run)
+
+    @property
+    def _file(self) -> RigFile:
+        return self._rig.file
+
+    @property
+    def _asks(self) -> bool:
+        """Whether motions are confirmed on the terminal: those of motors, unless --yes is given or ROS arms the rig."""
+        ros = self._file.ros
+        return self._rig.moves and not (self.args.yes or (ros is not None and ros.arm))
+
+    def _ros(self) -> RosSettings | None:
+        if self.args.ros is not None:
+            raise InputError("--ros: not with --rig, whose file has a section [ros] for it")
+        return self._file.ros
+
+    def registered(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with the registration of the rig file. Raises InputError for a second one."""
+        from flexneedle.lab.rig.supervised import registered
+
+        if self.args.registration is not None:
+            if self._file.registration is not None:
+                raise InputError(
+                    "--registration: not with a rig whose file has a section [registration]: remove one"
+                )
+            return super().registered(scenario)
+        return scenario if self._rig.dry_run else registered(self._file, scenario)
+
+    def start(self, stack: ExitStack, scenario: Scenario) -> Scenario:
+        """Let SIGTERM and SIGHUP act as Ctrl-C, so that the record is completed; require a terminal."""
+        interrupt_on_signals(stack)
+        started = super().start(stack, scenario)
+        if self._asks:
+            require_terminal()  # before the time of planning is spent
+        return started
+
+    def gate(self, progress: Progress, scenario: Scenario) -> Gate:
+        """Return the gate of ROS, then that of the user."""
+        asked = _UserGate(progress, scenario, moves=self._rig.moves, question="Insert?" if self._asks else "")
+        return asked if self._bridge is None else AllGates(self._bridge, asked)
+
+    def end(self) -> None:
+        """Print how the needle is withdrawn."""
+        if self._rig.moves:
+            print(f"flexneedle: {STILL_IN.format(rig=self.args.rig)}", file=sys.stderr)
+
+
+def interrupt_on_signals(stack: ExitStack) -> None:
+    """Let SIGTERM and SIGHUP act as Ctrl-C until the stack closes: an insertion on a rig completes its record."""
+    for number in SIGNALS:
+        stack.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
+
+
+class _UserGate(Gate):
+    """Prints where the axes are, and asks before motors move; question "": does not ask."""
+
+    def __init__(self, progress: Progress, scenario: Scenario, *, moves: bool, question: str) -> None:
+        self._progress, self._scenario = progress, scenario
+        self._moves, self._question = moves, question
+
+    def confirm(self, rig: Any) -> None:
+        """Ask. Raises RunError for any answer but yes."""
+        from flexneedle.lab.rig.start import announced
+
+        rig.take_signals()
+        if not self._moves:
+            return
+        with self._progress.paused():
+            lines = [*announced(rig.rig, self._scenario, rig.positions), ARMS]
+            confirm_motions(lines, self._question)

@@ -1,0 +1,48 @@
+"""Choices of an insertion besides its scenario and plan, resolved once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from flexneedle.arguments import refusal, whole
+from flexneedle.control.controllers import DEFAULT
+from flexneedle.control.interface import Controller
+from flexneedle.loop.parts import controller_of
+from flexneedle.loop.rig import RigSource
+from flexneedle.loop.virtual import VirtualRig
+
+_PARTS_OF_SOURCE = ("names", "moves", "check", "open", "results")
+
+
+@dataclass(frozen=True, eq=False)
+class Choices:
+    """Seed, controller with its name in the record, rig, and the options of `insert`."""
+
+    seed: int
+    name: str
+    controller: Controller
+    rig: RigSource
+    force: bool = False
+    threads: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        seed: int = 0,
+        controller: str | Controller = DEFAULT,
+        rig: RigSource | None = None,
+        *,
+        force: bool = False,
+        threads: int | None = None,
+    ) -> "Choices":
+        """Return the resolved choices. Raises InputError for an unknown controller, and for anything but a rig."""
+        name, resolved = controller_of(controller)
+        source = VirtualRig() if rig is None else rig
+        if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
+            wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"
+            raise refusal("rig", source, wanted, "see flexneedle.devices.open_rig")
+        return cls(whole("seed", seed, 0), name, resolved, source, force, threads)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Fields of `Insertion` that name what the insertion is made with."""
+        return {"controller": self.name, **self.rig.names}

@@ -1,0 +1,112 @@
+"""A rig: clock, driver and tracker of the closed loop, and where an insertion gets them."""
+
+import math
+from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from flexneedle.arguments import refusal
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.loop.events import Stream
+from flexneedle.phantom.phantom import Condition
+from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Control, Plan
+
+
+class RigSource(Protocol):
+    """Source of the ports of an insertion: a virtual rig, the rig of a rig file, or a `Rig` with ports of your own."""
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """Fields of `Insertion` that name the phantom, the tracker and the rig."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether motors move."""
+
+    def check(self, scenario: Scenario, strategy: str) -> None:
+        """Raise RigError, one line for each problem, if the rig cannot do what a plan of this strategy needs."""
+
+    def open(
+        self, scenario: Scenario, plan: Plan, seed: int, stream: Stream
+    ) -> AbstractContextManager["Rig"]:
+        """Connect the rig and yield its ports, ready for the first motion of the plan.
+
+        A rig with motors calls `stream.gate.confirm` before it arms them. Raises RigError for a rig that does not fit
+        the scenario, DriverError for a device that cannot be opened, StoppedError after a stop.
+        """
+
+    def results(self) -> dict[str, Any]:
+        """Fields of `Insertion` that are known at its end."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Ports of the closed loop, and a `RigSource` that gives them.
+
+    Args:
+        clock: Time of the insertion.
+        driver: Moves the needle.
+        tracker: Measures its tip.
+        truth: Returns the true state, which is only recorded; None on hardware.
+        expect: Called with the estimate and the command before each motion, so that readings during it can be checked;
+            None if they are not.
+        deadline: Time (s) of a decision after which it is late: the tracker is read again before it is used. None: no
+            decision is late.
+
+    Raises:
+        InputError: For a port without the functions of its protocol, and for a deadline that is not above 0.
+    """
+
+    clock: Clock
+    driver: Driver
+    tracker: TipTracker
+    truth: Callable[[], Condition] | None = None
+    expect: Callable[[Estimate, Control], None] | None = None
+    deadline: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_port("clock", self.clock, Clock, ("now", "wait"))
+        _check_port("driver", self.driver, Driver, ("apply", "stop"))
+        _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
+        if not (self.truth is None or callable(self.truth)):
+            raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+        if not (self.deadline is None or 0.0 < self.deadline < math.inf):
+            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """No names: the parts are objects of the caller."""
+        return {}
+
+    @property
+    def moves(self) -> bool:
+        """Whether motors move: unknown, so that nobody is asked."""
+        return False
+
+    def check(self, scenario: Scenario, strategy: str) -> None:
+        """Accept any scenario."""
+
+    def open(
+        self,
+        scenario: Scenario,
+        plan: Plan,
+        seed: int,
+        stream: Stream,
+    ) -> AbstractContextManager["Rig"]:
+        """Yield these ports."""
+        return nullcontext(self)
+
+    def results(self) -> dict[str, Any]:
+        """No results."""
+        return {}
+
+
+def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:
+    """Raise InputError unless an object has the parts of a port; a class has them, but no object that they act on."""
+    missing = [part for part in parts if isinstance(given, type) or not hasattr(given, part)]
+    if missing:
+        wanted = f"must be an object with {', '.join(parts)}"
+        raise refusal(name, given, wanted, f"see flexneedle.ports.{port.__name__}")
