@@ -30,7 +30,6 @@ from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.loop.closed_loop import run
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.ports import Clock
 from flexneedle.types import Insertion, Outcome, Plan
@@ -70,12 +69,9 @@ def taking(seconds: float, clock: Clock) -> Controller:
 def inserted(job: Job) -> Insertion:
     """The insertion of a job; without a decision time that of `flexneedle.insert`."""
     plan, scenario = plan_to(job.target), flexneedle.load_scenario("phantom")
-    phantom, tracker, control, room = np.random.SeedSequence(job.seed).spawn(4)
-    rig = virtual_rig(scenario, plan.roll, Seeds(phantom, tracker, room))
+    rig = virtual_rig(scenario, plan.roll, Seeds.of(job.seed))
     controller = taking(job.decision, rig.clock)
-    return run(
-        scenario, plan, rig, np.random.default_rng(control), job.seed, controller=controller, threads=1
-    )
+    return flexneedle.insert(scenario, plan, job.seed, rig=rig, controller=controller, threads=1)
 
 
 def row(job: Job) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from flexneedle import Scenario, load_scenario
 from flexneedle.figures import style
-from flexneedle.loop.closed_loop import run as carry_out
+from flexneedle.loop.insert import insert
 from flexneedle.loop.virtual import Seeds, virtual_rig, virtual_room
 from flexneedle.phantom.plants import DEFAULT_PLANT
 from flexneedle.planning.planner import plan as make_plan
@@ -103,16 +103,16 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
     depth, lateral = drawn.target
     scenario = scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
     plan = planned(drawn.target)
-    phantom, tracker, control, room = np.random.SeedSequence(drawn.seed).spawn(4)
+    seeds = Seeds.of(drawn.seed)
     rig = virtual_rig(
         scenario,
         plan.roll,
-        Seeds(phantom, tracker, room),
+        seeds,
         DEFAULT_PLANT,
         plate_distance_at=drawn.distance_at if plate else None,
     )
-    done = carry_out(scenario, plan, rig, np.random.default_rng(control), force=True, threads=1)
-    periods, around = done.periods, virtual_room(scenario, room, drawn.distance_at(0.0))
+    done = insert(scenario, plan, drawn.seed, rig=rig, force=True, threads=1)
+    periods, around = done.periods, virtual_room(scenario, seeds.room, drawn.distance_at(0.0))
     tips = np.array([period.true_tip[:2] for period in periods if period.true_tip])
     off = np.zeros(len(tips))
     if plate and around is not None:

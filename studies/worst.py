@@ -21,7 +21,7 @@ import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,10 @@ from flexneedle.errors import InputError
 from flexneedle.figures import style
 from flexneedle.lab.study.grid import Study, StudyInsertion, load_study
 from flexneedle.lab.study.plans import Plans, plan_key
-from flexneedle.loop.closed_loop import run as carry_out
+from flexneedle.loop import closed_loop
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.events import Stream
+from flexneedle.loop.insert import prepare
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import draw
 from flexneedle.planning.planner import plan as make_plan
@@ -127,7 +130,8 @@ def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, s
     phantom, tracker, control, room = np.random.SeedSequence(insertion.seed).spawn(4)
     rig = virtual_rig(scenario, plan.roll, Seeds(phantom, tracker, room), point.plant)
     rng = np.random.default_rng(control if sample == 0 else control.spawn(sample)[-1])
-    run = carry_out(scenario, plan, rig, rng, controller=point.controller, force=True, threads=1)
+    choices = Choices.of(insertion.seed, point.controller, rig, force=True, threads=1)
+    run = closed_loop.run(replace(prepare(scenario, plan, choices, Stream()), rng=rng), rig)
     last = run.periods[-1]
     x, y = last.true_tip[:2] if last.true_tip else (math.nan, math.nan)
     return Ending(

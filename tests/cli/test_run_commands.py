@@ -325,7 +325,7 @@ def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypa
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexneedle.planning.planner.plan", interrupted)
+    monkeypatch.setattr("flexneedle.record.recording.make_plan", interrupted)
     status, out, err = run(capsys, "insert", "--out", "here")
     assert (status, out, err.splitlines()[-1]) == (130, "", "flexneedle: interrupted")
     assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "interrupted"

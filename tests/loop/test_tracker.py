@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.loop.closed_loop import run
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig, virtual_room
 from flexneedle.phantom.tracking.field.poses import reference_poses
@@ -38,11 +37,8 @@ def inserted(plan):
         if plate_at is not None:
             plate = {"tracker.environment.plate": PLATE.model_dump(mode="json")}
             scenario = scenario.with_values(plate)
-        phantom, tracker, control, room = np.random.SeedSequence(seed).spawn(4)
-        rig = virtual_rig(
-            scenario, plan.roll, Seeds(phantom, tracker, room), "model", plate_distance_at=plate_at
-        )
-        return run(scenario, plan, rig, np.random.default_rng(control))
+        rig = virtual_rig(scenario, plan.roll, Seeds.of(seed), "model", plate_distance_at=plate_at)
+        return flexneedle.insert(scenario, plan, seed, rig=rig)
 
     return insert
 
@@ -111,11 +107,9 @@ def interrupted(plan, span, calls, **values):
     scenario = PHANTOM.with_values(
         {"tracker.environment": "ideal", "tracker.environment.plate": PLATE.model_dump(mode="json"), **values}
     )
-    phantom, tracker, control, room = np.random.SeedSequence(3).spawn(4)
-    seeds = Seeds(phantom, tracker, room)
-    rig = virtual_rig(scenario, plan.roll, seeds, "model", plate_distance_at=passing)
+    rig = virtual_rig(scenario, plan.roll, Seeds.of(3), "model", plate_distance_at=passing)
     rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
-    return run(scenario, plan, rig, np.random.default_rng(control))
+    return flexneedle.insert(scenario, plan, 3, rig=rig)
 
 
 def test_a_call_between_two_frames_does_not_change_a_hold(plan):
@@ -285,7 +279,7 @@ class Bench:
 def on_bench(plan, readings_at, status="unplugged", **values):
     bench = Bench(readings_at, status)
     rig = Rig(bench, bench, OnStage(bench, to_stage(None)))
-    return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
+    return flexneedle.insert(PHANTOM.with_values(values), plan, rig=rig)
 
 
 AT_START = SensorReading((-28.5, 0.0, 0.0))

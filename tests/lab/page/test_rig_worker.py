@@ -18,6 +18,8 @@ from flexneedle.lab.page.worker.rig import Follower, check
 from flexneedle.lab.page.worker.signals import Cancelled, Signals
 from flexneedle.lab.rig.supervisor.machine import State
 from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.loop.events import Stream
+from flexneedle.record import recording
 from flexneedle.scenario.files import load_scenario
 from page_tasks import Reported, task
 

@@ -248,7 +248,8 @@ def test_the_record_of_a_disturbed_insertion_says_so(tmp_path, inserted):
 
 def test_a_record_names_the_first_disturbances_and_counts_the_others():
     times = iter(range(100))
-    disturber = Disturber(short(), lambda: next(times), lambda _news: None)
+    disturber = Disturber(short(), lambda _news: None)
+    disturber.now = lambda: next(times)
     disturber.plant(draw(short(), np.random.default_rng(3)), 0.0)
     disturber.watch(None)
     for size in range(1, 14):
@@ -277,7 +278,8 @@ def test_a_layer_is_stiffer_where_it_truly_is(monkeypatch):
     assert abs(truth.layer_tops[1] - scenario.layer_tops[1]) > 0.1
     given = []
     monkeypatch.setattr(DisturbedPlant, "stiffen", lambda _plant, *how: given.append(how))
-    disturber = Disturber(scenario, lambda: 0.0, lambda _news: None)
+    disturber = Disturber(scenario, lambda _news: None)
+    disturber.now = lambda: 0.0
     disturber.plant(truth, 0.0)
     disturber.watch(None)
     for layer in (0, 1):

@@ -10,7 +10,6 @@ import flexneedle
 from emulated import emulated, read_until, until
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
-from flexneedle.loop.closed_loop import run
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import to_stage
 from flexneedle.phantom.tracking.stage import OnStage
@@ -52,7 +51,7 @@ def test_the_needle_moves_while_frames_arrive_and_is_held_without_replies():
         rig = Rig(
             clock, Motors(clock), tip
         )  # force: the tip does not follow the motors, so that a miss is predicted
-        done = run(scenario, plan, rig, np.random.default_rng(0), force=True)
+        done = flexneedle.insert(scenario, plan, rig=rig, force=True)
     assert done.outcome == "held"
     assert re.search(
         r"\(limit 0\.4 s\): missing: no reading \((no reply|no frame for 0\.\d s)\)$", done.reason

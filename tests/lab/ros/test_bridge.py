@@ -14,6 +14,7 @@ from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import RigError, StoppedError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
+from flexneedle.lab.rig.supervised import SupervisedRig
 from flexneedle.lab.ros import bridge
 from flexneedle.lab.ros.bridge import profile_of
 from flexneedle.lab.ros.profile import load_profile
@@ -260,7 +261,7 @@ def test_from_python_a_rig_with_a_section_that_nothing_follows_is_refused():
     plan = flexneedle.plan(scenario)
     rig = RigFile.model_validate(RIG | {"ros": {"arm": True}})
     with pytest.raises(RigError, match="ros: nothing listens to the stop of this section"):
-        flexneedle.insert(scenario, plan, rig=rig)
+        flexneedle.insert(scenario, plan, rig=SupervisedRig(rig))
 
 
 class Node:

@@ -40,9 +40,10 @@ def with_plate(scenario: Scenario) -> Scenario:
 class DisturbedRig(VirtualRig):
     """The virtual rig of an insertion that can be disturbed."""
 
-    def __init__(self, disturber: "Disturber") -> None:
+    def __init__(self, disturber: "Disturber", on_open: Callable[[], None]) -> None:
+        """on_open: called when there is a rig that can be disturbed."""
         super().__init__()
-        self._disturber = disturber
+        self._disturber, self._on_open = disturber, on_open
 
     @contextmanager
     def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
@@ -56,7 +57,9 @@ class DisturbedRig(VirtualRig):
             plate_distance_at=disturber.plate_distance_at,
         )
         disturber.now = rig.clock.now
-        yield replace(rig, tracker=disturber.watch(rig.tracker))
+        ports = replace(rig, tracker=disturber.watch(rig.tracker))
+        self._on_open()
+        yield ports
 
     def results(self) -> dict[str, Any]:
         """Return what was disturbed, and when."""

@@ -71,6 +71,5 @@ def _insert_virtually(live: Live) -> Insertion:
             lasted, before = event.period.time - before, event.period.time
             pacer.after(lasted)
 
-    pacer.start()
-    rig, listeners = DisturbedRig(disturber), (live.take, keep_pace)
+    rig, listeners = DisturbedRig(disturber, pacer.start), (live.take, keep_pace)
     return insert(task.scenario, plan, seed, controller=task.controller, rig=rig, listeners=listeners)
