@@ -15,6 +15,7 @@ from flexneedle.errors import CommandError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.loop.insert import insert
+from flexneedle.loop.virtual import VirtualRig
 from flexneedle.planning.planner import plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import MOVES, Limits
@@ -173,7 +174,7 @@ def _insert(controller: Controller, scenario: Scenario, planned: Plan, seed: int
     arrays = {name: getattr(planned, name).copy() for name in _ARRAYS}
     with _recorded(controller) as calls:
         insertion = insert(
-            scenario, planned, seed, controller=controller, phantom="model", force=True, threads=1
+            scenario, planned, seed, controller=controller, rig=VirtualRig("model"), force=True, threads=1
         )
     return _Run(insertion, arrays, tuple(calls))
 

@@ -21,7 +21,7 @@ _STEP_S = 0.5
 
 
 class TipTrackerConformance:
-    """Checks of a tracker of the tip. `make` is called as the factory of `insert(…, tracker=…)`.
+    """Checks of a tracker of the tip. `make` is called as the factory of `VirtualRig(tracker=…)`.
 
     Attributes:
         scenario: Scenario of the phantom (default: the shipped one, with the tip 4 mm before the skin).
