@@ -12,7 +12,7 @@ from importlib.resources import files
 import pytest
 
 from flexneedle.cli.main import main
-from flexneedle.lab.page import commands as serve
+from flexneedle.lab.commands import serve
 from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.lab.page.server.limits import Limits
 from flexneedle.lab.page.server.rig import ConnectedRig
