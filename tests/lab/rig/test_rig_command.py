@@ -13,7 +13,7 @@ from bench_rig import Motors, values
 from commands import run
 from emulated import emulated, emulator
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig import commands as command
+from flexneedle.lab.commands import rig as command
 from flexneedle.lab.rig.devices.galil.motors import factory
 
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}

@@ -6,7 +6,7 @@ import pytest
 
 from flexneedle.cli import main as cli
 from flexneedle.cli.progress import Progress
-from flexneedle.lab.study import commands as study_command
+from flexneedle.lab.commands import study as study_command
 from flexneedle.lab.study import pools, rows
 from flexneedle.lab.study.runner import Advance
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flexneedle.cli import main as cli
-from flexneedle.lab.study import commands as study_command
+from flexneedle.lab.commands import study as study_command
 from flexneedle.lab.study import pools, rows
 from flexneedle.lab.study.runner import Advance
 
