@@ -11,6 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.scenario.files import dump_scenario
+from kits import run_kits
 
 DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
 MODULES = dict(re.findall(r"^```python title=\"(\w+)\.py\"\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
@@ -72,9 +73,14 @@ def command(lab, *argv):
     return subprocess.run(line, cwd=lab, capture_output=True, text=True, check=False)
 
 
-def test_each_example_has_about_thirty_lines():
-    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench", "fung"]
-    assert all(15 < len(code.splitlines()) < 42 for code in MODULES.values())
+def test_each_example_is_one_short_file():
+    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench", "fung", "tilt", "test_parts"]
+    assert all(len(code.splitlines()) < 42 for code in MODULES.values())
+
+
+def test_the_parts_pass_their_kits(lab, imported):
+    del lab
+    run_kits(imported("test_parts:__dict__"))
 
 
 @pytest.mark.long
@@ -128,7 +134,7 @@ def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch)
 def test_the_example_of_objects_runs_as_printed(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     (lab / "mine.toml").write_bytes((lab / "quick.toml").read_bytes())
-    example, _ = [
+    example, *_ = [
         code for code in re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL) if code.startswith("import")
     ]
     names = {}
