@@ -9,7 +9,7 @@ from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import InputError
 from flexneedle.loop.progress import Late
-from flexneedle.record.columns import from_row, to_row
+from flexneedle.record.fields import from_row, to_row
 from flexneedle.types import STILL, Action, Outcome
 from insertions import READING, Tank, blind, run
 from tanks import STRAIGHT
