@@ -39,9 +39,9 @@ class Connection:
     """
 
     def __init__(self, args: argparse.Namespace) -> None:
-        from flexneedle.loop.parts import SCENARIO_TRACKER
         from flexneedle.loop.virtual import VirtualRig
         from flexneedle.phantom.plants import DEFAULT_PLANT
+        from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER
 
         self.args = args
         self.source: RigSource = VirtualRig(args.phantom or DEFAULT_PLANT, args.tracker or SCENARIO_TRACKER)

@@ -120,11 +120,10 @@ def _check(args: argparse.Namespace) -> int:
 
 def _checked(args: argparse.Namespace) -> Scenario:
     """Return the scenario with all defaults, including those of the controllers."""
-    from flexneedle.control.controllers import checked
-    from flexneedle.loop.parts import controller_of
+    from flexneedle.control.controllers import checked, find_controller
     from flexneedle.scenario.files import load_scenario
 
-    own = [controller_of(name)[1] for name in args.controller]
+    own = [find_controller(name)[1] for name in args.controller]
     return checked(load_scenario(args.scenario), *own, source=args.scenario)
 
 

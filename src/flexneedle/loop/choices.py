@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexneedle.arguments import refusal, whole
-from flexneedle.control.controllers import DEFAULT
+from flexneedle.control.controllers import DEFAULT, find_controller
 from flexneedle.control.interface import Controller
-from flexneedle.loop.parts import controller_of
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.virtual import VirtualRig
 
@@ -35,7 +34,7 @@ class Choices:
         threads: int | None = None,
     ) -> "Choices":
         """Return the resolved choices. Raises InputError for an unknown controller, and for anything but a rig."""
-        name, resolved = controller_of(controller)
+        name, resolved = find_controller(controller)
         source = VirtualRig() if rig is None else rig
         if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
             wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"

@@ -11,11 +11,11 @@ import numpy as np
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.registration import Rigid, fit_rigid, identity
 from flexneedle.loop.events import Stream
-from flexneedle.loop.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
+from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, TipTrackerFactory, find_tracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
 from flexneedle.phantom.tracking.field.tracker import FieldTracker
@@ -70,10 +70,10 @@ class VirtualRig:
     moves = False
 
     def __init__(
-        self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TrackerFactory = SCENARIO_TRACKER
+        self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TipTrackerFactory = SCENARIO_TRACKER
     ) -> None:
-        self._phantom, self._plant = plant_of(phantom)
-        self._tracker, self._factory = tracker_of(tracker)
+        self._phantom, self._plant = find_plant(phantom)
+        self._tracker, self._factory = find_tracker(tracker)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def virtual_rig(
     seeds: Seeds,
     phantom: str | PlantFactory = DEFAULT_PLANT,
     *,
-    tracker: TrackerFactory | None = None,
+    tracker: TipTrackerFactory | None = None,
     plate_distance_at: Callable[[float], float | None] | None = None,
 ) -> Rig:
     """Return a virtual phantom with the ports of a rig.
