@@ -8,10 +8,10 @@ from pathlib import Path
 
 from flexneedle.errors import DriverError
 from flexneedle.geometry.registration import identity
+from flexneedle.lab.rig.devices import clock
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor import suspension
 from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -313,7 +313,7 @@ def real_motors(settings, channels):
 def suspended_motors(settings, channels):
     """A driver of a rig file, `stages:suspended_motors`: the computer seems to be suspended for an hour on the way."""
     stage = real_motors(settings, channels)
-    suspension.asleep = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
+    clock.suspended_s = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
     return stage
 
 
