@@ -32,7 +32,7 @@ from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
 from flexneedle.lab.rig.devices.aurora.incoming import Incoming
 from flexneedle.lab.rig.devices.aurora.messages import parse
 from flexneedle.lab.rig.devices.aurora.readings import NAMES, readings, sensor_name
-from flexneedle.lab.rig.supervisor.messages import Expectation
+from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.phantom.tracking.stage import tip_on_stage

@@ -5,7 +5,7 @@ python tools/docs/rig_states.py
 
 from pathlib import Path
 
-from flexneedle.lab.rig.supervisor.machine import MOVING, RigEvent, State, next_state
+from flexneedle.lab.rig.supervisor.machine import MOVING, RigEvent, SupervisorState, next_state
 
 PAGE = Path(__file__).parents[2] / "docs" / "safety.md"
 BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
@@ -15,7 +15,7 @@ def table() -> str:
     """Return the table in Markdown: the state after each event, empty if it is refused."""
     heads = " | ".join(str(event) for event in RigEvent)
     lines = [f"| state | {heads} |", "|---" * (1 + len(RigEvent)) + "|"]
-    for state in State:
+    for state in SupervisorState:
         cells = " | ".join(str(next_state(state, event) or "") for event in RigEvent)
         lines.append(f"| {f'**{state}**' if state in MOVING else state} | {cells} |")
     return "\n".join(lines) + "\n"

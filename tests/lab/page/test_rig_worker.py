@@ -16,8 +16,8 @@ from flexneedle.lab.page.rigs import usable_rig
 from flexneedle.lab.page.worker.insertion import Insertions
 from flexneedle.lab.page.worker.rig import Follower, check
 from flexneedle.lab.page.worker.signals import Cancelled, Signals
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.loop.events import Stream
 from flexneedle.record import recording
 from flexneedle.scenario.files import load_scenario
@@ -238,20 +238,20 @@ def test_states_of_the_supervisor_are_reported_when_they_change():
     for state, why in [
         ("armed", ""), ("armed", ""), ("inserting", ""), ("holding", "missing"), ("stopped", "the controller"),
     ]:  # fmt: skip
-        made.report(Report(0.0, State(state), why))
+        made.report(TickReport(0.0, SupervisorState(state), why))
     found = [(news.state, news.why) for news in one.outbox.of("rig_report")]
     assert found == [("armed", ""), ("inserting", ""), ("holding", "missing"), ("ended", "")]
-    made.report(Report(0.0, State.STOPPED, "person 2"))
+    made.report(TickReport(0.0, SupervisorState.STOPPED, "person 2"))
     assert one.outbox.of("rig_report")[-1].state == "stopped"
 
 
 def test_a_rig_is_stopped_once_when_the_server_is_silent():
     made, one = follower()
-    made.report(Report(0.0, State.INSERTING))
+    made.report(TickReport(0.0, SupervisorState.INSERTING))
     assert made._supervisor.stops == []
     one.signals.heard -= SILENT_S + 0.1
     for _ in range(2):
-        made.report(Report(0.0, State.INSERTING))
+        made.report(TickReport(0.0, SupervisorState.INSERTING))
     (why,) = made._supervisor.stops
     assert why.startswith("no signal of the page's server for 1.")
 
@@ -260,7 +260,7 @@ def test_a_beat_is_a_signal():
     made, one = follower()
     one.signals.heard -= SILENT_S + 0.1
     one.signals.take(Signal(job=1, alive=True))
-    made.report(Report(0.0, State.INSERTING))
+    made.report(TickReport(0.0, SupervisorState.INSERTING))
     assert made._supervisor.stops == []
 
 

@@ -62,9 +62,9 @@ class Operator(Protocol):
 
 def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
     """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
-    from flexneedle.lab.rig.supervisor.client import Supervisor
+    from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
-    return Supervisor.of_operator(rig)
+    return SupervisorClient.of_operator(rig)
 
 
 def add_parser(commands: Commands) -> None:

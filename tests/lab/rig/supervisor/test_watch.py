@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from flexneedle.lab.rig.supervisor.messages import Expectation
+from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings

@@ -22,9 +22,9 @@ from flexneedle.lab.rig.check import Wanted, check_rig
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.start import announced
 from flexneedle.lab.rig.supervised import SupervisedRig, Tick
-from flexneedle.lab.rig.supervisor.client import CONTROLLER, Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.rig.supervisor.client import CONTROLLER, SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.check import check_ros
 from flexneedle.loop.choices import Choices
@@ -86,9 +86,9 @@ class Follower(Gate):
     def __init__(self, live: Live, scenario: Scenario) -> None:
         self._live, self._scenario = live, scenario
         self._signals = live.task.signals
-        self._supervisor: Supervisor | None = None
+        self._supervisor: SupervisorClient | None = None
         self._lock = Lock()
-        self._state, self._why = str(State.IDLE), ""
+        self._state, self._why = str(SupervisorState.IDLE), ""
         self._waits, self._moves, self._last = 0, list[str](), RigReport(state="")
         self._count = 0
         self._signals.on_stop = self.stop
@@ -100,7 +100,7 @@ class Follower(Gate):
 
     def confirm(self, rig: Any) -> None:
         """Report what will move, and wait until it may. Raises StoppedError after a stop, DriverError after a fault."""
-        supervisor: Supervisor = rig
+        supervisor: SupervisorClient = rig
         self._supervisor = supervisor
         if self._signals.stopped:
             raise StoppedError(f"stopped: {self._signals.stopped}")
@@ -121,13 +121,13 @@ class Follower(Gate):
             self._go()
         return held
 
-    def report(self, report: Report) -> None:
+    def report(self, report: TickReport) -> None:
         """Report what the rig has become; stop it if the server is silent."""
         silent = monotonic() - self._signals.heard
         if silent > SILENT_S and not self._signals.stopped:
             self._signals.stopped = f"no signal of the page's server for {silent:.1f} s"
             self.stop(self._signals.stopped)
-        ended = report.state is State.STOPPED and report.why == CONTROLLER
+        ended = report.state is SupervisorState.STOPPED and report.why == CONTROLLER
         self._state, self._why = ("ended", "") if ended else (str(report.state), report.why)
         self._tell()
 
@@ -137,7 +137,7 @@ class Follower(Gate):
             self._supervisor.request_stop(why)
 
     @property
-    def _opened(self) -> Supervisor:
+    def _opened(self) -> SupervisorClient:
         if self._supervisor is None:
             raise RuntimeError("the rig is not open")
         return self._supervisor
@@ -154,8 +154,10 @@ class Follower(Gate):
 
     def _tell(self) -> None:
         with self._lock:
-            resting = self._waits and self._state == State.INSERTING
-            state, why = (State.HOLDING, self._signals.held) if resting else (self._state, self._why)
+            resting = self._waits and self._state == SupervisorState.INSERTING
+            state, why = (
+                (SupervisorState.HOLDING, self._signals.held) if resting else (self._state, self._why)
+            )
             news = RigReport(state=state, why=why, waits=self._waits, moves=self._moves)
             if news != self._last:
                 self._last = news

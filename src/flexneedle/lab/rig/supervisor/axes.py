@@ -15,8 +15,8 @@ from flexneedle.lab.rig.supervisor.checks import (
     is_misplaced,
 )
 from flexneedle.lab.rig.supervisor.drives import Drive, MotorReading
-from flexneedle.lab.rig.supervisor.messages import AxisState
 from flexneedle.lab.rig.supervisor.motion import Leg, make_leg
+from flexneedle.lab.rig.supervisor.protocol import AxisState
 from flexneedle.ports import Clock, MotorPaces, Motors, MotorState
 
 _SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller takes

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.axes import RigAxes
 from flexneedle.lab.rig.supervisor.checks import (
     Inspection,
@@ -18,7 +18,7 @@ from flexneedle.lab.rig.supervisor.checks import (
     switch_problem,
 )
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.machine import RigEvent, State, next_state, refusal_reason
+from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
 from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
 from flexneedle.lab.rig.supervisor.requests import (
     RequestRules,
@@ -35,7 +35,7 @@ HEARTBEAT_S = 0.5
 """Longest time (s) without a message of the client during a motion."""
 
 _STALL_S = 0.5  # without a tick, after which a motion under way is not taken up again
-_UNCHECKED = frozenset({State.IDLE, State.STOPPED, State.FAULT})
+_UNCHECKED = frozenset({SupervisorState.IDLE, SupervisorState.STOPPED, SupervisorState.FAULT})
 """States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
 
 
@@ -46,10 +46,15 @@ class Supervisor:
     """
 
     def __init__(
-        self, task: say.Task, motors: Motors, tracker: Tracker, clock: Clock, send: Callable[[Any], None]
+        self,
+        task: protocol.SupervisorTask,
+        motors: Motors,
+        tracker: Tracker,
+        clock: Clock,
+        send: Callable[[Any], None],
     ) -> None:
         self._task, self._clock, self._send = task, clock, send
-        self.state, self.why = State.IDLE, ""
+        self.state, self.why = SupervisorState.IDLE, ""
         self._heard = self._ticked_at = now = clock.now()
         self._axes, self._tip = RigAxes(task.rig, motors, clock), TrackedTip(task, tracker, now)
         self._motion: CommandedMotion | None = None
@@ -63,30 +68,30 @@ class Supervisor:
 
     # Requests
 
-    def request(self, request: say.Request) -> None:
+    def request(self, request: protocol.Request) -> None:
         """Act on a message of the client."""
         self._heard = self._clock.now()
         self._requests += 1
         match request:
-            case say.Stop(who):
+            case protocol.StopRequest(who):
                 self.stop(who)
-            case say.Reset():
+            case protocol.ResetRequest():
                 if self._allow(RigEvent.RESET):
                     self._change_state(RigEvent.RESET)
-            case say.Off():
+            case protocol.OffRequest():
                 self._power_off()
-            case say.Arm(deepest):
+            case protocol.ArmRequest(deepest):
                 self._arm(deepest)
-            case say.Step():
+            case protocol.StepRequest():
                 self._begin_step(request)
-            case say.Go():
+            case protocol.MoveRequest():
                 self._begin_move(request)
-            case say.Home():
+            case protocol.HomeRequest():
                 self._begin_homing(request)
 
     def stop(self, who: str) -> None:
         """Stop all motors, in any state: a motor at rest may have been moved by another program."""
-        if self.state not in (State.STOPPED, State.FAULT):
+        if self.state not in (SupervisorState.STOPPED, SupervisorState.FAULT):
             self._change_state(RigEvent.STOP, who)
         self._halt_motors(who)
 
@@ -108,12 +113,12 @@ class Supervisor:
     def _accept(self, problem: str, number: int = 0) -> bool:
         """Return whether a request has no problem; otherwise refuse it."""
         if problem:
-            self._send(say.Refused(number, problem, self.state, self.why))
+            self._send(protocol.RequestRefused(number, problem, self.state, self.why))
         return not problem
 
     @property
     def _rules(self) -> RequestRules:
-        """Where the axes may go from here."""
+        """Rules of requests from the present goals."""
         drives = self._axes.drives
         return RequestRules(drives, {name: self._axes.goal(name) for name in drives}, self._deepest)
 
@@ -152,8 +157,8 @@ class Supervisor:
             self._change_state(RigEvent.FAULT, str(error))
             self._handle_lost_motors(str(error))
 
-    def _begin_step(self, step: say.Step) -> None:
-        if self.state is State.HOLDING and self._stopping is not None:
+    def _begin_step(self, step: protocol.StepRequest) -> None:
+        if self.state is SupervisorState.HOLDING and self._stopping is not None:
             self._report_nothing_done(step.number)
             return
         if not self._allow(RigEvent.STEP, step.number):
@@ -169,14 +174,16 @@ class Supervisor:
 
     def _report_nothing_done(self, number: int) -> None:
         now, why = self._clock.now(), self.why if self._tip.verdict.ok else str(self._tip.verdict)
-        self._send(say.Done(number, dict.fromkeys(self._axes.drives, 0.0), now, now, self.state, why))
+        self._send(
+            protocol.MotionResult(number, dict.fromkeys(self._axes.drives, 0.0), now, now, self.state, why)
+        )
 
-    def _begin_move(self, go: say.Go) -> None:
+    def _begin_move(self, go: protocol.MoveRequest) -> None:
         event = RigEvent.RETRACT if go.retract else RigEvent.JOG
-        if self._allow(event, go.number) and self._accept(self._rules.go_problem(go), go.number):
+        if self._allow(event, go.number) and self._accept(self._rules.move_problem(go), go.number):
             self._begin(event, make_move(go, self._axes.drives[go.axis], self._axes.goal(go.axis)))
 
-    def _begin_homing(self, home: say.Home) -> None:
+    def _begin_homing(self, home: protocol.HomeRequest) -> None:
         if not self._allow(RigEvent.HOME, home.number):
             return
         if not self._accept(self._rules.home_problem(home), home.number):
@@ -215,12 +222,14 @@ class Supervisor:
         elif self._motion is not None and self._motion.here is not None:
             self._define_home_here(self._motion, self._motion.here, now)
 
-    def report(self, late: float, work: float, missed: int) -> say.Report:
+    def report(self, late: float, work: float, missed: int) -> protocol.TickReport:
         """Return the report of the last tick, with the measurements since the last report."""
         axes, tip = self._axes, self._tip
         leg = None if self._motion is None or self._stopping is not None else self._motion.leg
         found = axes.axis_states(leg), tip.take(), tip.status, not self._is_busy
-        return say.Report(self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests)
+        return protocol.TickReport(
+            self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests
+        )
 
     def _check_ticks(self, seconds: float) -> None:
         """Stop after a long time without ticks: the motors have stopped at the end of their queue."""
@@ -233,7 +242,7 @@ class Supervisor:
         except DriverError as error:
             self._enter_fault(str(error))
             return
-        if not self._tip.verdict.ok and self.state is State.INSERTING:
+        if not self._tip.verdict.ok and self.state is SupervisorState.INSERTING:
             self._hold(str(self._tip.verdict))
 
     def _hold(self, why: str) -> None:
@@ -264,20 +273,20 @@ class Supervisor:
     def _check_rest(self) -> None:
         """Stop a motor again that moves after a stop or a fault."""
         moving = any(state.moving for state in self._axes.states.values())
-        if moving and self._stopping is None and self.state is not State.IDLE:
+        if moving and self._stopping is None and self.state is not SupervisorState.IDLE:
             self._halt_motors(self.why)
 
     def _check_client(self, now: float) -> None:
         silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
         if self._motion is not None and silent > HEARTBEAT_S:
             self.stop(f"no heartbeat of the controller for {silent:.2f} s")
-        elif self.state in (State.INSERTING, State.HOLDING) and silent > limit:
+        elif self.state in (SupervisorState.INSERTING, SupervisorState.HOLDING) and silent > limit:
             self.stop(f"no command of the controller for {silent:.2f} s, limit {limit:g} s")
 
     # Faults and stops
 
     def _enter_fault(self, why: str) -> None:
-        if self.state is not State.FAULT:
+        if self.state is not SupervisorState.FAULT:
             self._change_state(RigEvent.FAULT, why)
             self._halt_motors(why)
 
@@ -387,10 +396,12 @@ class Supervisor:
             return
         if motion.leg is not None:
             motion.spans.append(motion.leg.span(now, done=False))
-        if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
+        if self.state in (SupervisorState.HOMING, SupervisorState.JOGGING, SupervisorState.RETRACTING):
             self._change_state(RigEvent.ARRIVED)
         travelled, (begun, ended, turned) = self._axes.take_travel(), motion.times(now)
-        self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why, turned))
+        self._send(
+            protocol.MotionResult(motion.number, travelled, begun, ended, self.state, motion.why, turned)
+        )
 
     def _leave_switch(self, motion: CommandedMotion, drive: Drive) -> None:
         """Record the position of the switch that was searched, and begin to move off it."""

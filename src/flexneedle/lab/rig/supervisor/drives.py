@@ -88,7 +88,7 @@ class MotorReading:
 
     @property
     def time(self) -> float:
-        """When they most likely were (s)."""
+        """Most likely time of the states (s)."""
         return 0.5 * (self.asked + self.known)
 
 

@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 
-class State(StrEnum):
+class SupervisorState(StrEnum):
     """State of a rig."""
 
     IDLE = "idle"  # connected; nothing moves, motors may be off
@@ -33,48 +33,54 @@ class RigEvent(StrEnum):
     OFF = "off"  # motors are switched off
 
 
-TABLE: dict[tuple[State, RigEvent], State] = {
-    (State.IDLE, RigEvent.ARM): State.ARMED,
-    (State.ARMED, RigEvent.HOME): State.HOMING,
-    (State.ARMED, RigEvent.JOG): State.JOGGING,
-    (State.ARMED, RigEvent.RETRACT): State.RETRACTING,
-    (State.ARMED, RigEvent.STEP): State.INSERTING,
-    (State.ARMED, RigEvent.ARM): State.ARMED,
+TABLE: dict[tuple[SupervisorState, RigEvent], SupervisorState] = {
+    (SupervisorState.IDLE, RigEvent.ARM): SupervisorState.ARMED,
+    (SupervisorState.ARMED, RigEvent.HOME): SupervisorState.HOMING,
+    (SupervisorState.ARMED, RigEvent.JOG): SupervisorState.JOGGING,
+    (SupervisorState.ARMED, RigEvent.RETRACT): SupervisorState.RETRACTING,
+    (SupervisorState.ARMED, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.ARMED, RigEvent.ARM): SupervisorState.ARMED,
     (
-        State.HOMING,
+        SupervisorState.HOMING,
         RigEvent.ARRIVED,
-    ): State.IDLE,  # positions are others now, and with them what armed has taken
-    (State.JOGGING, RigEvent.ARRIVED): State.ARMED,
-    (State.RETRACTING, RigEvent.ARRIVED): State.ARMED,
-    (State.INSERTING, RigEvent.STEP): State.INSERTING,
-    (State.INSERTING, RigEvent.HOLD): State.HOLDING,
-    (State.HOLDING, RigEvent.HOLD): State.HOLDING,
-    (State.HOLDING, RigEvent.STEP): State.INSERTING,
-    (State.STOPPED, RigEvent.RESET): State.IDLE,
-    (State.FAULT, RigEvent.RESET): State.IDLE,
-    (State.STOPPED, RigEvent.OFF): State.STOPPED,
-    (State.FAULT, RigEvent.OFF): State.FAULT,
-    **{(state, RigEvent.STOP): State.STOPPED for state in State if state is not State.FAULT},
-    **{(state, RigEvent.FAULT): State.FAULT for state in State},
-    (State.FAULT, RigEvent.STOP): State.FAULT,
+    ): SupervisorState.IDLE,  # positions are others now, and with them what armed has taken
+    (SupervisorState.JOGGING, RigEvent.ARRIVED): SupervisorState.ARMED,
+    (SupervisorState.RETRACTING, RigEvent.ARRIVED): SupervisorState.ARMED,
+    (SupervisorState.INSERTING, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.INSERTING, RigEvent.HOLD): SupervisorState.HOLDING,
+    (SupervisorState.HOLDING, RigEvent.HOLD): SupervisorState.HOLDING,
+    (SupervisorState.HOLDING, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.STOPPED, RigEvent.RESET): SupervisorState.IDLE,
+    (SupervisorState.FAULT, RigEvent.RESET): SupervisorState.IDLE,
+    (SupervisorState.STOPPED, RigEvent.OFF): SupervisorState.STOPPED,
+    (SupervisorState.FAULT, RigEvent.OFF): SupervisorState.FAULT,
+    **{
+        (state, RigEvent.STOP): SupervisorState.STOPPED
+        for state in SupervisorState
+        if state is not SupervisorState.FAULT
+    },
+    **{(state, RigEvent.FAULT): SupervisorState.FAULT for state in SupervisorState},
+    (SupervisorState.FAULT, RigEvent.STOP): SupervisorState.FAULT,
 }
 """The state after an event. What is not listed is refused, and changes nothing."""
 
-MOVING = frozenset({State.HOMING, State.JOGGING, State.INSERTING, State.RETRACTING})
+MOVING = frozenset(
+    {SupervisorState.HOMING, SupervisorState.JOGGING, SupervisorState.INSERTING, SupervisorState.RETRACTING}
+)
 """The states in which motors may move."""
 
 
-def next_state(state: State, event: RigEvent) -> State | None:
+def next_state(state: SupervisorState, event: RigEvent) -> SupervisorState | None:
     """Return the state after an event; None if the event is refused in this state."""
     return TABLE.get((state, event))
 
 
-def accepted_events(state: State) -> tuple[RigEvent, ...]:
+def accepted_events(state: SupervisorState) -> tuple[RigEvent, ...]:
     """Return the events that a state accepts, for messages."""
     return tuple(event for event in RigEvent if (state, event) in TABLE)
 
 
-def refusal_reason(state: State, event: RigEvent, why: str, *, moving: bool) -> str:
+def refusal_reason(state: SupervisorState, event: RigEvent, why: str, *, moving: bool) -> str:
     """Return the reason why an event is refused in this state, or "". why: reason of the state; moving: motors still
     move."""
     because = f": {why}" if why else ""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from flexneedle.lab.rig.rig_file import LoopSettings
 from flexneedle.lab.rig.supervisor.drives import Drive, has_arrived
-from flexneedle.lab.rig.supervisor.messages import Expectation
+from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.lab.rig.supervisor.trajectory import Trajectory, fit_span, plan_trajectory
 from flexneedle.ports import MotorState
 

@@ -20,7 +20,7 @@ from flexneedle.lab.rig.devices.clock import Suspension, WallClock
 from flexneedle.lab.rig.devices.lock import held
 from flexneedle.lab.rig.devices.opening import address_of, open_motors, open_tracker
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
-from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.lab.rig.supervisor.dry import DryRunMotors
 from flexneedle.lab.rig.supervisor.signals import name_signals, open_signal_socket
@@ -59,11 +59,11 @@ def main(requests: int, received: int, sent: int) -> None:
         why = f"the supervisor failed: {describe_error(error)}"
         raise
     finally:
-        channel.send(say.Ended(why))
+        channel.send(protocol.SupervisorEnded(why))
         channel.flush(_FLUSH_S)
 
 
-def _serve(channel: MessageChannel, task: say.Task, signals: socket.socket) -> str:
+def _serve(channel: MessageChannel, task: protocol.SupervisorTask, signals: socket.socket) -> str:
     """Open the devices, tick until the end, and return its reason."""
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
@@ -125,7 +125,7 @@ def _tick(
 def _act_on_requests(channel: MessageChannel, core: Supervisor) -> str:
     """Act on what the client has sent; return why the supervisor shall end, "" if it shall continue."""
     for request in channel.receive():
-        if isinstance(request, say.Close):
+        if isinstance(request, protocol.CloseRequest):
             return _CLOSED
         core.request(request)
     return "the controller has ended" if channel.ended else ""

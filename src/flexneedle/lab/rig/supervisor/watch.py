@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from flexneedle.lab.rig.supervisor.messages import Expectation, Task
+from flexneedle.lab.rig.supervisor.protocol import Expectation, SupervisorTask
 from flexneedle.loop.monitor import rules
 from flexneedle.loop.monitor.monitor import Monitor, TipAt
 from flexneedle.phantom.tracking.stage import tip_on_stage
@@ -32,7 +32,7 @@ class TipWatch:
     verdict: Verdict = OK
 
     def with_expectation(self, expected: Expectation, begun: float, ended: float) -> "TipWatch":
-        """Return the watch with another expectation, by which the newest reading is judged again after an innovation."""
+        """Return the watch with another expectation; after an innovation it judges the newest reading again."""
         watch = replace(self, expected=expected, begun=begun, ended=ended)
         if self.verdict.kind is not VerdictKind.INNOVATION or self.newest is None:
             return watch
@@ -111,7 +111,7 @@ def _fixed_tip(place: Point) -> TipAt:
 class TrackedTip:
     """Tracker of a task, its measurements since the last report, and their watch. now: s on the run's clock."""
 
-    def __init__(self, task: Task, tracker: Tracker, now: float) -> None:
+    def __init__(self, task: SupervisorTask, tracker: Tracker, now: float) -> None:
         self._task, self._tracker = task, tracker
         self._watch = TipWatch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
         self._measurements: tuple[Measurement, ...] = ()
