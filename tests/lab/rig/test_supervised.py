@@ -25,7 +25,7 @@ from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepRequest, TickReport
 from flexneedle.loop.closed_loop import _carry_out
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
-from flexneedle.loop.step import StepRequest as LoopStep
+from flexneedle.loop.step import Step as LoopStep
 from flexneedle.record.topics import READINGS
 from flexneedle.simulator.pace import travel_time
 from flexneedle.simulator.simulator import Simulator
