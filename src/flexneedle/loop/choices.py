@@ -14,7 +14,7 @@ _PARTS_OF_SOURCE = ("names", "moves", "check", "open", "results")
 
 @dataclass(frozen=True, eq=False)
 class Choices:
-    """Seed, controller with its name in the record, rig, and the options of `insert`."""
+    """Seed, controller with its name in the record, rig, and options of an insertion."""
 
     seed: int
     name: str
@@ -43,5 +43,5 @@ class Choices:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Fields of `Insertion` that name what the insertion is made with."""
+        """Fields of `Insertion` that name controller, phantom, tracker and rig."""
         return {"controller": self.name, **self.rig.names}

@@ -4,7 +4,7 @@ A row of the CSV, and of the topic `/control/status`, has the columns of all fie
 numbers are exact (`repr`), so that a period is restored from its row to the last bit. A verdict is its kind, or
 `KIND: REASON`, divided at the first ": ", which no kind contains.
 
-To add a field: a line in `types.Period`, its value in `loop.record`, and a line here.
+To add a field: a line in `types.Period`, its value in `loop.period`, and a line here.
 """
 
 import math

@@ -38,7 +38,7 @@ class TipWatch:
             return watch
         place = [value for value in (self.newest.x, self.newest.y, self.newest.z) if value is not None]
         axes = min(len(place), 1 + self.monitor.axes)
-        again = rules.innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
+        again = rules.check_innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
         return replace(watch, verdict=again)
 
     def with_later_end(self, now: float, seconds: float) -> "TipWatch":
