@@ -170,6 +170,8 @@ def _bounds(node: dict[str, Any]) -> str:
     high, below = node.get("maximum"), node.get("exclusiveMaximum")
     if high is not None and high >= _LARGEST:
         high = None
+    if low is not None and high is not None:
+        return f"{low:g} to {high:,.12g}"
     least = f"at least {low:g}" if low is not None and low > -_LARGEST else ""
     least = f"above {above:g}" if above is not None else least
     most = f"at most {high:,.12g}" if high is not None else ""
