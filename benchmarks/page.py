@@ -126,7 +126,7 @@ def steal() -> float:
 @contextmanager
 def served(runs: Path) -> Iterator[Server]:
     """`flexneedle serve`, with kernels that are compiled before it starts."""
-    warm = "from flexneedle.lab.page.worker.warm import warm_up; warm_up()"
+    warm = "from flexneedle.lab.page.worker.plan_jobs import warm_up; warm_up()"
     subprocess.run([sys.executable, "-c", warm], check=True)
     command = [sys.executable, "-m", "flexneedle", "serve", "--no-open", "--port", "0", "--runs", str(runs)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -15,7 +15,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import flexneedle.lab.page
-from flexneedle.lab.page.messages import REQUESTS, Done, News, Refused
+from flexneedle.lab.page.protocol import DoneMessage, RefusedMessage, ServerMessage
+from flexneedle.lab.page.requests import REQUESTS
 from recorded_page import TARGET, opening, people, scene, scene_frames, session
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
@@ -160,11 +161,13 @@ class FakePage:
 
     async def _answer(self, socket, request):
         given = self.answers.get(request["type"])
-        if isinstance(given, Refused):
+        if isinstance(given, RefusedMessage):
             await self._send_to(socket, [given.model_copy(update={"request": request["request"]})])
             return
         await self._send_all(self._consequences(request))
-        await self._send_to(socket, [*(given(request) if given else ()), Done(request=request["request"])])
+        await self._send_to(
+            socket, [*(given(request) if given else ()), DoneMessage(request=request["request"])]
+        )
 
     def _consequences(self, request):
         if request["type"] == "steer":
@@ -184,7 +187,7 @@ class FakePage:
 
     async def _send_to(self, socket, news):
         for each in () if socket in self._cut else news:
-            if isinstance(each, News):
+            if isinstance(each, ServerMessage):
                 await socket.send_text(each.model_dump_json())
             else:
                 await socket.send_bytes(each)

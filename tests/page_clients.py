@@ -1,47 +1,57 @@
 """A served page, and clients of its web socket."""
 
 import json
-import sys
+import os
 from collections.abc import Callable
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic
+from unittest.mock import patch
 
 from websockets.sync.client import connect
 
-from flexneedle.lab.page.frames import unpacked
-from flexneedle.lab.page.server.desk import Setup
-from flexneedle.lab.page.server.hub import frame_key, key_of
-from flexneedle.lab.page.server.limits import Limits
-from flexneedle.lab.page.server.serve import PageServer
-from flexneedle.lab.page.server.session import Session
+from flexneedle.lab.page.server import worker_process
+from flexneedle.lab.page.server.clients import PageLimits
+from flexneedle.lab.page.server.page_server import PageServer
+from flexneedle.lab.page.server.page_session import PageSession
+from flexneedle.lab.page.server.request_handler import PageSetup
+from flexneedle.lab.page.shape_frames import unpack_frame
+from flexneedle.lab.process import ChildProcess
 from flexneedle.scenario.files import load_scenario
+from page_worker import WorkerThread
 
-STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))
+STUB = ("page_worker",)
 PATIENCE_S = 20.0
 """Time after which a test gives up; what it waits for takes milliseconds."""
-QUICK = Limits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
+QUICK = PageLimits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
 """Waits that tests can wait for; a changed scenario is not planned by itself."""
+
+
+def start_worker(module, *arguments):
+    """Start a worker: the stub in a thread, any other in a process."""
+    return WorkerThread() if (module,) == STUB else ChildProcess(module, *arguments)
 
 
 @contextmanager
 def served(runs: Path, *, limits=QUICK, rig=None, host="127.0.0.1", workers=(STUB, STUB)):
-    """A server in a thread, on a free port."""
-    session = Session.of("phantom", load_scenario("phantom"))
-    server = PageServer(Setup(session, runs, limits, workers, rig), host, 0)
+    """A server in a thread, on a free port; its workers may be modules of the tests."""
+    session = PageSession.of("phantom", load_scenario("phantom"))
+    server = PageServer(PageSetup(session, runs, limits, workers, rig), host, 0)
     listens = Event()
     server.on_start = listens.set
     thread = Thread(target=server.serve_until_interrupted)
-    thread.start()
-    try:
-        assert listens.wait(PATIENCE_S)
-        yield server
-    finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+    path = os.pathsep.join((str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")))
+    with patch.dict(os.environ, PYTHONPATH=path), patch.object(worker_process, "ChildProcess", start_worker):
+        thread.start()
+        try:
+            assert listens.wait(PATIENCE_S)
+            yield server
+        finally:
+            server.should_exit = True
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
 
 
 def port_of(server) -> int:
@@ -115,10 +125,10 @@ class Client:
         """Read one message."""
         message = self.socket.recv(timeout=timeout)
         if isinstance(message, bytes):
-            self.newest[frame_key(unpacked(message))] = message
+            self.newest[unpack_frame(message).key] = message
             return
         values = json.loads(message)
-        self.newest[key_of(values)] = values
+        self.newest[_key(values)] = values
         if values["type"] == "rows":
             rows = self.rows.setdefault(values["of"], [])
             assert values["first"] <= len(rows), "rows are missing"
@@ -130,6 +140,15 @@ class Client:
             self.wait(lambda: self.newest.get(f"job {kind}", {}).get("state") == state)
             and self.newest[f"job {kind}"]
         )
+
+
+_PARTS = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}
+
+
+def _key(values) -> str:
+    """The key of a message, as `ServerMessage.key`."""
+    kind = values["type"]
+    return f"{kind} {values[_PARTS[kind]]}" if kind in _PARTS else kind
 
 
 def get(server, path: str, **headers) -> tuple[int, str, dict[str, str]]:

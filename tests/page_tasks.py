@@ -4,10 +4,9 @@ from contextlib import suppress
 from functools import cache
 
 from flexneedle.errors import FlexneedleError
-from flexneedle.lab.page.messages import News
-from flexneedle.lab.page.orders import Work
-from flexneedle.lab.page.worker.signals import Cancelled, Signals
-from flexneedle.lab.page.worker.task import Task
+from flexneedle.lab.page.job_orders import RigReport, WorkOrder
+from flexneedle.lab.page.shape_frames import ShapeFrame
+from flexneedle.lab.page.worker.task import Cancelled, JobControl, WorkerTask
 from flexneedle.scenario.files import load_scenario
 
 NO_WAIT = 1e9
@@ -29,39 +28,42 @@ def short(name="phantom", **changes):
 
 
 class Reported:
-    """An outbox that keeps everything. then: called with each news."""
+    """The reports of a task. then: called with each message."""
 
-    def __init__(self, then=lambda _news: None):
-        self.news, self.frames, self._then = [], [], then
+    def __init__(self, then=lambda _message: None):
+        self.messages, self.frames, self.rig, self._then = [], [], [], then
 
-    def put(self, news: News) -> None:
-        news.model_dump_json()
-        self.news.append(news)
-        self._then(news)
-
-    def show(self, frame) -> None:
-        self.frames.append(frame)
+    def __call__(self, report) -> None:
+        if isinstance(report, ShapeFrame):
+            self.frames.append(report)
+        elif isinstance(report, RigReport):
+            self.rig.append(report)
+            self._then(report)
+        else:
+            report.model_dump_json()
+            self.messages.append(report)
+            self._then(report)
 
     def of(self, type_):
-        return [news for news in self.news if news.type == type_]
+        return [message for message in self.messages if message.type == type_]
 
     def shapes(self, kind, source=None):
         return [frame for frame in self.frames if frame.kind == kind and source in (None, frame.source)]
 
     @property
     def rows(self):
-        return [row for news in self.of("rows") for row in news.rows]
+        return [row for message in self.of("rows") for row in message.rows]
 
 
 def task(do, kind=None, scenario=None, *, reported=None, pace=NO_WAIT, **values):
-    """A task whose outbox is `reported`."""
+    """A task that reports to `reported`."""
     made = short() if scenario is None else scenario
-    work = Work(job=1, do=do, kind=kind or do, scenario=made.values(), name="small", revision=7, **values)
-    return Task(work, Signals(pace), reported or Reported())
+    order = WorkOrder(do, kind or do, 1, 7, "small", made.values(), **values)
+    return WorkerTask(order, JobControl(pace), reported or Reported())
 
 
 def done(action, one):
     """What a task has reported when it is done, also if it has failed or was cancelled."""
     with suppress(FlexneedleError, Cancelled):
         action(one)
-    return one.outbox
+    return one.report

@@ -1,209 +1,264 @@
-"""A worker of the page without physics: it answers every order at once with made-up news, and reports every signal.
+"""A worker of the page without physics: it answers each order at once with invented messages, and reports each change.
 
-Seeds of a plan choose what goes wrong: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled.
-Row 15 of a study does that, too; with 14 an insertion neither cancels nor stops.
+It runs in a thread of the test, behind the interface of a child process.
+
+Seeds of a plan choose a failure: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled. Row 15
+of a study does the last, too; with 14 an insertion neither cancels nor stops.
 A save waits for a pipe called GATE in the folder of runs, if there is one.
 An insertion that is cancelled still sends a row, and a run called SLOW is read only when it is cancelled.
-An insertion on a rig waits until it may go, and after a hold; seeds: 16 it has a fault then, 17 does
-not stop, 18 takes some beats of the server for its record.
+An insertion on a rig waits for "go", also after a hold; seeds: 16 it has a fault then, 17 it does not stop, 18 it takes
+some beats of the server for its record.
 """
 
 import json
-import os
-import struct
-import sys
+import socket
+from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Thread
 
-from flexneedle.lab.page.channel import packed, read
+import numpy as np
+
+from flexneedle.lab.page.job_orders import JobChange, RigReport, WorkerReady
+from flexneedle.lab.page.protocol import (
+    EstimateMessage,
+    InsertionMessage,
+    IterationMessage,
+    JobMessage,
+    PeriodRow,
+    PlanMessage,
+    RigCheckMessage,
+    RowsMessage,
+    StudyRowsMessage,
+)
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, pack_frame
+from flexneedle.lab.process import MessageChannel
 
 CRASHES, HANGS, WORKS_ON, FAULTY, UNSTOPPABLE, RECORDS = 13, 14, 15, 16, 17, 18
 ROWS, SLOW, GATE = 600, "slow", ".gate"
-FRAME = struct.pack("<BBBBIII", 4, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
-"""A sampled path of the live insertion, 24 kB."""
 
 
-def say(type_, **values):
-    write(json.dumps({"type": type_, **values}))
+def frame(number, source=FrameSource.LIVE):
+    """A sampled path, 24 kB."""
+    return ShapeFrame(FrameKind.SAMPLES, source, number, np.zeros((1, 2_000, 3), np.float32))
 
 
-def write(message):
-    sys.stdout.buffer.write(packed(message))
-    sys.stdout.buffer.flush()
+def packed_frame(number, source=FrameSource.LIVE):
+    """The bytes of `frame`, as a client receives them."""
+    return pack_frame(frame(number, source))
 
 
-def frame(number, source=1):
-    """FRAME with a number and a source."""
-    return FRAME[:2] + bytes([source]) + FRAME[3:4] + struct.pack("<I", number) + FRAME[8:]
+def as_text(change):
+    """The fields that are set, as JSON."""
+    values = {key: value for key, value in asdict(change).items() if value}
+    return json.dumps(values, default=lambda one: one.model_dump(exclude_defaults=True, exclude={"request"}))
 
 
-def job(order, state, text=""):
-    say("job", job=order["job"], kind=order["kind"], state=state, text=text)
+class Worker:
+    """The worker of a channel."""
 
+    def __init__(self, channel):
+        self._channel = channel
+        self._orders, self._changes = SimpleQueue(), SimpleQueue()
+        self.listener = Thread(target=self._listen, daemon=True)
+        self.listener.start()
 
-def insertion(order, of, state, summary="", pace=0.0, periods=0, row=None):
-    say(
-        "insertion",
-        of=of,
-        name=order.get("name", ""),
-        state=state,
-        summary=summary,
-        controller=order.get("controller", ""),
-        seed=order.get("seed", 0),
-        target=[40.0, 0.0, 0.0],
-        periods=periods,
-        pace=pace,
-        rig=order.get("rig", ""),
-        row=row,
-        folder="recorded" if order.get("rig") else "",
-    )
+    def _listen(self):
+        while not self._channel.ended:
+            for one in self._channel.receive(None):
+                (self._changes if isinstance(one, JobChange) else self._orders).put(one)
+        self._changes.put(None)
+        self._orders.put(None)
 
+    def report(self, message):
+        self._channel.send(message)
+        self._channel.flush(10.0)
 
-def rows(of, first, count):
-    say("rows", of=of, first=first, rows=[{"index": index} for index in range(first, first + count)])
+    def run(self):
+        self.report(WorkerReady())
+        while True:
+            order = self._get(self._orders)
+            self.job(order, "running")
+            self.job(order, self.do(order))
 
-
-class Signals:
-    """The signals of one job."""
-
-    def __init__(self, signals, number):
-        self._signals, self._number = signals, number
-
-    def get(self):
-        while (signal := self._signals.get())["job"] != self._number:
+    def change(self, order):
+        """The next change of a job."""
+        while (change := self._get(self._changes)).job != order.job:
             pass
-        return signal
+        return change
+
+    def _get(self, queue):
+        if (one := queue.get()) is None:
+            raise SystemExit(0)
+        return one
+
+    def job(self, order, state):
+        self.report(JobMessage(job=order.job, kind=order.kind, state=state))
+
+    def insertion(self, order, state, summary="", of="live", pace=0.0, periods=0, row=None):
+        self.report(
+            InsertionMessage(
+                of=of,
+                name=order.name,
+                state=state,
+                summary=summary,
+                controller=order.controller,
+                seed=order.seed,
+                target=(40.0, 0.0, 0.0),
+                periods=periods,
+                pace=pace,
+                rig=order.rig,
+                row=row,
+                folder="recorded" if order.rig else "",
+            )
+        )
+
+    def rows(self, of, first, count):
+        rows = [PeriodRow.model_construct(index=index) for index in range(first, first + count)]
+        self.report(RowsMessage.model_construct(of=of, first=first, rows=rows))
+
+    def rig(self, state, why="", waits=0):
+        self.report(RigReport(state, why, waits, (f"wait {waits}",) if waits else ()))
+
+    def do(self, order):
+        """Carry out an order; return the last state of its job."""
+        return getattr(self, order.action)(order) or "done"
+
+    def needle(self, _order):
+        self.report(frame(0))
+
+    def estimate(self, order):
+        self.report(EstimateMessage(revision=order.revision, error_mm=0.0, reached=True, roll_deg=0.0))
+
+    def plan(self, order):
+        if order.seed == CRASHES:
+            raise SystemExit(3)
+        while order.seed == HANGS:
+            self.change(order)
+        if order.seed == WORKS_ON:
+            return "cancelled" if self.change(order).cancel else "failed"
+        made = {"revision": order.revision, "strategy": order.strategy}
+        self.report(IterationMessage.model_construct(**made, iteration=1))
+        self.report(PlanMessage.model_construct(**made, cost=order.seed))
+        return "done"
+
+    def reach(self, order):
+        return "cancelled" if self.change(order).cancel else "failed"
+
+    def insert(self, order):
+        """Rows and frames at once unless it is paused, then one for each advance, until it is stopped."""
+        if order.rig:
+            return self.insert_on_rig(order)
+        count = 0
+        self.insertion(order, "paused" if order.paused else "running", as_text(order), pace=1.0)
+        if not order.paused:
+            for count in range(ROWS):
+                self.rows("live", count, 1)
+                self.report(frame(count))
+            count = ROWS
+        while True:
+            change = self.change(order)
+            if change.advance or change.cancel:
+                self.rows("live", count, 1)
+                count += 1
+            if change.cancel:
+                self.report(frame(count - 1))
+            ends = order.seed != HANGS and (change.stop or change.cancel)
+            self.insertion(order, "interrupted" if ends else "running", as_text(change))
+            if ends:
+                return "done" if change.stop else "cancelled"
+
+    def insert_on_rig(self, order):
+        """It waits, goes, holds and stops as the server asks; its number of periods is the number of beats."""
+        beats, waits = 0, 1
+        self.insertion(order, "ready", text := as_text(order))
+        self.rig("idle", waits=waits)
+        while True:
+            change = self.change(order)
+            beat = change == JobChange(order.job)
+            beats += beat
+            if beat:
+                self.insertion(order, "running" if waits == 0 else "ready", text, periods=beats)
+            elif change.go and order.seed == FAULTY:
+                self.rig("fault", "insertion: the motor is off")
+                self.insertion(order, "failed", "the motor is off")
+                return "done"
+            elif change.go:
+                waits = 0
+                self.rig("armed")
+                self.rig("inserting")
+                self.insertion(order, "running", as_text(change))
+            elif change.hold:
+                waits = 2
+                self.rig("holding", change.hold, waits)
+                self.insertion(order, "holding", as_text(change))
+            elif change.stop and order.seed != UNSTOPPABLE:
+                self.rig("stopped", change.stop)
+                for _ in range(3 if order.seed == RECORDS else 0):
+                    while self.change(order) != JobChange(order.job):
+                        pass
+                self.insertion(order, "interrupted", as_text(change))
+                return "done"
+
+    def read(self, order):
+        if Path(order.folder).name == SLOW:
+            self.change(order)
+        self.insertion(order, "done", order.folder, order.of)
+        self.rows(order.of, 0, ROWS)
+        self.report(frame(0, FrameSource.SECOND if order.of == "second" else FrameSource.FIRST))
+
+    def study(self, order):
+        more = {"insertions": 3, "finished": 0, "index": order.row, "rows": []}
+        self.report(StudyRowsMessage(name=order.name, title=order.folder, **more))
+
+    def row(self, order):
+        if order.row == WORKS_ON:
+            return self.reach(order)
+        self.insertion(order, "done", json.dumps([order.folder, order.row]), order.of, row=order.row)
+        return "done"
+
+    def check(self, order):
+        findings = [{"part": "driver", "item": "connection", "found": order.rig, "problem": ""}]
+        self.report(RigCheckMessage(revision=order.revision, findings=findings))
+
+    def save(self, order):
+        if (gate := Path(order.folder).parent / GATE).exists():
+            gate.read_bytes()  # of a pipe: until somebody has written to it
+        Path(order.folder).mkdir()
+        (Path(order.folder) / "run.json").write_text(as_text(order))
+
+    save_row = save
 
 
-def plan(order, signals):
-    if order["seed"] == CRASHES:
-        os._exit(3)
-    while order["seed"] == HANGS:
-        signals.get()
-    if order["seed"] == WORKS_ON:
-        return "cancelled" if signals.get().get("cancel") else "failed"
-    say("iteration", revision=order["revision"], strategy=order["strategy"], iteration=1)
-    say("plan", revision=order["revision"], strategy=order["strategy"], seed=order["seed"])
-    return "done"
+class WorkerThread:
+    """The worker in place of a `ChildProcess`."""
 
+    pid = -1
 
-def insert(order, signals):
-    """Rows and frames at once where it is not paused, then one for each advance, until it is stopped."""
-    if order.get("rig"):
-        return insert_on_rig(order, signals)
-    count = 0
-    insertion(order, "live", "paused" if order.get("paused") else "running", json.dumps(order), pace=1.0)
-    if not order.get("paused"):
-        for _ in range(ROWS):
-            rows("live", count, 1)
-            write(frame(count))
-            count += 1
-    while True:
-        signal = signals.get()
-        if signal.get("advance"):
-            rows("live", count, 1)
-            count += 1
-        ends = order["seed"] != HANGS and (signal.get("stop") or signal.get("cancel"))
-        if signal.get("cancel"):
-            rows("live", count, 1)
-            write(frame(count))
-        insertion(order, "live", "interrupted" if ends else "running", json.dumps(signal))
-        if ends:
-            return "done" if signal.get("stop") else "cancelled"
+    def __init__(self):
+        ours, theirs = socket.socketpair()
+        self.channel, self._theirs = MessageChannel(ours), MessageChannel(theirs, most_waiting=1_000_000)
+        self._code, self._killed = 0, False
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
 
+    def _run(self):
+        worker = Worker(self._theirs)
+        try:
+            worker.run()
+        except SystemExit as end:
+            self._code = end.code
+        finally:
+            self._theirs.end_sending()
+            worker.listener.join()
+            self._theirs.close()
 
-def rig_is(state, why="", waits=0):
-    say("rig_report", state=state, why=why, waits=waits, moves=[f"wait {waits}"] if waits else [])
+    def end(self, seconds):
+        self._killed |= seconds == 0.0
+        self.channel.end_sending()
+        self._thread.join(20.0)
+        assert not self._thread.is_alive()
+        return -9 if self._killed else self._code
 
-
-def insert_on_rig(order, signals):
-    """It waits, goes, holds and stops as it is signalled; its number of periods is that of the server's beats."""
-    beats, waits = 0, 1
-    insertion(order, "live", "ready", text := json.dumps(order))
-    rig_is("idle", waits=waits)
-    while True:
-        signal = signals.get()
-        beats += "alive" in signal
-        if "alive" in signal:
-            insertion(order, "live", "running" if waits == 0 else "ready", text, periods=beats)
-        elif signal.get("go") and order["seed"] == FAULTY:
-            rig_is("fault", "insertion: the motor is off")
-            insertion(order, "live", "failed", "the motor is off")
-            return "done"
-        elif signal.get("go"):
-            waits = 0
-            rig_is("armed")
-            rig_is("inserting")
-            insertion(order, "live", "running", json.dumps(signal))
-        elif "hold" in signal:
-            waits = 2
-            rig_is("holding", signal["hold"], waits)
-            insertion(order, "live", "holding", json.dumps(signal))
-        elif "stop" in signal and order["seed"] != UNSTOPPABLE:
-            rig_is("stopped", signal["stop"])
-            for _ in range(3 if order["seed"] == RECORDS else 0):
-                while "alive" not in signals.get():
-                    pass
-            insertion(order, "live", "interrupted", json.dumps(signal))
-            return "done"
-
-
-def do(order, signals):
-    match order["do"]:
-        case "needle":
-            write(frame(0, source=1))
-        case "estimate":
-            say("estimate", revision=order["revision"])
-        case "plan":
-            return plan(order, signals)
-        case "reach":
-            return "cancelled" if signals.get().get("cancel") else "failed"
-        case "insert":
-            return insert(order, signals)
-        case "read":
-            of = order.get("of", "first")
-            if Path(order["folder"]).name == SLOW:
-                signals.get()
-            insertion(order, of, "done", order["folder"])
-            rows(of, 0, ROWS)
-            write(frame(0, source=3 if of == "second" else 2))
-        case "study":
-            more = {"insertions": 3, "finished": 0, "index": order.get("row"), "rows": []}
-            say("study", name=order["name"], title=order["folder"], **more)
-        case "row":
-            if order["row"] == WORKS_ON:
-                return "cancelled" if signals.get().get("cancel") else "failed"
-            shown = json.dumps([order["folder"], order["row"]])
-            insertion(order, order.get("of", "first"), "done", shown, row=order["row"])
-        case "check":
-            findings = [{"part": "driver", "item": "connection", "found": order["rig"], "problem": ""}]
-            say("check", revision=order["revision"], findings=findings)
-        case "save" | "save_row":
-            if (gate := Path(order["folder"]).parent / GATE).exists():
-                gate.read_bytes()  # of a pipe: until somebody has written to it
-            Path(order["folder"]).mkdir()
-            (Path(order["folder"]) / "run.json").write_text(json.dumps(order))
-    return "done"
-
-
-def main():
-    from threading import Thread
-
-    works, signals = SimpleQueue(), SimpleQueue()
-
-    def listen():
-        while (message := read(sys.stdin.buffer)) is not None:
-            order = json.loads(message)
-            (works if "do" in order else signals).put(order)
-        os._exit(0)
-
-    Thread(target=listen, daemon=True).start()
-    say("ready")
-    while True:
-        order = {"seed": 0, "revision": 0, "strategy": "manipulation"} | works.get()
-        job(order, "running")
-        job(order, do(order, Signals(signals, order["job"])))
-
-
-if __name__ == "__main__":
-    main()
+    def close(self):
+        self.channel.close()

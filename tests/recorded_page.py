@@ -5,30 +5,30 @@ The needle begins at x = -90 mm, its guide is at -41 mm, its tip at the start at
 
 import numpy as np
 
-from flexneedle.lab.page.frames import Kind, Source, frame_of, packed
-from flexneedle.lab.page.messages import (
-    Disturbances,
-    Estimate,
-    Insertion,
-    Iteration,
-    Job,
-    People,
-    Plan,
-    Reach,
-    Row,
-    Rows,
-    Runs,
-    Scene,
-    Session,
-    Welcome,
+from flexneedle.lab.page.protocol import (
+    ClientsMessage,
+    DisturbancesMessage,
+    EstimateMessage,
+    InsertionMessage,
+    IterationMessage,
+    JobMessage,
+    PeriodRow,
+    PlanMessage,
+    ReachMessage,
+    RowsMessage,
+    RunsMessage,
+    SceneMessage,
+    SessionMessage,
+    WelcomeMessage,
 )
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
 
 TARGET = (40.0, 5.0, 3.0)
 PERIODS = 70
 ITERATIONS = 8
 START, LENGTH, NODES = -28.5, 90.0, 46
 
-WELCOME = Welcome(
+WELCOME = WelcomeMessage(
     client=1,
     presets=["phantom", "phantom3d"],
     controllers=[
@@ -40,7 +40,7 @@ WELCOME = Welcome(
 
 
 def people(clients=1, steering=None):
-    return People(clients=clients, steering=steering)
+    return ClientsMessage(clients=clients, steering=steering)
 
 
 def session(revision=1, target=TARGET, reach_since=None, **changes):
@@ -63,11 +63,11 @@ def session(revision=1, target=TARGET, reach_since=None, **changes):
         **changes,
     }
     since = revision if reach_since is None else reach_since
-    return Session(revision=revision, reach_since=since, values=values, changed=[], doubts=[], **given)
+    return SessionMessage(revision=revision, reach_since=since, values=values, changed=[], doubts=[], **given)
 
 
 def scene(revision=1, target=TARGET, axes=2, point=(0.0, 0.0)):
-    return Scene(
+    return SceneMessage(
         revision=revision,
         axes=axes,
         layers=[
@@ -88,7 +88,7 @@ def _reach():
     y, z = np.array(TARGET[1:]) / np.hypot(*TARGET[1:])
     ends = {"low": ((5.0, -1.0), (45.0, -12.0)), "high": ((5.0, 1.0), (44.0, 12.0))}
     edges = {edge: [(x, u * y, u * z) for x, u in points] for edge, points in ends.items()}
-    return Reach(revision=1, angle_deg=np.degrees(np.arctan2(z, y)), **edges)
+    return ReachMessage(revision=1, angle_deg=np.degrees(np.arctan2(z, y)), **edges)
 
 
 REACH = _reach()
@@ -111,22 +111,22 @@ def _tip_x(period):
 
 
 def shape(kind, source, number, *paths):
-    return packed(frame_of(kind, source, number, *paths))
+    return pack_frame(make_frame(kind, source, number, *paths))
 
 
 def scene_frames(target=TARGET):
-    return [shape(Kind.NEEDLE, Source.SCENE, 0, needle(START, target))]
+    return [shape(FrameKind.NEEDLE, FrameSource.SCENE, 0, needle(START, target))]
 
 
-def plan_frames(source=Source.MANIPULATION, sway=0.4):
+def plan_frames(source=FrameSource.MANIPULATION, sway=0.4):
     tips = curve(np.linspace(START, TARGET[0], PERIODS), sway=sway)
     sweep = [needle(x, sway=sway) for x in np.linspace(START, TARGET[0], 12)]
-    return [shape(Kind.PATH, source, 0, tips), shape(Kind.SWEEP, source, 0, *sweep)]
+    return [shape(FrameKind.PATH, source, 0, tips), shape(FrameKind.SWEEP, source, 0, *sweep)]
 
 
 def iteration(number, strategy="manipulation"):
     best = [2.0 / (1 + k) ** 2 for k in range(number + 1)]
-    return Iteration(
+    return IterationMessage(
         revision=1,
         strategy=strategy,
         iteration=number,
@@ -137,7 +137,7 @@ def iteration(number, strategy="manipulation"):
     )
 
 
-def samples(number, count=32, source=Source.MANIPULATION, x=(START, TARGET[0])):
+def samples(number, count=32, source=FrameSource.MANIPULATION, x=(START, TARGET[0])):
     """Frame of sampled paths, narrower with each iteration."""
     spread = 6.0 / (1 + number)
     ends = [
@@ -152,7 +152,7 @@ def samples(number, count=32, source=Source.MANIPULATION, x=(START, TARGET[0])):
         np.column_stack([curve(np.linspace(*x, 24), end), np.full(24, k / count)])
         for k, end in enumerate(ends)
     ]
-    return shape(Kind.SAMPLES, source, number, *paths)
+    return shape(FrameKind.SAMPLES, source, number, *paths)
 
 
 def reach_frame():
@@ -161,7 +161,7 @@ def reach_frame():
         np.column_stack([np.full(49, x), 0.3 * x * np.cos(angle), 0.25 * x * np.sin(angle)])
         for x in (15.0, 25.0, 35.0, 45.0)
     ]
-    return shape(Kind.REACH, Source.SCENE, 0, *outlines)
+    return shape(FrameKind.REACH, FrameSource.SCENE, 0, *outlines)
 
 
 def plan(strategy="manipulation", **changes):
@@ -171,17 +171,17 @@ def plan(strategy="manipulation", **changes):
         "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
         "seconds": 0.3, **changes,
     }  # fmt: skip
-    return Plan(strategy=strategy, **given)
+    return PlanMessage(strategy=strategy, **given)
 
 
 def estimate(revision=1, roll_deg=0.0):
-    return Estimate(revision=revision, error_mm=0.31, reached=True, roll_deg=roll_deg)
+    return EstimateMessage(revision=revision, error_mm=0.31, reached=True, roll_deg=roll_deg)
 
 
 def row(index):
     x, y, z = needle(_tip_x(index), sway=0.3)[-1]
     true = needle(_tip_x(index), sway=0.6)[-1]
-    return Row(
+    return PeriodRow(
         index=index, time=0.2 * index, action="advance", decision="advance as planned", verdict="ok",
         measured=(x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
         estimate=(x, y, z), true=tuple(true), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
@@ -193,7 +193,7 @@ def row(index):
 
 
 def rows(first=0, count=PERIODS, of="live"):
-    return Rows(of=of, first=first, rows=[row(k) for k in range(first, first + count)])
+    return RowsMessage(of=of, first=first, rows=[row(k) for k in range(first, first + count)])
 
 
 def insertion(state="running", of="live", periods=PERIODS, **changes):
@@ -201,10 +201,10 @@ def insertion(state="running", of="live", periods=PERIODS, **changes):
         "name": "phantom3d", "summary": "", "controller": "adaptive-mpc", "seed": 0, "target": TARGET, "pace": 1.0,
         "error_mm": None, "scene": scene(), **changes,
     }  # fmt: skip
-    return Insertion(of=of, state=state, periods=periods, **given)
+    return InsertionMessage(of=of, state=state, periods=periods, **given)
 
 
-def period_frames(period, source=Source.LIVE):
+def period_frames(period, source=FrameSource.LIVE):
     """Shapes at a control period."""
     tip = _tip_x(period)
     estimate, true = needle(tip, sway=0.3), needle(tip, sway=0.6)
@@ -213,12 +213,14 @@ def period_frames(period, source=Source.LIVE):
     cut = np.linspace(0.0, max(tip, 0.1), 24)
     stretch = 1.0 + 0.35 * np.sin(np.pi * cut / (TARGET[0] + 5.0))
     frames = [
-        shape(Kind.NEEDLE, source, period, estimate),
-        shape(Kind.TRUE, source, period, true),
-        shape(Kind.PREDICTED, source, period, predicted),
+        shape(FrameKind.NEEDLE, source, period, estimate),
+        shape(FrameKind.TRUE, source, period, true),
+        shape(FrameKind.PREDICTED, source, period, predicted),
     ]
     if tip > 0.0:
-        frames.append(shape(Kind.CHANNEL, source, period, np.column_stack([curve(cut, sway=0.3), stretch])))
+        frames.append(
+            shape(FrameKind.CHANNEL, source, period, np.column_stack([curve(cut, sway=0.3), stretch]))
+        )
     return frames
 
 
@@ -230,8 +232,8 @@ def opening(**changes):
         session(**changes),
         scene(),
         *scene_frames(),
-        Disturbances(active=[]),
-        Runs(runs=[{"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}]),
+        DisturbancesMessage(active=[]),
+        RunsMessage(runs=[{"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}]),
     ]
 
 
@@ -246,7 +248,7 @@ def planned():
         plan(
             "steering", reached=False, error_mm=2.1, cost=4.2, flips=2, terms={"accuracy": 4.0, "flips": 0.2}
         ),
-        *plan_frames(Source.STEERING, sway=-1.5),
+        *plan_frames(FrameSource.STEERING, sway=-1.5),
         reach_frame(),
     ]
 
@@ -258,8 +260,8 @@ def inserting(period=50):
         insertion(periods=period + 1),
         rows(0, period + 1),
         *(frame for each in range(period + 1) for frame in period_frames(each)),
-        samples(3, source=Source.LIVE, x=(_tip_x(period), TARGET[0])),
-        Job(
+        samples(3, source=FrameSource.LIVE, x=(_tip_x(period), TARGET[0])),
+        JobMessage(
             job=3,
             kind="insertion",
             state="running",

@@ -5,7 +5,7 @@ from base64 import b64decode
 from dataclasses import dataclass, field, replace
 from html.parser import HTMLParser
 
-from flexneedle.lab.page.worker.recording import recorded
+from flexneedle.lab.page.worker.recordings import describe_recording
 from flexneedle.scenario.files import load_scenario
 from synthetic import make_insertion, make_plan
 
@@ -18,7 +18,7 @@ def insertion(seed=0, **options):
 
 def record(made=None, name="mine", of="first", lacking=""):
     """What a worker reports of an insertion."""
-    return list(recorded(made or insertion(), name, of, lacking))
+    return list(describe_recording(made or insertion(), name, of, lacking))
 
 
 @dataclass

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexneedle.arguments import refusal, whole
-from flexneedle.control.controllers import DEFAULT, find_controller
+from flexneedle.control.controllers import DEFAULT
 from flexneedle.control.interface import Controller
+from flexneedle.loop.parts import controller_of
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.virtual import VirtualRig
 
@@ -14,7 +15,7 @@ _PARTS_OF_SOURCE = ("names", "moves", "check", "open", "results")
 
 @dataclass(frozen=True, eq=False)
 class Choices:
-    """Seed, controller with its name in the record, rig, and options of an insertion."""
+    """Seed, controller with its name in the record, rig, and the options of `insert`."""
 
     seed: int
     name: str
@@ -34,7 +35,7 @@ class Choices:
         threads: int | None = None,
     ) -> "Choices":
         """Return the resolved choices. Raises InputError for an unknown controller, and for anything but a rig."""
-        name, resolved = find_controller(controller)
+        name, resolved = controller_of(controller)
         source = VirtualRig() if rig is None else rig
         if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
             wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"
@@ -43,5 +44,5 @@ class Choices:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Fields of `Insertion` that name controller, phantom, tracker and rig."""
+        """Fields of `Insertion` that name what the insertion is made with."""
         return {"controller": self.name, **self.rig.names}

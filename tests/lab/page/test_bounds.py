@@ -11,9 +11,9 @@ import string
 import pytest
 from pydantic import ValidationError
 
-from flexneedle.lab.page.messages import REQUESTS, Request
+from flexneedle.lab.page.requests import REQUESTS, ClientRequest
 
-SCHEMAS = {model.__name__: model.model_json_schema() for model in Request.__subclasses__()}
+SCHEMAS = {model.__name__: model.model_json_schema() for model in ClientRequest.__subclasses__()}
 WORDS = {"title", "description", "default", "type"}
 """Of a schema that bound nothing; a type is tested by other types."""
 NUMBERS = {"minimum", "maximum", "exclusiveMaximum"}

@@ -7,16 +7,15 @@ import math
 import pytest
 
 from flexneedle.errors import RunError
-from flexneedle.lab.page import messages
-from flexneedle.lab.page.frames import Kind, Source, frame_of, packed, unpacked
-from flexneedle.lab.page.messages import Job, People, Refused
-from flexneedle.lab.page.server.hub import Hub, key_of
+from flexneedle.lab.page.protocol import ClientsMessage, JobMessage, PeriodRow, RefusedMessage, ServerMessage
+from flexneedle.lab.page.server.hub import Hub
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
 
 
 def joined(hub):
     """A client that has got its first message."""
-    outbox = hub.join(People(clients=0, steering=None))
-    assert '"people"' in outbox._taken()
+    outbox = hub.join(ClientsMessage(clients=0, steering=None))
+    assert '"people"' in outbox._take()
     return outbox
 
 
@@ -25,19 +24,24 @@ def drained(outbox):
 
     async def drain():
         found = []
-        while (message := outbox._taken()) is not None:
+        while (message := outbox._take()) is not None:
             found.append(message if isinstance(message, bytes) else json.loads(message))
         return found
 
     return asyncio.run(drain())
 
 
-def worker_says(hub, **values):
-    hub.hand_on(json.dumps(values), values)
+TYPES = {each.model_fields["type"].default: each for each in ServerMessage.__subclasses__()}
+
+
+def report(hub, type_, **values):
+    """Publish an unchecked message of a type."""
+    hub.publish(TYPES[type_].model_construct(**values))
 
 
 def rows(hub, first, count, of="live"):
-    worker_says(hub, type="rows", of=of, first=first, rows=[{"index": first + i} for i in range(count)])
+    made = [PeriodRow.model_construct(index=first + i) for i in range(count)]
+    report(hub, "rows", of=of, first=first, rows=made)
 
 
 def indices(found):
@@ -48,8 +52,8 @@ def test_a_client_gets_the_newest_of_each_key():
     hub = Hub()
     outbox = joined(hub)
     for clients in range(1000):
-        hub.publish(People(clients=clients, steering=None))
-        hub.publish(Job(job=clients, kind="plan", state="running"))
+        hub.publish(ClientsMessage(clients=clients, steering=None))
+        hub.publish(JobMessage(job=clients, kind="plan", state="running"))
     found = drained(outbox)
     assert [message["type"] for message in found] == ["people", "job"]
     assert found[0]["clients"] == found[1]["job"] == 999
@@ -57,9 +61,9 @@ def test_a_client_gets_the_newest_of_each_key():
 
 def test_a_new_client_gets_all_keys_once():
     hub = Hub()
-    worker_says(hub, type="plan", strategy="steering")
-    worker_says(hub, type="plan", strategy="manipulation")
-    worker_says(hub, type="plan", strategy="steering", cost=2)
+    report(hub, "plan", strategy="steering")
+    report(hub, "plan", strategy="manipulation")
+    report(hub, "plan", strategy="steering", cost=2)
     rows(hub, 0, 3)
     found = drained(joined(hub))
     assert [message.get("strategy") for message in found] == ["steering", "manipulation", None]
@@ -70,29 +74,29 @@ def test_frames_are_kept_by_source_and_kind():
     hub, outbox = Hub(), None
     outbox = joined(hub)
     frames = [
-        packed(frame_of(kind, source, number, [[1.0, 2.0, 3.0]]))
+        make_frame(kind, source, number, [[1.0, 2.0, 3.0]])
         for number in range(3)
-        for kind in (Kind.SAMPLES, Kind.CHANNEL)
-        for source in (Source.LIVE, Source.FIRST)
+        for kind in (FrameKind.SAMPLES, FrameKind.CHANNEL)
+        for source in (FrameSource.LIVE, FrameSource.FIRST)
     ]
     for frame in frames:
-        hub.hand_on(frame, None)
-    assert drained(outbox) == frames[-4:]
-    hub.forget_frames(Source.LIVE)
-    assert drained(joined(hub)) == [frames[-3], frames[-1]]
+        hub.publish(frame)
+    assert drained(outbox) == [pack_frame(frame) for frame in frames[-4:]]
+    hub.forget_frames(FrameSource.LIVE)
+    assert drained(joined(hub)) == [pack_frame(frames[-3]), pack_frame(frames[-1])]
 
 
-def needle(hub, first, count, points=1, source=Source.LIVE):
+def needle(hub, first, count, points=1, source=FrameSource.LIVE):
     """A worker shows needles of periods, at whose points x is the period."""
     paths = [[[number, 0.0, 0.0]] * points for number in range(first, first + count)]
-    hub.hand_on(packed(frame_of(Kind.NEEDLE, source, first, *paths)), None)
+    hub.publish(make_frame(FrameKind.NEEDLE, source, first, *paths))
 
 
 def periods(found):
     """x of the paths of frames, by the number of their period."""
     return {
         frame.number + at: float(path[0, 0])
-        for frame in map(unpacked, found)
+        for frame in map(unpack_frame, found)
         for at, path in enumerate(frame.values)
     }
 
@@ -136,9 +140,9 @@ def test_shapes_that_are_forgotten_are_not_sent():
     hub = Hub()
     outbox = joined(hub)
     needle(hub, 0, 3)
-    needle(hub, 0, 2, source=Source.FIRST)
+    needle(hub, 0, 2, source=FrameSource.FIRST)
     drained(outbox)
-    hub.forget_frames(Source.LIVE)
+    hub.forget_frames(FrameSource.LIVE)
     assert [*periods(drained(joined(hub)))] == [0, 1]
     needle(hub, 3, 1)
     for each in (outbox, joined(hub)):
@@ -151,12 +155,11 @@ def test_many_shapes_are_sent_in_parts():
     for first in (0, 2, 5, 9):
         needle(hub, first, 2, points=70_000)
     parts = drained(joined(hub))
-    assert [(unpacked(part).number, unpacked(part).end) for part in parts] == [(0, 4), (5, 7), (9, 11)]
-
-
-def test_bytes_that_are_no_frame_are_an_error_of_the_worker():
-    with pytest.raises(RunError, match="a frame of 3 bytes"):
-        Hub().hand_on(b"abc", None)
+    assert [(unpack_frame(part).number, unpack_frame(part).end) for part in parts] == [
+        (0, 4),
+        (5, 7),
+        (9, 11),
+    ]
 
 
 def test_rows_are_sent_once_and_in_order():
@@ -173,7 +176,7 @@ def test_rows_are_sent_once_and_in_order():
 def test_many_rows_leave_others_their_turn():
     hub = Hub()
     rows(hub, 0, 1000)
-    hub.publish(People(clients=1, steering=None))
+    hub.publish(ClientsMessage(clients=1, steering=None))
     outbox = joined(hub)
     types = [message["type"] for message in drained(outbox)]
     assert types.index("people") < len(types) - 1 - types[::-1].index("rows")
@@ -184,9 +187,9 @@ def test_rows_that_were_missed_are_sent_again():
     outbox = joined(hub)
     rows(hub, 0, 10)
     drained(outbox)
-    outbox.rows_from("rows live", 7)
+    outbox.resend_rows("rows live", 7)
     assert indices(drained(outbox)) == [7, 8, 9]
-    outbox.rows_from("rows live", 99)
+    outbox.resend_rows("rows live", 99)
     assert drained(outbox) == []
 
 
@@ -211,7 +214,7 @@ def test_rows_with_a_gap_are_an_error_of_the_worker():
 def test_what_is_forgotten_is_not_sent():
     hub = Hub()
     rows(hub, 0, 2, of="first")
-    worker_says(hub, type="insertion", of="first")
+    report(hub, "insertion", of="first")
     hub.forget(["rows first", "insertion first"])
     assert drained(joined(hub)) == []
 
@@ -219,9 +222,9 @@ def test_what_is_forgotten_is_not_sent():
 def test_the_end_of_a_job_comes_after_its_results():
     hub = Hub()
     outbox = joined(hub)
-    hub.publish(Job(job=1, kind="plan", state="waiting"))
-    worker_says(hub, type="plan", strategy="steering")
-    hub.publish(Job(job=1, kind="plan", state="done"))
+    hub.publish(JobMessage(job=1, kind="plan", state="waiting"))
+    report(hub, "plan", strategy="steering")
+    hub.publish(JobMessage(job=1, kind="plan", state="done"))
     for each in (outbox, joined(hub)):
         assert [message["type"] for message in drained(each)] == ["plan", "job"]
 
@@ -229,11 +232,11 @@ def test_the_end_of_a_job_comes_after_its_results():
 def test_what_is_forgotten_and_comes_again_comes_later():
     hub = Hub()
     outbox = joined(hub)
-    worker_says(hub, type="reach", revision=1)
+    report(hub, "reach", revision=1)
     rows(hub, 0, 5)
     hub.forget(["rows live", "reach"])
-    worker_says(hub, type="insertion", of="live")
-    worker_says(hub, type="reach", revision=2)
+    report(hub, "insertion", of="live")
+    report(hub, "reach", revision=2)
     rows(hub, 0, 2)
     found = drained(outbox)
     assert [message["type"] for message in found] == ["insertion", "reach", "rows"]
@@ -243,17 +246,17 @@ def test_what_is_forgotten_and_comes_again_comes_later():
 def test_an_answer_comes_after_the_news():
     hub = Hub()
     outbox = joined(hub)
-    worker_says(hub, type="session", revision=2)
-    outbox.answer(Refused(request=1, what="edit", reason="no"))
-    worker_says(hub, type="session", revision=3)
-    worker_says(hub, type="scene", revision=3)
+    report(hub, "session", revision=2)
+    outbox.answer(RefusedMessage(request=1, what="edit", reason="no"))
+    report(hub, "session", revision=3)
+    report(hub, "scene", revision=3)
     assert [message["type"] for message in drained(outbox)] == ["session", "refused", "scene"]
 
 
 def test_answers_are_not_replaced():
     outbox = joined(Hub())
     for number in range(3):
-        outbox.answer(Refused(request=number, what="edit", reason="no"))
+        outbox.answer(RefusedMessage(request=number, what="edit", reason="no"))
     assert [message["request"] for message in drained(outbox)] == [0, 1, 2]
 
 
@@ -264,19 +267,7 @@ def test_next_waits_for_news():
         waiting = asyncio.create_task(outbox.next())
         await asyncio.sleep(0)
         assert not waiting.done()
-        hub.publish(People(clients=1, steering=None))
+        hub.publish(ClientsMessage(clients=1, steering=None))
         return json.loads(await waiting)
 
     assert asyncio.run(wait())["clients"] == 1
-
-
-def example_of(news):
-    """An unchecked message with the parts that its key may have."""
-    return news.model_construct(of="first", kind="plan", strategy="steering")
-
-
-@pytest.mark.parametrize("news", [n for n in messages.News.__subclasses__() if n is not messages.Closed])
-def test_the_keys_of_workers_messages_are_those_of_the_classes(news):
-    message = example_of(news)
-    values = {"type": message.type, "of": "first", "kind": "plan", "strategy": "steering"}
-    assert key_of(values) == message.key

@@ -1,7 +1,6 @@
 """Jobs over a real worker's process: what replaces what, and what happens when the worker does not do as it should."""
 
 import json
-import sys
 from dataclasses import replace
 from threading import Event
 from time import monotonic
@@ -100,7 +99,7 @@ def test_an_insertion_whose_worker_ends_has_failed(tmp_path):
     with served(tmp_path) as server, Client(server) as client:
         client.steer().do("insert", paused=True)
         client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "paused")
-        server.desk._insertions.worker.kill()
+        server.handler._insertions.worker.kill()
         client.wait(lambda: client.newest["insertion live"]["state"] == "failed")
         assert "has ended" in client.newest["insertion live"]["summary"]
         client.job("insertion", "failed")
@@ -110,12 +109,15 @@ def test_an_insertion_whose_worker_ends_has_failed(tmp_path):
 
 
 def broken(script):
-    return (sys.executable, "-c", script)
+    return ("page_script_worker", script)
 
 
 def test_until_the_worker_is_ready_its_first_job_says_so(tmp_path):
     """The others do not repeat it; after an edit the first is the needle again."""
-    with served(tmp_path, workers=(broken("input()"), STUB)) as server, Client(server) as client:
+    with (
+        served(tmp_path, workers=(broken("channel.receive(None)"), STUB)) as server,
+        Client(server) as client,
+    ):
         needle, estimate, plan = (client.job(kind, "waiting") for kind in ("needle", "estimate", "plan"))
         assert "the first time after installation this takes about a minute" in needle["text"]
         assert estimate["text"] == plan["text"] == ""
@@ -125,7 +127,10 @@ def test_until_the_worker_is_ready_its_first_job_says_so(tmp_path):
 
 
 def test_the_scene_is_shown_before_a_worker_is_ready_and_follows_edits(tmp_path):
-    with served(tmp_path, workers=(broken("input()"), STUB)) as server, Client(server) as client:
+    with (
+        served(tmp_path, workers=(broken("channel.receive(None)"), STUB)) as server,
+        Client(server) as client,
+    ):
         depth = client.newest["session"]["values"]["target.depth_mm"]
         assert client.wait(lambda: client.newest.get("scene"))["target"][0] == depth != 31.0
         client.steer().do("edit", values={"target.depth_mm": 31.0})
@@ -143,11 +148,8 @@ def test_what_waits_for_another_job_does_not_say_that_its_worker_starts(planned)
     "script",
     [
         "import sys; sys.exit(7)",
-        "import sys; sys.stdout.buffer.write(b'\\0\\0\\0\\0'); sys.stdout.flush(); input()",
-        "print('this is no message', flush=True); input()",
-        "import sys; sys.stdout.buffer.write(b'\\2\\0\\0\\0{}'); sys.stdout.flush(); input()",
-        "import sys; sys.stdout.buffer.write(b'\\2\\0\\0\\0{x'); sys.stdout.flush(); input()",
-        "import sys; sys.stdout.buffer.write(b'\\1\\0\\0\\0\\1'); sys.stdout.flush(); input()",
+        "channel.send('no message'); channel.receive(None)",
+        "import os; os.write(channel.fileno(), b'\\2\\0\\0\\0no'); channel.receive(None)",
     ],
 )
 def test_a_broken_worker_fails_its_jobs_and_the_server_stays(tmp_path, script):
@@ -193,7 +195,7 @@ def test_a_plan_that_is_missing_is_made_when_somebody_comes_again(server):
 
 def wait_until_idle(server):
     end = monotonic() + PATIENCE_S
-    while not server.desk._idle and monotonic() < end:
+    while not server.handler._idle and monotonic() < end:
         Event().wait(0.01)
 
 
@@ -213,7 +215,7 @@ def test_a_run_that_is_closed_before_it_is_read_is_not_shown(server, client, tmp
 def wait_until_alone(server):
     """Wait for the timer that cancels; the server's thread has no other event to wait for."""
     end = monotonic() + PATIENCE_S
-    while (server.desk._plans.works or server.desk._insertions.works) and monotonic() < end:
+    while (server.handler._plans.orders or server.handler._insertions.orders) and monotonic() < end:
         Event().wait(0.01)
 
 
@@ -252,8 +254,8 @@ def test_a_plan_sets_a_row_back_which_is_then_begun_again(with_study):
 def test_a_row_does_not_set_another_back(server, with_study):
     first = open_row(with_study)
     with_study.do("open", name="many", row=3, second=True)
-    running = server.desk._plans._running
-    assert (running.work.job, running.cancelled) == (first, False)
+    running = server.handler._plans._running
+    assert (running.order.job, running.cancelled) == (first, False)
     with_study.do("cancel", job=first)
     with_study.job("row", "done")
     assert "insertion second" in with_study.newest

@@ -26,7 +26,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 import page_clients
-from flexneedle.lab.page.worker.rows import row_of
+from flexneedle.lab.page.worker.recordings import row_of
 from flexneedle.record.loading import load_insertion
 from page_clients import Client, port_of
 

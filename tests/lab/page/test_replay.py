@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 import flexneedle.lab.page
-from flexneedle.lab.page.frames import Kind, ShapeFrame, Source, packed, unpacked
-from flexneedle.lab.page.replay.bundle import bundled
-from flexneedle.lab.page.replay.document import as_data, document
+from flexneedle.lab.page.replay import bundle_modules, encode_record, make_document
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, pack_frame, unpack_frame
 from replays import File, insertion, record
 from synthetic import blind
 
@@ -25,7 +24,7 @@ HOSTILE = "</script><script>alert(1)</script><!-- <script> \u2028 & \" ' $run \\
 
 @pytest.fixture(scope="module")
 def text():
-    return document("mine", record())
+    return make_document("mine", record())
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +35,8 @@ def file(text):
 def as_sent(record):
     """As the page gets it from its server."""
     return [
-        packed(one) if isinstance(one, ShapeFrame) else json.loads(one.model_dump_json()) for one in record
+        pack_frame(one) if isinstance(one, ShapeFrame) else json.loads(one.model_dump_json())
+        for one in record
     ]
 
 
@@ -49,9 +49,13 @@ def test_the_record_is_what_a_worker_reports(file):
 
 def test_the_shapes_are_those_of_the_insertion(file):
     made = insertion()
-    path, needles, true = (unpacked(each) for each in file.record if isinstance(each, bytes))
-    assert [frame.kind for frame in (path, needles, true)] == [Kind.PATH, Kind.NEEDLE, Kind.TRUE]
-    assert {frame.source for frame in (path, needles, true)} == {Source.FIRST}
+    path, needles, true = (unpack_frame(each) for each in file.record if isinstance(each, bytes))
+    assert [frame.kind for frame in (path, needles, true)] == [
+        FrameKind.PATH,
+        FrameKind.NEEDLE,
+        FrameKind.TRUE,
+    ]
+    assert {frame.source for frame in (path, needles, true)} == {FrameSource.FIRST}
     assert path.values[0] == pytest.approx(made.plan.tips[:, :3], abs=1e-4)
     for at in (0, 68):
         assert needles.values[at] == pytest.approx(made.periods[at].shape[:, :3], abs=1e-4)
@@ -61,26 +65,29 @@ def test_the_shapes_are_those_of_the_insertion(file):
 def test_what_was_not_recorded_is_not_in_it():
     made = insertion()
     made = replace(made, periods=tuple(blind(period) for period in made.periods))
-    *_, rows = File.of(document("mine", record(made))).record
+    *_, rows = File.of(make_document("mine", record(made))).record
     assert {
         (row["measured"], row["true"], row["true_energy_mj"], row["miss_sd_mm"]) for row in rows["rows"]
     } == {(None, None, None, None)}
-    assert [one.kind for one in record(made) if isinstance(one, ShapeFrame)] == [Kind.PATH, Kind.NEEDLE]
+    assert [one.kind for one in record(made) if isinstance(one, ShapeFrame)] == [
+        FrameKind.PATH,
+        FrameKind.NEEDLE,
+    ]
 
 
 def test_a_text_of_the_record_ends_no_element():
     made = insertion(outcome="held", reason=HOSTILE)
-    file = File.of(document(HOSTILE, record(made, name=HOSTILE)))
+    file = File.of(make_document(HOSTILE, record(made, name=HOSTILE)))
     assert [tag for tag, *_ in file.elements].count("script") == 2
     assert file.record[0]["name"] == HOSTILE
     assert HOSTILE in file.record[0]["summary"]
     assert file.all("p", **{"class": "title"})[0].strip() == HOSTILE
-    assert "<" not in as_data(record(made, name=HOSTILE))
+    assert "<" not in encode_record(record(made, name=HOSTILE))
 
 
 def test_the_same_run_is_the_same_file(text):
-    assert document("mine", record()) == text
-    assert document("mine", record(insertion(seed=1))) != text
+    assert make_document("mine", record()) == text
+    assert make_document("mine", record(insertion(seed=1))) != text
 
 
 def test_nothing_is_loaded(file):
@@ -125,21 +132,21 @@ def test_copies_of_vendored_modules_have_their_licence(file):
 
 
 @pytest.mark.parametrize("path", sorted(STATIC.rglob("*.js")), ids=lambda path: path.name)
-def test_the_page_has_no_import_or_export_that_cannot_be_bundled(path):
+def test_all_modules_can_be_bundled(path):
     """main.js alone imports by a name that it computes."""
     name = path.relative_to(STATIC).as_posix()
     if name == "main.js":
         with pytest.raises(ValueError, match=r"main\.js"):
-            bundled(STATIC, name)
+            bundle_modules(STATIC, name)
     else:
-        assert not re.search(r"^(?:import|export)\b", bundled(STATIC, name), re.MULTILINE)
+        assert not re.search(r"^(?:import|export)\b", bundle_modules(STATIC, name), re.MULTILINE)
 
 
 def bundle_of(folder, **modules):
     for name, source in modules.items():
         path = folder / f"{name}.js"
         path.write_text(source)
-    return bundled(folder, "entry.js")
+    return bundle_modules(folder, "entry.js")
 
 
 def test_forms_of_import_and_export(tmp_path):
@@ -178,7 +185,7 @@ UNKNOWN = [
 
 @pytest.mark.parametrize("source", UNKNOWN)
 def test_other_forms_are_refused(tmp_path, source):
-    with pytest.raises(ValueError, match=r"^entry\.js: .* must be a form of import or export"):
+    with pytest.raises(ValueError, match=r"^entry\.js: .* a form of import or export"):
         bundle_of(tmp_path, entry=f"{source}\n", a="export const b = 1;\n")
 
 
@@ -189,12 +196,12 @@ def test_modules_that_import_each_other_are_refused(tmp_path):
 
 @pytest.mark.parametrize("piece", ["</script>", "<SCRIPT>", "<!--", "</style>"])
 def test_a_script_that_would_end_its_element_is_refused(monkeypatch, piece):
-    monkeypatch.setattr("flexneedle.lab.page.replay.document.bundled", lambda *_: f'"{piece}"')
+    monkeypatch.setattr("flexneedle.lab.page.replay.bundle_modules", lambda *_: f'"{piece}"')
     with pytest.raises(ValueError, match="it ends the element"):
-        document("mine", [])
+        make_document("mine", [])
 
 
 def test_it_needs_no_package_of_the_server():
-    script = "import sys, flexneedle.lab.page.replay.document; print(*sys.modules)"
+    script = "import sys, flexneedle.lab.page.replay; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not set(done.stdout.split()) & {"starlette", "uvicorn", "websockets", "anyio"}

@@ -1,13 +1,12 @@
 """Each request over a real socket: what it does, and why it is refused."""
 
 import json
-import sys
 from dataclasses import replace
 
 import pytest
 
-from flexneedle.lab.page import messages as m
-from flexneedle.lab.page.server.rig import ConnectedRig
+from flexneedle.lab.page import requests as r
+from flexneedle.lab.page.server.connected_rig import RigReference
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from page_clients import QUICK, STUB, Client, get, served
 from page_worker import HANGS, ROWS, WORKS_ON
@@ -37,7 +36,7 @@ def test_a_changed_scenario_is_planned_when_it_rests(tmp_path):
         for depth in (35.0, 36.0, 37.0):
             client.do("edit", values={"target.depth_mm": depth})
         client.do("options", seed=3)
-        client.wait(lambda: client.newest.get("plan manipulation", {}).get("seed") == 3)
+        client.wait(lambda: client.newest.get("plan manipulation", {}).get("cost") == 3)
         assert client.newest["plan manipulation"]["revision"] == client.newest["session"]["revision"] == 5
 
 
@@ -126,9 +125,9 @@ def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
 
 
 def test_all_requests_but_four_need_the_steering():
-    free = {request for request in m.Request.__subclasses__() if not request.steering}
-    assert free == {m.Steer, m.Stop, m.Ping, m.RowsFrom}
-    assert len(STEERED) + len(free) == len(m.Request.__subclasses__())
+    free = {request for request in r.ClientRequest.__subclasses__() if not request.needs_control}
+    assert free == {r.SteerRequest, r.StopRequest, r.PingRequest, r.RowsFromRequest}
+    assert len(STEERED) + len(free) == len(r.ClientRequest.__subclasses__())
 
 
 def test_an_edit_is_seen_by_all_and_computed(server, client):
@@ -180,7 +179,7 @@ def test_options_are_kept_and_checked(client):
     client.do("options", seed=3, strategy="steering", controller="ce-mpc")
     client.wait(lambda: client.newest["session"]["controller"] == "ce-mpc")
     client.do("start", work="plan")
-    client.wait(lambda: client.newest.get("plan steering", {}).get("seed") == 3)
+    client.wait(lambda: client.newest.get("plan steering", {}).get("cost") == 3)
     reason = client.refused("options", controller="nonsense")
     assert reason.startswith("controller = nonsense: must be one of adaptive-mpc, ")
 
@@ -210,7 +209,9 @@ def test_an_insertion_gets_the_session(client):
     running(client, paused=True)
     order = summary(client)
     assert order["scenario"]["target"]["depth_mm"] == 35.0
-    assert [order[key] for key in ("do", "seed", "strategy", "controller", "paused", "revision", "name")] == [
+    assert [
+        order[key] for key in ("action", "seed", "strategy", "controller", "paused", "revision", "name")
+    ] == [
         *("insert", 3, "steering", "ce-mpc", True),
         *(3, "phantom"),
     ]
@@ -257,12 +258,12 @@ def test_anybody_may_stop(server, client):
     assert client.refused("stop") == "no insertion runs: start one first"
 
 
-NEVER_READY = (sys.executable, "-c", "input()")
+NEVER_READY = ("page_script_worker", "channel.receive(None)")
 """A worker that imports and compiles for ever."""
 
 
 @pytest.mark.parametrize(
-    ("rig", "request_"), [(None, "insert"), (ConnectedRig("Bench", "b.toml"), "prepare")]
+    ("rig", "request_"), [(None, "insert"), (RigReference("Bench", "b.toml"), "prepare")]
 )
 def test_an_insertion_that_waits_for_its_worker_is_shown_and_stopped_by_anybody(tmp_path, rig, request_):
     with served(tmp_path, workers=(STUB, NEVER_READY), rig=rig) as server, Client(server) as client:
@@ -308,13 +309,13 @@ def test_what_comes_late_of_an_insertion_that_was_replaced_is_not_handed_on(serv
     """The worker sends a row of it after it was cancelled, when its rows are forgotten already."""
     running(client)
     client.wait(lambda: len(client.rows.get("live", ())) == ROWS)
-    worker = server.desk._insertions.worker._process.pid
+    worker = server.handler._insertions.worker._child.pid
     client.do("insert", paused=True)
     client.wait(lambda: client.newest["insertion live"]["state"] == "paused")
     client.do("advance")
     client.wait(lambda: len(client.rows["live"]) == 1)
     assert "frame 1 4" not in joined(server).newest
-    assert server.desk._insertions.worker._process.pid == worker
+    assert server.handler._insertions.worker._child.pid == worker
 
 
 def joined(server):

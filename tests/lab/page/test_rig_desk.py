@@ -1,49 +1,46 @@
-"""The server's part of a rig alone: what it signals to the insertion, by what is asked of it and what is reported."""
+"""The connected rig of the server alone: its changes of the insertion, by requests and reports."""
 
 import asyncio
-import json
 
 import pytest
 
-from flexneedle.lab.page.orders import RigReport, Work
+from flexneedle.lab.page.job_orders import RigReport, WorkOrder
+from flexneedle.lab.page.server.clients import PageLimits, Refusal
+from flexneedle.lab.page.server.connected_rig import ConnectedRig, RigReference
 from flexneedle.lab.page.server.hub import Hub
-from flexneedle.lab.page.server.limits import Limits
-from flexneedle.lab.page.server.refusal import Refusal
-from flexneedle.lab.page.server.rig import ConnectedRig, Rig
 
 JOB = 4
 
 
 class Jobs:
-    """The jobs of a worker that runs each at once; signals but beats, and deadlines of its end."""
+    """The jobs of a worker that runs each at once: its changes without beats, and deadlines of its end."""
 
     def __init__(self):
-        self.signals, self.deadlines = [], []
+        self.changes, self.deadlines = [], []
 
     def add(self, _work):
         return JOB
 
-    def signal(self, number, **change):
+    def change(self, number, **change):
         assert number == JOB
-        if change != {"alive": True}:
-            self.signals.append(change)
+        if change:
+            self.changes.append(change)
         return True
 
     def expect_end(self, seconds):
         self.deadlines.append(seconds)
 
 
-class Bench(Rig):
+class Bench(ConnectedRig):
     """A rig whose insertion is prepared."""
 
     def __init__(self):
         self.jobs, self.hub = Jobs(), Hub()
-        super().__init__(self.hub, lambda: self.jobs, Limits(), ConnectedRig("Bench", "rig.toml"))
-        self.prepare(Work(job=0, do="insert", kind="insertion", rig="rig.toml"))
+        super().__init__(self.hub, lambda: self.jobs, PageLimits(), RigReference("Bench", "rig.toml"))
+        self.prepare(WorkOrder("insert", "insertion", rig="rig.toml"))
 
     def reports(self, state, why="", waits=0):
-        news = RigReport(state=state, why=why, waits=waits, moves=["a"] if waits else [])
-        self.note(json.loads(news.model_dump_json()))
+        self.take(RigReport(state, why, waits, ("a",) if waits else ()))
 
     def starts(self):
         self.reports("idle", waits=1)
@@ -52,7 +49,7 @@ class Bench(Rig):
 
     @property
     def shown(self):
-        return json.loads(self.hub.newest("rig"))["state"]
+        return self.hub.newest("rig").state
 
 
 @pytest.fixture
@@ -63,7 +60,7 @@ def on_loop():
         async def run():
             bench = Bench()
             test(bench)
-            bench.ended("done", "")
+            bench.end("done", "")
 
         asyncio.run(run())
 
@@ -75,7 +72,7 @@ def test_one_arm_is_for_one_start(on_loop):
         bench.starts()
         with pytest.raises(Refusal, match="Bench is not armed"):
             bench.go()
-        assert bench.jobs.signals == [{"go": True}]
+        assert bench.jobs.changes == [{"go": True}]
 
     on_loop(test)
 
@@ -99,8 +96,8 @@ def test_nobody_steers_before_it_has_begun(on_loop, state):
         bench.starts()
         bench.reports(state)
         assert bench.shown == "starting"
-        bench.lost("nobody is in control")
-        assert bench.jobs.signals[1:] == [{"stop": "nobody is in control"}]
+        bench.lose_control("nobody is in control")
+        assert bench.jobs.changes[1:] == [{"stop": "nobody is in control"}]
 
     on_loop(test)
 
@@ -110,8 +107,8 @@ def test_nobody_steers_after_it_has_begun(on_loop, state, signals):
     def test(bench):
         bench.starts()
         bench.reports(state)
-        bench.lost("nobody is in control")
-        assert bench.jobs.signals[1:] == [{"hold": "nobody is in control"}] * signals
+        bench.lose_control("nobody is in control")
+        assert bench.jobs.changes[1:] == [{"hold": "nobody is in control"}] * signals
 
     on_loop(test)
 
@@ -127,12 +124,12 @@ def test_nobody_steers_before_the_insertion_has_gone_on(on_loop, times):
         bench.go()
         assert bench.shown == "holding"
         for _ in range(times):
-            bench.lost("person 2 is gone")
+            bench.lose_control("person 2 is gone")
         bench.reports("holding", why="person 2 is gone", waits=2)
         bench.arm(JOB)
         assert bench.shown == "armed"
         bench.go()
-        assert bench.jobs.signals[-1] == {"go": True}
+        assert bench.jobs.changes[-1] == {"go": True}
 
     on_loop(test)
 
@@ -141,7 +138,7 @@ def test_nobody_steers_just_after_the_insertion_has_gone_on(on_loop):
     def test(bench):
         bench.starts()
         bench.reports("inserting")
-        bench.lost("nobody is in control")
+        bench.lose_control("nobody is in control")
         with pytest.raises(Refusal, match="not ready"):
             bench.arm(JOB)
         bench.reports("holding", waits=2)
@@ -177,7 +174,7 @@ def test_a_worker_may_take_its_time_for_the_record_once_the_motors_are_stopped(o
     def test(bench):
         bench.starts()
         bench.stop("person 2")
-        assert bench.jobs.deadlines == [Limits().stop_s]
+        assert bench.jobs.deadlines == [PageLimits().stop_s]
         bench.reports(state)
         assert bench.jobs.deadlines[-1] is None
         with pytest.raises(Refusal, match="its record is being written"):
@@ -194,7 +191,7 @@ def test_how_it_has_ended_is_shown(state, shown):
         bench = Bench()
         bench.starts()
         bench.reports(state, why="person 2")
-        bench.ended("done", "the supervisor has ended")
+        bench.end("done", "the supervisor has ended")
         assert (bench.shown, bench.active) == (shown, False)
 
     asyncio.run(run())

@@ -22,8 +22,8 @@ import page_clients
 from emulated import until
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
-from flexneedle.lab.page.orders import SILENT_S
-from flexneedle.lab.page.server.limits import RIG
+from flexneedle.lab.page.job_orders import SILENT_S
+from flexneedle.lab.page.server.clients import RIG_LIMITS
 from flexneedle.scenario.files import dump_scenario
 from page_clients import Client, port_of
 from page_tasks import short
@@ -202,7 +202,7 @@ def test_a_steering_client_that_is_silent_is_lost(tmp_path):
         inserting(client.steer())
         silent = monotonic()  # from here on it reads nothing, and so answers no ping
         rig_is(watcher, "holding")
-        limit = RIG.ping_s + RIG.pong_s + PERIOD_S
+        limit = RIG_LIMITS.ping_s + RIG_LIMITS.pong_s + PERIOD_S
         Event().wait(max(0.0, silent + limit + 0.5 - monotonic()))
         assert one.moved_after(silent + limit) < 0.005
         watcher.do("stop")

@@ -11,13 +11,13 @@ import fake_engine
 from bench_rig import rig, values
 from commands import run
 from flexneedle.errors import DriverError, InputError, RigError
-from flexneedle.lab.page.orders import SILENT_S, Signal
+from flexneedle.lab.page.job_orders import SILENT_S, JobChange
 from flexneedle.lab.page.rigs import usable_rig
-from flexneedle.lab.page.worker.insertion import Insertions
-from flexneedle.lab.page.worker.rig import Follower, check
-from flexneedle.lab.page.worker.signals import Cancelled, Signals
-from flexneedle.lab.rig.supervisor.machine import SupervisorState
-from flexneedle.lab.rig.supervisor.protocol import TickReport
+from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
+from flexneedle.lab.page.worker.rig_insertion import RigGate, check
+from flexneedle.lab.page.worker.task import Cancelled, JobControl
+from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor.messages import Report
 from flexneedle.loop.events import Stream
 from flexneedle.record import recording
 from flexneedle.scenario.files import load_scenario
@@ -94,7 +94,7 @@ def order(tmp_path, reported=None, **more):
         folder=str(tmp_path),
         **more,
     )
-    return replace(one, signals=Signals(held="not armed"))
+    return replace(one, control=JobControl(held="not armed"))
 
 
 def going(one, calls):
@@ -102,18 +102,18 @@ def going(one, calls):
 
     def signalled():
         if calls.supervisor.waits % 3 == 0:
-            one.signals.take(Signal(job=1, go=True))
+            one.control.take(JobChange(job=1, go=True))
 
     calls.supervisor.on_wait = signalled
     return one
 
 
 def states(one):
-    return [news.state for news in one.outbox.of("insertion")]
+    return [news.state for news in one.report.of("insertion")]
 
 
 def reports(one):
-    return [(news.state, news.waits, len(news.moves)) for news in one.outbox.of("rig_report")]
+    return [(news.state, news.waits, len(news.moves)) for news in one.report.rig]
 
 
 def run_file(folder):
@@ -122,22 +122,22 @@ def run_file(folder):
 
 def test_it_waits_with_what_will_move_until_it_may_go(calls, in_tmp):
     one = going(order(in_tmp), calls)
-    Insertions().insert(one)
+    InsertionJobs().insert(one)
     assert states(one) == ["planning", "ready", "running", "done"]
     assert calls.supervisor.waits == 3
-    waiting, goes = one.outbox.of("rig_report")
-    assert waiting.moves[:-1] == MOVES
+    waiting, goes = one.report.rig
+    assert list(waiting.moves[:-1]) == MOVES
     assert waiting.moves[-1].startswith("The motors of all axes are switched on first.")
-    assert (waiting.waits, goes.waits, goes.moves) == (1, 0, [])
-    assert len(one.outbox.rows) == one.outbox.of("insertion")[-1].periods > 10
+    assert (waiting.waits, goes.waits, goes.moves) == (1, 0, ())
+    assert len(one.report.rows) == one.report.of("insertion")[-1].periods > 10
 
 
 def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
     one = going(order(in_tmp / "runs", seed=3, controller="ce-mpc"), calls)
-    Insertions().insert(one)
+    InsertionJobs().insert(one)
     arguments = ("--seed", "3", "--controller", "ce-mpc", "--out", "command", "--yes")
     assert run(capsys, "insert", "phantom", "--rig", "rig.toml", *arguments)[0] == 0
-    last = one.outbox.of("insertion")[-1]
+    last = one.report.of("insertion")[-1]
     assert last.rig == "Bench"
     ours, theirs = run_file(in_tmp / "runs" / last.folder), run_file(in_tmp / "command")
     timed = ("timing",)
@@ -156,37 +156,37 @@ def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
 
 def test_it_is_held_between_two_periods_and_goes_on_when_it_may(calls, in_tmp):
     def then(news):
-        if news.type == "rows" and news.first == 4:
-            one.signals.take(Signal(job=1, hold="nobody is in control"))
+        if getattr(news, "type", "") == "rows" and news.first == 4:
+            one.control.take(JobChange(job=1, hold="nobody is in control"))
 
     one = going(order(in_tmp, Reported(then)), calls)
-    Insertions().insert(one)
+    InsertionJobs().insert(one)
     assert states(one) == ["planning", "ready", "running", "holding", "running", "done"]
-    assert one.outbox.of("insertion")[3].summary == "nobody is in control"
-    assert one.outbox.of("insertion")[3].periods == 5
+    assert one.report.of("insertion")[3].summary == "nobody is in control"
+    assert one.report.of("insertion")[3].periods == 5
     assert reports(one) == [("idle", 1, 5), ("idle", 0, 0), ("idle", 2, 4), ("idle", 0, 0)]
-    assert one.outbox.of("rig_report")[2].moves == MOVES
+    assert list(one.report.rig[2].moves) == MOVES
 
 
 @pytest.mark.parametrize("signal", [{"stop": "person 2"}, {"cancel": True, "stop": "the server has ended"}])
 def test_a_stop_goes_to_the_supervisor_in_the_thread_that_reads_orders(calls, in_tmp, signal):
     one = order(in_tmp)
-    calls.supervisor.on_wait = lambda: (one.signals.take(Signal(job=1, **signal)), ended())
+    calls.supervisor.on_wait = lambda: (one.control.take(JobChange(job=1, **signal)), ended())
 
     def ended():
         raise DriverError("stopped")
 
     with pytest.raises(DriverError):
-        Insertions().insert(one)
+        InsertionJobs().insert(one)
     assert calls.supervisor.stops == [signal["stop"]]
 
 
 def test_one_that_is_stopped_before_its_rig_is_open_moves_nothing_and_has_a_record(calls, in_tmp):
     one = order(in_tmp)
-    one.signals.take(Signal(job=1, stop="person 2"))
+    one.control.take(JobChange(job=1, stop="person 2"))
     with pytest.raises(Cancelled):
-        Insertions().insert(one)
-    last = one.outbox.of("insertion")[-1]
+        InsertionJobs().insert(one)
+    last = one.report.of("insertion")[-1]
     assert (last.state, last.summary) == ("interrupted", "stopped: person 2")
     assert calls.found == []
     stored = run_file(in_tmp / last.folder)
@@ -194,12 +194,14 @@ def test_one_that_is_stopped_before_its_rig_is_open_moves_nothing_and_has_a_reco
 
 
 def test_one_that_is_stopped_while_the_rig_opens_is_not_armed(calls, in_tmp):
-    one = order(in_tmp, Reported(lambda news: news.type == "job" and "5 of 5" in news.text and stop()))
+    one = order(
+        in_tmp, Reported(lambda news: getattr(news, "type", "") == "job" and "5 of 5" in news.text and stop())
+    )
 
     def stop():
-        one.signals.take(Signal(job=1, stop="person 2"))
+        one.control.take(JobChange(job=1, stop="person 2"))
 
-    Insertions().insert(one)
+    InsertionJobs().insert(one)
     assert states(one)[-1] == "interrupted"
     assert calls.supervisor.waits == 0
 
@@ -209,26 +211,26 @@ LEFT_IN = "the needle stays where it is: withdraw it by flexneedle rig retract r
 
 def test_a_needle_that_is_left_in_is_said_to_be(calls, in_tmp):
     def then(news):
-        if news.type == "rows" and news.first == 4:
+        if getattr(news, "type", "") == "rows" and news.first == 4:
             raise DriverError("the motor is off")
 
     one = going(order(in_tmp, Reported(then)), calls)
     with pytest.raises(DriverError):
-        Insertions().insert(one)
-    last = one.outbox.of("insertion")[-1]
+        InsertionJobs().insert(one)
+    last = one.report.of("insertion")[-1]
     assert (last.state, last.summary) == ("failed", f"the motor is off; {LEFT_IN}")
 
 
 def test_a_needle_at_its_target_is_left_in_too(calls, in_tmp):
     one = going(order(in_tmp), calls)
-    Insertions().insert(one)
-    last = one.outbox.of("insertion")[-1]
+    InsertionJobs().insert(one)
+    last = one.report.of("insertion")[-1]
     assert (last.state, last.summary[-len(LEFT_IN) :]) == ("done", LEFT_IN)
 
 
 def follower(**more):
     one = order("", **more)
-    made = Follower(SimpleNamespace(task=one, announce=lambda *_: None), None)
+    made = RigGate(SimpleNamespace(task=one, announce=lambda *_: None), None)
     made._supervisor = Supervisor()
     return made, one
 
@@ -238,37 +240,37 @@ def test_states_of_the_supervisor_are_reported_when_they_change():
     for state, why in [
         ("armed", ""), ("armed", ""), ("inserting", ""), ("holding", "missing"), ("stopped", "the controller"),
     ]:  # fmt: skip
-        made.report(TickReport(0.0, SupervisorState(state), why))
-    found = [(news.state, news.why) for news in one.outbox.of("rig_report")]
+        made.take(Report(0.0, State(state), why))
+    found = [(news.state, news.why) for news in one.report.rig]
     assert found == [("armed", ""), ("inserting", ""), ("holding", "missing"), ("ended", "")]
-    made.report(TickReport(0.0, SupervisorState.STOPPED, "person 2"))
-    assert one.outbox.of("rig_report")[-1].state == "stopped"
+    made.take(Report(0.0, State.STOPPED, "person 2"))
+    assert one.report.rig[-1].state == "stopped"
 
 
 def test_a_rig_is_stopped_once_when_the_server_is_silent():
     made, one = follower()
-    made.report(TickReport(0.0, SupervisorState.INSERTING))
+    made.take(Report(0.0, State.INSERTING))
     assert made._supervisor.stops == []
-    one.signals.heard -= SILENT_S + 0.1
+    one.control.heard -= SILENT_S + 0.1
     for _ in range(2):
-        made.report(TickReport(0.0, SupervisorState.INSERTING))
+        made.take(Report(0.0, State.INSERTING))
     (why,) = made._supervisor.stops
     assert why.startswith("no signal of the page's server for 1.")
 
 
 def test_a_beat_is_a_signal():
     made, one = follower()
-    one.signals.heard -= SILENT_S + 0.1
-    one.signals.take(Signal(job=1, alive=True))
-    made.report(TickReport(0.0, SupervisorState.INSERTING))
+    one.control.heard -= SILENT_S + 0.1
+    one.control.take(JobChange(1))
+    made.take(Report(0.0, State.INSERTING))
     assert made._supervisor.stops == []
 
 
 def test_a_check_is_that_of_the_command(monkeypatch):
-    monkeypatch.setattr("flexneedle.lab.page.worker.rig._CHECKED_S", 0.0)
+    monkeypatch.setattr("flexneedle.lab.page.worker.rig_insertion._CHECKED_S", 0.0)
     one = task("check", "check", load_scenario("phantom"), rig="rig.toml")
     check(one)
-    (found,) = one.outbox.of("check")
+    (found,) = one.report.of("check")
     assert found.revision == 7
     items = {(line["part"], line["item"]): line for line in found.findings}
     assert items["scenario", "fit"]["found"] == load_scenario("phantom").name
@@ -286,7 +288,7 @@ def test_a_rig_that_ros_arms_or_gives_its_target_is_refused(in_tmp, key):
 
 
 def test_an_insertion_on_a_rig_is_not_saved_again(calls, in_tmp):
-    one, worker = going(order(in_tmp), calls), Insertions()
+    one, worker = going(order(in_tmp), calls), InsertionJobs()
     worker.insert(one)
     with pytest.raises(InputError, match="no insertion to save"):
         worker.save(task("save", folder=str(in_tmp / "again")))

@@ -14,8 +14,8 @@ import pytest
 import flexneedle
 from commands import run
 from flexneedle.lab.page.server import app
-from flexneedle.lab.page.server.folder import RunsFolder, zipped
-from flexneedle.lab.page.server.refusal import Refusal
+from flexneedle.lab.page.server.clients import Refusal
+from flexneedle.lab.page.server.runs_folder import RunsFolder, zip_run
 from page_clients import PATIENCE_S, Client, get, port_of, served
 from page_worker import GATE, ROWS
 from replays import insertion
@@ -157,7 +157,7 @@ def test_nothing_is_overwritten(runs, name):
 def test_an_archive_has_the_files_of_the_run_alone(runs):
     (runs / "older" / "trace.mcap").write_bytes(b"trace")
     (runs / "older" / "elsewhere").symlink_to(runs.parent / "secret" / "run.json")
-    with zipfile.ZipFile(io.BytesIO(zipped(runs / "older"))) as archive:
+    with zipfile.ZipFile(io.BytesIO(zip_run(runs / "older"))) as archive:
         assert archive.namelist() == ["older/run.json", "older/trace.mcap"]
         assert archive.read("older/trace.mcap") == b"trace"
 
@@ -230,7 +230,7 @@ def test_a_row_of_a_study_is_opened(runs, client):
     client.do("save", name="kept", of="second")
     client.job("save", "done")
     order = json.loads((runs / "kept" / "run.json").read_text())
-    assert (order["do"], order["of"]) == ("save_row", "second")
+    assert (order["action"], order["of"]) == ("save_row", "second")
     assert client.refused("save", name="kept", of="second").startswith("kept: there is already something of")
     client.do("open", name="older", second=True)
     client.job("recording", "done")
@@ -306,10 +306,10 @@ def test_what_a_command_refuses_is_the_reason(server, file):
 
 
 def test_two_downloads_are_made_at_once_and_no_more(runs, server):
-    downloads = app.Downloads(server.desk)
+    downloads = app.Downloads(server.handler)
     downloads._busy = 2
     with pytest.raises(Refusal, match="two downloads are being made"):
-        downloads._two_at_once(None, runs).send(None)
+        downloads._make_one_of_two(None, runs).send(None)
 
 
 def test_a_download_ends_when_its_browser_has_gone(runs, monkeypatch):
@@ -322,7 +322,7 @@ def test_a_download_ends_when_its_browser_has_gone(runs, monkeypatch):
         finally:
             ended.set()
 
-    monkeypatch.setattr(app, "trace_csv", endless)
+    monkeypatch.setattr(app, "export_csv", endless)
     with served(runs) as server:
         connection = HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
         connection.request("GET", "/runs/older/trace.csv")
@@ -341,8 +341,8 @@ PATHS = [
     "/runs//etc/run.zip",
     "/runs/older/..%2frun.json",
     "/runs/older/%2e%2e/%2e%2e/secret/run.json",
-    "/static/../server/desk.py",
-    "/static/..%2fserver%2fdesk.py",
+    "/static/../server/app.py",
+    "/static/..%2fserver%2fapp.py",
     "/static/%2e%2e/messages.py",
     "/static//etc/passwd",
     "/static/..\\messages.py",

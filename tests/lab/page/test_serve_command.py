@@ -14,8 +14,8 @@ import pytest
 from flexneedle.cli.main import main
 from flexneedle.lab.commands import serve
 from flexneedle.lab.page.server.catalog import build_catalog
-from flexneedle.lab.page.server.limits import Limits
-from flexneedle.lab.page.server.rig import ConnectedRig
+from flexneedle.lab.page.server.clients import PageLimits
+from flexneedle.lab.page.server.connected_rig import RigReference
 from page_clients import PATIENCE_S
 
 
@@ -26,7 +26,7 @@ def test_the_schema_is_what_the_command_prints(capsys):
 
 
 def test_the_server_does_not_import_the_compiler_or_the_simulator():
-    script = "import sys, flexneedle.lab.page.server.serve; print(*sys.modules)"
+    script = "import sys, flexneedle.lab.page.server.page_server; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert not loaded & {"numba", "scipy", "matplotlib", "pyarrow", "pandas", "mcap"}
@@ -95,7 +95,7 @@ def test_a_port_has_a_range(capsys, port):
 
 def test_without_its_packages_it_names_them(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    monkeypatch.delitem(sys.modules, "flexneedle.lab.page.server.serve", raising=False)
+    monkeypatch.delitem(sys.modules, "flexneedle.lab.page.server.page_server", raising=False)
     message = failed(capsys)
     assert message == (
         "flexneedle: the page needs starlette, uvicorn and websockets: pip install 'flexneedle[page]'\n"
@@ -107,7 +107,8 @@ def setups(monkeypatch):
     """What servers were started with."""
     found = []
     monkeypatch.setattr(
-        "flexneedle.lab.page.server.serve.PageServer", lambda setup, *_where: found.append(setup) or Ended()
+        "flexneedle.lab.page.server.page_server.PageServer",
+        lambda setup, *_where: found.append(setup) or Ended(),
     )
     return found
 
@@ -117,14 +118,14 @@ def test_a_world_is_shown_without_a_rig(setups):
     (setup,) = setups
     assert setup.rig is None
     assert setup.session.name == "world:7"
-    assert setup.limits == Limits()
+    assert setup.limits == PageLimits()
 
 
 def test_a_rig_is_named_by_its_file_and_clients_are_lost_sooner(setups):
     assert main(["serve", "phantom", "--rig", "emulated", "--no-open"]) == 0
     (setup,) = setups
-    assert setup.rig == ConnectedRig("Emulated rig", "emulated")
-    assert setup.limits.ping_s + setup.limits.pong_s <= 2.0 < Limits().pong_s
+    assert setup.rig == RigReference("Emulated rig", "emulated")
+    assert setup.limits.ping_s + setup.limits.pong_s <= 2.0 < PageLimits().pong_s
 
 
 def test_a_rig_that_cannot_be_used_is_refused_in_one_line(capsys, tmp_path):
@@ -155,7 +156,7 @@ class Ended:
 )
 def test_a_browser_is_opened_where_there_is_a_display(monkeypatch, arguments, display, opened):
     addresses = []
-    monkeypatch.setattr("flexneedle.lab.page.server.serve.PageServer", lambda *_setup: Ended())
+    monkeypatch.setattr("flexneedle.lab.page.server.page_server.PageServer", lambda *_setup: Ended())
     monkeypatch.setattr("webbrowser.open", addresses.append)
     monkeypatch.setattr(serve, "Thread", Immediate)
     monkeypatch.setattr(sys, "platform", "linux")

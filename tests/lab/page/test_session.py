@@ -4,23 +4,23 @@ import tomllib
 
 import pytest
 
-from flexneedle.lab.page.messages import Options
-from flexneedle.lab.page.server.refusal import Refusal
-from flexneedle.lab.page.server.session import Session
+from flexneedle.lab.page.requests import OptionsRequest
+from flexneedle.lab.page.server.clients import Refusal
+from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.sections.needle import GAUGES
 
 
 @pytest.fixture
 def session():
-    return Session.of("phantom", load_scenario("phantom"))
+    return PageSession.of("phantom", load_scenario("phantom"))
 
 
 def test_an_edit_changes_values_by_key(session):
     edited = session.edited({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0})
     assert edited.revision == session.revision + 1
     assert edited.scenario.target.depth_mm == 35.0
-    news = edited.news()
+    news = edited.describe()
     assert news.changed == ["tissue.0.alpha", "target.depth_mm"]
     assert news.values["tissue.0.alpha"] == 9.0
 
@@ -37,7 +37,7 @@ def test_a_reach_stays_while_only_the_target_has_changed(session, values, stays)
     before = session.edited({"needle.outer_diameter_mm": 0.9})
     assert before.reach_since == before.revision
     after = before.edited(values)
-    assert after.news().reach_since == (before.revision if stays else after.revision)
+    assert after.describe().reach_since == (before.revision if stays else after.revision)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_reach_stays_while_only_the_target_has_changed(session, values, stays)
     [({"controller": "ce-mpc"}, True), ({"seed": 3}, False), ({"strategy": "steering"}, False)],
 )
 def test_a_reach_is_of_a_seed_and_a_strategy(session, option, stays):
-    after = session.with_options(Options(type="options", **option))
+    after = session.with_options(OptionsRequest(type="options", **option))
     assert after.reach_since == (session.revision if stays else after.revision)
 
 
@@ -125,13 +125,13 @@ def test_rules_between_sections_have_a_key(session):
 def test_implausible_values_are_doubts(session):
     assert any(
         "youngs_modulus" in line
-        for line in session.edited({"needle.youngs_modulus_gpa": 20_000}).news().doubts
+        for line in session.edited({"needle.youngs_modulus_gpa": 20_000}).describe().doubts
     )
 
 
 def test_a_preset_begins_anew(session):
     begun = session.edited({"target.depth_mm": 35.0}).with_preset("phantom3d")
-    assert begun.news().changed == []
+    assert begun.describe().changed == []
     assert begun.name == "phantom3d"
     assert begun.revision == session.revision + 2
 
@@ -151,7 +151,7 @@ def test_no_other_name_is_a_preset(session, name, tmp_path, monkeypatch):
 
 def test_a_file_is_loaded_with_its_warnings(session, minimal_text):
     loaded = session.with_file("mine", minimal_text)
-    assert (loaded.name, loaded.scenario.name, loaded.news().changed) == ("mine", "Minimal", [])
+    assert (loaded.name, loaded.scenario.name, loaded.describe().changed) == ("mine", "Minimal", [])
 
 
 def test_a_file_that_was_written_is_the_same_scenario(session):
@@ -190,6 +190,6 @@ def test_a_file_that_would_take_long_to_read_is_refused_before(session, monkeypa
 
 
 def test_options_that_are_not_set_stay(session):
-    changed = session.with_options(Options(type="options", seed=7))
+    changed = session.with_options(OptionsRequest(type="options", seed=7))
     assert (changed.seed, changed.strategy, changed.controller) == (7, "manipulation", "")
     assert changed.revision == session.revision + 1

@@ -104,7 +104,7 @@ def test_what_has_no_finished_insertion_is_refused(capsys, in_tmp):
 
 @pytest.mark.usefixtures("recorded")
 def test_an_insertion_without_a_period_is_refused(capsys, monkeypatch):
-    monkeypatch.setattr("flexneedle.lab.page.replay.document.load_insertion", without_periods)
+    monkeypatch.setattr("flexneedle.lab.page.replay.load_insertion", without_periods)
     assert refused(capsys, "one", "--html") == (
         1,
         "flexneedle: one: nothing to replay: no control period is recorded\n",

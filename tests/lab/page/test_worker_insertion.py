@@ -8,16 +8,15 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError
-from flexneedle.lab.page.frames import Kind, Source
-from flexneedle.lab.page.messages import Disturb
-from flexneedle.lab.page.orders import Signal
-from flexneedle.lab.page.server.folder import RunsFolder
-from flexneedle.lab.page.worker import saving
+from flexneedle.lab.page.job_orders import JobChange
+from flexneedle.lab.page.requests import DisturbRequest
+from flexneedle.lab.page.server.runs_folder import RunsFolder
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
+from flexneedle.lab.page.worker import recordings
 from flexneedle.lab.page.worker.disturbances import DisturbedPlant, Disturber
-from flexneedle.lab.page.worker.insertion import Insertions
-from flexneedle.lab.page.worker.recording import read
-from flexneedle.lab.page.worker.rows import row_of
-from flexneedle.lab.page.worker.signals import Cancelled
+from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
+from flexneedle.lab.page.worker.recordings import read_run, row_of
+from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.phantom.draw import draw
 from flexneedle.record.export import marks
 from flexneedle.record.saving import save
@@ -42,14 +41,14 @@ def by_command():
 @pytest.fixture(scope="module")
 def inserted():
     """The worker of a finished insertion, and what it has reported."""
-    worker, one = Insertions(), task("insert", "insertion", seed=3)
+    worker, one = InsertionJobs(), task("insert", "insertion", seed=3)
     worker.insert(one)
-    return worker, one.outbox
+    return worker, one.report
 
 
 def advancing(signals, count):
     for _ in range(count):
-        signals.take(Signal(job=1, advance=True))
+        signals.take(JobChange(job=1, advance=True))
 
 
 def test_rows_are_those_of_the_command(inserted, by_command):
@@ -93,10 +92,10 @@ def test_the_indicator_of_the_tip_counts_only_without_references():
 
 def test_rows_are_the_same_period_by_period(by_command):
     one = task("insert", "insertion", seed=3, pace=0.0)
-    advancing(one.signals, len(by_command.periods) + 1)
-    Insertions().insert(one)
-    assert plain(one.outbox.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
-    assert "paused" in [news.state for news in one.outbox.of("insertion")]
+    advancing(one.control, len(by_command.periods) + 1)
+    InsertionJobs().insert(one)
+    assert plain(one.report.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
+    assert "paused" in [news.state for news in one.report.of("insertion")]
 
 
 def test_states_are_reported_in_order(inserted, by_command):
@@ -110,11 +109,11 @@ def test_states_are_reported_in_order(inserted, by_command):
 
 def test_each_period_has_its_frames(inserted, by_command):
     reported, count = inserted[1], len(by_command.periods)
-    for kind in (Kind.NEEDLE, Kind.TRUE, Kind.PREDICTED):
-        assert [frame.number for frame in reported.shapes(kind, Source.LIVE)] == list(range(count))
-    decided = {frame.number for frame in reported.shapes(Kind.SAMPLES, Source.LIVE)}
+    for kind in (FrameKind.NEEDLE, FrameKind.TRUE, FrameKind.PREDICTED):
+        assert [frame.number for frame in reported.shapes(kind, FrameSource.LIVE)] == list(range(count))
+    decided = {frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.LIVE)}
     assert decided == {period.index for period in by_command.periods if not math.isnan(period.cost)}
-    channel = reported.shapes(Kind.CHANNEL, Source.LIVE)[-1].values[0]
+    channel = reported.shapes(FrameKind.CHANNEL, FrameSource.LIVE)[-1].values[0]
     assert channel[0, 0] < 1.0 < channel[-1, 0]
     assert (channel[:, 3] >= 1.0).all()
     assert channel[:, 3].max() > 1.0
@@ -123,9 +122,9 @@ def test_each_period_has_its_frames(inserted, by_command):
 @pytest.mark.parametrize("controller", ["ce-mpc", "open-loop"])
 def test_another_controller(controller):
     one = task("insert", "insertion", seed=1, controller=controller)
-    Insertions().insert(one)
-    assert one.outbox.of("insertion")[-1].controller == controller
-    assert bool(one.outbox.shapes(Kind.SAMPLES, Source.LIVE)) == (controller == "ce-mpc")
+    InsertionJobs().insert(one)
+    assert one.report.of("insertion")[-1].controller == controller
+    assert bool(one.report.shapes(FrameKind.SAMPLES, FrameSource.LIVE)) == (controller == "ce-mpc")
 
 
 def stopping(at, **signal):
@@ -133,7 +132,7 @@ def stopping(at, **signal):
 
     def then(news):
         if news.type == "rows" and news.first == at:
-            one.signals.take(Signal(job=1, **signal))
+            one.control.take(JobChange(job=1, **signal))
 
     one = task("insert", "insertion", reported=Reported(then))
     return one
@@ -141,24 +140,24 @@ def stopping(at, **signal):
 
 def test_a_stop_ends_it_as_interrupted():
     one = stopping(4, stop="person 2")
-    Insertions().insert(one)
-    last = one.outbox.of("insertion")[-1]
+    InsertionJobs().insert(one)
+    last = one.report.of("insertion")[-1]
     assert (last.state, last.periods) == ("interrupted", 5)
     assert last.summary.endswith("stopped: person 2")
 
 
 def test_a_cancelled_one_has_no_result():
-    one, worker = stopping(4, cancel=True), Insertions()
+    one, worker = stopping(4, cancel=True), InsertionJobs()
     with pytest.raises(Cancelled):
         worker.insert(one)
-    assert len(one.outbox.rows) == 5
+    assert len(one.report.rows) == 5
     with pytest.raises(InputError, match="no insertion to save"):
         worker.save(task("save", folder="nowhere"))
 
 
 def test_one_that_is_refused_is_reported():
     scenario = short(**{"target.lateral_mm": 12.0})
-    reported = done(Insertions().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
+    reported = done(InsertionJobs().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
     assert reported.of("insertion")[-1].state == "refused"
     assert "misses the target" in reported.of("insertion")[-1].summary
 
@@ -170,7 +169,7 @@ def test_an_insertion_is_listed_once_it_is_saved_as_a_whole(inserted, tmp_path, 
         save(insertion, folder)
         while_saving.append((runs.listed(), list(tmp_path.glob("*/run.json"))))
 
-    monkeypatch.setattr(saving, "save", watched)
+    monkeypatch.setattr(recordings, "save", watched)
     (tmp_path / ".saved").mkdir()  # of somebody else
     inserted[0].save(task("save", folder=str(tmp_path / "saved")))
     ((listed, (written,)),) = while_saving
@@ -185,31 +184,31 @@ def test_a_saved_insertion_is_read_as_it_was(inserted, tmp_path):
     folder = tmp_path / "saved"
     worker.save(task("save", folder=str(folder)))
     again = task("read", "recording", folder=str(folder), of="second")
-    read(again)
-    rows = again.outbox.rows
-    assert [news.of for news in again.outbox.of("rows")] == ["second"]
+    read_run(again)
+    rows = again.report.rows
+    assert [news.of for news in again.report.of("rows")] == ["second"]
     assert len(rows) == len(reported.rows)
     for row, live in zip(rows, reported.rows, strict=True):
         assert row.true == pytest.approx(live.true, abs=1e-6)
         assert row.error_mm == pytest.approx(live.error_mm, abs=1e-6)
         assert (row.action, row.verdict, row.decision) == (live.action, live.verdict, live.decision)
-    (needles,) = again.outbox.shapes(Kind.NEEDLE, Source.SECOND)
+    (needles,) = again.report.shapes(FrameKind.NEEDLE, FrameSource.SECOND)
     assert needles.values.shape[0] == len(rows)
-    assert needles.values[-1] == pytest.approx(reported.shapes(Kind.NEEDLE)[-1].values[0], abs=1e-4)
+    assert needles.values[-1] == pytest.approx(reported.shapes(FrameKind.NEEDLE)[-1].values[0], abs=1e-4)
 
 
 def test_a_folder_without_an_insertion_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"run\.json is missing"):
-        read(task("read", "recording", folder=str(tmp_path)))
+        read_run(task("read", "recording", folder=str(tmp_path)))
 
 
 def disturbed(*disturbs, scenario=None, seed=3):
     """What an insertion reports that is disturbed from its start."""
     one = task("insert", "insertion", scenario, seed=seed, pace=NO_WAIT)
     for disturb in disturbs:
-        one.signals.take(Signal(job=1, disturb=Disturb(type="disturb", **disturb)))
-    Insertions().insert(one)
-    return one.outbox
+        one.control.take(JobChange(job=1, disturb=DisturbRequest(type="disturb", **disturb)))
+    InsertionJobs().insert(one)
+    return one.report
 
 
 def test_a_push_moves_the_true_tip_in_its_direction(by_command):
@@ -229,19 +228,19 @@ def test_no_push_is_no_disturbance(by_command):
 
 def test_the_record_of_a_disturbed_insertion_says_so(tmp_path, inserted):
     """Its seed alone does not give it again."""
-    one, worker = task("insert", "insertion", seed=3, pace=NO_WAIT), Insertions()
+    one, worker = task("insert", "insertion", seed=3, pace=NO_WAIT), InsertionJobs()
     for size in (0.05, 0.0):
-        one.signals.take(
-            Signal(job=1, disturb=Disturb(type="disturb", what="push", size=size, angle_deg=90.0))
+        one.control.take(
+            JobChange(job=1, disturb=DisturbRequest(type="disturb", what="push", size=size, angle_deg=90.0))
         )
     worker.insert(one)
     disturbed_by = "push of 0.05 N at 90° at 0.0 s, push ended at 0.0 s"
-    assert one.outbox.of("insertion")[-1].summary.endswith(f"; disturbed: {disturbed_by}")
+    assert one.report.of("insertion")[-1].summary.endswith(f"; disturbed: {disturbed_by}")
     for folder, ended in (("pushed", worker), ("plain", inserted[0])):
         ended.save(task("save", folder=str(tmp_path / folder)))
     pushed, plain_one = flexneedle.load(tmp_path / "pushed"), flexneedle.load(tmp_path / "plain")
     assert (pushed.disturbed, plain_one.disturbed) == (disturbed_by, "")
-    assert pushed.summary == one.outbox.of("insertion")[-1].summary
+    assert pushed.summary == one.report.of("insertion")[-1].summary
     assert marks(pushed) == {"disturbed": True}
     assert marks(plain_one) == {}
 
@@ -253,7 +252,7 @@ def test_a_record_names_the_first_disturbances_and_counts_the_others():
     disturber.plant(draw(short(), np.random.default_rng(3)), 0.0)
     disturber.watch(None)
     for size in range(1, 14):
-        disturber.take(Disturb(type="disturb", what="push", size=0.01 * size))
+        disturber.take(DisturbRequest(type="disturb", what="push", size=0.01 * size))
     assert disturber.summary.startswith("push of 0.01 N at 0° at 0.0 s, push of 0.02 N at 0° at 1.0 s, ")
     assert disturber.summary.endswith("push of 0.1 N at 0° at 9.0 s, 3 more")
 
@@ -283,7 +282,7 @@ def test_a_layer_is_stiffer_where_it_truly_is(monkeypatch):
     disturber.plant(truth, 0.0)
     disturber.watch(None)
     for layer in (0, 1):
-        disturber.take(Disturb(type="disturb", what="stiffen", size=3.0, layer=layer))
+        disturber.take(DisturbRequest(type="disturb", what="stiffen", size=3.0, layer=layer))
     boundary = truth.layer_tops[1]
     assert given == [(0.0, boundary, 3.0), (boundary, math.inf, 3.0)]
 

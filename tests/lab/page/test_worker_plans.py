@@ -1,20 +1,20 @@
 """Needle at the start, estimate, plans and reach of the page's worker."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.lab.page.frames import Kind, Source, packed, unpacked
-from flexneedle.lab.page.orders import Signal
-from flexneedle.lab.page.scene import scene_of
-from flexneedle.lab.page.worker import plans
+from flexneedle.lab.page.job_orders import JobChange
+from flexneedle.lab.page.protocol import describe_scene
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, pack_frame, unpack_frame
+from flexneedle.lab.page.worker import plan_jobs
 from flexneedle.lab.page.worker.__main__ import carry_out
-from flexneedle.lab.page.worker.needle import needle
-from flexneedle.lab.page.worker.plans import estimate, plan, samples_of
-from flexneedle.lab.page.worker.reach import _DEEPEST, reach
-from flexneedle.lab.page.worker.signals import Cancelled
+from flexneedle.lab.page.worker.plan_jobs import estimate, needle, plan, samples_of
+from flexneedle.lab.page.worker.reach_job import _DEEPEST, reach
+from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.planning.horizon import Samples
 from page_tasks import Reported, done, short, task
 
@@ -22,17 +22,17 @@ from page_tasks import Reported, done, short, task
 def test_the_needle_at_the_start_lies_from_its_base_to_its_tip():
     made = short("phantom3d", **{"entry.lateral_mm": 1.0, "entry.slope_z_mrad": 20.0})
     reported = done(needle, task("needle", scenario=made))
-    (shape,) = reported.shapes(Kind.NEEDLE, Source.SCENE)
-    assert shape.values[0, 0] == pytest.approx(scene_of(made, 1).base, abs=1e-4)
+    (shape,) = reported.shapes(FrameKind.NEEDLE, FrameSource.SCENE)
+    assert shape.values[0, 0] == pytest.approx(describe_scene(made, 1).base, abs=1e-4)
     assert shape.values[0, -1, 0] == pytest.approx(-2.0, abs=0.05)
 
 
 def test_an_estimate_ends_near_the_target():
     reported = done(estimate, task("estimate"))
     (news,) = reported.of("estimate")
-    (path,) = reported.shapes(Kind.PATH, Source.SCENE)
+    (path,) = reported.shapes(FrameKind.PATH, FrameSource.SCENE)
     assert math.dist(path.values[0, -1], short().target.position) == pytest.approx(news.error_mm, abs=1e-4)
-    (needle_at_target,) = reported.shapes(Kind.SWEEP, Source.SCENE)
+    (needle_at_target,) = reported.shapes(FrameKind.SWEEP, FrameSource.SCENE)
     assert needle_at_target.values.shape[0] == 1
     assert needle_at_target.values[0, -1] == pytest.approx(path.values[0, -1], abs=1e-4)
 
@@ -47,7 +47,7 @@ def test_an_estimate_of_few_elites():
 
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
 def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch):
-    monkeypatch.setattr(plans, "BETWEEN_S", 0.0)
+    monkeypatch.setattr(plan_jobs, "BETWEEN_S", 0.0)
     reported = done(plan, task("plan", strategy=strategy, seed=2))
     made = flexneedle.plan(short(), strategy=strategy, seed=2)
     (news,) = reported.of("plan")
@@ -55,8 +55,8 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch
     assert news.roll_deg == math.degrees(made.roll)
     iterations = reported.of("iteration")
     assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
-    source = Source[strategy.upper()]
-    samples = reported.shapes(Kind.SAMPLES, source)
+    source = FrameSource[strategy.upper()]
+    samples = reported.shapes(FrameKind.SAMPLES, source)
     assert [frame.number for frame in samples] == [one.iteration for one in iterations]
     for one, frame in zip(iterations, samples, strict=True):
         costs = frame.values[:, -1, 3]
@@ -65,17 +65,17 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch
         assert costs[0] <= one.elite[-1] * (1.0 + 1e-5) <= one.median[-1] * (1.0 + 2e-5)
         assert len(one.best) == len(one.elite) == len(one.median) == one.iteration
     assert (np.diff(iterations[-1].best) <= 0.0).all()
-    assert reported.shapes(Kind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
+    assert reported.shapes(FrameKind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
 
 
 def test_a_fast_search_shows_its_first_and_last_iteration_and_all_costs(monkeypatch):
-    monkeypatch.setattr(plans, "BETWEEN_S", 60.0)
+    monkeypatch.setattr(plan_jobs, "BETWEEN_S", 60.0)
     reported = done(plan, task("plan", seed=2))
     made = flexneedle.plan(short(), seed=2)
     first, last = reported.of("iteration")
     assert (first.iteration, last.iteration) == (1, made.iterations)
     assert last.best == [entry["best"] for entry in made.history]
-    assert [frame.number for frame in reported.shapes(Kind.SAMPLES, Source.MANIPULATION)] == [
+    assert [frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.MANIPULATION)] == [
         1,
         made.iterations,
     ]
@@ -103,21 +103,21 @@ def test_a_comparison_plans_both():
 def test_a_plan_is_cancelled_between_two_iterations():
     def then(news):
         if news.type == "iteration":
-            one.signals.take(Signal(job=1, cancel=True))
+            one.control.take(JobChange(job=1, cancel=True))
 
     one = task("plan", reported=Reported(then))
     carry_out(one, {"plan": plan})
-    assert len(one.outbox.of("iteration")) == 1
-    assert one.outbox.of("plan") == []
-    assert one.outbox.of("job")[-1].state == "cancelled"
+    assert len(one.report.of("iteration")) == 1
+    assert one.report.of("plan") == []
+    assert one.report.of("job")[-1].state == "cancelled"
 
 
 def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_them():
     rng = np.random.default_rng(0)
     tips, costs = rng.normal(size=(200, 100, 5)), rng.uniform(size=200)
-    frame = samples_of(Samples(tips, costs), Source.LIVE, 3)
+    frame = samples_of(Samples(tips, costs), FrameSource.LIVE, 3)
     assert frame.values.shape == (64, 48, 4)
-    shown = unpacked(packed(frame)).values
+    shown = unpack_frame(pack_frame(frame)).values
     assert shown[0, :, :3][[0, -1]] == pytest.approx(tips[costs.argmin()][[0, -1], :3], abs=1e-5)
     assert shown[-1, -1, 3] == pytest.approx(costs.max())
     assert not shown[:, :-1, 3].any()
@@ -126,7 +126,7 @@ def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_th
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """Few and short searches of the reach."""
-    monkeypatch.setattr("flexneedle.lab.page.worker.reach._PASSES", ((1, (12, 2)), (2, (16, 4))))
+    monkeypatch.setattr("flexneedle.lab.page.worker.reach_job._PASSES", ((1, (12, 2)), (2, (16, 4))))
 
 
 def reached(scenario, **values):
@@ -155,7 +155,7 @@ def test_the_reach_ends_where_the_needle_does():
     assert max(depth for depth, *_ in (*last.low, *last.high)) < sought - 0.2
     edges = np.array([last.high, last.low]).swapaxes(0, 1)
     assert (np.diff(edges[:, :, 0], axis=0) >= 0.0).all()
-    outlines = reported.shapes(Kind.REACH, Source.SCENE)[-1].values
+    outlines = reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values
     np.testing.assert_allclose(outlines[:, :2], edges, atol=1e-4)
 
 
@@ -168,7 +168,7 @@ def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
     values = {"setup.stroke_mm": 12.0, "target.depth_mm": 8.0, "target.lateral_z_mm": 0.5}
     reported, last = reached(short("phantom3d", **values))
     assert last.angle_deg == pytest.approx(45.0)
-    outlines = reported.shapes(Kind.REACH, Source.SCENE)[-1].values
+    outlines = reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values
     assert outlines.shape == (2, 9, 3)
     assert (outlines[:, 0] == outlines[:, -1]).all()
     np.testing.assert_allclose(outlines[:, 0], last.high, atol=1e-4)
@@ -190,24 +190,26 @@ def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
 def test_the_reach_does_not_depend_on_the_target(name, one, other):
     first, second = (reached(short(name, **{"setup.stroke_mm": 12.0}, **target)) for target in (one, other))
     assert first[1] == second[1]
-    shapes = [reported.shapes(Kind.REACH, Source.SCENE)[-1].values for reported, _ in (first, second)]
+    shapes = [
+        reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values for reported, _ in (first, second)
+    ]
     np.testing.assert_array_equal(*shapes)
 
 
 def test_a_reach_is_cancelled():
     one = task("reach")
-    one.signals.take(Signal(job=1, cancel=True))
+    one.control.take(JobChange(job=1, cancel=True))
     with pytest.raises(Cancelled):
         reach(one)
 
 
 def test_what_goes_wrong_is_the_end_of_the_job(capsys):
     one = task("plan")
-    bad = one.work.model_copy(update={"scenario": one.work.scenario | {"needle": {}}})
-    failed = type(one)(bad, one.signals, Reported())
+    bad = replace(one.order, scenario=one.order.scenario | {"needle": {}})
+    failed = type(one)(bad, one.control, Reported())
     carry_out(failed, {"plan": plan})
-    (job,) = failed.outbox.of("job")
+    (job,) = failed.report.of("job")
     assert (job.state, job.text.startswith("small: needle")) == ("failed", True)
     carry_out(one, {"plan": lambda _task: 1 / 0})
-    assert one.outbox.of("job")[-1].text.startswith("ZeroDivisionError")
+    assert one.report.of("job")[-1].text.startswith("ZeroDivisionError")
     assert "Traceback" in capsys.readouterr().err

@@ -1,21 +1,20 @@
 """The page's worker as a process, and behind the server over a web socket."""
 
-import json
 import os
-import subprocess
-import sys
+from contextlib import contextmanager
 from time import monotonic
 
 import pytest
 
 import page_clients
-from flexneedle.lab.page import channel
-from flexneedle.lab.page.orders import Signal, Work
-from flexneedle.lab.page.server.limits import Limits
+from flexneedle.lab.page.job_orders import JobChange, WorkerReady, WorkOrder
+from flexneedle.lab.page.protocol import IterationMessage, JobMessage
+from flexneedle.lab.page.server.clients import PageLimits
+from flexneedle.lab.process import ChildProcess
 from page_clients import Client, served
 from page_tasks import short
 
-COMMAND = (sys.executable, "-m", "flexneedle.lab.page.worker")
+MODULE = "flexneedle.lab.page.worker"
 _LONG = {"plan.samples": 2000, "plan.iterations": 500, "plan.max_iterations": 500}
 
 
@@ -25,46 +24,49 @@ def patience(monkeypatch):
     monkeypatch.setattr(page_clients, "PATIENCE_S", 100.0)
 
 
-def until(process, wanted):
-    while (message := channel.read(process.stdout)) is not None:
-        if isinstance(message, str) and wanted(values := json.loads(message)):
-            return values
+@contextmanager
+def started(name):
+    child = ChildProcess(MODULE, name)
+    try:
+        until(child, lambda report: isinstance(report, WorkerReady))
+        yield child
+    finally:
+        child.end(0.0)
+        child.close()
+
+
+def until(child, wanted):
+    """Wait for a report."""
+    while not child.channel.ended:
+        for report in child.channel.receive(100.0):
+            if wanted(report):
+                return
     raise AssertionError("the worker has ended")
 
 
-def send(process, order):
-    process.stdin.write(channel.packed(order.model_dump_json(exclude_defaults=True)))
-    process.stdin.flush()
-
-
-def test_it_cancels_within_a_plan_and_ends_with_its_stdin():
-    with subprocess.Popen((*COMMAND, "plans"), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        until(process, lambda news: news["type"] == "ready")
-        send(process, Work(job=1, do="plan", kind="plan", scenario=short(**_LONG).values()))
-        until(process, lambda news: news["type"] == "iteration")
-        begun = monotonic()
-        send(process, Signal(job=1, cancel=True))
-        until(process, lambda news: news["type"] == "job" and news["state"] == "cancelled")
-        assert monotonic() - begun < 30.0  # 0.1 s on a machine that is free, where the plan takes a minute
-        send(process, Work(job=2, do="plan", kind="plan", scenario=short(**_LONG).values()))
-        until(process, lambda news: news["type"] == "iteration")
-        process.stdin.close()
-        process.stdout.read()
-        assert process.wait(60.0) == 0
+def test_it_cancels_within_a_plan_and_ends_with_its_channel():
+    with started("plans") as child:
+        for job in (1, 2):
+            child.channel.send(WorkOrder("plan", "plan", job, scenario=short(**_LONG).values()))
+            until(child, lambda report: isinstance(report, IterationMessage))
+            if job == 1:
+                begun = monotonic()
+                child.channel.send(JobChange(1, cancel=True))
+                until(child, lambda report: isinstance(report, JobMessage) and report.state == "cancelled")
+                assert monotonic() - begun < 30.0  # 0.1 s on an idle machine, where the plan takes a minute
+        assert child.end(60.0) == 0
 
 
 @pytest.mark.parametrize(("name", "more"), [("plans", 0), ("plans-beside-a-rig", 10)])
-def test_beside_a_rig_plans_give_way(name, more):
-    with subprocess.Popen((*COMMAND, name), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        until(process, lambda news: news["type"] == "ready")
-        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.nice(0) + more, 19)
-        process.stdin.close()
+def test_plans_beside_a_rig_have_a_lower_priority(name, more):
+    with started(name) as child:
+        assert os.getpriority(os.PRIO_PROCESS, child.pid) == min(os.nice(0) + more, 19)
 
 
 @pytest.mark.slow
 def test_plan_insert_save_and_read_over_a_web_socket(tmp_path):
-    workers = ((*COMMAND, "plans"), (*COMMAND, "insertion"))
-    with served(tmp_path / "runs", limits=Limits(), workers=workers) as server, Client(server) as client:
+    workers = ((MODULE, "plans"), (MODULE, "insertion"))
+    with served(tmp_path / "runs", limits=PageLimits(), workers=workers) as server, Client(server) as client:
         client.steer()
         client.do("edit", values={key: short().flat()[key] for key in _CHANGED})
         revision = client.newest["session"]["revision"]

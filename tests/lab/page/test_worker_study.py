@@ -7,13 +7,13 @@ import pytest
 
 import small_study
 from flexneedle.errors import InputError
-from flexneedle.lab.page.frames import Kind, Source
-from flexneedle.lab.page.messages import StudyRow
-from flexneedle.lab.page.orders import Signal
-from flexneedle.lab.page.worker import study as worker
+from flexneedle.lab.page.job_orders import JobChange
+from flexneedle.lab.page.protocol import StudyRow
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
+from flexneedle.lab.page.worker import study_jobs
 from flexneedle.lab.page.worker.__main__ import carry_out
-from flexneedle.lab.page.worker.recording import recorded
-from flexneedle.lab.page.worker.study import Rows, rows
+from flexneedle.lab.page.worker.recordings import describe_recording
+from flexneedle.lab.page.worker.study_jobs import ShownRows, list_rows
 from flexneedle.lab.study.recompute import recompute
 from page_tasks import Reported, task
 
@@ -48,8 +48,8 @@ def recorded_rows(folder):
 def listed(folder, index=None):
     """What is reported of the rows of a study."""
     one = task("study", folder=str(folder), row=index)
-    rows(one)
-    (news,) = one.outbox.of("study")
+    list_rows(one)
+    (news,) = one.report.of("study")
     return news
 
 
@@ -99,7 +99,7 @@ def test_rows_are_listed_from_an_index_on(made):
 
 
 def test_no_more_rows_than_the_limit_are_sent(made, monkeypatch):
-    monkeypatch.setattr(worker, "MOST_ROWS", 3)
+    monkeypatch.setattr(study_jobs, "MOST_ROWS", 3)
     assert [row.index for row in listed(made, 2).rows] == [2, 3, 4]
     assert len(listed(made).rows) == 3
     assert listed(made).finished == SIZE
@@ -107,41 +107,41 @@ def test_no_more_rows_than_the_limit_are_sent(made, monkeypatch):
 
 def test_a_row_is_reported_as_a_recording(made):
     one = task("row", folder=str(made), row=6, of="second")
-    Rows().row(one)
+    ShownRows().recompute(one)
     insertion = recompute(made, 6).insertion
-    (news,) = one.outbox.of("insertion")
+    (news,) = one.report.of("insertion")
     assert (news.of, news.name, news.state) == ("second", "small, row 6", "done")
     assert (news.seed, news.periods, news.summary) == (
         insertion.seed,
         len(insertion.periods),
         insertion.summary,
     )
-    *_, expected = recorded(insertion, "", "second", "")
+    *_, expected = describe_recording(insertion, "", "second", "")
     untimed = {"decide_ms"}
-    assert [each.model_dump(exclude=untimed) for each in one.outbox.rows] == [
+    assert [each.model_dump(exclude=untimed) for each in one.report.rows] == [
         each.model_dump(exclude=untimed) for each in expected.rows
     ]
-    (needles,) = one.outbox.shapes(Kind.NEEDLE, Source.SECOND)
+    (needles,) = one.report.shapes(FrameKind.NEEDLE, FrameSource.SECOND)
     assert needles.values.shape[0] == news.periods
-    shares = [job.share for job in one.outbox.of("job")]
+    shares = [job.share for job in one.report.of("job")]
     assert len(shares) == news.periods
     assert shares[0] < 0.3 < 0.9 < shares[-1] <= 1.0
-    assert one.outbox.of("job")[0].text == "small, row 6"
+    assert one.report.of("job")[0].text == "small, row 6"
     assert news.row == 6
 
 
 def test_a_row_that_is_shown_is_saved_as_a_run(made, tmp_path):
-    again, folder, untimed = Rows(), tmp_path / "saved", {"decide_ms"}
+    again, folder, untimed = ShownRows(), tmp_path / "saved", {"decide_ms"}
     one = task("row", folder=str(made), row=6, of="second")
-    again.row(one)
+    again.recompute(one)
     again.save(task("save_row", "save", folder=str(folder), of="second"))
     with pytest.raises(InputError, match="no row to save"):
         again.save(task("save_row", "save", folder=str(tmp_path / "other"), of="first"))
     other = task("read", "recording", folder=str(folder), of="second")
     again.read(other)
-    texts = ([row.model_dump_json(exclude=untimed) for row in each.outbox.rows] for each in (one, other))
+    texts = ([row.model_dump_json(exclude=untimed) for row in each.report.rows] for each in (one, other))
     assert next(texts) == next(texts)
-    assert other.outbox.of("insertion")[0].row is None
+    assert other.report.of("insertion")[0].row is None
     with pytest.raises(InputError, match="no row to save"):
         again.save(task("save_row", "save", folder=str(tmp_path / "other"), of="second"))
     assert not (tmp_path / "other").exists()
@@ -149,24 +149,24 @@ def test_a_row_that_is_shown_is_saved_as_a_run(made, tmp_path):
 
 def test_what_differs_from_the_recorded_row_is_in_the_summary(changed):
     one = task("row", folder=str(changed(row_6={"flips": 99})), row=6)
-    Rows().row(one)
-    (news,) = one.outbox.of("insertion")
+    ShownRows().recompute(one)
+    (news,) = one.report.of("insertion")
     assert "; recomputed with the study's code, and not the same: flips " in news.summary
 
 
 def test_a_row_is_cancelled_between_two_periods(made):
     def then(news):
         if news.type == "job" and news.state == "running":
-            one.signals.take(Signal(job=1, cancel=True))
+            one.control.take(JobChange(job=1, cancel=True))
 
     one = task("row", folder=str(made), row=0, reported=Reported(then))
-    carry_out(one, {"row": Rows().row})
-    assert one.outbox.of("insertion") == []
-    assert [job.state for job in one.outbox.of("job")] == ["running", "cancelled"]
+    carry_out(one, {"row": ShownRows().recompute})
+    assert one.report.of("insertion") == []
+    assert [job.state for job in one.report.of("job")] == ["running", "cancelled"]
 
 
 def test_errors_name_the_study_and_no_path(made, tmp_path):
     with pytest.raises(InputError, match=r"^small: row = 8: must be from 0 to 7$"):
-        Rows().row(task("row", folder=str(made), row=SIZE))
+        ShownRows().recompute(task("row", folder=str(made), row=SIZE))
     with pytest.raises(InputError, match=r"^small: contains no study: study\.json is missing$"):
-        rows(task("study", folder=str(tmp_path)))
+        list_rows(task("study", folder=str(tmp_path)))

@@ -15,11 +15,11 @@ from flexneedle.errors import InputError
 from flexneedle.files import RUNS
 
 if TYPE_CHECKING:
-    from flexneedle.lab.page.server.desk import Setup
-    from flexneedle.lab.page.server.rig import ConnectedRig
+    from flexneedle.lab.page.server.connected_rig import RigReference
+    from flexneedle.lab.page.server.request_handler import PageSetup
 
 _HOST, _PORT, _LAST_PORT = "127.0.0.1", 8472, 65535
-_WORKER = (sys.executable, "-m", "flexneedle.lab.page.worker")
+_WORKER = "flexneedle.lab.page.worker"
 
 
 def add_parser(commands: Commands) -> None:
@@ -31,8 +31,8 @@ def add_parser(commands: Commands) -> None:
         _serve,
         "flexneedle serve",
         "flexneedle serve mine.toml --rig rig.toml",
-        about="Serve a page to plan, insert and replay in a browser, without internet access. One client "
-        "at a time is in control; every client may watch and stop.",
+        about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
+        "access. Prints its address; Ctrl-C ends it. One page at a time is in control; any may watch, and stop.",
     )
     parser.add_argument(
         "scenario",
@@ -44,8 +44,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="path of a rig file, or emulated; nothing moves before the rig is armed on the page (default: "
-        "virtual phantom)",
+        help="rig file (its path, or emulated for the one of the package), on which the page can insert once it is "
+        "prepared and armed there; nothing moves before (default: virtual rigs alone)",
     )
     parser.add_argument(
         "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
@@ -54,8 +54,8 @@ def add_parser(commands: Commands) -> None:
         "--host",
         default=_HOST,
         metavar="HOST",
-        help="address to listen on; other addresses than loopback require the token in the printed address "
-        "(default: 127.0.0.1)",
+        help="address to listen on; with another than this computer's own, the page needs the token in the printed "
+        f"address (default: {_HOST})",
     )
     parser.add_argument(
         "--port",
@@ -81,7 +81,7 @@ def _port(text: str) -> int:
 
 def _serve(args: argparse.Namespace) -> int:
     try:
-        from flexneedle.lab.page.server.serve import PageServer
+        from flexneedle.lab.page.server.page_server import PageServer
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("starlette", "uvicorn", "websockets", "anyio"):
             raise
@@ -95,24 +95,24 @@ def _serve(args: argparse.Namespace) -> int:
     return 0
 
 
-def _setup(args: argparse.Namespace) -> Setup:
-    from flexneedle.lab.page.server.desk import Setup
-    from flexneedle.lab.page.server.limits import RIG, Limits
-    from flexneedle.lab.page.server.session import Session
+def _setup(args: argparse.Namespace) -> PageSetup:
+    from flexneedle.lab.page.server.clients import RIG_LIMITS, PageLimits
+    from flexneedle.lab.page.server.page_session import PageSession
+    from flexneedle.lab.page.server.request_handler import PageSetup
     from flexneedle.scenario.files import load_scenario
 
-    session = Session.of(Path(args.scenario).name, load_scenario(args.scenario))
+    session = PageSession.of(Path(args.scenario).name, load_scenario(args.scenario))
     rig = None if args.rig is None else _connected(args.rig)
-    workers = (*_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (*_WORKER, "insertion")
-    return Setup(session, args.runs, Limits() if rig is None else RIG, workers, rig)
+    workers = (_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (_WORKER, "insertion")
+    return PageSetup(session, args.runs, PageLimits() if rig is None else RIG_LIMITS, workers, rig)
 
 
-def _connected(source: str) -> ConnectedRig:
+def _connected(source: str) -> RigReference:
     """The rig of a file. Raises RigError for one that the page cannot insert on. No device is opened."""
     from flexneedle.lab.page.rigs import usable_rig
-    from flexneedle.lab.page.server.rig import ConnectedRig
+    from flexneedle.lab.page.server.connected_rig import RigReference
 
-    return ConnectedRig(usable_rig(source).name, source)
+    return RigReference(usable_rig(source).name, source)
 
 
 def _announce(address: str, opens: bool) -> None:

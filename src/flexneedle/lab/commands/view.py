@@ -28,7 +28,7 @@ def add_options(commands: Commands) -> None:
         "--row",
         type=int,
         metavar="INDEX",
-        help="compute this row of the study again, and save and draw the run",
+        help="compute this row of the study again, keep it as a run, and draw that",
     )
     parser.add_argument(
         "--out",
@@ -41,8 +41,8 @@ def add_options(commands: Commands) -> None:
         nargs="?",
         const="",
         metavar="FILE",
-        help="write one HTML file that replays a finished insertion offline in any browser; -: stdout "
-        "(default: RUN/replay.html)",
+        help="instead of figures, write one file that replays a finished insertion by itself in any browser, without "
+        f"network; {_STDOUT}: stdout (default: {_REPLAY} in the folder of the run)",
     )
     parser.add_argument(
         "--compare",
@@ -112,9 +112,9 @@ def _recomputed(study: Path, index: int) -> Insertion:
 
 def _replay(folder: Path, html: str, compare: Path | None) -> int:
     from flexneedle.files import replace_file
-    from flexneedle.lab.page.replay.document import replay_of
+    from flexneedle.lab.page.replay import make_replay
 
-    data = replay_of(folder, compare, print_note).encode()
+    data = make_replay(folder, compare, print_note).encode()
     if html == _STDOUT:
         sys.stdout.buffer.write(data)
         return 0

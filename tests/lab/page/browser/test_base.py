@@ -8,8 +8,8 @@ import pytest
 
 from browser_layout import too_wide
 from fake_page import until
-from flexneedle.lab.page.frames import Source
-from flexneedle.lab.page.messages import Closed, Job, Refused
+from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage
+from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import insertion, people, period_frames, planned, rows, session
 
 pytestmark = pytest.mark.page
@@ -63,7 +63,7 @@ def test_edits_are_merged_and_sent_at_most_twenty_times_a_second(visit, server):
 
 
 def test_a_refusal_is_shown_in_words(visit, server):
-    server.answers["steer"] = Refused(what="steer", reason="Person 2 is in control: ask for it first.")
+    server.answers["steer"] = RefusedMessage(what="steer", reason="Person 2 is in control: ask for it first.")
     page = visit()
     page.click("text=Take control")
     page.wait_for_selector("[role=alert] >> text=Person 2 is in control")
@@ -85,7 +85,7 @@ def test_a_page_among_others_says_which_person_it_is(visit, server):
 def test_the_refusal_of_a_value_goes_when_another_is_taken(visit, server):
     page = visit()
     problems = {"target.depth_mm": "must be above 0"}
-    server.answers["edit"] = Refused(
+    server.answers["edit"] = RefusedMessage(
         what="edit", reason="target.depth_mm = -1: must be above 0", problems=problems
     )
     page.evaluate("flexneedle.link.edit({'target.depth_mm': -1})")
@@ -108,7 +108,7 @@ def test_taking_and_releasing_control_keeps_the_focus(visit):
 
 def test_a_worker_that_starts_is_named(visit, server):
     page = visit()
-    server.send(Job(job=1, kind="needle", state="waiting", text="the computation starts"))
+    server.send(JobMessage(job=1, kind="needle", state="waiting", text="the computation starts"))
     page.wait_for_selector(f"{STATUS} >> text=Needle: the computation starts")
     assert page.locator(f"{STATUS} .job").count() == 1
     assert page.get_attribute(f"{STATUS} progress", "value") is None  # nobody knows how long it takes
@@ -116,11 +116,11 @@ def test_a_worker_that_starts_is_named(visit, server):
 
 def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     page = visit()
-    server.send(Job(job=7, kind="plan", state="running", share=0.25, text="iteration 5 of 20"))
+    server.send(JobMessage(job=7, kind="plan", state="running", share=0.25, text="iteration 5 of 20"))
     page.wait_for_selector("text=Plan: iteration 5 of 20")
     assert page.eval_on_selector(f"{STATUS} progress", "bar => bar.value") == 0.25
     page.click("[aria-label='Cancel: Plan']")
-    server.send(Job(job=7, kind="plan", state="cancelled"))
+    server.send(JobMessage(job=7, kind="plan", state="cancelled"))
     page.wait_for_selector("text=Plan: iteration", state="detached")
     assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
@@ -129,7 +129,10 @@ def test_an_insertion_is_stopped_and_a_run_that_is_saved_is_not_cancelled(visit,
     page = visit()
     server.send(insertion("running"))
     server.send(
-        *(Job(job=n, kind=kind, state="running") for n, kind in enumerate(("insertion", "save", "plan")))
+        *(
+            JobMessage(job=n, kind=kind, state="running")
+            for n, kind in enumerate(("insertion", "save", "plan"))
+        )
     )
     page.wait_for_selector(f"{STATUS} >> text=Saving")
     cancels = page.locator(f"{STATUS} .job button:visible")
@@ -139,7 +142,7 @@ def test_an_insertion_is_stopped_and_a_run_that_is_saved_is_not_cancelled(visit,
 
 def test_work_without_a_share_has_the_time_since_it_began(visit, server):
     page = visit()
-    server.send(Job(job=1, kind="needle", state="waiting", text="the computation starts"))
+    server.send(JobMessage(job=1, kind="needle", state="waiting", text="the computation starts"))
     page.wait_for_selector(f"{STATUS} .job")
     assert page.inner_text(f"{STATUS} .job span") == "Needle: the computation starts"
     page.evaluate("() => { const now = performance.now(); performance.now = () => now + 75_000; }")
@@ -158,8 +161,8 @@ def test_a_server_that_was_started_again_is_reported(visit, server):
 
 def test_work_of_every_kind_has_a_name(visit, server):
     page = visit()
-    kinds = get_args(Job.model_fields["kind"].annotation)
-    server.send(*(Job(job=number, kind=kind, state="running") for number, kind in enumerate(kinds)))
+    kinds = get_args(JobMessage.model_fields["kind"].annotation)
+    server.send(*(JobMessage(job=number, kind=kind, state="running") for number, kind in enumerate(kinds)))
     page.wait_for_selector(f"{STATUS} .job >> nth={len(kinds) - 1}")
     assert "undefined" not in page.inner_html(STATUS)
 
@@ -177,13 +180,15 @@ def test_an_insertion_is_stopped_from_the_bar_in_every_state(visit, server, stat
 def test_work_that_runs_or_has_failed_before_is_shown(visit, server):
     server.news = [
         *server.news,
-        Job(job=3, kind="plan", state="running", text="iteration 2 of 20"),
-        Job(job=4, kind="reach", state="failed", text="the worker has ended"),
+        JobMessage(job=3, kind="plan", state="running", text="iteration 2 of 20"),
+        JobMessage(job=4, kind="reach", state="failed", text="the worker has ended"),
     ]
     page = visit()
     page.wait_for_selector("text=Plan: iteration 2 of 20")
     page.wait_for_selector("text=Reach: the worker has ended")
-    server.send(Job(job=5, kind="reach", state="running"), Job(job=5, kind="reach", state="done"))
+    server.send(
+        JobMessage(job=5, kind="reach", state="running"), JobMessage(job=5, kind="reach", state="done")
+    )
     page.wait_for_selector("text=the worker has ended", state="detached")
     assert page.locator(f"{STATUS} .job").all_inner_texts() == ["Plan: iteration 2 of 20\nCancel"]
 
@@ -242,10 +247,10 @@ def test_the_reason_of_a_lost_connection_is_shown(visit, server):
 def test_another_insertion_and_a_closed_recording_are_forgotten(visit, server):
     page = visit()
     page.wait_for_selector("text=nobody is in control")
-    for of, source in (("live", Source.LIVE), ("first", Source.FIRST)):
+    for of, source in (("live", FrameSource.LIVE), ("first", FrameSource.FIRST)):
         server.send(insertion("done", of=of), rows(0, 3, of), *period_frames(2, source))
     until(page, "flexneedle.store.track('needle', 'first') && flexneedle.store.track('needle', 'live')")
-    server.send(insertion("planning", periods=0), Closed(of="first"))
+    server.send(insertion("planning", periods=0), ClosedMessage(of="first"))
     until(
         page,
         "!flexneedle.store.get('insertion first') && flexneedle.store.get('insertion live').periods === 0",

@@ -5,8 +5,8 @@ import pytest
 
 from browser_blends import BLENDS, FLAT, added, arrived
 from browser_layout import too_wide
-from flexneedle.lab.page.frames import Kind, Source
-from flexneedle.lab.page.messages import Reach, Rows
+from flexneedle.lab.page.protocol import ReachMessage, RowsMessage
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from recorded_page import (
     ITERATIONS,
     REACH,
@@ -54,7 +54,9 @@ def elsewhere(**changes):
 
 def known(**missing):
     """The rows until PERIOD, without some of their positions."""
-    return Rows(of="live", first=0, rows=[row(k).model_copy(update=missing) for k in range(PERIOD + 1)])
+    return RowsMessage(
+        of="live", first=0, rows=[row(k).model_copy(update=missing) for k in range(PERIOD + 1)]
+    )
 
 
 def parts_of_a_plan():
@@ -68,7 +70,7 @@ def parts_of_a_plan():
         ("--estimate", [iteration(ITERATIONS - 1), samples(2)]),
         ("--plan", [plan(), path]),
         ("--predicted", [sweep]),
-        ("--steering", [plan("steering"), plan_frames(Source.STEERING, sway=-1.5)[0]]),
+        ("--steering", [plan("steering"), plan_frames(FrameSource.STEERING, sway=-1.5)[0]]),
         ("--reach", [REACH, reach_frame()]),
     ]
 
@@ -84,7 +86,7 @@ def parts_of_an_insertion():
         ("--needle", [estimated]),
         ("--true", [true]),
         ("--predicted", [predicted]),
-        ("--estimate", [samples(3, source=Source.LIVE, x=(20.0, TARGET[0]))]),
+        ("--estimate", [samples(3, source=FrameSource.LIVE, x=(20.0, TARGET[0]))]),
     ]
 
 
@@ -121,7 +123,7 @@ def test_the_sampled_horizon_is_shown_from_its_period_on(views, server):
     page = views([*opening(), insertion("running", periods=20), rows(0, 20), *frames])
     page.wait_for_selector("[data-panel=space] .legend li")
     for number, count in ((5, 8), (12, 16)):
-        server.send(samples(number, count, source=Source.LIVE, x=(number, TARGET[0])))
+        server.send(samples(number, count, source=FrameSource.LIVE, x=(number, TARGET[0])))
     arrived(page)
     for period, count in ((4, 0), (5, 8), (11, 8), (12, 16), (19, 16)):
         page.evaluate(f"flexneedle.store.set('view period', {period})")
@@ -159,7 +161,10 @@ def ellipses(*depths, wide=1.0):
     angle = np.linspace(0.0, 2.0 * np.pi, 97)
     y, z = wide * SLOPES[0] * np.cos(angle), wide * SLOPES[1] * np.sin(angle)
     return shape(
-        Kind.REACH, Source.SCENE, 0, *(np.column_stack([np.full(97, x), x * y, x * z]) for x in depths)
+        FrameKind.REACH,
+        FrameSource.SCENE,
+        0,
+        *(np.column_stack([np.full(97, x), x * y, x * z]) for x in depths),
     )
 
 
@@ -197,9 +202,9 @@ def test_in_the_plane_the_reach_in_section_is_a_strip(views, server, plane, entr
     arrived(page)
     ends = [np.array([[x, -0.2 * x, 0.0], [x, 0.1 * x, 0.0], [x, -0.2 * x, 0.0]]) for x in (15.0, 40.0)]
     edges = {"low": [tuple(end[0]) for end in ends], "high": [tuple(end[1]) for end in ends]}
-    strip = Reach(revision=1, angle_deg=0.0, **edges)
+    strip = ReachMessage(revision=1, angle_deg=0.0, **edges)
     before, inside = reach_at(
-        page, server, FLAT[0], BOX, (12.0, 30.0), strip, shape(Kind.REACH, Source.SCENE, 0, *ends)
+        page, server, FLAT[0], BOX, (12.0, 30.0), strip, shape(FrameKind.REACH, FrameSource.SCENE, 0, *ends)
     )
     assert before is None
     off = entry if plane == "target" else 0.0

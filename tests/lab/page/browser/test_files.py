@@ -9,8 +9,8 @@ from matplotlib.image import imread
 from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
-from flexneedle.lab.page.frames import Source
-from flexneedle.lab.page.messages import Job, Runs, StudyRow, StudyRows
+from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRow, StudyRowsMessage
+from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import insertion, period_frames, rows, session
 
 pytestmark = pytest.mark.page
@@ -123,7 +123,7 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
     page.click("summary:has-text('Download')")
     links = page.locator(".run a").evaluate_all("all => all.map((one) => one.getAttribute('href'))")
     assert links == [f"/runs/first/{file}" for file in ("figure.png", "trace.csv", "run.zip", "replay.html")]
-    server.send(insertion("done", of="first"), rows(0, 3, "first"), *period_frames(2, Source.FIRST))
+    server.send(insertion("done", of="first"), rows(0, 3, "first"), *period_frames(2, FrameSource.FIRST))
     page.click("[aria-label='Close phantom3d']")
     assert server.wait_for("open", 3) == [
         {"type": "open", "name": "first", "second": False},
@@ -162,13 +162,13 @@ def test_news_of_runs_leave_open_what_is_open_and_the_focus(files, server):
     page.click("summary:has-text('Download')")
     page.focus("[aria-label='CSV of first']")
     first = {"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}
-    server.send(Runs(runs=[MANY, first | {"summary": "changed"}]))
+    server.send(RunsMessage(runs=[MANY, first | {"summary": "changed"}]))
     page.wait_for_selector("text=changed")
     names = page.locator(".run strong").all_inner_texts()
     assert names == ["many", "first"]
     assert page.is_visible("[aria-label='CSV of first']")
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
-    server.send(Runs(runs=[MANY]))
+    server.send(RunsMessage(runs=[MANY]))
     page.wait_for_selector("text=changed", state="detached")
 
 
@@ -193,14 +193,14 @@ def listing(request):
     index = request.get("index")
     found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
     about = {"title": "Many targets", "insertions": 150, "finished": 149}
-    return [StudyRows(name=request["name"], index=index, rows=found, **about)]
+    return [StudyRowsMessage(name=request["name"], index=index, rows=found, **about)]
 
 
 @pytest.mark.parametrize(
     ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
 )
 def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width, scheme):
-    server.news[-1] = Runs(runs=[MANY])
+    server.news[-1] = RunsMessage(runs=[MANY])
     server.answers["study"] = listing
     page = files(width=width, scheme=scheme)
     assert not page.is_visible("text=Worst first")
@@ -233,9 +233,9 @@ def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures,
 
 
 def test_a_study_without_finished_rows_is_named_so(files, server):
-    server.news[-1] = Runs(runs=[MANY])
+    server.news[-1] = RunsMessage(runs=[MANY])
     about = {"title": "Many", "insertions": 150, "finished": 0}
-    server.answers["study"] = lambda _: [StudyRows(name="many", index=None, rows=[], **about)]
+    server.answers["study"] = lambda _: [StudyRowsMessage(name="many", index=None, rows=[], **about)]
     page = files()
     page.click("[aria-label='Rows of many']")
     page.wait_for_selector("text=No row is finished yet")
@@ -243,7 +243,7 @@ def test_a_study_without_finished_rows_is_named_so(files, server):
 
 def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
     page = files()
-    server.send(Job(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
+    server.send(JobMessage(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
     page.wait_for_selector("text=Computing again: many, row 17")
     page.click("[aria-label='Cancel: Computing again']")
     assert server.wait_for("cancel") == [{"type": "cancel", "job": 7}]
@@ -389,4 +389,4 @@ def test_pictures_without_webgl_are_of_the_section_though_it_is_off_the_screen(f
 
 
 def frames_of(count):
-    return [frame for period in range(count) for frame in period_frames(period, Source.FIRST)]
+    return [frame for period in range(count) for frame in period_frames(period, FrameSource.FIRST)]

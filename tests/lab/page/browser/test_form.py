@@ -6,7 +6,7 @@ import pytest
 
 from browser_layout import too_wide
 from fake_page import until
-from flexneedle.lab.page.messages import Refused, Session
+from flexneedle.lab.page.protocol import RefusedMessage, SessionMessage
 from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
@@ -20,7 +20,7 @@ FORM = "[data-panel=form]"
 def session(revision=1, changed=(), doubts=(), seed=0, preset="phantom3d", **values):
     flat = load_scenario(preset).flat() | values
     given = {"reach_since": revision, "seed": seed, "strategy": "manipulation", "controller": "adaptive-mpc"}
-    return Session(
+    return SessionMessage(
         revision=revision, name=preset, values=flat, changed=list(changed), doubts=list(doubts), **given
     )
 
@@ -163,7 +163,7 @@ def test_a_layer_with_a_law_of_its_own_has_fields_for_its_values(form):
 )
 def test_a_choice_that_is_refused_stays_with_the_problem_of_its_part(form, server, key, chosen, part):
     """Of a part that has no field yet."""
-    server.answers["edit"] = Refused(what="edit", reason="no", problems={part: "must be at most 5"})
+    server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems={part: "must be at most 5"})
     linear = session(**{"tissue.1.law": "linear"})
     del linear.values["tissue.1.alpha"]
     page = form([WELCOME, people(), linear, scene(), *scene_frames()])
@@ -181,7 +181,7 @@ def test_a_problem_of_a_field_is_not_shown_at_its_table_too(form, server):
     values = {"phantom.structure.hidden_layer": {"top_mm": 10.0, "thickness_mm": 5.0, "modulus_factor": 2.0}}
     hidden = load_scenario("phantom3d").with_values(values)
     key = "phantom.structure.hidden_layer.thickness_mm"
-    server.answers["edit"] = Refused(what="edit", reason="no", problems={key: "must be above 0 mm"})
+    server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems={key: "must be above 0 mm"})
     page = form([WELCOME, people(), session(**hidden.flat()), scene(), *scene_frames()])
     page.fill(f"{FORM} input[type=search]", "hidden_layer")
     page.fill("#field-phantom-structure-hidden_layer-thickness_mm", "-1")
@@ -271,7 +271,7 @@ def test_a_value_is_taken_with_enter_and_a_slider_at_once(form, server):
 
 def test_a_problem_is_beside_its_field_and_the_value_stays(form, server):
     rule = "must be at least 0.0 mm"
-    server.answers["edit"] = Refused(what="edit", reason="no", problems={"target.depth_mm": rule})
+    server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems={"target.depth_mm": rule})
     page = form()
     page.fill("#field-target-depth_mm", "-3")
     page.press("#field-target-depth_mm", "Enter")
@@ -288,7 +288,9 @@ def test_a_problem_is_beside_its_field_and_the_value_stays(form, server):
 
 
 def test_a_problem_is_left_with_another_state(form, server):
-    server.answers["edit"] = Refused(what="edit", reason="no", problems={"target.lateral_mm": "must be less"})
+    server.answers["edit"] = RefusedMessage(
+        what="edit", reason="no", problems={"target.lateral_mm": "must be less"}
+    )
     page = form()
     page.fill("#field-target-depth_mm", "-3")
     page.press("#field-target-depth_mm", "Enter")

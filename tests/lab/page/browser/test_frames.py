@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import flexneedle.lab.page
-from flexneedle.lab.page.frames import Kind, Source, frame_of, packed, unpacked
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
 
 TEXT = (Path(flexneedle.lab.page.__file__).parent / "static/frames.js").read_text()
 READ = """async (frames) => {
-  const { unpacked } = await import("/static/frames.js");
+  const { unpack_frame } = await import("/static/frames.js");
   return frames.map((bytes) => {
     try {
-      const frame = unpacked(new Uint8Array(bytes).buffer);
+      const frame = unpack_frame(new Uint8Array(bytes).buffer);
       return { ...frame, values: [...frame.values] };
     } catch (error) {
       return error.message;
@@ -23,7 +23,7 @@ READ = """async (frames) => {
 }"""
 
 
-@pytest.mark.parametrize(("name", "numbers"), [("Kind", Kind), ("Source", Source)])
+@pytest.mark.parametrize(("name", "numbers"), [("Kind", FrameKind), ("Source", FrameSource)])
 def test_names_and_numbers_are_the_same(name, numbers):
     body = re.search(rf"const {name} = Object.freeze\({{(.*?)}}\)", TEXT, re.DOTALL).group(1)
     assert {key: int(value) for key, value in re.findall(r"(\w+): (\d+)", body)} == numbers.__members__
@@ -32,16 +32,20 @@ def test_names_and_numbers_are_the_same(name, numbers):
 @pytest.mark.page
 def test_a_browser_reads_what_python_packs(visit):
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4) / 7
-    frame = packed(frame_of(Kind.SAMPLES, Source.STEERING, 3_000_000_000, *values))
+    frame = pack_frame(make_frame(FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values))
     (read,) = visit().evaluate(READ, [list(frame)])
-    assert (read["kind"], read["source"], read["number"]) == (Kind.SAMPLES, Source.STEERING, 3_000_000_000)
+    assert (read["kind"], read["source"], read["number"]) == (
+        FrameKind.SAMPLES,
+        FrameSource.STEERING,
+        3_000_000_000,
+    )
     assert (read["paths"], read["points"], read["columns"]) == values.shape
     np.testing.assert_array_equal(np.float32(read["values"]), values.ravel())
 
 
 @pytest.mark.page
 def test_a_browser_refuses_what_python_refuses(visit):
-    good = packed(frame_of(Kind.NEEDLE, Source.LIVE, 0, np.zeros((4, 3))))
+    good = pack_frame(make_frame(FrameKind.NEEDLE, FrameSource.LIVE, 0, np.zeros((4, 3))))
     bad = [
         good[:15],
         good[:-1],
@@ -52,5 +56,5 @@ def test_a_browser_refuses_what_python_refuses(visit):
     ]
     for frame in bad:
         with pytest.raises(ValueError):
-            unpacked(frame)
+            unpack_frame(frame)
     assert all(isinstance(read, str) for read in visit().evaluate(READ, [list(frame) for frame in bad]))

@@ -4,7 +4,7 @@ import pytest
 
 from browser_layout import too_wide
 from fake_page import until
-from flexneedle.lab.page.messages import Disturbances, Job, RigCheck, RigState
+from flexneedle.lab.page.protocol import DisturbancesMessage, JobMessage, RigCheckMessage, RigStateMessage
 from recorded_page import WELCOME, inserting, insertion, opening, people, row, rows, session
 
 pytestmark = pytest.mark.page
@@ -123,7 +123,7 @@ def test_disturbances_are_sent_and_listed(panel, server):
         {"type": "disturb", "what": "plate", "size": 100},
         {"type": "disturb", "what": "plate", "size": 0},
     ]
-    server.send(Disturbances(active=["0.25 N on the tip"]))
+    server.send(DisturbancesMessage(active=["0.25 N on the tip"]))
     page.wait_for_selector("text=Active: 0.25 N on the tip")
 
 
@@ -168,7 +168,7 @@ MOVES = [
 
 
 def rig(state, *moves, **more):
-    return RigState(name="Bench", state=state, moves=list(moves), **more)
+    return RigStateMessage(name="Bench", state=state, moves=list(moves), **more)
 
 
 @pytest.fixture
@@ -264,14 +264,14 @@ def test_a_check_lists_its_problems(rig_panel, server):
     page = rig_panel()
     click(page, "Check")
     page.wait_for_selector("text=you are in control")
-    server.send(Job(job=9, kind="check", state="running", text="each device is read, nothing moves"))
+    server.send(JobMessage(job=9, kind="check", state="running", text="each device is read, nothing moves"))
     page.wait_for_selector("text=Checking: each device is read, nothing moves …")
     assert page.is_disabled(f"{PANEL} button:text-is('Check')")
     findings = [
         {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
         {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},
     ]
-    server.send(RigCheck(revision=1, findings=findings), Job(job=9, kind="check", state="done"))
+    server.send(RigCheckMessage(revision=1, findings=findings), JobMessage(job=9, kind="check", state="done"))
     page.wait_for_selector("text=The check has found 1 problem.")
     assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
     assert page.locator(".findings details li").count() == 2

@@ -6,8 +6,8 @@ import pytest
 from browser_blends import BLENDS, arrived
 from browser_layout import too_wide
 from fake_page import until
-from flexneedle.lab.page.frames import Kind, Source
-from flexneedle.lab.page.messages import Estimate, Job
+from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from recorded_page import (
     insertion,
     iteration,
@@ -52,10 +52,10 @@ def test_work_is_started_and_cancelled(plans, server):
     for work in ("plan", "compare", "reach"):
         page.click(f"{PLANS} [data-work={work}]")
     assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
-    server.send(Job(job=4, kind="compare", state="running", share=0.25))
+    server.send(JobMessage(job=4, kind="compare", state="running", share=0.25))
     page.click(f"{PLANS} button:has-text('Cancel')")
     assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
-    server.send(Job(job=4, kind="compare", state="cancelled"))
+    server.send(JobMessage(job=4, kind="compare", state="cancelled"))
     page.wait_for_selector(f"{PLANS} progress", state="hidden")
     assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
 
@@ -155,7 +155,7 @@ def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans, strategy):
     x = np.linspace(-60.0, 45.0, 12)
     needles = [np.column_stack([x, np.full(12, 8.0 - 0.5 * step), np.zeros(12)]) for step in range(33)]
     flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0))]
-    sweep = shape(Kind.SWEEP, Source[strategy.upper()], 0, *needles)
+    sweep = shape(FrameKind.SWEEP, FrameSource[strategy.upper()], 0, *needles)
     page = plans([*opening(), *flat, plan(strategy), sweep])
     canvas = f"{PLANS} .sweeps figure:not([hidden]) canvas"
     page.locator(canvas).scroll_into_view_if_needed()
@@ -169,7 +169,7 @@ def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans, strategy):
 def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
     page = plans([*opening(), plan(), *plan_frames()])
     page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
-    server.send(session(2), Estimate(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
+    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
     page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
@@ -224,10 +224,10 @@ SAMPLED = """async () => {
 def test_in_a_comparison_the_paths_of_the_strategy_that_is_searched_are_shown(plans, server):
     page = plans()
     server.send(iteration(2), samples(2))
-    server.send(Job(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
-    server.send(samples(3, source=Source.STEERING))
+    server.send(JobMessage(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
+    server.send(samples(3, source=FrameSource.STEERING))
     until(page, "flexneedle.store.get('shape samples steering')")
     assert page.evaluate(SAMPLED) == 3
-    server.send(Job(job=4, kind="compare", state="done"))
+    server.send(JobMessage(job=4, kind="compare", state="done"))
     until(page, "flexneedle.store.get('job compare').state === 'done'")
     assert page.evaluate(SAMPLED) == 2

@@ -7,8 +7,8 @@ import pytest
 
 from browser_layout import too_wide
 from fake_page import until
-from flexneedle.lab.page.frames import Kind, Source, frame_of, packed
-from flexneedle.lab.page.messages import Closed
+from flexneedle.lab.page.protocol import ClosedMessage
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
 from recorded_page import inserting, insertion, opening, period_frames, row, rows
 
 pytestmark = pytest.mark.page
@@ -20,7 +20,7 @@ PLAYING = "flexneedle.store.get('view playing')"
 
 
 def recorded(of="first", count=50, **changes):
-    source = Source.FIRST if of == "first" else Source.SECOND
+    source = FrameSource.FIRST if of == "first" else FrameSource.SECOND
     announced = insertion("done", of=of, periods=count, **changes)
     return [announced, rows(0, count, of), *period_frames(count - 1, source)]
 
@@ -150,10 +150,10 @@ def test_a_run_that_is_compared_or_closed_changes_the_period_only_where_it_is_sh
     server.send(*recorded("second"))
     until(page, "flexneedle.store.get('insertion second')")
     assert page.evaluate(PERIOD) == 20
-    server.send(Closed(of="second"))
+    server.send(ClosedMessage(of="second"))
     until(page, "!flexneedle.store.get('insertion second')")
     assert page.evaluate(PERIOD) == 20
-    server.send(Closed(of="first"))
+    server.send(ClosedMessage(of="first"))
     shows(page, "live")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 30 of 30']")
 
@@ -306,7 +306,7 @@ def test_a_second_run_begins_where_the_first_does(player, server):
 def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
     """With a clock and a period of its own, as the plots show it."""
     page = player()
-    shapes = [frame for period in range(50) for frame in period_frames(period, Source.SECOND)]
+    shapes = [frame for period in range(50) for frame in period_frames(period, FrameSource.SECOND)]
     faster = of_rows("second", lambda k: {"time": 0.1 * k + 60.0})
     server.send(insertion("done", of="second", periods=50), faster, *shapes)
     until(page, "flexneedle.store.get('rows second')?.length === 50")
@@ -421,8 +421,8 @@ def test_plots_grow_while_rows_come(player, server):
 
 def test_a_period_without_a_shape_shows_none(player):
     path = np.zeros((1, 3), np.float32)
-    shapes = frame_of(Kind.PREDICTED, Source.FIRST, 2, path + 2, path + np.nan, path + 4)
-    page = player([*opening(), *recorded()[:2], packed(shapes)])
+    shapes = make_frame(FrameKind.PREDICTED, FrameSource.FIRST, 2, path + 2, path + np.nan, path + 4)
+    page = player([*opening(), *recorded()[:2], pack_frame(shapes)])
     until(page, "flexneedle.store.track('predicted', 'first', 4)")
     read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
     assert page.evaluate(read) == [2, None, 4, None]

@@ -5,8 +5,8 @@ import pytest
 from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
-from flexneedle.lab.page.frames import Source, unpacked
-from flexneedle.lab.page.replay.document import document
+from flexneedle.lab.page.replay import make_document
+from flexneedle.lab.page.shape_frames import FrameSource, unpack_frame
 from recorded_page import PERIODS, insertion, period_frames, row, rows
 
 pytestmark = pytest.mark.page
@@ -20,8 +20,8 @@ NO_STORAGE = "Object.defineProperty(window, 'localStorage', { get() { throw new 
 
 def record(of="first", **changes):
     """An insertion in space with the shapes of all periods, as a worker reports a recorded one."""
-    source = Source[of.upper()]
-    shapes = [unpacked(frame) for period in range(PERIODS) for frame in period_frames(period, source)]
+    source = FrameSource[of.upper()]
+    shapes = [unpack_frame(frame) for period in range(PERIODS) for frame in period_frames(period, source)]
     return [insertion("done", of=of, pace=0.0, **changes), *shapes, rows(0, PERIODS, of)]
 
 
@@ -35,7 +35,7 @@ def replay(tab, tmp_path):
 
     def opened(records=None, width=1280, height=900, scheme="light", before=None, ready=DRAWN, **how):
         path = tmp_path / "replay.html"
-        path.write_text(document("mine", records or record()), encoding="utf-8")
+        path.write_text(make_document("mine", records or record()), encoding="utf-8")
         page = tab(width, height, scheme, before, **how)
         page.context.set_offline(True)
         page.on("request", note)

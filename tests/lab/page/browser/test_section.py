@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fake_page import until
-from flexneedle.lab.page.frames import Source
-from flexneedle.lab.page.messages import Rows
+from flexneedle.lab.page.protocol import RowsMessage
+from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import (
     REACH,
     TARGET,
@@ -95,7 +95,7 @@ def test_during_an_insertion_all_views_name_the_true_and_the_measured_tip(views,
     assert [both & names for names in legends(page)] == [both] * 3
     blind = [row(k).model_copy(update={"measured": None, "true": None}) for k in range(3)]
     server.send(
-        insertion("planning", periods=0), insertion(rig="Bench"), Rows(of="live", first=0, rows=blind)
+        insertion("planning", periods=0), insertion(rig="Bench"), RowsMessage(of="live", first=0, rows=blind)
     )
     until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
     assert [both & names for names in legends(page)] == [set()] * 3
@@ -121,7 +121,15 @@ def test_all_legends_show_the_needle_at_the_target_alike(views, state, text, for
 def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
     """Also where there is one of an earlier state of the scenario."""
     page = views(
-        [*opening(), plan(), *plan_frames(), session(2), scene(2), *plan_frames(Source.SCENE), estimate(2)]
+        [
+            *opening(),
+            plan(),
+            *plan_frames(),
+            session(2),
+            scene(2),
+            *plan_frames(FrameSource.SCENE),
+            estimate(2),
+        ]
     )
     until(page, "document.querySelector('[data-panel=space] .legend li')")
     wanted = {"first estimate", "needle at the target, first estimate", "needle", "target, 1 mm"}
@@ -325,7 +333,7 @@ OF_TONE = """async (tone) => {
 def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
     """In the section that of the period, along the axis also those before."""
     known = [row(k) for k in range(10)]
-    measured = Rows(of="live", first=0, rows=known)
+    measured = RowsMessage(of="live", first=0, rows=known)
     page = views([*opening(), insertion("running", periods=10), measured, *period_frames(9)])
     section, axial = page.evaluate(OF_TONE, "--measured")
     assert section > 8

@@ -1,4 +1,4 @@
-"""The addresses of the server."""
+"""Routes of the server: pages, downloads, web socket."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -16,27 +16,27 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
+from flexneedle.lab.page.server.access import AccessGuard, AccessRules
 from flexneedle.lab.page.server.catalog import build_catalog
-from flexneedle.lab.page.server.desk import Desk
-from flexneedle.lab.page.server.folder import FIGURES, replay_html, trace_csv, zipped
-from flexneedle.lab.page.server.guard import Gate, Guard
-from flexneedle.lab.page.server.live import live
-from flexneedle.lab.page.server.refusal import Refusal
+from flexneedle.lab.page.server.clients import Refusal
+from flexneedle.lab.page.server.request_handler import RequestHandler
+from flexneedle.lab.page.server.runs_folder import FIGURES, export_csv, export_replay, zip_run
+from flexneedle.lab.page.server.web_socket import serve_client
 from flexneedle.scenario.files import dump_scenario
 
 STATIC = Path(__file__).parents[1] / "static"
-"""What browsers get, as it is."""
+"""Files that browsers load unchanged."""
 
 
-def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
-    """The server's application (ASGI): pages, downloads and the web socket of a desk behind a gate."""
-    downloads = Downloads(desk)
+def make_application(handler: RequestHandler, rules: AccessRules, static: Path = STATIC) -> ASGIApp:
+    """Return the server's application (ASGI), behind the access rules."""
+    downloads = Downloads(handler)
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
-        await desk.start()
+        await handler.start()
         yield
-        await desk.end()
+        await handler.end()
 
     async def index(_request: Request) -> Response:
         return FileResponse(static / "index.html")
@@ -45,7 +45,7 @@ def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
         return Response(build_catalog().schema, media_type="application/schema+json")
 
     async def socket(connection: WebSocket) -> None:
-        await live(connection, desk)
+        await serve_client(connection, handler)
 
     routes = [
         Route("/", index),
@@ -55,48 +55,50 @@ def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
         WebSocketRoute("/live", socket),
         Mount("/static", StaticFiles(directory=static)),
     ]
-    handlers = {HTTPException: _refused}
+    handlers = {HTTPException: _answer_error}
     app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
-    app.router.redirect_slashes = False  # a path is an address of the page, or refused
-    return Guard(app, gate)
+    app.router.redirect_slashes = False  # other paths are refused
+    return AccessGuard(app, rules)
 
 
 class Downloads:
-    """Files that people take with them."""
+    """Files for download."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
         self._made: dict[str, tuple[str, Callable[[Path], Coroutine[Any, Any, bytes]]]] = {
-            "trace.csv": ("text/csv", trace_csv),
-            "run.zip": ("application/zip", _zipped),
-            "replay.html": ("text/html", replay_html),
+            "trace.csv": ("text/csv", export_csv),
+            "run.zip": ("application/zip", _zip),
+            "replay.html": ("text/html", export_replay),
         }
         self._busy = 0
 
     async def scenario(self, _request: Request) -> Response:
-        """The present scenario as a file (TOML)."""
-        text = dump_scenario(self._desk.session.scenario)
-        return _file(text.encode(), "application/toml", "scenario.toml")
+        """Return the present scenario as a file (TOML)."""
+        text = dump_scenario(self._handler.session.scenario)
+        return _download(text.encode(), "application/toml", "scenario.toml")
 
     async def of_run(self, request: Request) -> Response:
-        """A file of a run."""
+        """Return a file of a run."""
         name, file = request.path_params["name"], request.path_params["file"]
         try:
-            folder = self._desk.runs.run(name)
+            folder = self._handler.runs.run(name)
             if file == "figure.png":
                 return _figure(folder)
             if file not in self._made:
                 choices = ", ".join(("figure.png", *self._made))
                 raise Refusal(f"{file!r}: must be one of {choices}")
             media, make = self._made[file]
-            if make is not _zipped:
-                self._desk.require_processor()
-            made = await _unless_gone(request, self._two_at_once(make, folder))
-            return Response() if made is None else _file(made, media, f"{name}-{file}")
+            if make is not _zip:
+                self._handler.require_processor()
+            made = await _make_unless_gone(request, self._make_one_of_two(make, folder))
+            return Response() if made is None else _download(made, media, f"{name}-{file}")
         except Refusal as refusal:
             raise HTTPException(404, refusal.reason) from None
 
-    async def _two_at_once(self, make: Callable[[Path], Coroutine[Any, Any, bytes]], folder: Path) -> bytes:
+    async def _make_one_of_two(
+        self, make: Callable[[Path], Coroutine[Any, Any, bytes]], folder: Path
+    ) -> bytes:
         if self._busy >= 2:
             raise Refusal("two downloads are being made: try again in a moment")
         self._busy += 1
@@ -106,10 +108,10 @@ class Downloads:
             self._busy -= 1
 
 
-async def _unless_gone(request: Request, making: Coroutine[Any, Any, bytes]) -> bytes | None:
-    """What is made, or None if the browser has gone, at which the making is cancelled."""
+async def _make_unless_gone(request: Request, making: Coroutine[Any, Any, bytes]) -> bytes | None:
+    """Return the file; cancel it and return None if the browser disconnects."""
     task = asyncio.create_task(making)
-    gone = asyncio.create_task(_gone(request))
+    gone = asyncio.create_task(_wait_for_disconnect(request))
     try:
         await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
         return await task if task.done() else None
@@ -119,13 +121,13 @@ async def _unless_gone(request: Request, making: Coroutine[Any, Any, bytes]) -> 
         await asyncio.gather(task, gone, return_exceptions=True)
 
 
-async def _gone(request: Request) -> None:
+async def _wait_for_disconnect(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
-async def _zipped(folder: Path) -> bytes:
-    return await to_thread.run_sync(zipped, folder)
+async def _zip(folder: Path) -> bytes:
+    return await to_thread.run_sync(zip_run, folder)
 
 
 def _figure(folder: Path) -> Response:
@@ -135,15 +137,15 @@ def _figure(folder: Path) -> Response:
     raise Refusal("the run has no figure: flexneedle view draws it")
 
 
-def _file(data: bytes, media: str, name: str) -> Response:
-    """A download. Header names are ASCII; those of runs may be anything."""
+def _download(data: bytes, media: str, name: str) -> Response:
+    """Return a download. Header names are ASCII; names of runs may have any letters."""
     plain = "".join(letter if letter.isascii() and letter.isprintable() else "_" for letter in name)
     return Response(
         data, media_type=media, headers={"content-disposition": f'attachment; filename="{plain}"'}
     )
 
 
-async def _refused(_request: Request, error: Exception) -> Response:
+async def _answer_error(_request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
     return PlainTextResponse(f"{error.detail}\n", error.status_code, headers=error.headers)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import get_args
 
-from flexneedle.lab.page.messages import Strategy
+from flexneedle.lab.page.protocol import Strategy
 
 STRATEGIES: list[str] = list(get_args(Strategy))
 

@@ -1,4 +1,4 @@
-"""What disturbs a virtual insertion: its true needle, its true tissue and its tracker. The controller does not know."""
+"""Disturbances of a virtual insertion: of its true needle, tissue and tracker, unknown to the controller."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.lab.page.messages import Disturb, Disturbances
+from flexneedle.lab.page.protocol import DisturbancesMessage
+from flexneedle.lab.page.requests import DisturbRequest
 from flexneedle.loop.events import Stream
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, VirtualRig, virtual_rig
@@ -22,15 +23,15 @@ from flexneedle.types import Frame, Measurement, Plan, SensorReading
 
 _MISSING = "missing"
 _METAL = "noisy"
-"""The environment whose metal plate is brought where the scenario's has none."""
+"""Environment with the metal plate for a scenario without one."""
 _LISTED = 10
-"""Disturbances that the record of an insertion names."""
+"""Most disturbances that the record of an insertion lists."""
 _FAR_MM = 1e4
-"""Distance of a metal plate that is taken away: it distorts nothing, to the last bit."""
+"""Distance of a removed metal plate: it distorts no bit."""
 
 
-def with_plate(scenario: Scenario) -> Scenario:
-    """The scenario with a metal plate in the tracker's environment, if it has an environment without one."""
+def with_metal_plate(scenario: Scenario) -> Scenario:
+    """Return the scenario with a metal plate in the tracker's environment, if that has none."""
     environment = scenario.tracker.environment
     if environment is None or environment.plate is not None:
         return scenario
@@ -50,7 +51,7 @@ class DisturbedRig(VirtualRig):
         """Yield the ports of a new phantom."""
         disturber = self._disturber
         rig = virtual_rig(
-            with_plate(scenario),
+            with_metal_plate(scenario),
             plan.roll,
             Seeds.of(seed),
             disturber.plant,
@@ -67,25 +68,25 @@ class DisturbedRig(VirtualRig):
 
 
 class DisturbedPlant(ExactPlant):
-    """The true needle, which can be pushed at its tip, and whose tissue can be stiffened."""
+    """The true needle, with a force on its tip, in tissue of variable stiffness."""
 
     def __init__(self, truth: Truth, roll: float) -> None:
         super().__init__(truth, roll)
         self._load, self._foundation = np.array(truth.load), self.rod.foundation.copy()
 
     def push(self, force: complex) -> None:
-        """Let a force y + iz (N) act on the tip, beside that of the phantom, in place of the push before."""
+        """Apply a force y + iz (N) to the tip in place of the last one, in addition to the phantom's."""
         self.state["load"][1:] = self._load + np.array([force.real, force.imag])
 
     def stiffen(self, top: float, bottom: float, factor: float) -> None:
-        """Make the tissue between two depths (mm) `factor` times as stiff as it was drawn."""
+        """Make the tissue between two depths (mm) `factor` times as stiff as drawn."""
         middle = (np.arange(len(self._foundation)) + 0.5) * self.rod.cell
         inside = (middle >= top) & (middle < bottom)
         self.rod.foundation[inside] = factor * self._foundation[inside]
 
 
 class DisturbedTracker:
-    """A `TipTracker` that can lose the tip for a time."""
+    """A `TipTracker` that loses the tip on request."""
 
     def __init__(self, tracker: TipTracker) -> None:
         self._tracker = tracker
@@ -96,7 +97,7 @@ class DisturbedTracker:
         self._lost = begin, end
 
     def read(self) -> tuple[Measurement, ...]:
-        """The readings since the last call, oldest first."""
+        """Return the readings since the last call, oldest first."""
         begin, end = self._lost
         return tuple(_without_tip(one) if begin <= one.time < end else one for one in self._tracker.read())
 
@@ -116,17 +117,17 @@ def _frame_without_tip(frame: Frame) -> Frame:
 
 
 class Disturber:
-    """Disturbs the parts of a virtual rig, and reports what disturbs it.
+    """Disturbs the parts of a virtual rig, and reports the active disturbances.
 
-    plant, plate_distance_at: for `virtual_rig`; its tracker is given by `watch`.
+    Pass `plant` and `plate_distance_at` to `virtual_rig`, and its tracker to `watch`.
     """
 
     now: Callable[[], float]
     """Time (s) of the run, once there is a rig."""
 
-    def __init__(self, scenario: Scenario, say: Callable[[Disturbances], None]) -> None:
-        """say: is called when something else disturbs it than before."""
-        self._scenario, self._say = scenario, say
+    def __init__(self, scenario: Scenario, on_change: Callable[[DisturbancesMessage], object]) -> None:
+        """on_change: called when the active disturbances change."""
+        self._scenario, self._on_change = scenario, on_change
         self._plant: DisturbedPlant | None = None
         self._layers: tuple[float, ...] = ()
         self._tracker: DisturbedTracker | None = None
@@ -138,20 +139,20 @@ class Disturber:
         self._dropped_until = -math.inf
 
     def plant(self, truth: Truth, roll: float) -> DisturbedPlant:
-        """The factory of the plant."""
+        """Create the plant."""
         self._plant, self._layers = DisturbedPlant(truth, roll), (*truth.layer_tops, math.inf)
         return self._plant
 
     def plate_distance_at(self, _time: float) -> float | None:
-        """Distance (mm) of the metal plate of `with_plate`; None: that of the scenario."""
+        """Return the distance (mm) of the plate of `with_metal_plate`; None: the scenario's distance."""
         return self._plate
 
     def watch(self, tracker: TipTracker) -> TipTracker:
-        """The tracker, which can lose the tip."""
+        """Return the tracker with a tip that can be lost."""
         self._tracker = DisturbedTracker(tracker)
         return self._tracker
 
-    def take(self, disturb: Disturb) -> None:
+    def take(self, disturb: DisturbRequest) -> None:
         """Disturb the rig from now on."""
         size, layer = disturb.size, disturb.layer
         key = f"stiffen {layer}" if disturb.what == "stiffen" else disturb.what
@@ -172,15 +173,15 @@ class Disturber:
 
     @property
     def summary(self) -> str:
-        """What it has disturbed, and when, for the record; "" for nothing."""
+        """Disturbances and their times for the record, "" for none."""
         return ", ".join((*self._taken, *([f"{self._unlisted} more"] if self._unlisted else [])))
 
-    def _end(self, disturb: Disturb) -> str:
+    def _end(self, disturb: DisturbRequest) -> str:
         return {
             "push": "push ended",
             "stiffen": f"layer {self._name(disturb.layer)} as stiff as before",
             "drop": "tip measured again",
-            "plate": "metal plate taken away",
+            "plate": "metal plate removed",
         }[disturb.what]
 
     def _note(self, text: str) -> None:
@@ -190,14 +191,14 @@ class Disturber:
             self._unlisted += 1
 
     def expire(self) -> None:
-        """Report the end of what has ended by itself."""
+        """Report the end of a disturbance that had a duration."""
         if "drop" in self._active and self.now() >= self._dropped_until:
             del self._active["drop"]
             self._report()
 
-    def _disturb(self, disturb: Disturb) -> None:
+    def _disturb(self, disturb: DisturbRequest) -> None:
         if self._plant is None or self._tracker is None:
-            raise RuntimeError("there is no rig yet")
+            raise RuntimeError("the rig is not open")
         match disturb.what:
             case "push":
                 angle = math.radians(disturb.angle_deg)
@@ -215,4 +216,4 @@ class Disturber:
         return self._scenario.tissue[layer].name or str(layer + 1)
 
     def _report(self) -> None:
-        self._say(Disturbances(active=list(self._active.values())))
+        self._on_change(DisturbancesMessage(active=list(self._active.values())))

@@ -1,0 +1,369 @@
+"""Dispatch requests; handle connects and disconnects."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, assert_never
+
+from flexneedle.lab.page import requests as ask
+from flexneedle.lab.page.job_orders import Action, WorkOrder
+from flexneedle.lab.page.protocol import (
+    ClosedMessage,
+    InsertionMessage,
+    JobKind,
+    PlanMessage,
+    Recording,
+    RunsMessage,
+    WelcomeMessage,
+    describe_scene,
+)
+from flexneedle.lab.page.server.catalog import STRATEGIES, build_catalog
+from flexneedle.lab.page.server.clients import Clients, PageLimits, Refusal
+from flexneedle.lab.page.server.connected_rig import ConnectedRig, RigReference
+from flexneedle.lab.page.server.hub import ClientOutbox, Hub
+from flexneedle.lab.page.server.job_queue import JobQueue
+from flexneedle.lab.page.server.live_insertion import LiveInsertion
+from flexneedle.lab.page.server.page_session import PageSession
+from flexneedle.lab.page.server.runs_folder import RunsFolder
+from flexneedle.lab.page.shape_frames import FrameSource
+from flexneedle.scenario.preset import PRESETS
+
+_SEARCHES: tuple[JobKind, ...] = ("plan", "compare", "reach")
+_RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
+_WORK: tuple[JobKind, ...] = ("needle", "estimate", *_SEARCHES, "recording", "study", "row")
+_SOURCES: dict[Recording, FrameSource] = {"first": FrameSource.FIRST, "second": FrameSource.SECOND}
+
+
+@dataclass(frozen=True)
+class PageSetup:
+    """Settings of a server. workers: module and arguments of the worker of plans, and of the one of insertions."""
+
+    session: PageSession
+    runs: Path
+    limits: PageLimits
+    workers: tuple[Sequence[str], Sequence[str]]
+    rig: RigReference | None = None
+
+
+class RequestHandler:
+    """The state of the server, in the thread of its event loop."""
+
+    def __init__(self, setup: PageSetup) -> None:
+        self.limits, self.hub, self.clients = setup.limits, Hub(), Clients()
+        self.session, self.runs = setup.session, RunsFolder(setup.runs)
+        numbers, (plans, insertions) = count(1), setup.workers
+        self._plans = JobQueue(
+            "plans", plans, self.hub, setup.limits, numbers, self._end_job, lambda _report: None
+        )
+        self.rig = ConnectedRig(self.hub, lambda: self._insertions, setup.limits, setup.rig)
+        self.live = LiveInsertion(self.hub, lambda: self._insertions, setup.limits, self.rig)
+        self._rig_name = None if setup.rig is None else setup.rig.name
+        self._insertions = JobQueue(
+            "insertions", insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
+        )
+        self._timers = dict[str, asyncio.TimerHandle]()
+        self._watching: asyncio.Task[None] | None = None
+        self._runs_changed = asyncio.Event()
+        self._idle = False
+
+    # Start and end
+
+    async def start(self) -> None:
+        """Start the workers, and the plan of the first scenario."""
+        for jobs in (self._plans, self._insertions):
+            jobs.worker.start()
+        default = (await asyncio.to_thread(build_catalog)).controllers[0]["name"]
+        self.session = replace(self.session, controller=self.session.controller or default)
+        self.hub.publish(self.clients.describe())
+        self._begin(self.session)
+        self._order("plan", "plan")
+        self._watching = asyncio.create_task(self._watch_runs())
+
+    def halt(self) -> None:
+        """Stop the insertion, if one runs."""
+        with suppress(Refusal):
+            self.live.stop("the server of the page ends")
+
+    async def end(self) -> None:
+        """End the workers."""
+        for timer in self._timers.values():
+            timer.cancel()
+        if self._watching is not None:
+            self._watching.cancel()
+        insertions = self._insertions.worker
+        recorded = insertions.end(self.limits.record_s) if self.rig.active else insertions.end()
+        await asyncio.gather(self._plans.worker.end(), recorded)
+
+    # Clients
+
+    def join(self) -> tuple[int, ClientOutbox]:
+        """Return number and outbox of a new client. Raises Refusal if there are too many."""
+        if len(self.clients.connected) >= self.limits.clients:
+            raise Refusal(f"{self.limits.clients} pages are connected, which is the limit: close one")
+        client = self.clients.join()
+        outbox = self.hub.join(self._welcome(client))
+        self._stop_timer("alone")
+        self._runs_changed.set()
+        if self._idle:  # the state of every page is computed again; requested work is not
+            self._idle = False
+            self._order("needle", "needle")
+            self._order("estimate", "estimate")
+            self._plan_if_missing()
+        self.hub.publish(self.clients.describe())
+        return client, outbox
+
+    def _welcome(self, client: int) -> WelcomeMessage:
+        return WelcomeMessage(
+            client=client,
+            presets=PRESETS.names(),
+            controllers=build_catalog().controllers,
+            strategies=STRATEGIES,
+            rig=self._rig_name,
+        )
+
+    def leave(self, client: int, outbox: ClientOutbox) -> None:
+        """Handle the disconnect of a client."""
+        self.hub.leave(outbox)
+        in_control = self.clients.in_control == client
+        self.clients.leave(client)
+        self.hub.publish(self.clients.describe())
+        if in_control:
+            self.rig.lose_control("nobody is in control: the connection was lost")
+        if not self.clients.connected:
+            self._start_timer("alone", self.limits.alone_s, self._end_unattended)
+
+    # Requests
+
+    def carry_out(self, client: int, outbox: ClientOutbox, request: ask.AnyRequest) -> None:
+        """Carry out a request. Raises Refusal."""
+        if request.needs_control:
+            self.clients.require_control(client)
+        match request:
+            case ask.SteerRequest():
+                self._steer(client, request.take)
+            case ask.EditRequest():
+                self._begin(self.session.edited(request.values))
+            case ask.RestRequest():
+                if self._stop_timer("plan"):
+                    self._plan_unless_inserting()
+            case ask.PresetRequest():
+                self._begin(self.session.with_preset(request.name))
+            case ask.LoadRequest():
+                self._begin(self.session.with_file(request.name, request.text))
+            case ask.OptionsRequest():
+                self._begin(self._with_options(request))
+            case ask.StartRequest():
+                self.require_processor()
+                self._order("reach" if request.work == "reach" else "plan", request.work)
+            case ask.CancelRequest():
+                self._cancel(request.job)
+            case ask.PingRequest():
+                pass
+            case ask.RowsFromRequest():
+                outbox.resend_rows("rows live", request.index)
+            case ask.OpenRequest():
+                self._open(request)
+            case ask.StudyRequest():
+                folder = str(self.runs.study(request.name))
+                order = WorkOrder("study", "study", name=request.name, folder=folder, row=request.index)
+                self._plans.add(order)
+            case ask.SaveRequest():
+                self._save(request)
+            case ask.StopRequest():
+                self.live.stop(f"person {client} on the page")
+            case ask.CheckRequest() | ask.PrepareRequest() | ask.ArmRequest() | ask.GoRequest():
+                self._change_rig(request)
+            case _:
+                self._change_insertion(request)
+
+    def _change_insertion(
+        self, request: ask.InsertRequest | ask.PaceRequest | ask.AdvanceRequest | ask.DisturbRequest
+    ) -> None:
+        match request:
+            case ask.InsertRequest():
+                self.live.start(self._work("insert", "insertion", paused=request.paused))
+            case ask.PaceRequest():
+                self.live.set_pace(request.pace)
+            case ask.AdvanceRequest():
+                self.live.advance()
+            case ask.DisturbRequest():
+                self.live.disturb(request)
+            case _:
+                assert_never(request)
+
+    def _change_rig(
+        self, request: ask.CheckRequest | ask.PrepareRequest | ask.ArmRequest | ask.GoRequest
+    ) -> None:
+        match request:
+            case ask.CheckRequest():
+                source = self.rig.reference.source
+                self.live.require_none("it uses the devices: stop it first")
+                self._insertions.add(self._work("check", "check", rig=source))
+            case ask.PrepareRequest():
+                self.live.prepare(self._work("insert", "insertion", folder=str(self.runs.path)))
+                self._plans.cancel(*_SEARCHES, "row")
+            case ask.ArmRequest() if request.armed:
+                self.rig.arm(request.job)
+            case ask.ArmRequest():
+                self.rig.disarm("")
+            case ask.GoRequest():
+                self.rig.go()
+            case _:
+                assert_never(request)
+
+    def _steer(self, client: int, take: bool) -> None:
+        before = self.clients.in_control
+        self.clients.steer(client, take)
+        self.hub.publish(self.clients.describe())
+        if before == client and not take:
+            self.rig.lose_control("nobody is in control: it was released")
+
+    def _begin(self, session: PageSession) -> None:
+        """Continue with a changed session, and cancel what is computed for the old one.
+
+        The plan follows when no other change has come for `rest_s`: each place of a dragged target gets an estimate,
+        and its last place a plan. A reach that is valid for the new session, too, is kept or continues.
+        """
+        if session.origin is not self.session.origin:  # results of another scenario must not follow
+            self.hub.forget_types(*_RESULTS)
+            self.hub.forget_frames(FrameSource.SCENE, FrameSource.MANIPULATION, FrameSource.STEERING)
+        outdated: tuple[JobKind, ...] = ("reach",) if session.reach_since == session.revision else ()
+        self.session = session
+        self.hub.publish(session.describe())
+        self.hub.publish(describe_scene(session.scenario, session.revision))
+        self.rig.invalidate("the scenario or an option was changed")
+        self._plans.cancel("plan", "compare", *outdated)
+        self._order("needle", "needle")
+        self._order("estimate", "estimate")
+        self._start_timer("plan", self.limits.rest_s, self._plan_unless_inserting)
+
+    def _with_options(self, options: ask.OptionsRequest) -> PageSession:
+        known = [controller["name"] for controller in build_catalog().controllers]
+        if options.controller is not None and options.controller not in known:
+            raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
+        return self.session.with_options(options)
+
+    def require_processor(self) -> None:
+        """Raise Refusal during an insertion on the rig: a long computation would delay its loop."""
+        if self.rig.active:
+            raise Refusal(
+                "an insertion is on the rig, and this would take processor time from it: wait for its end"
+            )
+
+    def _order(self, action: Action, kind: JobKind) -> None:
+        if action == "plan":
+            self._stop_timer("plan")
+        self._plans.add(self._work(action, kind))
+
+    def _work(self, action: Action, kind: JobKind, **more: Any) -> WorkOrder:
+        session = self.session
+        return WorkOrder(
+            action,
+            kind,
+            revision=session.revision,
+            name=session.name,
+            scenario=session.scenario.values(),
+            seed=session.seed,
+            strategy=session.strategy,
+            controller=session.controller,
+            **more,
+        )
+
+    def _cancel(self, number: int) -> None:
+        for jobs in (self._plans, self._insertions):
+            kind = next((order.kind for order in jobs.orders if order.job == number), None)
+            if kind is None:
+                continue
+            if number == self.rig.job:
+                raise Refusal("it is an insertion on the rig: stop it instead")
+            if kind == "save":
+                raise Refusal("a run that is being saved is not cancelled: its data is nowhere else")
+            jobs.cancel_job(number)
+            return
+        raise Refusal(f"job = {number}: does not run or wait")
+
+    def _open(self, request: ask.OpenRequest) -> None:
+        of: Recording = "second" if request.second else "first"
+        order = WorkOrder("read", "recording", name=request.name or "", of=of)
+        if request.name is not None and request.row is not None:
+            self.require_processor()
+            folder = str(self.runs.study(request.name))
+            order = replace(order, action="row", kind="row", row=request.row, folder=folder)
+        elif request.name is not None:
+            order = replace(order, folder=str(self.runs.run(request.name)))
+        self._plans.cancel_slot("recording", of)
+        self.hub.forget((f"rows {of}", f"insertion {of}"))
+        self.hub.forget_frames(_SOURCES[of])
+        if request.name is None:
+            self.hub.publish(ClosedMessage(of=of))
+        else:
+            self._plans.add(order)
+
+    def _save(self, request: ask.SaveRequest) -> None:
+        if any(order.kind == "save" for jobs in (self._plans, self._insertions) for order in jobs.orders):
+            raise Refusal("another run is being saved: wait for its end")
+        if request.of == "live":
+            self.live.require_ended()
+            jobs, order = self._insertions, WorkOrder("save", "save", name=request.name)
+        else:
+            self._require_row(request.of)
+            jobs, order = self._plans, WorkOrder("save_row", "save", name=request.name, of=request.of)
+        jobs.add(replace(order, folder=str(self.runs.new(request.name))))
+
+    def _require_row(self, of: Recording) -> None:
+        newest = self.hub.newest(f"insertion {of}")
+        if not isinstance(newest, InsertionMessage) or newest.row is None:
+            raise Refusal("no row of a study is shown there: open one first")
+
+    # Timers and ends of jobs
+
+    def _plan_unless_inserting(self) -> None:
+        if not self.rig.active:  # else at the end of its insertion
+            self._order("plan", "plan")
+
+    def _plan_if_missing(self) -> None:
+        newest = self.hub.newest(f"plan {self.session.strategy}")
+        if not isinstance(newest, PlanMessage) or newest.revision != self.session.revision:
+            self._plan_unless_inserting()
+
+    def _end_job(self, order: WorkOrder, state: str, text: str) -> None:
+        if order.kind == "insertion":
+            self.live.end(order, state, text)
+            if order.rig and not self._idle:
+                self._plan_if_missing()
+        if order.kind == "save":
+            self._runs_changed.set()
+
+    def _end_unattended(self) -> None:
+        self._idle = True
+        self._plans.cancel(*_WORK)
+        self._insertions.cancel("check")
+        self.live.end_unattended()
+
+    def _start_timer(self, name: str, seconds: float, then: Callable[[], None]) -> None:
+        self._stop_timer(name)
+        self._timers[name] = asyncio.get_running_loop().call_later(seconds, then)
+
+    def _stop_timer(self, name: str) -> bool:
+        """Stop a timer; return whether there was one."""
+        timer = self._timers.pop(name, None)
+        if timer is not None:
+            timer.cancel()
+        return timer is not None
+
+    async def _watch_runs(self) -> None:
+        """Publish the folder of runs when it has changed; a thread reads it, since a disk may be slow."""
+        before: list[dict[str, Any]] | None = None
+        while True:
+            if self.clients.connected or before is None:
+                listed = await asyncio.to_thread(self.runs.listed)
+                if listed != before:
+                    before = listed
+                    self.hub.publish(RunsMessage(runs=listed))
+            self._runs_changed.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self.limits.runs_s):
+                    await self._runs_changed.wait()

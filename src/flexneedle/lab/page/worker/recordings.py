@@ -1,0 +1,169 @@
+"""Recorded insertions: read, described as rows and frames, and saved."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.lab.page.protocol import (
+    InsertionMessage,
+    PeriodRow,
+    Recording,
+    RowsMessage,
+    ServerMessage,
+    describe_scene,
+)
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
+from flexneedle.lab.page.worker.task import WorkerTask
+from flexneedle.loop.monitor.rules import has_indicator
+from flexneedle.phantom.tracking.table import TIP
+from flexneedle.record.loading import load_insertion
+from flexneedle.record.saving import save
+from flexneedle.simulator.state import Contacts
+from flexneedle.types import Floats, Insertion, Period, Plan, Shape, X, scenario_of
+
+_SOURCES: dict[Recording, FrameSource] = {"first": FrameSource.FIRST, "second": FrameSource.SECOND}
+
+
+def read_run(task: WorkerTask) -> None:
+    """Report a recorded insertion. Raises InputError or RunError for a folder without one."""
+    insertion, lacking = load_insertion(Path(task.order.folder))
+    report_recording(task, insertion, task.order.name, lacking)
+
+
+def report_recording(
+    task: WorkerTask, insertion: Insertion, name: str, note: str, row: int | None = None
+) -> None:
+    """Report an insertion as the recording of the order. note: added to its summary; row: of its study."""
+    for report in describe_recording(insertion, name, task.order.of, note, row):
+        task.control.check()
+        task.report(report)
+
+
+def describe_recording(
+    insertion: Insertion, name: str, of: Recording, note: str, row: int | None = None
+) -> Iterator[ServerMessage | ShapeFrame]:
+    """Yield messages and frames of a recorded insertion. note: added to its summary; row: of its study."""
+    plan, source, error = insertion.plan, _SOURCES[of], insertion.error_mm
+    yield InsertionMessage(
+        of=of,
+        name=name,
+        state=str(insertion.outcome),
+        summary="; ".join(filter(None, (insertion.summary, note))),
+        controller=insertion.controller,
+        seed=insertion.seed,
+        target=insertion.target,
+        periods=len(insertion.periods),
+        pace=0.0,
+        error_mm=error if error == error else None,
+        rig=insertion.rig,
+        row=row,
+        scene=describe_scene(scenario_of(insertion), 0),
+    )
+    yield make_frame(FrameKind.PATH, source, 0, plan.tips[:, :3])
+    if insertion.periods:
+        yield from frames_of(insertion.periods, source)
+    yield RowsMessage(of=of, first=0, rows=[row_of(period, plan) for period in insertion.periods])
+
+
+def save_complete(insertion: Insertion, folder: str) -> None:
+    """Save an insertion in a folder that appears in the list of runs only once all files are written.
+
+    Until then its name begins with a dot and is unique; a worker that is killed leaves it. Raises InputError and
+    RecordError as `flexneedle.save`.
+    """
+    whole = Path(folder)
+    part = whole.with_name(f".saving-{uuid4().hex}")
+    try:
+        save(insertion, part)
+    finally:  # a run without a figure is complete
+        if part.exists():
+            try:
+                part.rename(whole)
+            except OSError as error:
+                raise InputError(f"{whole}: cannot be created: {error.strerror}") from error
+
+
+def row_of(period: Period, plan: Plan) -> PeriodRow:
+    """Return the row of a period."""
+    tip = period.true_tip or period.estimate
+    measured = period.measurement
+    return PeriodRow(
+        index=period.index,
+        time=period.time,
+        action=str(period.action),
+        decision=period.decision,
+        verdict=str(period.verdict),
+        measured=None if measured.x is None else (measured.x, measured.y, measured.z),
+        estimate=period.estimate.point,
+        true=None if period.true_tip is None else period.true_tip.point,
+        error_mm=_distance_from_path(plan, tip.point),
+        guide=period.guide,
+        roll_deg=math.degrees(period.roll),
+        indicator=_largest_indicator(period),
+        energy_mj=period.strain_energy,
+        true_energy_mj=period.true_strain_energy,
+        miss_mm=period.miss,
+        miss_sd_mm=period.miss_sd,
+        decide_ms=1e3 * period.durations.get("decide", 0.0),
+        late=period.late,
+        warning=period.warning,
+    )
+
+
+def _distance_from_path(plan: Plan, point: Sequence[float]) -> float:
+    """Return the lateral distance (mm) of a point from the planned path of the tip, at its depth."""
+    y, z = (float(np.interp(point[0], plan.tips[:, X], plan.tips[:, column])) for column in (1, 2))
+    return math.hypot(point[1] - y, point[2] - z)
+
+
+def _largest_indicator(period: Period) -> float | None:
+    """Return the largest median of the references' indicators in a period; without references that of the tip."""
+    found: dict[str, list[float]] = {}
+    for checked in period.readings:
+        frame = checked.measurement.frame
+        for name, reading in ({} if frame is None else frame.readings).items():
+            if has_indicator(reading):
+                found.setdefault(name, []).append(reading.indicator or 0.0)
+    medians = {name: median(values) for name, values in found.items()}
+    references = [value for name, value in medians.items() if name != TIP]
+    return max(references, default=medians.get(TIP))
+
+
+def frames_of(periods: Sequence[Period], source: FrameSource) -> list[ShapeFrame]:
+    """Return the frames of successive periods: the needle, and the true and the predicted needle where known."""
+    first = periods[0].index
+    shapes: dict[FrameKind, list[Any]] = {
+        FrameKind.NEEDLE: [period.shape[:, :3] for period in periods],
+        FrameKind.TRUE: [period.true_shape for period in periods],
+        FrameKind.PREDICTED: [
+            None if period.predicted is None else _with_deviation(period.predicted) for period in periods
+        ],
+    }
+    found = []
+    for kind, paths in shapes.items():
+        known = [path for path in paths if path is not None]
+        if known:
+            without = np.full_like(known[0], np.nan, dtype=np.float32)
+            found.append(
+                make_frame(kind, source, first, *(without if path is None else path for path in paths))
+            )
+    return found
+
+
+def _with_deviation(shape: Shape) -> Floats:
+    """Return the points of a predicted needle, and the larger standard deviation across it."""
+    return np.column_stack([shape.nodes[:, :3], shape.sd.max(axis=1)])
+
+
+def channel_of(contacts: Contacts, number: int) -> ShapeFrame | None:
+    """Return the frame of the cut channel, with the stretch of the released tissue; None before the skin."""
+    if len(contacts.x) == 0:
+        return None
+    values = np.column_stack([contacts.x, contacts.position, 2.0 - contacts.stretch])
+    return make_frame(FrameKind.CHANNEL, FrameSource.LIVE, number, values)

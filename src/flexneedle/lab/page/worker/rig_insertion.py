@@ -1,0 +1,163 @@
+"""The connected rig: its check, and insertions on it, as by `flexneedle insert --rig`."""
+
+import sys
+from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from threading import Lock
+from time import monotonic
+from typing import Any
+
+from flexneedle.cli.common import SWITCHED_ON
+from flexneedle.control.controllers import used
+from flexneedle.errors import StoppedError
+from flexneedle.files import new_folder
+from flexneedle.lab.page.job_orders import SILENT_S, RigReport
+from flexneedle.lab.page.protocol import RigCheckMessage
+from flexneedle.lab.page.rigs import usable_rig
+from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
+from flexneedle.lab.page.worker.task import WorkerTask
+from flexneedle.lab.rig.check import Wanted, check_rig
+from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.start import announced
+from flexneedle.lab.rig.supervised import SupervisedRig, Tick
+from flexneedle.lab.rig.supervisor.client import CONTROLLER, Supervisor
+from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.ros.bridge import Bridge
+from flexneedle.lab.ros.check import check_ros
+from flexneedle.loop.choices import Choices
+from flexneedle.loop.events import AllGates, Event, Gate, Listener
+from flexneedle.loop.insert import check_choices
+from flexneedle.record.folder import Folder
+from flexneedle.record.recording import record_insertion
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Insertion
+
+_CHECKED_S = 2.0
+"""Time for which frames of the tracker are counted, as by `flexneedle rig check`."""
+_POLL_S = 0.05
+"""Time between two checks whether a waiting insertion may begin; the supervisor gets heartbeats meanwhile."""
+
+
+def check(task: WorkerTask) -> None:
+    """Compare the rig with its file and the scenario, and report the findings. Nothing moves."""
+    rig, clock, wanted = usable_rig(task.order.rig), WallClock(), Wanted(task.scenario, task.order.strategy)
+    task.report_job("running", text="each device is read, nothing moves")
+    findings = [*check_rig(rig, clock, _CHECKED_S, wanted), *check_ros(rig, clock, _CHECKED_S)]
+    task.report(
+        RigCheckMessage(revision=task.order.revision, findings=[asdict(finding) for finding in findings])
+    )
+
+
+def insert_on_rig(reporter: InsertionReporter) -> Insertion:
+    """Plan, open the rig, wait for "go", and insert, with a record in a new folder.
+
+    Raises StoppedError if it is stopped while it plans, and otherwise as `record_insertion`.
+    """
+    task, order = reporter.task, reporter.task.order
+    rig, scenario = usable_rig(order.rig), used(task.scenario)
+    reporter.rig = rig.name
+    choices = Choices.of(order.seed, task.controller, SupervisedRig(rig))
+    check_choices(scenario, order.strategy, choices)
+    path = new_folder(Path(order.name).stem, str(order.seed), root=Path(order.folder))
+    folder = Folder.claim(path, "", "insertion", scenario, order.seed)
+    reporter.folder = path.name
+    gate = RigGate(reporter, scenario)
+
+    with ExitStack() as stack:
+        listeners: list[Listener] = [reporter.take, gate]
+        gates: list[Gate] = [gate]
+        if rig.ros is not None:
+            bridge = stack.enter_context(Bridge(rig.ros, partial(print, file=sys.stderr, flush=True)))
+            listeners, gates = [*listeners, bridge], [bridge, gate]
+        insertion = record_insertion(
+            folder, scenario, order.strategy, choices, listeners=listeners, gate=AllGates(*gates)
+        )
+    reporter.notes += [*folder.problems, *folder.undrawn]
+    return insertion
+
+
+class RigGate(Gate):
+    """Starts, holds and stops an insertion as the server asks, and reports the rig's state; also a listener.
+
+    Ticks and `stop` come in other threads.
+    """
+
+    def __init__(self, reporter: InsertionReporter, scenario: Scenario) -> None:
+        self._reporter, self._scenario = reporter, scenario
+        self._control = reporter.task.control
+        self._supervisor: Supervisor | None = None
+        self._lock = Lock()
+        self._state, self._why = str(State.IDLE), ""
+        self._waits, self._moves, self._last = 0, list[str](), RigReport(state="")
+        self._count = 0
+        self._control.on_stop = self.stop
+
+    def __call__(self, event: Event) -> None:
+        """Report a tick."""
+        if isinstance(event, Tick):
+            self.take(event.report)
+
+    def confirm(self, rig: Any) -> None:
+        """Report the motions, and wait for "go". Raises StoppedError after a stop, DriverError after a fault."""
+        supervisor: Supervisor = rig
+        self._supervisor = supervisor
+        if self._control.stopped:
+            raise StoppedError(f"stopped: {self._control.stopped}")
+        self._wait([*announced(supervisor.rig, self._scenario, supervisor.positions), SWITCHED_ON])
+        self._reporter.announce("ready")
+        while self._control.held:
+            supervisor.wait(_POLL_S)
+        self._go()
+
+    def hold(self) -> str:
+        """Return the reason to hold, "" without one. Raises StoppedError after a stop, DriverError after a fault."""
+        held, waits = self._control.held, self._waits > 0
+        if held and not waits:
+            self._wait(announced(self._opened.rig, self._scenario, self._opened.positions))
+            self._reporter.announce("holding", held)
+        elif waits and not held:
+            self._go()
+        return held
+
+    def take(self, report: Report) -> None:
+        """Report the new state of the rig; stop it if the server is silent."""
+        silent = monotonic() - self._control.heard
+        if silent > SILENT_S and not self._control.stopped:
+            self._control.stopped = f"no signal of the page's server for {silent:.1f} s"
+            self.stop(self._control.stopped)
+        ended = report.state is State.STOPPED and report.why == CONTROLLER
+        self._state, self._why = ("ended", "") if ended else (str(report.state), report.why)
+        self._report()
+
+    def stop(self, why: str) -> None:
+        """Stop the motors at once."""
+        if self._supervisor is not None:
+            self._supervisor.request_stop(why)
+
+    @property
+    def _opened(self) -> Supervisor:
+        if self._supervisor is None:
+            raise RuntimeError("the rig is not open")
+        return self._supervisor
+
+    def _wait(self, moves: list[str]) -> None:
+        self._count += 1
+        self._waits, self._moves = self._count, moves
+        self._report()
+
+    def _go(self) -> None:
+        self._waits, self._moves = 0, []
+        self._report()
+        self._reporter.announce("running")
+
+    def _report(self) -> None:
+        with self._lock:
+            holds = self._waits and self._state == State.INSERTING
+            state, why = (State.HOLDING, self._control.held) if holds else (self._state, self._why)
+            report = RigReport(str(state), why, self._waits, tuple(self._moves))
+            if report != self._last:
+                self._last = report
+                self._reporter.task.report(report)

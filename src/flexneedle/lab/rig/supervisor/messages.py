@@ -1,0 +1,195 @@
+"""Messages between the supervisor and its client, pickled on a socket pair of one machine.
+
+Positions of axes are in mm or rad, times in s on the run's clock.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from flexneedle.geometry.registration import Rigid
+from flexneedle.lab.rig.devices.lock import this_program
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.ports import MotorState
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import Measurement, Point
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the supervisor works with, its first message.
+
+    started: zero of the run's clock on the monotonic clock (s); lateral_axes: of the needle; to_stage: map from the
+    tracker's frame to that of the insertion; tip_offset: from the sensor to the tip (mm); stale_after: age (s) above
+    which a reading is stale; dry: motors are read, and never moved; tracked: whether the tracker is opened;
+    client: the program that the motors are held for, for the message to another one.
+    """
+
+    rig: RigFile
+    started: float
+    lateral_axes: int
+    monitor: MonitorSettings
+    to_stage: Rigid
+    tip_offset: float
+    stale_after: float
+    dry: bool = False
+    tracked: bool = True
+    client: str = field(default_factory=this_program)
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Where the tip is expected during a step: positions (mm) at its begin and end, and how far from it a reading may
+    be (mm)."""
+
+    begin: Point
+    end: Point
+    most_off: float
+
+
+# To the supervisor
+
+
+@dataclass(frozen=True)
+class Heartbeat:
+    """The client is there."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Switch motors on and take their positions as the start. deepest: largest advance (mm) from there."""
+
+    deepest: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of an insertion: the roll (rad) in `roll_duration` s, confirmed by its position; then `travel` by axis in
+    `duration` s. An axis that cannot do that takes longer."""
+
+    number: int
+    roll: float
+    travel: Mapping[str, float]
+    duration: float
+    expected: Expectation | None = None
+    roll_duration: float = 0.0
+
+
+@dataclass(frozen=True)
+class Go:
+    """Move one axis alone to a position, at most at `speed` (mm/s or rad/s).
+
+    retract: as a withdrawal of the base, and not as a motion of the operator.
+    """
+
+    number: int
+    axis: str
+    position: float
+    speed: float
+    retract: bool = False
+
+
+@dataclass(frozen=True)
+class Home:
+    """Find the home of an axis."""
+
+    number: int
+    axis: str
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Stop all motors. who: the keyboard, a service, a signal."""
+
+    who: str
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Leave the states stopped and fault; nothing moves."""
+
+
+@dataclass(frozen=True)
+class Off:
+    """Switch all motors off, after a stop."""
+
+
+@dataclass(frozen=True)
+class Close:
+    """Stop, and end the supervisor."""
+
+
+Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Off | Close
+
+
+# From the supervisor
+
+
+@dataclass(frozen=True)
+class AxisState:
+    """An axis: its measured position, its motor, and how far from there its last target is (mm or rad)."""
+
+    position: float
+    motor: MotorState
+    queued: float = 0.0
+
+
+@dataclass(frozen=True)
+class Done:
+    """A motion has ended: what was really done by axis, from `begun` to `ended` (s).
+
+    turned: when the travel began after a roll, None without one;
+    why: why it was ended before its goal, or ""; state: of the rig after it.
+    """
+
+    number: int
+    travelled: Mapping[str, float]
+    begun: float
+    ended: float
+    state: State
+    why: str = ""
+    turned: float | None = None
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A request that the state does not allow, or that breaks a limit; nothing moved.
+
+    number: of the motion, or 0; state, cause: of the rig, and the reason of a stop or fault.
+    """
+
+    number: int
+    why: str
+    state: State
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What one tick found.
+
+    time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault, or what arming has changed;
+    axes: by name; measurements: since the last report, oldest first; tracker: its status; at_rest: whether no motion
+    and no stop is under way; late, work: how much later than scheduled the tick began, and how long it took (s);
+    missed: ticks left out since the start; requests: how many the rig had acted on, so that a client can wait for what
+    its request has changed.
+    """
+
+    time: float
+    state: State
+    why: str = ""
+    axes: Mapping[str, AxisState] = field(default_factory=dict)
+    measurements: tuple[Measurement, ...] = ()
+    tracker: str = ""
+    at_rest: bool = True
+    late: float = 0.0
+    work: float = 0.0
+    missed: int = 0
+    requests: int = 0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The supervisor ends; why: the reason, "" at a request."""
+
+    why: str = ""
