@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from flexneedle.control.controllers import CONTROLLERS, checked
+from flexneedle.control.controllers import CONTROLLERS as INCLUDED
+from flexneedle.control.controllers import checked
 from flexneedle.errors import InputError
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.spec import LARGEST_SEED, STUDIES
@@ -17,8 +18,8 @@ from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.files import dump_scenario, load_scenario
 
 PHANTOM = checked(load_scenario("phantom"))
-CONTROLLERS = tuple(CONTROLLERS)[:2]
-CHOICES = "must be one of " + ", ".join(CONTROLLERS)
+CONTROLLERS = tuple(INCLUDED)[:2]
+CHOICES = "must be one of " + ", ".join(INCLUDED)
 SEEDS = f"from 0 to {LARGEST_SEED}"
 DEPTHS, LATERALS = (25, 30, 35, 40, 45), (-5, 0, 5)
 
@@ -190,7 +191,7 @@ def test_the_targets_of_space_are_those_that_were_drawn(capsys):
 
 def test_all_means_every_controller(study):
     points = study('[[axes]]\nkey = "controller"\nvalues = "all"').points
-    assert [point.controller for point in points] == list(CONTROLLERS)
+    assert [point.controller for point in points] == list(INCLUDED)
 
 
 def test_keys_of_the_base_can_be_removed(study):
@@ -348,7 +349,7 @@ def test_the_shipped_studies_load():
         "phantom": 150,
         "phantom-published": 150,
         "odd-targets": 150,
-        "controllers": 150 * len(CONTROLLERS),
+        "controllers": 150 * len(INCLUDED),
         "mismatch": 5 * 150,
         "mismatch-doubled": 10_005,
         "imperfections": 18 * 150,
@@ -387,7 +388,7 @@ def test_the_controllers_study_has_the_phantoms_of_the_phantom_study():
     seeds = {}
     for insertion in insertions(load_study("controllers")):
         seeds.setdefault(insertion.point.controller, []).append(insertion.seed)
-    assert list(seeds) == list(CONTROLLERS)
+    assert list(seeds) == list(INCLUDED)
     assert all(own == list(range(100000, 100150)) for own in seeds.values())
 
 
