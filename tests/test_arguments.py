@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.arguments import point, whole
+from flexneedle.arguments import check_point, check_whole
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.errors import FlexneedleError, InputError
 from flexneedle.scenario.files import dump_scenario
@@ -136,9 +136,9 @@ def test_the_error_for_any_value_is_one_short_line(value):
 
 
 def test_numpy_numbers_are_accepted():
-    assert whole("seed", np.int64(3), 0) == 3
-    assert point("target", np.array([40.0, 5.0]), "x, y and z") == (40.0, 5.0, 0.0)
-    assert point("target", np.array([40.0, 5.0, -2.0]), "x, y and z") == (40.0, 5.0, -2.0)
+    assert check_whole("seed", np.int64(3), 0) == 3
+    assert check_point("target", np.array([40.0, 5.0]), "x, y and z") == (40.0, 5.0, 0.0)
+    assert check_point("target", np.array([40.0, 5.0, -2.0]), "x, y and z") == (40.0, 5.0, -2.0)
 
 
 def test_a_scenario_may_be_given_by_name_or_path(tmp_path):

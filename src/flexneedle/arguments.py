@@ -17,18 +17,18 @@ _LONGEST = 60  # characters of a value in a message
 _ROUNDING = 1e-6  # of the largest entry: rounding of a product of matrices in single precision
 
 
-def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
+def check_whole(name: str, value: Any, least: int, remedy: str = "") -> int:
     """Return an integer. Raises InputError for anything else, and for values below `least`."""
     try:
         number = least - 1 if isinstance(value, bool) else index(value)
     except TypeError:
         number = least - 1
     if number < least:
-        raise refusal(name, value, f"must be a whole number, at least {least}", remedy)
+        raise make_refusal(name, value, f"must be a whole number, at least {least}", remedy)
     return number
 
 
-def point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
+def check_point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
     """Return three numbers, the last 0 if only two are given; `parts` describes them. Raises InputError for others."""
     try:
         given = [] if isinstance(value, str | Mapping) else list(value)
@@ -36,12 +36,12 @@ def point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) not in (2, 3):
-        raise refusal(name, value, f"must be two or three numbers, {parts}")
+        raise make_refusal(name, value, f"must be two or three numbers, {parts}")
     x, y, z = (*numbers, 0.0)[:3]
     return x, y, z
 
 
-def numbers(value: Any, count: int) -> tuple[float, ...] | None:
+def read_numbers(value: Any, count: int) -> tuple[float, ...] | None:
     """Return a row of `count` numbers, finite or not, as floats; None for anything else."""
     try:
         row = tuple(value)
@@ -52,58 +52,58 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return tuple(map(float, row))
 
 
-def rows_of(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
+def read_rows(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
     """Return any number of rows of `count` numbers, finite or not, as floats; None for anything else."""
     try:
-        rows = [numbers(row, count) for row in value]
+        rows = [read_numbers(row, count) for row in value]
     except TypeError:
         return None
     known = tuple(row for row in rows if row is not None)
     return known if len(known) == len(rows) else None
 
 
-def covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...], ...]:
+def check_covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...], ...]:
     """Return a covariance by rows. Raises InputError unless it has `size` rows of `size` numbers, is symmetric up to
     rounding and has no negative variance; entries that are not finite may be anything.
     """
-    rows = rows_of(value, size)
+    rows = read_rows(value, size)
     if rows is None or len(rows) != size:
-        raise refusal(name, value, f"must be {size} rows of {size} numbers")
+        raise make_refusal(name, value, f"must be {size} rows of {size} numbers")
     rounding = _ROUNDING * max((abs(part) for row in rows for part in row if isfinite(part)), default=0.0)
     for i, row in enumerate(rows):
         if -inf < row[i] < 0.0:
-            raise refusal(f"{name}[{i}][{i}]", row[i], "must be at least 0, a variance")
+            raise make_refusal(f"{name}[{i}][{i}]", row[i], "must be at least 0, a variance")
         for j in range(i + 1, size):
             if rounding < abs(row[j] - rows[j][i]) < inf:
                 rule = f"must equal {name}[{j}][{i}], here {rows[j][i]!r}, up to rounding"
-                raise refusal(f"{name}[{i}][{j}]", row[j], rule)
+                raise make_refusal(f"{name}[{i}][{j}]", row[j], rule)
     return rows
 
 
-def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
+def check_instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
     """Return a value of the class `kind`. Raises InputError, with the remedy, for another."""
     if not isinstance(value, kind):
         rule = f"must be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
-        raise refusal(name, value, rule, remedy)
+        raise make_refusal(name, value, rule, remedy)
     return value
 
 
-def path(name: str, value: Any) -> Path:
+def check_path(name: str, value: Any) -> Path:
     """Return the path of a file or folder. Raises InputError for anything but text and paths."""
     if not isinstance(value, str | PathLike):
-        raise refusal(name, value, "must be a path")
+        raise make_refusal(name, value, "must be a path")
     return Path(value)
 
 
-def shown(value: object) -> str:
+def shorten(value: object) -> str:
     """Return any value as short text in one line."""
     text = " ".join(reprlib.repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def refusal(name: str, value: object, rule: str, remedy: str = "") -> InputError:
+def make_refusal(name: str, value: object, rule: str, remedy: str = "") -> InputError:
     """Return the error for a value that violates a rule."""
-    return InputError(f"{name} = {shown(value)}: {rule}{remedy and f'; {remedy}'}")
+    return InputError(f"{name} = {shorten(value)}: {rule}{remedy and f'; {remedy}'}")
 
 
 def require_extra(extra: str, *modules: str) -> None:

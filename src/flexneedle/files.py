@@ -31,7 +31,7 @@ def replace_file(path: Path, data: bytes) -> None:
             raise RecordError.of(path, error) from error
 
 
-def new_folder(*parts: str, now: datetime | None = None, root: Path = RUNS) -> Path:
+def create_folder(*parts: str, now: datetime | None = None, root: Path = RUNS) -> Path:
     """Create and return a folder `<root>/<date>-<part>-<part>`; further ones in the same second get a number.
 
     now: time in the name (default: the present). Raises InputError if it cannot be created.

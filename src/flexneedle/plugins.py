@@ -15,7 +15,7 @@ from pathlib import Path
 from traceback import extract_tb
 from typing import Any, TypeVar
 
-from flexneedle.arguments import shown
+from flexneedle.arguments import shorten
 from flexneedle.errors import DriverError, FlexneedleError, InputError, describe_error, make_printable
 
 OWN = "module:NAME of your own"
@@ -56,7 +56,7 @@ def find_part(
         found, problem = given, rule(given)
         problem += f"; or give one of {', '.join(included)}, or {OWN}" if problem else ""
     if problem:
-        label = repr(given) if isinstance(given, str) else getattr(given, "__name__", shown(given))
+        label = repr(given) if isinstance(given, str) else getattr(given, "__name__", shorten(given))
         raise InputError(f"{key} = {make_printable(label)}: {problem}")
     return given if isinstance(given, str) else _name_of(given), found
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.arguments import covariance, numbers, refusal, rows_of
+from flexneedle.arguments import check_covariance, make_refusal, read_numbers, read_rows
 
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
@@ -138,9 +138,9 @@ class Control(_Columns):
         values: tuple[Any, ...] = (db_x, db_y, db_z, db_theta, db_psi, dg_y, dg_z, roll, spin)
         for name, value in zip(COLUMNS, values, strict=True):
             if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-                raise refusal(name, value, "must be a number, in mm or rad")
+                raise make_refusal(name, value, "must be a number, in mm or rad")
         if not isinstance(flip, bool | np.bool_):
-            raise refusal("flip", flip, "must be True or False")
+            raise make_refusal("flip", flip, "must be True or False")
         turn = roll + math.pi if flip else roll
         return super().__new__(cls, *map(float, (*values[:ROLL], turn, spin)))
 
@@ -149,7 +149,7 @@ class Control(_Columns):
         """Return the control of nine columns. Raises InputError for another number of them."""
         values = tuple(row)
         if len(values) != len(COLUMNS):
-            raise refusal("control", values, f"must have {len(COLUMNS)} columns: {', '.join(COLUMNS)}")
+            raise make_refusal("control", values, f"must have {len(COLUMNS)} columns: {', '.join(COLUMNS)}")
         return cls(*values)
 
     @property
@@ -254,17 +254,17 @@ class Measurement:
 
     def __post_init__(self) -> None:
         if self.direction is not None:
-            slopes = numbers(self.direction, 2)
+            slopes = read_numbers(self.direction, 2)
             if slopes is None:
-                raise refusal("direction", self.direction, "must be two numbers, dy/dx and dz/dx in rad")
+                raise make_refusal("direction", self.direction, "must be two numbers, dy/dx and dz/dx in rad")
             object.__setattr__(self, "direction", slopes)
-        points = rows_of(self.points, 3)
+        points = read_rows(self.points, 3)
         if points is None:
-            raise refusal("points", self.points, "must each be three numbers, x, y, z in mm")
+            raise make_refusal("points", self.points, "must each be three numbers, x, y, z in mm")
         object.__setattr__(self, "points", points)
         for name, size in (("covariance", 3), ("direction_covariance", 2)):
             if (matrix := getattr(self, name)) is not None:
-                object.__setattr__(self, name, covariance(name, matrix, size))
+                object.__setattr__(self, name, check_covariance(name, matrix, size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -562,10 +562,10 @@ class Insertion:
 def scenario_of(record: Plan | Insertion) -> "Scenario":
     """Return the scenario of a plan or an insertion. Raises InputError if it has none, and for other types."""
     if not isinstance(record, Plan | Insertion):
-        raise refusal("record", record, "must be a Plan or an Insertion", _MAKE_ONE)
+        raise make_refusal("record", record, "must be a Plan or an Insertion", _MAKE_ONE)
     scenario = record.scenario or (record.plan.scenario if isinstance(record, Insertion) else None)
     if scenario is None:
-        raise refusal("scenario", None, f"must be known: {record!r} has none", _GIVE_ONE)
+        raise make_refusal("scenario", None, f"must be known: {record!r} has none", _GIVE_ONE)
     return scenario
 
 

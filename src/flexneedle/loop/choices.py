@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from flexneedle.arguments import refusal, whole
+from flexneedle.arguments import check_whole, make_refusal
 from flexneedle.control.controllers import DEFAULT
 from flexneedle.control.interface import Controller
 from flexneedle.loop.parts import controller_of
@@ -39,8 +39,8 @@ class Choices:
         source = VirtualRig() if rig is None else rig
         if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
             wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"
-            raise refusal("rig", source, wanted, "see flexneedle.devices.open_rig")
-        return cls(whole("seed", seed, 0), name, resolved, source, force, threads)
+            raise make_refusal("rig", source, wanted, "see flexneedle.devices.open_rig")
+        return cls(check_whole("seed", seed, 0), name, resolved, source, force, threads)
 
     @property
     def parts(self) -> dict[str, Any]:

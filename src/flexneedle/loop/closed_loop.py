@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from flexneedle.arguments import instance
+from flexneedle.arguments import check_instance
 from flexneedle.control.forecast import missed, warning
 from flexneedle.control.interface import Decision, at_depth
 from flexneedle.errors import CommandError, DriverError, RefusedError, StoppedError, one_line
@@ -182,7 +182,7 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
         motion = rig.driver.apply(command, max(1, readings) * reading)
     except CommandError as error:  # of a controller: refused, with a record of all before
         raise RefusedError(one_line(error)) from error
-    motion = instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
+    motion = check_instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
     if (
         motion.held
     ):  # a decision that the rig does not carry out takes no time: the next one shall have a reading

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flexneedle.arguments import instance
+from flexneedle.arguments import check_instance
 from flexneedle.control import tables
 from flexneedle.control.controllers import DEFAULT, used
 from flexneedle.control.guide import check_guide
@@ -68,7 +68,7 @@ def insert(
     """
     scenario, plan = (
         load_scenario(scenario),
-        instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)"),
+        check_instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)"),
     )
     choices = Choices.of(seed, controller, rig, force=force, threads=threads)
     return carry_out(placed(scenario, plan), plan, choices, Stream(tuple(listeners), gate or Gate()))

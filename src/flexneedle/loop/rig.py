@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from flexneedle.arguments import refusal
+from flexneedle.arguments import make_refusal
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.events import Stream
 from flexneedle.phantom.phantom import Condition
@@ -72,9 +72,11 @@ class Rig:
         _check_port("driver", self.driver, Driver, ("apply", "stop"))
         _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
         if not (self.truth is None or callable(self.truth)):
-            raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+            raise make_refusal(
+                "truth", self.truth, "must be a function of () that returns a Condition, or None"
+            )
         if not (self.deadline is None or 0.0 < self.deadline < math.inf):
-            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
+            raise make_refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
 
     @property
     def names(self) -> dict[str, Any]:
@@ -109,4 +111,4 @@ def _check_port(name: str, given: object, port: type, parts: Collection[str]) ->
     missing = [part for part in parts if isinstance(given, type) or not hasattr(given, part)]
     if missing:
         wanted = f"must be an object with {', '.join(parts)}"
-        raise refusal(name, given, wanted, f"see flexneedle.ports.{port.__name__}")
+        raise make_refusal(name, given, wanted, f"see flexneedle.ports.{port.__name__}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexneedle.arguments import point, whole
+from flexneedle.arguments import check_point, check_whole
 from flexneedle.costs.table import Trajectories
 from flexneedle.costs.terms import PLAN
 from flexneedle.errors import InputError
@@ -72,10 +72,10 @@ def plan(
     result. Same seed, same plan.
     Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
     """
-    scenario, seed = load_scenario(scenario), whole("seed", seed, 0)
+    scenario, seed = load_scenario(scenario), check_whole("seed", seed, 0)
     if strategy not in STRATEGIES:
         raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
-    goal = scenario.target.position if target is None else point("target", target, _TARGET)
+    goal = scenario.target.position if target is None else check_point("target", target, _TARGET)
     check_target(scenario, *goal)
     begun, rng = time.perf_counter(), np.random.default_rng(seed)
     simulator = Simulator(scenario, threads)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError, ScenarioError
-from flexneedle.files import new_folder, replace_file
+from flexneedle.files import create_folder, replace_file
 from flexneedle.record.plain import plan_from_values, plan_values, to_text
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Plan
@@ -77,7 +77,7 @@ class Folder:
         Raises InputError if the folder already contains a run or a study, or cannot be created.
         """
         now = datetime.now(UTC)
-        path = _make(new_folder(name, str(seed), now=now) if out is None else out)
+        path = _make(create_folder(name, str(seed), now=now) if out is None else out)
         values = {
             "format": _FORMAT,
             "kind": kind,

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from flexneedle.arguments import instance
+from flexneedle.arguments import check_instance
 from flexneedle.errors import InputError
 from flexneedle.record.columns import COLUMNS, to_values
 from flexneedle.record.export import marks
@@ -18,7 +18,9 @@ def to_dataframe(insertion: Insertion) -> "DataFrame":
     Column names end in their unit; unknown numbers are NaN. Raises InputError for another type, or if pandas is not
     installed.
     """
-    checked = instance("insertion", insertion, Insertion, "make one with flexneedle.insert(scenario, plan)")
+    checked = check_instance(
+        "insertion", insertion, Insertion, "make one with flexneedle.insert(scenario, plan)"
+    )
     try:
         from pandas import DataFrame
     except ModuleNotFoundError:

@@ -3,7 +3,7 @@
 import warnings
 from pathlib import Path
 
-from flexneedle.arguments import path
+from flexneedle.arguments import check_path
 from flexneedle.errors import InputError, RunError
 from flexneedle.record.folder import TRACE_FILE, RunFile, read_run
 from flexneedle.record.reader import read_trace
@@ -19,7 +19,7 @@ def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
     recorded, and of an incomplete trace. Raises InputError if the folder contains no run or is damaged, RunError if the
     run ended before it had a plan.
     """
-    run = _planned(read_run(path("run_dir", run_dir)))
+    run = _planned(read_run(check_path("run_dir", run_dir)))
     found: Insertion | Plan | dict[str, Plan]
     if run.kind == "insertion":
         found, note = insertion_of(run)

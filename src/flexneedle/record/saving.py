@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flexneedle.arguments import path
+from flexneedle.arguments import check_path
 from flexneedle.control.controllers import used
 from flexneedle.errors import RecordError, describe_error
 from flexneedle.record.figures import draw_run
@@ -26,7 +26,7 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
     that already contains a run or cannot be created, and for a record without its scenario; RecordError if a file
     cannot be written.
     """
-    scenario, out = scenario_of(record), path("folder", folder)
+    scenario, out = scenario_of(record), check_path("folder", folder)
     if isinstance(record, Plan):
         claimed = Folder.claim(out, "", "plan", used(scenario), record.seed)
         keep_plan(claimed, record)

@@ -5,7 +5,7 @@ from pathlib import Path
 import tomli_w
 from pydantic import ValidationError
 
-from flexneedle.arguments import shown
+from flexneedle.arguments import shorten
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.library import Library, label
 from flexneedle.scenario.model import Scenario
@@ -27,7 +27,7 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
     if isinstance(source, Scenario):
         return source
     if not isinstance(source, str | Path):
-        raise ScenarioError(f"scenario = {shown(source)}: must be a preset name, a path or a Scenario")
+        raise ScenarioError(f"scenario = {shorten(source)}: must be a preset name, a path or a Scenario")
     if isinstance(source, str) and source in PRESETS.names():
         return Scenario.from_values(PRESETS.shipped(source), source)
     if isinstance(source, str) and source.startswith(WORLD):

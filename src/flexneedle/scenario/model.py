@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from flexneedle.arguments import refusal
+from flexneedle.arguments import make_refusal
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.dotted import flatten, set_value, split_key
 from flexneedle.scenario.problems import describe, key_path, refuse, to_line
@@ -104,7 +104,9 @@ class Scenario(Section):
         Raises ScenarioError if a key is unknown or the copy breaks a rule.
         """
         if not isinstance(changes, Mapping):
-            raise refusal("changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}')
+            raise make_refusal(
+                "changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}'
+            )
         values = self.values()
         for key, value in changes.items():
             set_value(values, key, _expanded(key, value))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.arguments import refusal, whole
+from flexneedle.arguments import check_whole, make_refusal
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
@@ -22,14 +22,14 @@ def controls(*shape: int, **columns: ArrayLike) -> Floats:
     """Return an array (*shape, 9) of controls: `columns` by name, the others 0. Raises InputError for other names, for
     sizes that are not whole numbers from 0, and for values that do not broadcast to the shape.
     """
-    array = np.zeros((*(whole("size", size, 0, _SIZES) for size in shape), len(COLUMNS)))
+    array = np.zeros((*(check_whole("size", size, 0, _SIZES) for size in shape), len(COLUMNS)))
     for name, values in columns.items():
         if name not in COLUMNS:
-            raise refusal("column", name, f"must be one of {', '.join(COLUMNS)}")
+            raise make_refusal("column", name, f"must be one of {', '.join(COLUMNS)}")
         try:
             array[..., COLUMNS.index(name)] = values
         except (TypeError, ValueError):
-            raise refusal(name, values, f"must be numbers that broadcast to the shape {shape}") from None
+            raise make_refusal(name, values, f"must be numbers that broadcast to the shape {shape}") from None
     return array
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.arguments import instance, refusal, whole
+from flexneedle.arguments import check_instance, check_whole, make_refusal
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
@@ -73,7 +73,7 @@ class Simulator:
         constants: model.Model | None = None,
     ) -> None:
         self.scenario = load_scenario(scenario)
-        self.threads = _cores() if threads is None else whole("threads", threads, 1, _ALL_CORES)
+        self.threads = _cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
         self._model = constants or _build_model(self.scenario)
         self._limits = Limits.of(self.scenario)
 
@@ -106,8 +106,8 @@ class Simulator:
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
-        instance("state", state, State, "begin with simulator.start()")
-        instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
+        check_instance("state", state, State, "begin with simulator.start()")
+        check_instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
         self.check(state, control)
         return self._carried_out(state, np.array([control]))[0]
 
@@ -176,7 +176,7 @@ class Simulator:
         rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays
         if rows.ndim != 3 or rows.shape[2] != len(COLUMNS):
             rule = f"must be (N, m, {len(COLUMNS)}), sequences of controls with the columns of Control"
-            raise refusal("shape of controls", rows.shape, rule)
+            raise make_refusal("shape of controls", rows.shape, rule)
         if limits:
             self._limits.check(state.travel, rows, state.roll)
         rows = along_entry(self.scenario, rows)

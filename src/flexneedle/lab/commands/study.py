@@ -64,7 +64,7 @@ def _study(args: argparse.Namespace) -> int:
     from flexneedle.arguments import require_extra
     from flexneedle.cli.progress import Progress
     from flexneedle.errors import InputError, RunError
-    from flexneedle.files import new_folder
+    from flexneedle.files import create_folder
     from flexneedle.lab.study.grid import load_study
     from flexneedle.lab.study.pools import check_address
     from flexneedle.lab.study.runner import run_study
@@ -77,7 +77,7 @@ def _study(args: argparse.Namespace) -> int:
     if args.scheduler is not None:
         check_address(args.scheduler)
     study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
-    folder = args.out or new_folder("study", study.name)
+    folder = args.out or create_folder("study", study.name)
     compile_first(*study.axes)
     begun = time.monotonic()
     try:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 
-from flexneedle.arguments import shown as text_of
+from flexneedle.arguments import shorten as text_of
 from flexneedle.errors import InputError, RefusedError
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import STILL

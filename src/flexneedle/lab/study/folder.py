@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError, describe_error, make_printable, one_line
-from flexneedle.files import RUNS, new_folder, replace_file
+from flexneedle.files import RUNS, create_folder, replace_file
 from flexneedle.lab.study.grid import Study, StudyInsertion, recorded_study
 from flexneedle.lab.study.journal import Journal, read_rows
 from flexneedle.record.folder import STUDY_FILE, versions
@@ -69,7 +69,7 @@ def study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
     """
     outer = RUNS if out is None else out
     missing = [path for path in (outer, *outer.parents) if not _exists(path)]
-    folder = new_folder("study", name) if out is None else out
+    folder = create_folder("study", name) if out is None else out
     try:
         yield folder, not _exists(folder / STUDY_FILE)
     except BaseException:

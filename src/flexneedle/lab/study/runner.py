@@ -10,7 +10,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from flexneedle.arguments import path, require_extra, whole
+from flexneedle.arguments import check_path, check_whole, require_extra
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.study import pools
 from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder, remove_unused, study_folder
@@ -64,13 +64,13 @@ def run_study(
     from flexneedle.lab.study.tables import write_tables
 
     if not isinstance(source, Study):
-        path("source", source)
+        check_path("source", source)
     study = load_study(source)
     if workers is not None and scheduler is not None:
         raise InputError(f"workers = {workers}: sets local processes: remove it, or remove the scheduler")
     if workers is not None:
-        workers = whole("workers", workers, 1, "omit it for one per core")
-    given = None if out is None else path("out", out)
+        workers = check_whole("workers", workers, 1, "omit it for one per core")
+    given = None if out is None else check_path("out", out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
     # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
     # script.

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flexneedle.errors import InputError
-from flexneedle.files import new_folder
+from flexneedle.files import create_folder
 
 
 def results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:
@@ -12,7 +12,7 @@ def results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:
 
     Raises InputError if `out` already contains one of the files `results` or cannot be created.
     """
-    path = out if out is not None else new_folder("em", name)
+    path = out if out is not None else create_folder("em", name)
     for result in results:
         if (path / result).exists():
             raise InputError(f"{path}: already contains {result}: choose another folder")

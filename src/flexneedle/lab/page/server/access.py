@@ -14,7 +14,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from flexneedle.arguments import shown
+from flexneedle.arguments import shorten
 
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:\d{1,5})?")
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -79,12 +79,12 @@ class AccessRules:
         host = headers.get("host", "")
         if len(headers.getlist("host")) != 1 or not self._is_here(host):
             choices = ", ".join(sorted(self.names)) + (" or an address" if self.literal else "")
-            return 403, f"Host = {shown(host)}: must be one of {choices}"
+            return 403, f"Host = {shorten(host)}: must be one of {choices}"
         origin = headers.get("origin")
         if origin is None and socket:
             return 403, "Origin is missing: only the page itself may connect"
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
-            return 403, f"Origin = {shown(origin)}: must be http://{host}, only the page itself may connect"
+            return 403, f"Origin = {shorten(origin)}: must be http://{host}, only the page itself may connect"
         if not page and headers.get("sec-fetch-site") == "cross-site":
             return 403, "Sec-Fetch-Site = cross-site: only the page itself may ask for this"
         if self.token and not any(self._matches(given) for given in self._tokens(headers, query)):

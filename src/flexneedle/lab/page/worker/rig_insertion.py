@@ -12,7 +12,7 @@ from typing import Any
 from flexneedle.cli.common import SWITCHED_ON
 from flexneedle.control.controllers import used
 from flexneedle.errors import StoppedError
-from flexneedle.files import new_folder
+from flexneedle.files import create_folder
 from flexneedle.lab.page.job_orders import SILENT_S, RigReport
 from flexneedle.lab.page.protocol import RigCheckMessage
 from flexneedle.lab.page.rigs import usable_rig
@@ -61,7 +61,7 @@ def insert_on_rig(reporter: InsertionReporter) -> Insertion:
     reporter.rig = rig.name
     choices = Choices.of(order.seed, task.controller, SupervisedRig(rig))
     check_choices(scenario, order.strategy, choices)
-    path = new_folder(Path(order.name).stem, str(order.seed), root=Path(order.folder))
+    path = create_folder(Path(order.name).stem, str(order.seed), root=Path(order.folder))
     folder = Folder.claim(path, "", "insertion", scenario, order.seed)
     reporter.folder = path.name
     gate = RigGate(reporter, scenario)

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexneedle.arguments import shown
+from flexneedle.arguments import shorten
 from flexneedle.errors import DriverError, FlexneedleError, InputError, RigError, make_printable, one_line
 from flexneedle.lab.rig.rig_file import Part, RigFile
 from flexneedle.lab.rig.speeds import pace_problems
@@ -283,7 +283,7 @@ def _record_rule(record: Any) -> str:
         wanted, fits = _TYPES.get(field.type, ("", None))
         value = getattr(record, field.name)
         if fits is not None and not fits(value):
-            return f"{field.name} must be {wanted}, not {shown(value)}"
+            return f"{field.name} must be {wanted}, not {shorten(value)}"
     turn = getattr(record, "orientation", None)
     if turn is not None and abs((size := hypot(*turn)) - 1.0) > _UNIT:
         return f"orientation must be a unit quaternion w, x, y, z, not one of length {size:g}"
