@@ -33,7 +33,9 @@ CHECKED = (
     "src/flexneedle/errors.py",
     "src/flexneedle/files.py",
     "src/flexneedle/interrupts.py",
+    "src/flexneedle/lab/commands/serve.py",
     "src/flexneedle/lab/emulators",
+    "src/flexneedle/lab/page",
     "src/flexneedle/lab/process.py",
 )
 # Construction, pattern (a space matches any white space), what to write.

@@ -126,5 +126,5 @@ def _announce(address: str, opens: bool) -> None:
 
 
 def _has_display() -> bool:
-    """Whether a browser could open a window; in a terminal without one a text browser would start."""
+    """Return whether a browser could open a window; in a terminal without one a text browser would start."""
     return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -154,7 +154,7 @@ def test_a_server_that_was_started_again_is_reported(visit, server):
     server.send(session(5, seed=7))
     page.wait_for_selector("text=seed 7")
     server.drop()
-    page.wait_for_selector("text=The server was started again")
+    page.wait_for_selector("text=The server was restarted")
     page.wait_for_selector("text=seed 0")
     assert page.evaluate("flexneedle.store.get('refusals').length") == 1
 

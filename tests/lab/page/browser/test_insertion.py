@@ -114,7 +114,7 @@ def test_disturbances_are_sent_and_listed(panel, server):
     click(page, "Stiffen")
     click(page, "Drop")
     click(page, "Bring")
-    click(page, "Take away")
+    click(page, "Remove the plate")
     assert server.wait_for("disturb", 6) == [
         {"type": "disturb", "what": "push", "size": 0.25, "angle_deg": 0},
         {"type": "disturb", "what": "push", "size": 0},
@@ -239,7 +239,7 @@ def test_a_rig_that_is_held_has_to_be_confirmed_again(rig_panel, server):
     server.send(rig("holding", "Bench: further", job=7, begun=True, why="nobody is in control"))
     page.wait_for_selector("text=It holds: the needle rests where it is: nobody is in control.")
     assert not page.is_checked("#rig-free")
-    assert shown_buttons(page) == {"Arm": False, "Go on": False}
+    assert shown_buttons(page) == {"Arm": False, "Continue": False}
     page.check("#rig-free")
     server.send(rig("armed", "Bench: further", job=7, begun=True))
     page.wait_for_selector("text=It is armed for one start.")

@@ -32,7 +32,7 @@ class WorkerProcess:
         self._name, self._command = name, command
         self._on_report, self._on_end = on_report, on_end
         self.ready = False
-        """Whether the process can take work."""
+        """True once the process can take work."""
         self._child: ChildProcess | None = None
         self._keeping: asyncio.Task[None] | None = None
 

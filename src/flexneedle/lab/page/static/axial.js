@@ -11,7 +11,7 @@ import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js"
 
 const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
 
-// Half of what is shown (mm): the target with room to move it, and the reach.
+// Half of the shown width (mm): the target with room to move it, and the reach.
 function halfAround(target, ends) {
   const far = ([, y, z]) => Math.max(Math.abs(y), Math.abs(z));
   return Math.max(LEAST, Math.ceil(far(target) + AROUND), ...ends.map((end) => Math.ceil(far(end) + EDGE)));

@@ -1,4 +1,4 @@
-// What part of space the views show.
+// The part of space that the views show.
 
 const [BEHIND, BEYOND, AROUND, STEP] = [8, 8, 4, 5]; // mm
 

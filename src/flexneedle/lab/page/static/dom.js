@@ -1,7 +1,7 @@
-// Elements of the page, made without markup in strings.
+// Create elements without markup in strings.
 
 // An element: name with classes ("div.stage"), properties and attributes, children (elements or text).
-// A function is a listener of the event by that name ({click: …}); a value of undefined or false is left out.
+// A function is a listener of the event by that name ({click: …}); undefined and false are left out.
 export function make(name, properties = {}, ...children) {
   const [tag, ...classes] = name.split(".");
   const element = document.createElement(tag);
@@ -32,7 +32,7 @@ export function arrange(element, children) {
   });
 }
 
-// A number for people: digits after the point, with a true minus sign; "–" if it is unknown.
+// Format a number: digits after the point, with a true minus sign; "–" if it is unknown.
 export function shown(value, digits = 2) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   return value.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−");

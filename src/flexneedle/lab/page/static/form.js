@@ -48,18 +48,18 @@ class Form {
   #schema;
   #store;
   #link;
-  #made = ""; // name, keys and layers that the form was made of
+  #made = ""; // name, keys and layers of the form
   #sections = [];
   #problems = {}; // by key
-  #refusal = 0; // number of the newest that was read
+  #refusal = 0; // number of the newest refusal
   #revision;
-  #chosen = ""; // key of the field that was edited last
+  #chosen = ""; // key of the last edited field
 
   constructor(element, schema, store, link) {
     [this.#element, this.#schema, this.#store, this.#link] = [element, schema, store, link];
   }
 
-  // Show the session with the draft. Returns whether the fields are others than before.
+  // Show the session with the draft. Return whether the fields have changed.
   update() {
     const session = this.#store.get("session");
     if (!session) return false;
@@ -69,7 +69,7 @@ class Form {
     return remade;
   }
 
-  // Show the fields with all of some words, and their sections; without words all. Returns how many with them.
+  // Show the fields that contain all words, and their sections; without words all. Return their number.
   find(words) {
     let count = 0;
     for (const section of this.#sections) {
@@ -84,7 +84,7 @@ class Form {
     return count;
   }
 
-  // The form is made again for another scenario, and when it has other layers or tables.
+  // Make the form again for another scenario, and for other layers or tables.
   #remake({ name, values }) {
     const words = Object.keys(values).filter((key) => /^tissue\.\d+\.(law|name)$/.test(key)).map((key) => values[key]);
     const made = JSON.stringify([name, Object.keys(values), words]);
@@ -93,7 +93,7 @@ class Form {
     const focused = this.#element.contains(document.activeElement) && document.activeElement.id;
     this.#made = made;
     const found = sectionsOf(this.#schema, values).sort((a, b) => place(a.name) - place(b.name));
-    if (this.#sections.length) open.push(this.#chosen); // a table that was just chosen
+    if (this.#sections.length) open.push(this.#chosen); // a table chosen just now
     this.#sections = found.map((section) => this.#sectionOf(section, open));
     this.#element.replaceChildren(...this.#sections.map((section) => section.element));
     if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
@@ -113,7 +113,7 @@ class Form {
     return made;
   }
 
-  // The fields of a section are made when it is opened first.
+  // Make the fields of a section when it is first opened.
   #make(section) {
     if (section.views.length) return;
     const { values } = this.#store.get("session");
@@ -127,7 +127,7 @@ class Form {
     this.#fill(section);
   }
 
-  // The problem of a field: its own, or of a part of its value that has no field; of a law that of a part of its layer.
+  // The problem of a field, or of a part of its value without a field; for a law also of a part of its layer.
   #problemOf(field) {
     const { [field.key]: own, ...others } = this.#problems;
     const whole = field.key.replace(LAW, "$1") + ".";
@@ -185,14 +185,14 @@ class Form {
   }
 }
 
-// What a field shows of edits that are not answered yet; undefined where none is of it.
+// Pending value of a field; undefined without a pending edit.
 function editedOf(field, draft) {
   const [, name] = LAW.exec(field.key) ?? [];
   if (name && draft.tissue) return draft.tissue[Number(name.split(".")[1])]?.law;
   return field.key in draft ? shownOf(field, draft[field.key]) : undefined;
 }
 
-// Whether a key is that of a field, or of the table that it stands for.
+// Return whether a key belongs to a field or its table.
 const isOf = (field, key) => key === field.key || (field.start && key.startsWith(`${field.key}.`));
 
 // Tables of the layers, from values by key.

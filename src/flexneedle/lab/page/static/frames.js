@@ -1,4 +1,4 @@
-// Binary frames of shapes: the counterpart of page/frames.py, which is the reference.
+// Binary frames of shapes: the counterpart of page/shape_frames.py, which is the reference.
 
 export const Kind = Object.freeze({
   NEEDLE: 1, TRUE: 2, PREDICTED: 3, SAMPLES: 4, PATH: 5, CHANNEL: 6, REACH: 7, SWEEP: 8,
@@ -11,7 +11,7 @@ const MOST_VALUES = 4_000_000;
 const known = (names, value) => Object.values(names).includes(value);
 
 // The frame of an ArrayBuffer: {kind, source, number, paths, points, columns, values}; values is a Float32Array,
-// path by path, point by point. Throws RangeError for bytes that are none.
+// path by path, point by point. Throws RangeError for invalid bytes.
 export function unpacked(buffer) {
   if (buffer.byteLength < HEADER) {
     throw new RangeError(`a frame of ${buffer.byteLength} bytes: must have at least ${HEADER}`);

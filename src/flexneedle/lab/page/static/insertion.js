@@ -19,7 +19,7 @@ export function mount(element, store, link) {
   const slowly = button("Start paused", () => link.ask({ type: "insert", paused: true }));
   const stop = button("Stop", () => link.ask({ type: "stop" }), { class: "danger stop" });
   const pause = button("Pause", () => link.ask({ type: "pace", pace: pause.dataset.next === "go" ? Number(pace.value) : 0 }));
-  const step = button("One period", () => link.ask({ type: "advance" }), { title: "Carry out one control period" });
+  const step = button("One period", () => link.ask({ type: "advance" }), { title: "Execute one control period" });
   const pace = make("select", { "aria-label": "Pace", change: () => isPaused() || link.ask({ type: "pace", pace: Number(pace.value) }) }); // paused: “Continue” takes it
   pace.append(...PACES.map((each) => make("option", { value: String(each) }, `${each}×`)));
   pace.value = "1";
@@ -39,7 +39,7 @@ export function mount(element, store, link) {
   store.subscribe(["insertion live", "rows live"], () => {
     const live = store.get("insertion live");
     const words = live ? inWords(live, store.get("rows live")) : NONE;
-    if (state.textContent !== words) state.textContent = words; // what is set anew is read out again
+    if (state.textContent !== words) state.textContent = words; // a text that is set again is read out again
   });
   store.subscribe(SHOWN_BY, () => {
     const live = store.get("insertion live");

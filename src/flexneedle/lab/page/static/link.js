@@ -1,4 +1,4 @@
-// The web socket: connects and connects again by itself, matches answers to requests, hands news to the store.
+// The web socket: connects and connects again by itself, matches answers to requests, passes messages to the store.
 
 import { unpacked } from "./frames.js";
 
@@ -6,9 +6,9 @@ const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
 const EDIT_EVERY = 50; // ms
 const MOST_REFUSALS = 20;
 const ANSWER_WITHIN = 10_000; // ms
-const LOOK_EVERY = 1000; // ms, whether the server is there
-const MOST_SILENT = 4; // looks without a word of it: more, and the line is dead, which a browser notices after minutes
-const FREE = ["steer", "stop", "rows_from", "ping"]; // what a client that does not steer may ask for
+const LOOK_EVERY = 1000; // ms between two checks of the server
+const MOST_SILENT = 4; // checks without a message: more, and the line is dead, which a browser notices after minutes
+const FREE = ["steer", "stop", "rows_from", "ping"]; // requests that need no control
 
 export class Link {
   #store;
@@ -18,12 +18,12 @@ export class Link {
   #timer = 0;
   #number = 0;
   #revision = -1; // of the newest session
-  #silent = 0; // looks since the server's last word; not a time, as a page that stood still has its words to take yet
+  #silent = 0; // checks since the last message; not a time, since a page that was suspended has messages pending
   #waiting = new Map(); // by number of the request: {resolve, timer}
   #edits = {};
   #editTimer = 0;
   #lastEdit = -Infinity;
-  #filling = new Map(); // by insertion: first row that was asked for
+  #filling = new Map(); // by insertion: first requested row
 
   // store.js; address of the web socket (default: /live of this page).
   constructor(store, address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`) {
@@ -33,7 +33,7 @@ export class Link {
   }
 
   // Connect, now and whenever the connection is lost. Store key "connection": connecting, open, lost; "connection
-  // reason": the server's words when it was lost, which may be empty.
+  // reason": the server's reason, which may be empty.
   connect() {
     clearTimeout(this.#timer);
     this.#timer = 0;
@@ -46,8 +46,8 @@ export class Link {
     this.#silent = 0;
   }
 
-  // Send a request. Resolves to {done: true} or {done: false, reason, problems}; never rejects. What needs steering
-  // takes it first where nobody steers. A refusal is shown to the user unless `quiet`.
+  // Send a request. Resolves to {done: true} or {done: false, reason, problems}; never rejects. A request that
+  // needs control takes it first if nobody is in control. A refusal is shown to the user unless `quiet`.
   async ask(message, { quiet = false } = {}) {
     if (this.#mustSteer(message)) {
       const steering = await this.#send({ type: "steer", take: true });
@@ -57,14 +57,14 @@ export class Link {
   }
 
   // Change values of the scenario by key. Edits are merged and sent at most 20 times a second; until the last is
-  // answered, store key "draft" has them, so that all panels show them at once.
+  // answered, store key "draft" contains them for all panels.
   edit(values) {
     this.#store.set("draft", { ...this.#store.get("draft"), ...values });
     Object.assign(this.#edits, values);
     this.#editTimer ||= setTimeout(() => this.#sendEdits(), this.#lastEdit + EDIT_EVERY - performance.now());
   }
 
-  // Say that no edit follows for now, as when what was dragged is let go: the plan is made at once.
+  // Report that no edit follows, as when a drag ends: the plan is made at once.
   rest() {
     if (this.#editTimer) {
       clearTimeout(this.#editTimer);
@@ -83,7 +83,7 @@ export class Link {
     return answer;
   }
 
-  // Values of the draft that no later edit has changed are now the scenario's, or refused.
+  // Drop values of the draft that no later edit has changed: they are accepted, or refused.
   #settle(values) {
     const draft = { ...this.#store.get("draft") };
     for (const [key, value] of Object.entries(values)) {
@@ -162,10 +162,10 @@ export class Link {
     }
   }
 
-  // A server that was started again counts its revisions from the beginning.
+  // A restarted server counts its revisions from the beginning.
   #compare({ revision }) {
     if (revision < this.#revision) {
-      this.#refuse({ reason: "The server was started again, with the scenario that it starts with. A scenario that was not saved is lost." });
+      this.#refuse({ reason: "The server was restarted with its initial scenario. Unsaved changes are lost." });
     }
     this.#revision = revision;
   }

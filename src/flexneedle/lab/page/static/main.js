@@ -1,5 +1,5 @@
 // Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place in index.html.
-// What one looks at comes first, space.js, the largest, last of it; the rest when that is drawn.
+// The scene comes first, and in it space.js, the largest, last; the rest when the scene is drawn.
 
 import { Link } from "./link.js";
 import { Store } from "./store.js";
@@ -8,7 +8,7 @@ import { followTheme } from "./theme.js";
 const SCENE = ["status", "section", "axial", "space"];
 const OTHERS = ["form", "insertion", "player", "plans", "plots", "files"];
 const PATIENCE = 2000; // ms
-const FRAMES = 3; // until what is mounted is on the screen
+const FRAMES = 3; // until the mounted panels are on the screen
 
 const store = new Store();
 const link = new Link(store);

@@ -1,4 +1,4 @@
-// What this browser remembers. It may refuse to, above all for a page from a file: then nothing outlasts the visit.
+// Storage of this browser. It may refuse, above all for a page from a file; then nothing is stored.
 
 // A text by key, or null.
 export function remembered(key) {

@@ -1,8 +1,8 @@
-// Paths out of the shapes and rows of the store, for all views.
+// Paths from the shapes and rows of the store, for all views.
 
 import { isStale } from "./shown.js";
 
-// What `key` holds, if the news that it belongs to is of the present state of the scenario.
+// Value of `key`, if its message belongs to the present state of the scenario.
 export const fresh = (store, news, key) => (isStale(store, store.get(news)) ? undefined : store.get(key));
 
 // First and last path of a shape, or null.
@@ -35,7 +35,7 @@ export function pathOfRows(rows, key) {
   return { points: known.length, paths: 1, columns: 3, values: Float32Array.from(known.flatMap((row) => row[key])) };
 }
 
-// Rank of each path by its cost, column 4 of its last point, from 0 (least) to 1; 0 where there is none.
+// Rank of each path by its cost, column 4 of its last point, from 0 (least) to 1; 0 without a cost.
 export function ranksOf({ values, paths, points, columns }) {
   const ranks = new Float32Array(paths);
   if (columns < 4 || paths < 2) return ranks;

@@ -1,5 +1,5 @@
-// What is planned, for all views: the path of the tip, the needle at the target, and the roll at the start. Of the plan,
-// and while there is none of the present scenario, of its first estimate.
+// The plan, or its first estimate while the present scenario has no plan: the path of the tip, the needle at the target,
+// and the roll at the start, for all views.
 
 import { first, fresh, last } from "./paths.js";
 import { isStale, shownRow, shownShape } from "./shown.js";
@@ -24,7 +24,7 @@ export function plannedPaths(store, of) {
   };
 }
 
-// Sampled paths before an insertion: of the chosen strategy, while both are compared of the one that is searched, or null.
+// Sampled paths before an insertion: of the chosen strategy, or of the strategy that is searched during a comparison; or null.
 export function sampledPaths(store) {
   const comparing = store.get("job compare")?.state === "running";
   const strategy = (comparing && store.get("view searched")) || strategyOf(store);
@@ -40,7 +40,7 @@ export function foreseen(store, of) {
   return { path, text: `needle at the target, ${estimated ? "first estimate" : "planned"}`, spread: 0 };
 }
 
-// Roll (deg) at the period that is shown, before the first that of the plan.
+// Roll (deg) at the shown period; before the first the plan's.
 export function rollOf(store, of) {
   const row = of === "scene" ? null : shownRow(store, of);
   if (row) return row.roll_deg;

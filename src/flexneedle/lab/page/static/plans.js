@@ -60,7 +60,7 @@ function lines(store) {
     found.push([`${titled(plan.strategy)}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
   }
   const reach = shownReach(store);
-  if (reach) found.push([`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not looked at.`, false]);
+  if (reach) found.push([`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not searched.`, false]);
   return found;
 }
 

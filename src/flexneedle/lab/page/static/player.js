@@ -1,4 +1,4 @@
-// Time: which insertion and which period all views show; scrub, play, slower, faster.
+// Time: the insertion and the period that all views show; scrub, play, slower, faster.
 // Keys within the panel: space plays, , and . step, Home and End, < and > change the speed.
 
 import { button, make, shown } from "./dom.js";
@@ -12,8 +12,8 @@ export function mount(element, store) {
   const player = new Player(store);
   const choices = Object.entries(NAMES).map(([of, text]) => button(text, () => player.choose(of), { "data-of": of }));
   const play = button("Play", () => player.toggle(), { "aria-keyshortcuts": "Space", class: "primary" });
-  const back = button("‹", () => player.step(-1), { "aria-label": "One period back", "aria-keyshortcuts": "," });
-  const on = button("›", () => player.step(1), { "aria-label": "One period on", "aria-keyshortcuts": "." });
+  const back = button("‹", () => player.step(-1), { "aria-label": "Previous period", "aria-keyshortcuts": "," });
+  const on = button("›", () => player.step(1), { "aria-label": "Next period", "aria-keyshortcuts": "." });
   const slower = button("Slower", () => player.change(-1), { "aria-keyshortcuts": "<" });
   const faster = button("Faster", () => player.change(1), { "aria-keyshortcuts": ">" });
   const newest = button("Latest period", () => player.follow(), { title: "Show the latest period, and each new one" });
@@ -21,7 +21,7 @@ export function mount(element, store) {
   const scrub = make("input", { type: "range", min: "0", step: "1", "aria-label": "Period", input: () => player.show(Number(scrub.value)) });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, slower, speed, faster, newest, place);
   const nothing = make("p.quiet", {}, "No insertion and no recorded run yet.");
-  const group = make("div.tools", { role: "group", "aria-label": "What is shown" }, ...choices);
+  const group = make("div.tools", { role: "group", "aria-label": "Shown insertion" }, ...choices);
   element.append(group, scrub, tools, nothing);
   element.addEventListener("keydown", (event) => player.key(event));
 
@@ -53,7 +53,7 @@ class Player {
   #store;
   #frame = 0;
   #time = 0; // s of the insertion
-  #period = 0; // that it has shown last
+  #period = 0; // last shown
   #before = 0; // ms of the last paint
 
   constructor(store) {
@@ -74,7 +74,7 @@ class Player {
     this.#store.set("view period", undefined);
   }
 
-  // Show a period, which ends playing.
+  // Show a period, and end playing.
   show(period) {
     this.#pause();
     this.#store.set("view period", Math.min(Math.max(period, 0), this.#rows.length - 1));
@@ -128,7 +128,7 @@ class Player {
     this.#store.set("view playing", undefined);
   }
 
-  // Playing ends at the end, and where another period was chosen, such as by a click on a plot.
+  // End playing at the end, and when another period is chosen, such as by a click on a plot.
   #tick(now) {
     if (this.#store.get("view period") !== this.#period) {
       this.#pause();

@@ -1,5 +1,5 @@
 // Plots over time: error, guide, roll, indicator, tissue energy, predicted miss; the line is the player's period.
-// The error is that of the true tip, which only a virtual rig has; on a rig it is that of the estimated one.
+// The error is the true tip's on a virtual rig, the estimated tip's on a rig.
 
 import { make } from "./dom.js";
 import { PlotView } from "./plots/plot.js";

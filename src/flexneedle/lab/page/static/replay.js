@@ -1,5 +1,4 @@
-// A recorded run by itself (page/replay): the panels of the page that need no server, and what a worker reports of the
-// run, which is an element of the document.
+// A recorded run without a server (page/replay.py): the panels that need no server; the run is an element of the document.
 
 import { mount as mountAxial } from "./axial.js";
 import { make } from "./dom.js";
@@ -13,7 +12,7 @@ import { mount as mountSpace } from "./space.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-// In the order of main.js. Without a server nobody steers, so none of them asks for anything: they get no link.
+// In the order of main.js. Without a server there are no requests: the panels get no link.
 const PANELS = { insertion: mountWords, player: mountPlayer, section: mountSection, axial: mountAxial, plots: mountPlots, space: mountSpace };
 const RUNS = { first: "", second: "Compared with " };
 

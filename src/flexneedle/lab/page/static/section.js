@@ -46,7 +46,7 @@ class SectionView {
   #link;
   #stretch = 1;
   #box = null;
-  #frozen = null; // plane while something is dragged
+  #frozen = null; // plane during a drag
   plane = "target";
   changed = () => {};
 
@@ -68,7 +68,7 @@ class SectionView {
     this.#stage.schedule();
   }
 
-  // The canvas with the section drawn into it just now.
+  // Draw the section and return its canvas.
   drawn() {
     return this.#stage.drawn();
   }

@@ -1,6 +1,6 @@
-// What the views show: the scene before an insertion, the running insertion, or a recorded one, at a period.
-//   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
-//   "view newest": "live" or "first", which of both began, or was opened, last
+// The shown state: the scene before an insertion, the running insertion, or a recorded one, at a period.
+//   "view of": "scene", "live" or "first", as chosen by the user; undefined: the newest
+//   "view newest": "live" or "first", the one that began, or was opened, last
 //   "view searched": the strategy of the newest iteration of a search
 //   "view period": the period that is shown; undefined: the newest
 // An insertion that begins, and a recording that is opened, makes both undefined (store.js).
@@ -9,10 +9,10 @@ const RUNS = ["waiting", "planning", "ready", "running", "paused", "holding"];
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
 const SAME = 1e-3; // s, by which times of the same period may differ
 
-// Whether an insertion (news "insertion", or none) runs or waits.
+// Return whether an insertion (message "insertion", or none) runs or waits.
 export const runs = (live) => RUNS.includes(live?.state);
 
-// Keys to subscribe to for all that this module gives.
+// Keys to subscribe to for the functions of this module.
 export const SHOWN = [
   "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "shape ", "plan ",
   "iteration ", "job compare", "reach", "estimate",
@@ -41,10 +41,10 @@ export function shownRow(store, of = shownOf(store)) {
   return store.get(`rows ${of}`)?.[shownPeriod(store, of)] ?? null;
 }
 
-// Whether the tip was measured at the period of a row.
+// Return whether the tip was measured at the period of a row.
 export const isMeasured = (row) => Boolean(row?.measured?.every((part) => part !== null));
 
-// Shape (paths, points, columns, values) of a kind, such as "needle", of what is shown; or null.
+// Shape (paths, points, columns, values) of a kind, such as "needle", of the shown state; or null.
 export function shownShape(store, kind, of = shownOf(store)) {
   const period = of === "scene" ? null : shownPeriod(store, of);
   const before = of === "scene" || (kind === "needle" && period === null); // of the insertion's first period
@@ -56,8 +56,8 @@ export function startOf(store, of) {
   return store.get(`insertion ${of}`)?.rig ? store.get(`rows ${of}`)?.[0]?.time ?? 0 : 0;
 }
 
-// The second recorded run, {row, shape(kind)}, as long after its first period as what is shown; or null. Where the scene
-// was chosen instead of an insertion, no run is compared.
+// The second recorded run, {row, shape(kind)}, at the same time after its first period as the shown one; or null. If the
+// user chose the scene, no run is compared.
 export function shownSecond(store) {
   const chosen = store.get("view of") === "scene" && ["live", "first"].some((of) => store.get(`insertion ${of}`));
   if (!store.get("insertion second") || chosen) return null;
@@ -68,13 +68,13 @@ export function shownSecond(store) {
   return { row: rows[period] ?? null, shape: (kind) => store.track(kind, "second", period) };
 }
 
-// Scene of what is shown, or null before the first has come.
+// Scene of the shown state, or null before the first.
 export function shownScene(store) {
   const of = shownOf(store);
   return (of === "scene" ? null : store.get(`insertion ${of}`)?.scene) ?? store.get("scene") ?? null;
 }
 
-// Position of the target (x, y, z), with an edit that is not answered yet; or null.
+// Position of the target (x, y, z), with a pending edit; or null.
 export function shownTarget(store) {
   const of = shownOf(store);
   if (of !== "scene") return store.get(`insertion ${of}`).target;
@@ -91,28 +91,28 @@ export function targetEdit(store, point) {
   return Object.fromEntries(keys.map((key, axis) => [key, Math.round(point[axis] * 100) / 100]));
 }
 
-// Whether this client is in control of the page (messages.py: it steers), or can take control.
+// Return whether this client is in control, or can take control.
 export function maySteer(store) {
   const [people, welcome] = [store.get("people"), store.get("welcome")];
   return Boolean(people) && (people.steering === null || people.steering === welcome?.client);
 }
 
-// Whether this client is in control.
+// Return whether this client is in control.
 export function steers(store) {
   const people = store.get("people");
   return Boolean(people) && people.steering !== null && people.steering === store.get("welcome")?.client;
 }
 
-// Whether what is shown can be moved by hand: the scene before an insertion.
+// Return whether the shown state can be edited: the scene before an insertion.
 export const mayMove = (store) => maySteer(store) && shownOf(store) === "scene";
 
-// The reach, if it is that of the present scenario, or null; it stays while only the target is moved (messages.py).
+// The reach, if it is that of the present scenario, or null; it is kept while only the target moves (protocol.py).
 export function shownReach(store) {
   const reach = shownOf(store) === "scene" ? store.get("reach") : null;
   return reach && reach.revision >= store.get("session")?.reach_since ? reach : null;
 }
 
-// Whether a plan or estimate is of an earlier state of the scenario than the present.
+// Return whether a plan or estimate belongs to an earlier state of the scenario.
 export function isStale(store, result) {
   return Boolean(result) && result.revision !== store.get("session")?.revision;
 }

@@ -5,7 +5,7 @@ import { button, make, shown } from "./dom.js";
 import { SHOWN, shownRow, shownTarget } from "./shown.js";
 import { stillNote } from "./still.js";
 
-const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 look at x–y, x–z and along the axis.";
+const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 show x–y, x–z and along the axis.";
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const VIEWS = [["Reset", "reset", "0"], ["x–y", "side", "1"], ["x–z", "top", "2"], ["Axis", "axis", "3"]];
 

@@ -14,10 +14,10 @@ const JOBS = {
   save: "Saving",
 };
 const CONTROL = {
-  take: "To change the scenario, plan and insert. Anyone can stop an insertion.",
-  release: "So that another page can take control. An insertion on a rig is then held.",
+  take: "Needed to change the scenario, plan and insert. Anyone can stop an insertion.",
+  release: "Lets another page take control. An insertion on a rig is then held.",
 };
-const OWN_END = ["insertion", "save"]; // no cancel: an insertion is stopped, and a run is saved as a whole
+const OWN_END = ["insertion", "save"]; // not cancelled: an insertion is stopped, and a run is saved completely
 const SHOWN_FOR = 12_000; // ms
 const LONG = 5; // s
 const SHORT = 1_000; // ms: work that ends sooner is not shown
@@ -53,7 +53,7 @@ function showTitle(session) {
   document.title = session ? `${session.values.name} – flexneedle` : "flexneedle";
 }
 
-// Who is in control, and a button that takes it or releases it, which keeps the focus.
+// The client in control, and a button that takes or releases control and keeps the focus.
 function followSteering(element, store, link) {
   let mine = false;
   const words = make("span", { "aria-live": "polite" });
@@ -70,14 +70,14 @@ function followSteering(element, store, link) {
   });
 }
 
-// The number of this page is said where there are others, since refusals and stops name people by their numbers.
+// The number of this page is shown if there are others, since refusals and stops name people by number.
 function inControl({ clients, steering }, own) {
   const [alone, mine] = [clients === 1, steering === own];
   const all = alone ? "1 person connected" : `${clients} people connected, you are person ${own}`;
   return `${all}, ${steering === null ? "nobody is" : mine ? "you are" : `person ${steering} is`} in control`;
 }
 
-// Work that takes longer than a second has a bar; what has failed stays until the next of its kind begins.
+// Work that takes longer than a second has a bar; a failure stays until the next job of its kind begins.
 function followJobs(element, store, link) {
   const entries = new Map(); // by kind
   store.subscribe(["job "], () => {
@@ -115,7 +115,7 @@ function followJobs(element, store, link) {
     if ((job.share ?? null) === null) bar.removeAttribute("value");
     else bar.value = job.share;
   }
-  // Without a share, the time since it began: what is slow and what hangs would look the same.
+  // Without a share, the time since its beginning: it shows that slow work continues.
   function tell({ words, counts, text, begun }) {
     const seconds = Math.floor((performance.now() - begun) / 1000);
     text.textContent = counts && seconds >= LONG ? `${words} (${seconds} s)` : words;
@@ -129,7 +129,7 @@ function followJobs(element, store, link) {
   }
 }
 
-// The newest refusals, each for some seconds or until it is closed; that of a value until a change is taken.
+// The newest refusals, each for some seconds or until it is closed; the refusal of a value until the next accepted change.
 function followRefusals(element, store) {
   let newest = 0;
   store.subscribe(["session"], () => {
@@ -144,7 +144,7 @@ function followRefusals(element, store) {
   });
   function show({ reason, problems }) {
     const keys = Object.keys(problems).join();
-    if (keys && element.lastChild?.dataset.keys === keys) element.lastChild.remove(); // such as while dragging
+    if (keys && element.lastChild?.dataset.keys === keys) element.lastChild.remove(); // for example during a drag
     const close = button("Close", () => shown.remove());
     const shown = make("div.refusal", { "data-keys": keys }, make("p", {}, reason), close);
     element.append(shown);

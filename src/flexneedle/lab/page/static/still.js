@@ -1,11 +1,11 @@
-// Where an insertion is shown, nothing can be moved by hand: a line that says so, with the way back.
+// A line that explains why a shown insertion cannot be edited, with a button back to the scene.
 
 import { button, make } from "./dom.js";
 import { SHOWN, maySteer, runs, shownOf } from "./shown.js";
 
 export const TARGET_AND_PLAN = "Target and plan";
 
-// The line, for a view with handles; it is hidden while they are there, and while an insertion runs.
+// The line of a view with handles; hidden while there are handles, and while an insertion runs.
 export function stillNote(store) {
   const back = button(TARGET_AND_PLAN, () => {
     store.set("view of", "scene");

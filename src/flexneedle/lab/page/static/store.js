@@ -1,10 +1,10 @@
-// State of the page by key. A message of the server is the state of its key (as `News.key` in page/messages.py):
+// State of the page by key. A message of the server is the state of its key (as `ServerMessage.key` in protocol.py):
 //   "session", "scene", "people", "job plan", "iteration steering", "plan manipulation", "insertion live", …
-//   "rows live" | "rows first" | "rows second": all rows so far, by index
+//   "rows live" | "rows first" | "rows second": all rows, by index
 //   "shape KIND SOURCE", such as "shape needle live": the newest frame; `track` has those of all periods
-// What only this browser knows has keys that begin with "view ", and "connection", "refusals", "draft".
+// State of this browser alone has keys that begin with "view ", and "connection", "refusals", "draft".
 //
-// Who subscribes is called once before the next paint, however many of its keys have changed by then.
+// A subscriber is called once before the next paint, for any number of changed keys.
 
 import { Kind, Source, pathOf } from "./frames.js";
 import { runs } from "./shown.js";
@@ -28,7 +28,7 @@ export function keyOf(message) {
 export class Store {
   #values = new Map();
   #tracks = new Map(); // "needle live" → array of paths by period
-  #before = new Map(); // by key: insertions of the connection that was lost
+  #before = new Map(); // by key: insertions of the lost connection
   #listeners = new Set();
   #changed = new Set();
   #frame = 0;
@@ -59,7 +59,7 @@ export class Store {
     return () => this.#listeners.delete(entry);
   }
 
-  // Take a message of the server. Returns the index of the first row that is missing, or null.
+  // Take a message of the server. Return the index of the first row that is missing, or null.
   receive(message) {
     if (message.type === "rows") return this.#receiveRows(message);
     if (message.type === "closed") return this.#close(message);
@@ -81,8 +81,8 @@ export class Store {
     this.set(`shape ${kind} ${source}`, frame);
   }
 
-  // The shape of an insertion at a period: {period, paths, points, columns, values}, or null if it has none. Samples and
-  // the cut channel, which are not of every period: the newest until then.
+  // The shape of an insertion at a period: {period, paths, points, columns, values}, or null. Samples and cut channel, which
+  // not every period has: the newest until then.
   track(kind, source, period = Infinity) {
     const track = this.#tracks.get(`${kind} ${source}`) ?? [];
     let at = Math.min(period, track.length - 1);
@@ -114,7 +114,7 @@ export class Store {
   }
 
   // An insertion that begins, or a recording that is opened, takes the place of the last one, and is shown. After a
-  // lost connection all are announced again: one that is known leaves what is shown as it is.
+  // lost connection all are announced again: a known one does not change the shown state.
   #announce(key, message) {
     const known = this.get(key);
     const earlier = known ?? this.#before.get(key);
@@ -122,7 +122,7 @@ export class Store {
     const opened = Boolean(known) && RECORDED.includes(message.of);
     if (earlier && !opened && !isAnother(message, earlier)) return;
     this.#forget(message.of);
-    if (message.of === "second" && this.get("view of") === "scene") this.set("view of", undefined); // nothing is compared with it
+    if (message.of === "second" && this.get("view of") === "scene") this.set("view of", undefined); // the scene is not compared
     if (message.of === "first" || (message.of === "live" && runs(message))) this.set("view newest", message.of);
   }
 
@@ -142,14 +142,14 @@ export class Store {
     }
   }
 
-  // A connection begins: the server sends all that there is.
+  // A connection begins: the server sends its complete state.
   #forgetAll() {
     for (const key of this.keys("insertion ")) this.#before.set(key, this.get(key));
     this.#tracks.clear();
     for (const key of [...this.#values.keys()]) if (!OWN.test(key)) this.set(key, undefined);
   }
 
-  // A plan of another revision of the same scenario is shown as such; of another scenario it is not shown.
+  // A plan of another revision of the same scenario is shown as outdated; of another scenario it is dropped.
   #forgetPlans() {
     for (const key of [...this.#values.keys()]) if (PLANS.test(key)) this.set(key, undefined);
   }
@@ -175,7 +175,7 @@ export class Store {
       try {
         entry.listener();
       } catch (error) {
-        reportError(error); // and the other panels go on
+        reportError(error); // and the other panels continue
       }
     }
   }

@@ -1,4 +1,4 @@
-// Light or dark: as the system prefers, or as chosen by the switch, which this browser remembers.
+// Light or dark: as the system prefers, or as chosen by the switch, which this browser stores.
 
 import { remember, remembered } from "./memory.js";
 

@@ -1,4 +1,4 @@
-// How strong the colour of a layer is, for all views.
+// Strength of a layer's colour, for all views.
 
 const [SOFT, STIFF] = [1, 30]; // kPa
 

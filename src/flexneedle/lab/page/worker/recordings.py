@@ -123,7 +123,7 @@ def _distance_from_path(plan: Plan, point: Sequence[float]) -> float:
 
 
 def _largest_indicator(period: Period) -> float | None:
-    """Return the largest median of the references' indicators in a period; without references that of the tip."""
+    """Return the largest median of the references' indicators in a period; without references the tip's."""
     found: dict[str, list[float]] = {}
     for checked in period.readings:
         frame = checked.measurement.frame

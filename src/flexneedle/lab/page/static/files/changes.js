@@ -1,9 +1,9 @@
-// A question before the changes of a scenario are lost.
+// Confirmation before the changes of a scenario are lost.
 
 import { button } from "../dom.js";
 
-// Do `open`, which begins another scenario, or where this one was changed ask for it in `status` before. words: what is to
-// be done, as the beginning of a sentence; name: of the button that does it.
+// Call `open`, which begins another scenario; if this one was changed, ask in `status` first. words: the action, as the
+// beginning of a sentence; name: of the button.
 export function unlessChanged(store, status, words, name, open) {
   status.textContent = "";
   if (!store.get("session")?.changed.length) return open();

@@ -8,8 +8,8 @@ export function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(address), 10_000);
 }
 
-// Get a file of the server, which may take its time to make it or refuse it, and save it. what: its name in words;
-// status: an element, with a line until it is there, or why it is not.
+// Request a file from the server, and save it. what: its name in words; status: element for progress or the reason of a
+// refusal.
 export async function fetched(address, name, what, status) {
   const line = make("p.quiet", {}, `${what} is being made…`);
   for (const earlier of status.querySelectorAll(".bad")) earlier.remove();

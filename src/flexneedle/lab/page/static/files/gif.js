@@ -19,7 +19,7 @@ export class Gif {
     words(bytes, width, height);
     bytes.push(0xf7, 0, 0, ...PALETTE.flat(), 0x21, 0xff, 11);
     text(bytes, "NETSCAPE2.0");
-    bytes.push(3, 1, 0, 0, 0); // for ever
+    bytes.push(3, 1, 0, 0, 0); // endless
   }
 
   // Encode a frame. pixels: RGBA, as of getImageData.
@@ -33,7 +33,7 @@ export class Gif {
     blocks(bytes, compressed(indices(pixels)));
   }
 
-  // The file, to which no frame is added any more.
+  // Return the complete file.
   bytes() {
     this.#bytes.push(0x3b);
     return Uint8Array.from(this.#bytes);
@@ -48,7 +48,7 @@ function paletteOf() {
   return colors;
 }
 
-// Colour of each pixel: a grey where it is nearly one.
+// Colour of each pixel: a grey if it is nearly grey.
 function indices(pixels) {
   const found = new Uint8Array(pixels.length / 4);
   for (let at = 0; at < found.length; at++) {

@@ -1,4 +1,4 @@
-// Pictures of what the page shows, made from its canvases: PNG of the scene, GIF of an insertion.
+// Pictures of the page's canvases: PNG of the scene, GIF of an insertion.
 
 import { make } from "../dom.js";
 import { shownOf } from "../shown.js";
@@ -15,7 +15,7 @@ export async function savePng() {
   picture.toBlob((blob) => download(blob, "flexneedle.png"));
 }
 
-// Save a GIF of the shown insertion; progress(share) is called with each frame, which is then encoded. Returns false where there is none.
+// Save a GIF of the shown insertion; progress(share) is called with each frame, which is then encoded. Returns false without an insertion.
 export async function saveGif(store, progress) {
   const rows = store.get(`rows ${shownOf(store)}`) ?? [];
   if (!rows.length) return false;
@@ -37,7 +37,7 @@ export async function saveGif(store, progress) {
 
 async function drawing() {
   const [{ spaceView }, { sectionView }] = await Promise.all([import("../space.js"), import("../section.js")]);
-  return (spaceView() ?? sectionView()).drawn(); // by hand: what is off the screen is not drawn by itself
+  return (spaceView() ?? sectionView()).drawn(); // explicitly: a view off the screen is not drawn
 }
 
 // A copy at most `widest` wide, on the ground of its stage.

@@ -29,7 +29,7 @@ export function showRuns(element, store, link) {
   store.subscribe(["insertion first", "insertion second"], () => showOpened(opened, store, link));
 }
 
-// What is shown stays where it is: with its focus, and an open list of downloads.
+// Entries that remain keep their focus and an open list of downloads.
 function showList(list, entries, text, store, link) {
   const found = (store.get("runs")?.runs ?? []).filter(({ name, summary, kind }) => `${name} ${kind} ${summary}`.toLowerCase().includes(text));
   const shown = found.slice(0, MOST).map((run) => {
@@ -41,7 +41,7 @@ function showList(list, entries, text, store, link) {
   entries.clear();
   for (const [name, entry] of shown) entries.set(name, entry);
   const remarks = [];
-  if (!found.length) remarks.push(text ? "No run has this in its name or summary" : "No recorded runs yet");
+  if (!found.length) remarks.push(text ? "No run matches" : "No recorded runs yet");
   if (found.length > MOST) remarks.push(`${found.length - MOST} more: search for them`);
   arrange(list, [...shown.map(([, { element }]) => element), ...remarks.map((remark) => make("li.quiet", {}, remark))]);
 }
@@ -91,7 +91,7 @@ function showOpened(element, store, link) {
   element.replaceChildren(...lines);
 }
 
-// What is saved: the insertion that has ended last, or the row of a study that is shown.
+// The last insertion, or the shown row of a study.
 function saveForm(link, of, proposed, text) {
   const name = make("input", { type: "text", maxlength: "80", value: proposed, placeholder: "Name of the run", "aria-label": proposed ? `Name to save ${proposed} as` : "Name of the run to save" });
   const problem = make("p.problem.bad", { role: "alert", hidden: true }, RULE);

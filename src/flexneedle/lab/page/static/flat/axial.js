@@ -6,10 +6,10 @@ import { isMeasured, shownOf, shownReach, shownRow } from "../shown.js";
 import { area, cross, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 import { reachAt } from "./reach.js";
 
-const READINGS = 40; // measured positions that are shown, as crosses: what else there is a point for is a disc
+const READINGS = 40; // measured positions, as crosses; other points are discs
 const BEVEL = 26; // px, length of the arrow
 
-// Ends of the reach at the target's depth [[x, y, z], …], none where it is not shown.
+// Ends of the reach at the target's depth [[x, y, z], …], none unless it is shown.
 export function endsOf(store, target) {
   const outlines = store.get("shape reach scene");
   return shownReach(store) && outlines ? reachAt(target[0], outlines) : [];

@@ -13,7 +13,7 @@ export class Handles {
   #made = new Map(); // by id: {element, handle}
   dragged = false;
 
-  // stage: element that the handles are placed in; dropped: called when one that was dragged is let go.
+  // stage: element that the handles are placed in; dropped: called when a dragged handle is released.
   constructor(stage, dropped) {
     this.#stage = stage;
     this.#dropped = dropped;
@@ -39,7 +39,7 @@ export class Handles {
   #make({ id, form }) {
     const element = make(`button.handle.${form}`, { type: "button", "data-handle": id, "aria-roledescription": "handle", title: KEYS });
     const made = { element, handle: null };
-    let grab = null; // where the pointer is on the handle
+    let grab = null; // position of the pointer on the handle
     let moved = false; // since it was taken
     element.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;

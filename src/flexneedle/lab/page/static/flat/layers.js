@@ -1,4 +1,4 @@
-// Layers and guide as they are shown: of the scene, with edits that are not answered yet; and the edits that move them.
+// Layers and guide of the scene with pending edits, and the edits that move them.
 
 import { shownOf } from "../shown.js";
 

@@ -1,4 +1,4 @@
-// The legend of a drawing, made anew only when it differs.
+// The legend of a drawing, replaced only when it differs.
 
 import { make } from "../dom.js";
 

@@ -1,4 +1,4 @@
-// What moves, for views in two dimensions: {path, tone, width, alpha, dash, text, spread}, from back to front.
+// Moving parts of views in two dimensions: {path, tone, width, alpha, dash, text, spread}, from back to front.
 
 import { first, pathOfRows, ranksOf } from "../paths.js";
 import { foreseen, plannedPaths, sampledPaths } from "../planned.js";
@@ -52,7 +52,7 @@ function tips(store, of) {
   ];
 }
 
-// Entry of the legend for the measured tip, where one was measured until the shown period.
+// Entry of the legend for the measured tip, if one was measured until the shown period.
 export function measuredTip(store) {
   const row = shownRow(store);
   const some = row && store.get(`rows ${shownOf(store)}`).slice(0, row.index + 1).some(isMeasured);

@@ -69,7 +69,7 @@ export function widthOf(pen, text) {
   return pen.measureText(text).width;
 }
 
-// Draw within the grid: what goes on to the left, such as a needle's shaft, would strike through its labels.
+// Clip to the grid: a needle's shaft to the left of it would cross the labels.
 export function inside(pen, width, height, draw) {
   pen.save();
   pen.beginPath();

@@ -45,7 +45,7 @@ export function stretchIn({ sx, sy }) {
 export function mappingOf({ left, right, half }, width, height, stretch, [side, foot] = [SIDE, FOOT]) {
   const room = (height - foot) / 2;
   const sx = Math.min((width - side) / (right - left), room / half);
-  const sy = Math.min(sx * stretch, room / half); // perhaps less than was asked for
+  const sy = Math.min(sx * stretch, room / half); // may be less than requested
   const middle = (width + side) / 2;
   const center = (left + right) / 2;
   return {

@@ -1,4 +1,4 @@
-// The reach in a section: where its outlines, or its strip, cut the plane.
+// The reach in a section: the cut of its outlines, or of its strip, with the plane.
 
 import { across, lateral } from "./plane.js";
 
@@ -22,7 +22,7 @@ function cutsOf(plane, { paths, points, columns, values }) {
   return spans;
 }
 
-// [[x, u]] where an edge crosses the plane, if it does.
+// [[x, u]] of the crossing of an edge with the plane, if any.
 function cutOf(plane, a, b) {
   const [before, after] = [across(plane, ...a), across(plane, ...b)];
   if (before === after || (before > 0 && after > 0) || (before < 0 && after < 0)) return [];
@@ -46,7 +46,7 @@ export function reachAt(depth, { paths, points, columns, values }) {
   return found;
 }
 
-// Whether the strip of a reach is in a section's plane.
+// Return whether the strip of a reach is in a section's plane.
 export function isIn({ e }, { angle_deg: angle }) {
   const cosine = e[0] * Math.cos((angle * Math.PI) / 180) + e[1] * Math.sin((angle * Math.PI) / 180);
   return 1 - Math.abs(cosine) <= NEAR ** 2;

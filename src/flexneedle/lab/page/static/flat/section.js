@@ -1,4 +1,4 @@
-// Draws a section: tissue, grid, reach, guide, target, and what moves.
+// Draws a section: tissue, grid, reach, guide, target, and moving parts.
 
 import { isMeasured, shownReach, shownRow } from "../shown.js";
 import { shadeOf } from "../tissue.js";
@@ -11,7 +11,7 @@ const GUIDE = [6, 3.2]; // mm, length and width
 const NAMES = { top: 24, step: 13, rows: 4, gap: 4 }; // px, of the names of layers; thin ones are below each other
 const UP = { "x–y": "y (mm)", "x–z": "z (mm)", target: "from the axis (mm)" };
 
-// The outline [[x, u], …] of the reach in a plane, none where it is not shown.
+// The outline [[x, u], …] of the reach in a plane, none unless it is shown.
 export function outlineOf(plane, store) {
   const news = shownReach(store);
   return (news && reachIn(plane, news, store.get("shape reach scene"))) ?? [];
@@ -47,7 +47,7 @@ export function drawScene(pen, { width, height, map, plane, name, scene }) {
 
 const upward = (name, map) => [UP[name], stretchIn(map)].filter(Boolean).join(", ");
 
-// Its sphere of 1 mm, which is as high as the lateral axis has it.
+// Its sphere of 1 mm, stretched as the lateral axis.
 function drawTarget(pen, map, plane, [x, y, z]) {
   const radii = [map.sx, map.sy].map((scale) => Math.max(scale, 3));
   disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], radii, { tone: "--target", alpha: 0.85 });
@@ -64,7 +64,7 @@ function drawTissue(pen, map, layers, width, height) {
   });
 }
 
-// Names of the layers, each in the first row in which it does not run into the one before; what has no room has none.
+// Names of the layers, each in the first row with room for it; without room a name is left out.
 function drawNames(pen, map, layers, width) {
   const { top: first, step, rows, gap } = NAMES;
   const ends = Array(rows).fill(SIDE); // px, where the last name of each row ends

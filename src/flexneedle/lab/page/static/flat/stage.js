@@ -1,5 +1,5 @@
-// A drawing in two dimensions that fills its place, is sharp, and is drawn only when it has changed and is on the screen,
-// or for a picture.
+// A sharp drawing in two dimensions that fills its element, drawn only when it has changed and is on the screen, or for a
+// picture.
 
 const SHARPEST = 2; // device pixels to a pixel of the page
 
@@ -38,7 +38,7 @@ export class Stage {
     this.#draw(this.pen, this);
   }
 
-  // The canvas as it is to be now, also off the screen.
+  // The canvas in its present state, also off the screen.
   drawn() {
     this.draw();
     return this.canvas;

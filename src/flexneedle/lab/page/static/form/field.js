@@ -1,4 +1,4 @@
-// One field of the form: label, value with its unit, slider, words, and the problem that the server has with it.
+// A field of the form: label, value with its unit, slider, description, and the problem of its value.
 
 import { make } from "../dom.js";
 import { rangeOf, read, written } from "./fields.js";
@@ -10,7 +10,7 @@ export class FieldView {
   #slider = null;
   #problem = make("p.problem.bad", { hidden: true });
   #shown; // value of the scenario, or of the draft
-  #taken = false; // whether the text is the user's, and not answered yet or refused
+  #taken = false; // whether the text is the user's, and pending or refused
   #dismissed; // problem that was left with Escape
   #before = ""; // text when the field got the focus
 
@@ -31,14 +31,14 @@ export class FieldView {
     this.element.append(...[this.#slider, this.#problem, help].filter(Boolean));
   }
 
-  // Text that a search compares with.
+  // Text for the search.
   get words() {
     const { key, label, unit, description } = this.#field;
     return `${key} ${label} ${unit} ${description}`.toLowerCase();
   }
 
-  // Show a value. state: {changed: from that of the file, problem: of the server, pending: not answered yet}. What is
-  // being written, or is refused, stays.
+  // Show a value. state: {changed: from that of the file, problem: of the server, pending: not answered yet}. Text
+  // that is being written, or was refused, stays.
   update(value, { changed, problem, pending }) {
     this.element.classList.toggle("changed", changed);
     if (problem !== this.#dismissed) this.#dismissed = undefined;
@@ -100,7 +100,7 @@ export class FieldView {
     if (problem === undefined) this.edit(value);
   }
 
-  // What has come while the field had the focus is shown, unless its user wrote something.
+  // Show a value that arrived while the field had the focus, unless the user wrote something.
   #leave() {
     const refused = this.input.getAttribute("aria-invalid") === "true";
     if (!refused && this.input.value === this.#before) this.input.value = written(this.#shown);

@@ -1,17 +1,17 @@
-// Fields of a scenario, from its JSON schema: what each value is, its unit, bounds and words. No elements here.
+// Fields of a scenario, from its JSON schema: name, unit, bounds and description of each value. No elements here.
 
 // By the end of a key, the longest first.
 const UNITS = Object.entries({
   _mrad_per_mm: "mrad/mm", _mrad_s: "mrad/s", _mn_per_mm: "mN/mm", _deg_s: "°/s", _mm_s: "mm/s", _per_mm: "/mm", _per_mj: "/mJ", _per_m: "1/m",
   _kpa: "kPa", _gpa: "GPa", _mrad: "mrad", _percent: "%", _deg: "°", _hz: "Hz", _mm: "mm", _mn: "mN", _n: "N", _s: "s",
 });
-const TECHNICAL = 1e5; // a bound from here on only keeps out nonsense
-const FAR = 20; // a bound this many times the usual value is none for a slider
+const TECHNICAL = 1e5; // a larger bound is not shown
+const FAR = 20; // a slider ignores a bound this many times the usual value
 const STEPS = 200; // of a slider
-const OWN = "own values"; // of a table, none of those that have a name
-const LAW = "Law of radial compression. One of your own is set in a scenario file.";
-const OWN_TERMS = "own_terms"; // cost terms of a user are set in a scenario file
-const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by that of the value
+const OWN = "own values"; // of a table without a name
+const LAW = "Law of radial compression. A custom law is set in a scenario file.";
+const OWN_TERMS = "own_terms"; // custom cost terms are set in a scenario file
+const OWN_TYPES = { number: "number", string: "string", boolean: "boolean" }; // by type of the value
 
 // Sections with their fields: [{name, title, description, fields}]; a layer of the tissue and a table is a section.
 export function sectionsOf(schema, values) {
@@ -59,12 +59,12 @@ function addLayers(sections, schema, property, values) {
   }
 }
 
-// The table of a layer whose law is the user's own: what all laws have, and its other values as they are.
+// The table of a layer with a custom law: the keys of all laws, and its other values.
 function ownLaw([table, ...others], name, values) {
   const common = Object.entries(table.properties).filter(([part]) => others.every(({ properties }) => part in properties));
   const parts = Object.keys(values).filter((key) => key.startsWith(`${name}.`)).map((key) => key.slice(name.length + 1));
   const own = parts.map((part) => [part, { type: OWN_TYPES[typeof values[`${name}.${part}`]] ?? "array" }]);
-  return { description: "A layer with a law of your own.", properties: { ...Object.fromEntries(own), ...Object.fromEntries(common) } };
+  return { description: "A layer with a custom law.", properties: { ...Object.fromEntries(own), ...Object.fromEntries(common) } };
 }
 
 // A layer with another law: it keeps the values that both have.
@@ -79,7 +79,7 @@ function lawsOf(schema) {
   return Object.fromEntries(tables.map((table) => [table.properties.law.const, table]));
 }
 
-// What a field shows of the values by key: of a table its name, or that it has own values.
+// Value of a field from the values by key: for a table its name, or "own values".
 export function valueOf({ key, start, choices }, values) {
   if (!start) return values[key] ?? null;
   if (!isUsed(values, key)) return null;
@@ -87,13 +87,13 @@ export function valueOf({ key, start, choices }, values) {
   return choices.includes(name) ? name : OWN;
 }
 
-// The edit {key: value} of a field for what it shows: of a table with own values those that it has, or to begin with.
+// The edit {key: value} for a field's shown value; a table with own values keeps them, or begins with examples.
 export function editOf({ key, start }, value, values) {
   if (!start || value !== OWN) return { [key]: value };
   return isUsed(values, key) ? { [`${key}.name`]: start.name } : { [key]: start };
 }
 
-// What a field shows of a value that is in an edit.
+// Shown value of an edited value.
 export const shownOf = ({ start }, value) => (start && typeof value === "object" && value ? OWN : value);
 
 const isUsed = (values, key) => Object.keys(values).some((each) => each.startsWith(`${key}.`));
@@ -121,7 +121,7 @@ function fieldOf(key, property) {
   };
 }
 
-// Bounds that are not merely technical, for people.
+// Bounds in words, without technical ones.
 function inWords([min, max]) {
   const given = max < TECHNICAL;
   if (min === undefined && !given) return "";
@@ -129,7 +129,7 @@ function inWords([min, max]) {
   return min === undefined ? ` At most ${max}.` : ` From ${min} to ${max}.`;
 }
 
-// Range of a slider about a value: {min, max, step}, within the bounds, or null for what has none.
+// Range of a slider about a value: {min, max, step}, within the bounds, or null without bounds.
 export function rangeOf({ kind, min, max, open, usual }, value) {
   if (kind !== "number" && kind !== "integer") return null;
   const size = Math.max(Math.abs(value ?? 0), Math.abs(usual ?? 0)) || 5;
@@ -139,7 +139,7 @@ export function rangeOf({ kind, min, max, open, usual }, value) {
   return { min: open ? low + step : low, max: high, step };
 }
 
-// What a user wrote, as a value of a field: {value} or {problem}.
+// Parse the user's text: {value} or {problem}.
 export function read({ kind, nullable }, text) {
   const words = text.trim();
   if (kind === "text" || kind === "choice") return { value: words === "" && nullable ? null : words };

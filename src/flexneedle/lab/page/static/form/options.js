@@ -4,14 +4,14 @@ import { button, make } from "../dom.js";
 
 const MOST = 2 ** 53;
 
-// Fields of the options in `element`, which follow the session. Returns a function that shows those with all of some
-// words, and returns how many that are.
+// Fields of the options in `element`, which follow the session. Return a function that shows the options that
+// contain all given words, and returns their number.
 export function followOptions(element, store, link) {
   const ask = async (options) => {
     const answer = await link.ask({ type: "options", ...options });
     if (!answer.done) show();
   };
-  let known = null; // seed of the session that was shown last
+  let known = null; // last shown seed
   const seed = make("input", {
     id: "option-seed", type: "number", min: "0", step: "1", inputmode: "numeric", change: () => takeSeed(seed.value.trim() === "" ? NaN : Number(seed.value)),
   });

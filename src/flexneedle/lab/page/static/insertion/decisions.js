@@ -1,4 +1,4 @@
-// What the controller decided, in words: the decision of the shown period, and a list of where its words change.
+// Decisions of the controller in words: of the shown period, and a list of changes.
 
 import { button, make, shown } from "../dom.js";
 import { SHOWN, shownOf, shownPeriod, shownRow, startOf } from "../shown.js";
@@ -32,7 +32,7 @@ export function followDecisions(element, store) {
     list.replaceChildren();
   }
 
-  // An entry where the words differ from those of the period before; numbers alone change nearly every period.
+  // An entry for each change of the words; numbers alone change nearly every period.
   function add(row, time) {
     made.count = row.index + 1;
     const text = textOf(row);

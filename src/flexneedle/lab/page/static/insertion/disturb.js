@@ -2,9 +2,9 @@
 
 import { button, make } from "../dom.js";
 
-const NO_FIELD = "The tracker of this scenario has no field that metal distorts. To have one, set its environment to ideal.";
+const NO_FIELD = "The tracker of this scenario has no field that metal distorts. Set its environment to ideal.";
 
-// A form whose requests act at once; what is active is listed.
+// A form whose requests act at once, with a list of active disturbances.
 export function disturbForm(store, link) {
   const active = make("p.quiet", { role: "status" });
   const number = (label, value, more = {}) => make("input", { type: "number", min: "0", max: "10000", step: "any", required: true, value: String(value), "aria-label": label, ...more });
@@ -19,12 +19,12 @@ export function disturbForm(store, link) {
   const plate = [
     number("Distance of the plate from the center of the tracker's workspace in mm", 100),
     button("Bring", () => disturb("plate", plate[0])),
-    button("Take away", () => none("plate")),
+    button("Remove the plate", () => none("plate")),
   ];
   const why = make("span.quiet", {}, NO_FIELD);
 
   const form = make(
-    "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
+    "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb the insertion"),
     line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => angle.reportValidity() && disturb("push", force, { angle_deg: angle.valueAsNumber })), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
     line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
     line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),

@@ -1,4 +1,4 @@
-// The connected rig: check it, prepare an insertion, arm it once what will move is confirmed, and let it go.
+// The connected rig: check it, prepare an insertion, arm it once its motions are confirmed, and start it.
 
 import { button, make, renew } from "../dom.js";
 import { isStale, maySteer, runs } from "../shown.js";
@@ -15,9 +15,9 @@ export function rigForm(store, link) {
   const [state, name] = [make("p", { role: "status" }), make("legend")];
   const check = button("Check", () => link.ask({ type: "check" }), { title: "Compare the rig with its file and the scenario; nothing moves" });
   const prepare = button("Prepare", () => link.ask({ type: "prepare" }), { title: "Plan, open the rig, and measure the tip; nothing moves" });
-  const [findings, moves] = [make("div.findings"), make("ul.moves", { "aria-label": "What will move" })];
+  const [findings, moves] = [make("div.findings"), make("ul.moves", { "aria-label": "Motions" })];
   const free = make("input", { id: "rig-free", type: "checkbox" });
-  const seen = make("label.tools", { for: "rig-free" }, free, "I have read what will move, its path is free, and I can see the rig and reach its emergency stop.");
+  const seen = make("label.tools", { for: "rig-free" }, free, "I have read the motions, their path is free, and I can see the rig and reach its emergency stop.");
   const arm = button("Arm", () => link.ask({ type: "arm", armed: !isArmed(store), job: store.get("rig").job }));
   const go = button("Insert on the rig", () => link.ask({ type: "go" }), { class: "danger" });
   const form = make(
@@ -35,7 +35,7 @@ export function rigForm(store, link) {
     check.hidden = prepare.hidden = rig.job !== null;
     check.disabled = prepare.disabled = !steers || busy || isChecking(store);
     for (const each of [moves, seen, arm, go]) each.hidden = !waits;
-    if (rig.moves.join() !== shownMoves) { // what was confirmed is not what is shown now
+    if (rig.moves.join() !== shownMoves) { // the confirmed motions have changed
       shownMoves = rig.moves.join();
       free.checked = false;
       moves.replaceChildren(...rig.moves.map((line) => make("li", {}, line)));
@@ -44,7 +44,7 @@ export function rigForm(store, link) {
     go.dataset.was = rig.state;
     arm.textContent = isArmed(store) ? "Disarm" : "Arm";
     arm.disabled = !steers || !(isArmed(store) || free.checked);
-    go.textContent = rig.begun ? "Go on" : "Insert on the rig";
+    go.textContent = rig.begun ? "Continue" : "Insert on the rig";
     go.disabled = !steers || !isArmed(store);
   };
   free.addEventListener("change", show);

@@ -1,4 +1,4 @@
-// How an insertion goes, or has ended, in words.
+// State or outcome of an insertion, in words.
 
 import { shown } from "../dom.js";
 
@@ -9,7 +9,7 @@ const STATES = {
 
 const COUNTED = ["paused", "holding", "done", "held", "failed", "interrupted"]; // else the player counts the periods
 
-// insertion: the news of that type; rows: of its periods so far.
+// insertion: the message of that type; rows: of its periods.
 export function inWords(insertion, rows = []) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";

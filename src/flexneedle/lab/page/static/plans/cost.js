@@ -1,4 +1,4 @@
-// Cost over the iterations of the search (uPlot, logarithmic): the best so far, and elite and median of the samples.
+// Cost over the iterations of the search (uPlot, logarithmic): the best sample, and elite and median of the samples.
 
 import uPlot from "../vendor/uplot.js";
 import { make } from "../dom.js";
@@ -7,7 +7,7 @@ import { color } from "../theme.js";
 
 const HEIGHT = 150; // px
 const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
-const CAPTION = "Cost over iterations: the best sample so far; elite, the highest cost among the samples that the next iteration is drawn from; the median of all samples";
+const CAPTION = "Cost over iterations: the best sample until then; elite, the highest cost of the samples from which the next iteration is drawn; the median of all samples";
 const positive = (value) => (value > 0 ? value : null); // the axis is logarithmic
 
 export class CostPlot {

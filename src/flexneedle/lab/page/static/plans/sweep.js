@@ -63,7 +63,7 @@ export class SweepView {
   }
 }
 
-// Steps that are drawn: evenly, first and last among them.
+// Drawn steps: evenly spaced, with the first and the last.
 function stepsOf(count) {
   const shown = Math.min(NEEDLES, count);
   return Array.from({ length: shown }, (_, at) => (shown === 1 ? count - 1 : Math.round((at * (count - 1)) / (shown - 1))));

@@ -1,4 +1,4 @@
-// Table of plans: where each ends, and the weighted terms of its cost.
+// Table of plans: the end of each, and the weighted terms of its cost.
 
 import { make, shown } from "../dom.js";
 
@@ -6,10 +6,10 @@ const ROWS = [
   ["Error at the target (mm)", ({ error_mm: error }) => shown(error, 3)],
   ["Tissue energy (mJ)", ({ energy_mj: energy }) => shown(energy, 4)],
   ["Flips (half-turns of the bevel)", ({ flips }) => String(flips)],
-  ["Found in (s)", ({ seconds }) => shown(seconds, 2)],
+  ["Planning time (s)", ({ seconds }) => shown(seconds, 2)],
 ];
 
-// A table in a list, or none without plans.
+// The table in a list; an empty list without plans.
 export function termsTable(plans) {
   if (!plans.length) return [];
   const row = (name, cell) => make("tr", {}, make("th", { scope: "row" }, name), ...plans.map((plan) => make("td.number", {}, cell(plan))));
@@ -21,7 +21,7 @@ export function termsTable(plans) {
   return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost", ({ cost }) => shown(cost, 3)), ...ROWS.map((each) => row(...each))))];
 }
 
-// A number with a bar of its size.
+// A number with a bar of that length.
 function barOf(value, most) {
   if (value === undefined) return "–";
   const bar = make("meter", { min: "0", max: String(most), value: String(value), "aria-hidden": "true" });

@@ -1,4 +1,4 @@
-// One plot over time (uPlot): lines of the shown insertion, those of the second run beside them, the player's line.
+// One plot over time (uPlot): lines of the shown insertion and of the second run, and the player's line.
 
 import uPlot from "../vendor/uplot.js";
 import { make, shown } from "../dom.js";
@@ -21,7 +21,7 @@ export class PlotView {
   #start = 0;
   #time = null;
 
-  // spec: {title, lines: [{name, tone, of, dash, thin}], none: words where no line has a value}; choose: called with the index of the row that is clicked.
+  // spec: {title, lines: [{name, tone, of, dash, thin}], none: text without any value}; choose: called with the index of the clicked row.
   constructor(parent, spec, choose) {
     [this.#spec, this.#choose] = [spec, choose];
     this.#place = make("div.plot", { role: "img", "aria-label": spec.title });
@@ -30,8 +30,8 @@ export class PlotView {
     new ResizeObserver(([{ contentRect }]) => this.#chart?.setSize({ width: contentRect.width, height: HEIGHT })).observe(this.#place);
   }
 
-  // Rows of the shown insertion, one at least, whose times count from `start`, and of the second run (or null), which
-  // begins where that does.
+  // Rows of the shown insertion, one at least, whose times count from `start`, and of the second run (or null), with
+  // the same beginning.
   update(rows, second, start, theme) {
     [this.#rows, this.#start] = [rows, start];
     const compared = Boolean(second?.length);
@@ -59,7 +59,7 @@ export class PlotView {
     return [rows.map(({ time }) => time - start), ...this.#spec.lines.map(({ of }) => rows.map(of))];
   }
 
-  // Of several lines, those that have a value; or that there is none.
+  // The lines that have a value, or the text without any.
   #showLegend(data) {
     const known = this.#lines.filter((_, at) => data[at + 1].some((value) => (value ?? null) !== null));
     const none = known.length ? "" : this.#spec.none ?? "";
@@ -113,7 +113,7 @@ export class PlotView {
   }
 }
 
-// Range of the values about those that are shown; a line without a change is in the middle, not on the edge.
+// Range around the shown values; a constant line is in the middle, not on the edge.
 export function rangeOf(_chart, low, high) {
   if (low === null) return [null, null];
   if (low !== high) return uPlot.rangeNum(low, high, 0.1, true);
@@ -133,8 +133,8 @@ function seriesOf({ name, tone, dash, thin }) {
   return { label: name, stroke, width: thin ? 1 : 1.75, dash: dash ? [5, 3] : undefined, points };
 }
 
-// Indices of values between unknown ones, which are points since no line has them. What is undefined is at a time of
-// the other run.
+// Indices of values between unknown ones: points, since no line contains them. Undefined values are at times of the other
+// run.
 function alone({ data }, series) {
   const values = data[series];
   const own = Array.from(values.keys()).filter((at) => values[at] !== undefined);

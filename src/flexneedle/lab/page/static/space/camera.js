@@ -43,7 +43,7 @@ export class Camera {
     this.#refit();
   }
 
-  // Look from a side: reset, side (x–y), top (x–z) or axis.
+  // Show a side: reset, side (x–y), top (x–z) or axis.
   look(name) {
     this.#moved = name !== "reset";
     this.#fit(DIRECTIONS[name] ?? (this.camera.aspect > 1.5 ? WIDE : NARROW));

@@ -13,7 +13,7 @@ export class Labels {
     this.group = new Group();
   }
 
-  // Add a label at a point [x, y, z]. anchor: which place of the text is there, [0, 0] is its lower left corner.
+  // Add a label at a point [x, y, z]. anchor: the part of the text at that point, [0, 0] is its lower left corner.
   add(text, point, color, anchor = [0.5, 0.5]) {
     const { canvas, width, height } = drawn(text, color);
     const texture = new CanvasTexture(canvas);

@@ -1,4 +1,4 @@
-// The reach: a shaded strip in its plane from the news, and the outlines at each depth from the frame.
+// The reach: a shaded strip in its plane from the message, and the outlines at each depth from the frame.
 
 import { BufferAttribute, BufferGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial } from "../vendor/three.js";
 import { Lines } from "./lines.js";
@@ -15,7 +15,7 @@ export class Outlines {
     this.group.add(this.strip, this.#lines.object);
   }
 
-  // reach: its news (messages.py), or null; strip: whether it is shown; shape: outlines, or null.
+  // reach: its message, or null; strip: whether it is shown; shape: outlines, or null.
   update(reach, strip, shape, color) {
     this.group.visible = Boolean(reach);
     this.strip.visible = strip;

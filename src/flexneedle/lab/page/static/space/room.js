@@ -1,4 +1,4 @@
-// What stays while a needle moves: layers of tissue, skin, mm grid with labels. y points upwards, z to the viewer.
+// Fixed parts: layers of tissue, skin, mm grid with labels. y points upwards, z to the viewer.
 
 import {
   BackSide, BoxGeometry, BufferAttribute, BufferGeometry, Color, DoubleSide, EdgesGeometry, Group, LineBasicMaterial,

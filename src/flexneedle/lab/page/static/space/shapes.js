@@ -1,4 +1,4 @@
-// What moves: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
+// Moving parts: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
 
 import {
   Color, ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, SRGBColorSpace,
@@ -27,7 +27,7 @@ export class Shapes {
   #outlines = new Outlines();
   #reading;
   #theme = "";
-  #seen = new Map(); // by part: what it was drawn from
+  #seen = new Map(); // by part: its data
 
   constructor() {
     this.group = new Group();
@@ -45,7 +45,7 @@ export class Shapes {
     this.group.add(this.#paths.object, this.#outlines.group);
   }
 
-  // Draw what the store has. Returns entries of the legend: {text, tone, form} and for the channel {text, ramp}.
+  // Draw the state of the store. Return entries of the legend: {text, tone, form} and for the channel {text, ramp}.
   update(store, scene, of) {
     const row = shownRow(store);
     const shape = (kind) => shownShape(store, kind, of);
@@ -110,7 +110,7 @@ export class Shapes {
     this.group.add(this.measured);
   }
 
-  // Whether a part is drawn from something else than before.
+  // Return whether the data of a part has changed.
   #differs(part, inputs) {
     const before = this.#seen.get(part);
     this.#seen.set(part, inputs);
@@ -171,7 +171,7 @@ export class Shapes {
     return shape && { text: `${shape.paths} sampled paths`, tone: "--estimate", form: "thin" };
   }
 
-  // Where the tip was: estimated and true.
+  // Past positions of the tip: estimated and true.
   #tips(store, of, row) {
     const rows = row && of !== "scene" ? store.get(`rows ${of}`).slice(0, row.index + 1) : [];
     const count = rows.length;
@@ -184,7 +184,7 @@ export class Shapes {
     return count > 1 ? [estimated, truth] : [];
   }
 
-  // Where the tip was measured at the shown period.
+  // Measured tip at the shown period.
   #measured(row) {
     this.measured.visible = isMeasured(row);
     if (!this.measured.visible) return null;
@@ -203,7 +203,7 @@ export class Shapes {
     return second && { text: "second run", tone: "--second" };
   }
 
-  // Its strip is in the plane of the target for which it was computed: one that was moved out of that is not in it.
+  // Its strip is in the plane of the target for which it was computed; a target that was moved may be outside.
   #reach(store, scene) {
     const reach = shownReach(store);
     const outlines = reach && store.get("shape reach scene");

@@ -1,4 +1,4 @@
-// The target: its sphere of 1 mm, and arrows that move it while nobody else steers.
+// The target: its sphere of 1 mm, and arrows that move it while nobody else is in control.
 
 import { Group, Mesh, MeshLambertMaterial, SphereGeometry, TransformControls } from "../vendor/three.js";
 import { mayMove, shownTarget, targetEdit } from "../shown.js";
@@ -13,7 +13,7 @@ export class Target {
   #gizmo;
   dragged = false;
 
-  // camera: of camera.js; changed: called when it has to be drawn again.
+  // camera: of camera.js; changed: called when it must be drawn again.
   constructor(camera, canvas, store, link, changed) {
     this.#store = store;
     this.ball = new Mesh(new SphereGeometry(RADIUS, 32, 16), new MeshLambertMaterial({ transparent: true, opacity: 0.75 }));

@@ -40,7 +40,7 @@ export class Tube {
   #reserve(points, colored) {
     if (points <= this.#room) return;
     this.#room = Math.ceil(1.5 * points);
-    const rings = this.#room + 2; // one of no radius closes each end
+    const rings = this.#room + 2; // a ring of radius 0 closes each end
     const geometry = this.mesh.geometry;
     geometry.dispose();
     for (const name of ["position", "normal", ...(colored ? ["color"] : [])]) {

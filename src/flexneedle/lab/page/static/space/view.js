@@ -39,7 +39,7 @@ export class SpaceView {
     store.subscribe([...SHOWN, "people", "welcome"], () => this.#update());
   }
 
-  // The canvas with the scene drawn into it just now. Read it before returning to the browser, which clears it.
+  // Draw the scene and return its canvas. Read it before returning to the browser, which clears it.
   drawn() {
     this.renderer.render(this.scene, this.camera.camera);
     return this.#canvas;
@@ -57,7 +57,7 @@ export class SpaceView {
     this.#later ||= requestAnimationFrame(() => {
       this.#later = 0;
       this.#schedule();
-    }); // in the frame after that of the flat views, so that none has too much to do
+    }); // one frame after the flat views, to spread the work
   }
 
   #updateRoom(scene) {
@@ -109,7 +109,7 @@ export class SpaceView {
   }
 }
 
-// Light from everywhere, and from above the viewer's left shoulder.
+// Ambient light, and light from above the viewer's left shoulder.
 function lights(camera) {
   const sun = new DirectionalLight("#ffffff", 2.2);
   sun.position.set(-0.5, 1, 0.6);
