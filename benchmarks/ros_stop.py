@@ -27,8 +27,8 @@ import flexneedle
 from flexneedle.errors import StoppedError
 from flexneedle.geometry.registration import identity
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.messages import Task
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.protocol import SupervisorTask
 from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.dds import Writer, participant
 from flexneedle.lab.ros.profile import load_profile
@@ -73,9 +73,9 @@ def measure(count: int) -> dict[str, dict[str, float]]:
             "tracker": {"kind": "stages:Still"},
         }
         rig = RigFile.model_validate(RIG | parts)
-        task = Task(rig, time.monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
+        task = SupervisorTask(rig, time.monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
         command = [sys.executable, HERE, "--publisher"]
-        with Bridge(RosSettings()) as bridge, Supervisor(task, bridge.report) as supervisor:
+        with Bridge(RosSettings()) as bridge, SupervisorClient(task, bridge.report) as supervisor:
             bridge.opened(supervisor)
             other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
             if not other.stdout.readline():
@@ -92,7 +92,7 @@ def measure(count: int) -> dict[str, dict[str, float]]:
 
 
 def _stops(
-    supervisor: Supervisor,
+    supervisor: SupervisorClient,
     other: subprocess.Popen[str],
     notes: Path,
     count: int,

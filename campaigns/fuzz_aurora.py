@@ -32,8 +32,8 @@ from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
 from flexneedle.lab.rig.devices.aurora.incoming import Incoming
 from flexneedle.lab.rig.devices.aurora.messages import parse
 from flexneedle.lab.rig.devices.aurora.readings import NAMES, readings, sensor_name
-from flexneedle.lab.rig.supervisor.messages import Expectation
-from flexneedle.lab.rig.supervisor.watch import Watch
+from flexneedle.lab.rig.supervisor.protocol import Expectation
+from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.phantom.tracking.stage import tip_on_stage
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -321,7 +321,7 @@ def watch_inputs(random: Random) -> Iterator[str]:
         turn = np.array([random.gauss(0, 1) for _ in range(4)])
         to_stage = Rigid(to_matrix(turn), np.array([random.uniform(-100, 100) for _ in range(3)]))
         monitor = Monitor(MonitorSettings(enabled=random.random() < 0.8), random.choice((1, 2)))
-        watching = Watching(Watch(monitor, STALE_S, 0.0), to_stage, random.choice((0.0, 0.0, 7.5)))
+        watching = Watching(TipWatch(monitor, STALE_S, 0.0), to_stage, random.choice((0.0, 0.0, 7.5)))
         for _ in range(random.randint(1, 300)):
             ticked(watching, random)
             yield ""
@@ -331,7 +331,7 @@ def watch_inputs(random: Random) -> Iterator[str]:
 class Watching:
     """A watch, the map to the stage, the time, and the number of the last frame that was not rejected at once."""
 
-    watch: Watch
+    watch: TipWatch
     to_stage: Rigid
     tip_offset: float
     now: float = 10.0
@@ -346,14 +346,16 @@ def ticked(watching: Watching, random: Random) -> None:
         begin, end = ((random.uniform(0, 9), 0.0, 0.0) for _ in range(2))
         most_off = random.choice((MOST_OFF_MM, 1e4, math.inf))
         expected = Expectation(begin, end, most_off)
-        watching.watch = watching.watch.expecting(
+        watching.watch = watching.watch.with_expectation(
             expected, watching.now, watching.now + random.choice((0.0, 1.0))
         )
     frames = [random_tip_frame(random, watching) for _ in range(random.choice((0, 1, 1, 1, 1, 2, 5)))]
     try:
         with np.errstate(all="ignore"):  # not a number in, not a number out
             found = tuple(tip_on_stage(frame, watching.to_stage, watching.tip_offset) for frame in frames)
-        watching.watch = watching.watch.after(found, watching.now, random.choice((VISIBLE, "no reply")))
+        watching.watch = watching.watch.with_readings(
+            found, watching.now, random.choice((VISIBLE, "no reply"))
+        )
     except Exception as error:
         raise Failure(f"{frames} at {watching.now}: {error!r}") from error
     check_verdict(watching, found)

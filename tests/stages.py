@@ -8,10 +8,10 @@ from pathlib import Path
 
 from flexneedle.errors import DriverError
 from flexneedle.geometry.registration import identity
+from flexneedle.lab.rig.devices import clock
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor import suspension
+from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -237,7 +237,7 @@ class Bench:
         if loop:
             rig = rig.model_copy(update={"loop": rig.loop.model_copy(update=loop)})
         monitor = monitor or MonitorSettings(references=0)
-        task = say.Task(rig, 0.0, 2, monitor, identity(), 0.0, 0.3, tracked=tracked)
+        task = protocol.SupervisorTask(rig, 0.0, 2, monitor, identity(), 0.0, 0.3, tracked=tracked)
         self.sent, self.reports = [], []
         self.core = Supervisor(task, self.stage, self.camera, self.clock, self.sent.append)
 
@@ -246,7 +246,7 @@ class Bench:
         for _ in range(count):
             self.clock.wait(TICK_S)
             if beat:
-                self.core.request(say.Heartbeat())
+                self.core.request(protocol.Heartbeat())
             self.core.tick()
             self.reports.append(self.core.report(0.0, 0.0, 0))
 
@@ -261,7 +261,7 @@ class Bench:
 
     def armed(self, deepest=50.0):
         """The same, armed."""
-        self.core.request(say.Arm(deepest))
+        self.core.request(protocol.ArmRequest(deepest))
         return self
 
     def position(self, name):
@@ -313,7 +313,7 @@ def real_motors(settings, channels):
 def suspended_motors(settings, channels):
     """A driver of a rig file, `stages:suspended_motors`: the computer seems to be suspended for an hour on the way."""
     stage = real_motors(settings, channels)
-    suspension.asleep = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
+    clock.suspended_s = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
     return stage
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from flexneedle.record.columns import verdict_of
+from flexneedle.record.fields import parse_verdict
 from flexneedle.types import Action, CheckedMeasurement, Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -32,7 +32,7 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
     readings = tuple(
         CheckedMeasurement(
             Measurement(frame.time, period.measurement.x, period.measurement.y, 0.0, frame),
-            verdict_of(verdict),
+            parse_verdict(verdict),
         )
         for frame in frames
     )
@@ -41,4 +41,4 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
 
 def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):
     """Return the period as one in which the needle was held."""
-    return replace(period, action=Action.HOLD, decision="held", verdict=verdict_of(reason))
+    return replace(period, action=Action.HOLD, decision="held", verdict=parse_verdict(reason))

@@ -11,6 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.scenario.files import dump_scenario
+from kits import run_kits
 
 DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
 MODULES = dict(re.findall(r"^```python title=\"(\w+)\.py\"\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
@@ -72,9 +73,19 @@ def command(lab, *argv):
     return subprocess.run(line, cwd=lab, capture_output=True, text=True, check=False)
 
 
-def test_each_example_has_about_thirty_lines():
-    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench", "fung"]
-    assert all(15 < len(code.splitlines()) < 42 for code in MODULES.values())
+def insert(scenario, plan, controller, phantom, tracker):
+    rig = flexneedle.VirtualRig(phantom, tracker)
+    return flexneedle.insert(scenario, plan, 3, controller=controller, rig=rig, force=True)
+
+
+def test_each_example_is_one_short_file():
+    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench", "fung", "tilt", "test_parts"]
+    assert all(len(code.splitlines()) < 42 for code in MODULES.values())
+
+
+def test_the_parts_pass_their_kits(lab, imported):
+    del lab
+    run_kits(imported("test_parts:__dict__"))
 
 
 @pytest.mark.long
@@ -114,27 +125,27 @@ def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch)
     scenario = flexneedle.load_scenario("quick.toml")
     plan = flexneedle.plan(scenario, seed=0)
     own = {key: imported(name) for key, name in PARTS.items()}
-    by_object = flexneedle.insert(scenario, plan, 3, force=True, **own)
-    by_name = flexneedle.insert(scenario, plan, 3, force=True, **PARTS)
+    by_object = insert(scenario, plan, **own)
+    by_name = insert(scenario, plan, **PARTS)
     assert by_object.outcome == "done"
     assert [p.true_tip for p in by_object.periods] == [p.true_tip for p in by_name.periods]
     assert (by_object.controller, by_object.phantom) == ("follow-path", "Unicycle")
     assert (by_name.controller, by_name.phantom) == (PARTS["controller"], PARTS["phantom"])
     stiff = scenario.with_values({"control.follow_path.gain": 2.0})
-    other = flexneedle.insert(stiff, plan, 3, force=True, **own)
+    other = insert(stiff, plan, **own)
     assert other.periods[-1].guide != by_object.periods[-1].guide
 
 
 def test_the_example_of_objects_runs_as_printed(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     (lab / "mine.toml").write_bytes((lab / "quick.toml").read_bytes())
-    example, _ = [
+    example, *_ = [
         code for code in re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL) if code.startswith("import")
     ]
     names = {}
     exec(compile(example, "extend.md", "exec"), names)
     own = {key: imported(name) for key, name in PARTS.items()}
-    same = flexneedle.insert("quick.toml", names["plan"], 3, force=True, **own)
+    same = insert("quick.toml", names["plan"], **own)
     loaded = flexneedle.load("runs/mine")
     assert [p.true_tip for p in loaded.periods] == [p.true_tip for p in same.periods]
     assert (loaded.controller, loaded.phantom, loaded.tracker) == ("follow-path", "Unicycle", "Camera")

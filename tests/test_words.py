@@ -21,7 +21,7 @@ BANNED = {
     "learnt": ["The stiffness is learnt."],
     "believed": ["It is believed.", "The belief is updated.", "It believes the reading."],
     "sees": ["The tracker sees the tip."],
-    "looks": ["It looks for a file.", "Look at the picture.", "It looked right."],
+    "looks": ["It looks for a file.", "It looked right."],
     "stands": ["The limit stands twice."],
     "lies": ["The tip lies below."],
     "goes on": ["The insertion goes on.", "Press Go on.", "It went on.", "Steps going on."],

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Controller, Decision, travel_left
+    from flexneedle.costs.table import Trajectories
     from flexneedle.errors import (
         CommandError,
+        DriverError,
         FlexneedleError,
         InputError,
         RunError,
@@ -47,16 +49,49 @@ if TYPE_CHECKING:
     from flexneedle.simulator.control import controls
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
-    from flexneedle.types import Control, Insertion, Measurement, Motion, Plan, Pose
+    from flexneedle.types import (
+        DB_PSI,
+        DB_THETA,
+        DB_X,
+        DB_Y,
+        DB_Z,
+        DG_Y,
+        DG_Z,
+        PSI,
+        ROLL,
+        SPIN,
+        THETA,
+        Control,
+        Insertion,
+        Measurement,
+        Motion,
+        Plan,
+        Pose,
+        X,
+        Y,
+        Z,
+    )
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "DB_PSI",
+    "DB_THETA",
+    "DB_X",
+    "DB_Y",
+    "DB_Z",
+    "DG_Y",
+    "DG_Z",
+    "PSI",
+    "ROLL",
+    "SPIN",
+    "THETA",
     "CommandError",
     "Control",
     "Controller",
     "Decided",
     "Decision",
+    "DriverError",
     "Ended",
     "Estimate",
     "Event",
@@ -84,8 +119,12 @@ __all__ = [
     "StateError",
     "Task",
     "TipTracker",
+    "Trajectories",
     "Truth",
     "VirtualRig",
+    "X",
+    "Y",
+    "Z",
     "__version__",
     "controls",
     "insert",
@@ -102,9 +141,18 @@ __all__ = [
 _HOMES = {
     "control.interface": ("Decision", "Controller", "travel_left"),
     "errors": (
-        *("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "ScenarioWarning"),
+        *(
+            "CommandError",
+            "DriverError",
+            "FlexneedleError",
+            "InputError",
+            "RunError",
+            "ScenarioError",
+            "ScenarioWarning",
+        ),
         "StateError",
     ),
+    "costs.table": ("Trajectories",),
     "estimation.estimate": ("Estimate",),
     "estimation.task": ("Task",),
     "figures.record": ("plot",),
@@ -127,7 +175,25 @@ _HOMES = {
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
     "lab.study.runner": ("run_study",),
-    "types": ("Control", "Insertion", "Measurement", "Motion", "Plan", "Pose"),
+    "types": (
+        *(
+            "DB_PSI",
+            "DB_THETA",
+            "DB_X",
+            "DB_Y",
+            "DB_Z",
+            "DG_Y",
+            "DG_Z",
+            "ROLL",
+            "SPIN",
+            "PSI",
+            "THETA",
+            "X",
+            "Y",
+            "Z",
+        ),
+        *("Control", "Insertion", "Measurement", "Motion", "Plan", "Pose"),
+    ),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

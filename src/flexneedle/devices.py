@@ -1,4 +1,7 @@
-"""Public names for a motor driver or a tracker of a rig file: ports, records, settings and errors."""
+"""Public names for rig files and their devices: ports, records, settings, errors, and the rig of a file."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flexneedle.errors import DriverError, RigError
 from flexneedle.lab.rig.devices.opening import MotorsFactory, TrackerFactory
@@ -6,6 +9,10 @@ from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.ports import Clock, MotorPaces, Motors, MotorSetup, MotorState, Tracker
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.types import VISIBLE, Frame, SensorReading
+
+if TYPE_CHECKING:
+    from flexneedle.lab.rig.rig_file import RigFile
+    from flexneedle.lab.rig.supervised import SupervisedRig
 
 __all__ = [
     "VISIBLE",
@@ -23,4 +30,20 @@ __all__ = [
     "Tracker",
     "TrackerFactory",
     "check_settings",
+    "open_rig",
 ]
+
+
+def open_rig(file: "str | Path | RigFile", *, dry_run: bool = False) -> "SupervisedRig":
+    """Return the rig of a rig file for `flexneedle.insert(…, rig=…)`.
+
+    Args:
+        file: A rig file, or its name or path.
+        dry_run: Whether the motors are only read and never move (default: False).
+
+    Raises:
+        RigError: The rig file breaks a rule.
+    """
+    from flexneedle.lab.rig.supervised import SupervisedRig  # not needed by drivers, and slow to import
+
+    return SupervisedRig(file, dry_run=dry_run)

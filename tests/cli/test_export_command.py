@@ -8,7 +8,7 @@ import pytest
 import fake_engine
 from commands import run
 from flexneedle.cli import main as cli
-from flexneedle.record.columns import COLUMNS
+from flexneedle.record.fields import COLUMNS
 from flexneedle.record.reader import read_trace
 from flexneedle.types import CheckedMeasurement
 from synthetic import make_periods

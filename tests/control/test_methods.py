@@ -192,13 +192,6 @@ def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(
 
 
 @pytest.mark.parametrize("name", FIELD)
-def test_the_same_seed_gives_the_same_commands(quick_plan, name):
-    again = flexneedle.insert(PHANTOM, quick_plan, 5000, controller=name, force=True, threads=1)
-    one = [period.applied for period in inserted(name, quick_plan).periods]
-    assert [period.applied for period in again.periods] == one
-
-
-@pytest.mark.parametrize("name", FIELD)
 def test_without_a_guide_they_work_or_say_what_they_need(name):
     bare = PHANTOM.with_values({"setup.guide_to_skin_mm": None, "plan.iterations": 2})
     plan = flexneedle.plan(bare, (25.0, 0.0), seed=0, threads=1)

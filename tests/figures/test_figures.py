@@ -14,7 +14,7 @@ from flexneedle.figures.curves import held_spans, worst_indicator
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import NEEDLE, save
-from flexneedle.record.columns import verdict_of
+from flexneedle.record.fields import parse_verdict
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import ROLL, THETA, CheckedMeasurement, Insertion, Measurement, Outcome
@@ -417,7 +417,7 @@ def with_frames(insertion, frames, verdicts=()):
     """Return the insertion with these frames as the readings of its first period."""
     verdicts = verdicts or ["ok"] * len(frames)
     readings = tuple(
-        CheckedMeasurement(Measurement(frame.time, 0.0, 0.0, 0.0, frame), verdict_of(verdict))
+        CheckedMeasurement(Measurement(frame.time, 0.0, 0.0, 0.0, frame), parse_verdict(verdict))
         for frame, verdict in zip(frames, verdicts, strict=True)
     )
     return replace(insertion, periods=(replace(insertion.periods[0], readings=readings),))

@@ -10,8 +10,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control.interface import Controller, Decision
-from flexneedle.record.columns import to_row
 from flexneedle.record.export import write_csv
+from flexneedle.record.fields import to_row
 from flexneedle.record.reader import read_trace
 from flexneedle.record.results import insertion_result
 from flexneedle.record.writer import TraceWriter

@@ -10,7 +10,7 @@ from flexneedle.errors import CommandError, InputError
 from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom, evenly_spaced
-from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, plant
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, make_plant
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA
 from reference.rods import IDEAL, Bench
@@ -38,7 +38,7 @@ def test_the_needle_starts_at_the_true_pose_of_the_clamp(kind):
 def test_a_command_is_executed_in_finer_steps(kind):
     """One roll of the bevel, to and fro, then 1 mm in steps of 0.25 mm: four equal parts."""
     phantom = tank(kind=kind)
-    by_hand = plant(kind, Truth(IDEAL), 0.0)
+    by_hand = make_plant(kind, Truth(IDEAL), 0.0)
     flipped = Control(db_x=1.0, dg_y=0.1, flip=True)
     for number in range(32):
         roll = (-1) ** number * math.pi
@@ -257,7 +257,7 @@ def test_points_at_equal_distances_are_along_the_chain():
 def test_a_plant_without_nodes_has_no_shape():
     class Without:
         def __init__(self, truth, roll):
-            self._plant = plant("model", truth, roll)
+            self._plant = make_plant("model", truth, roll)
 
         def __getattr__(self, name):
             if name == "nodes":

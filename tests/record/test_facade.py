@@ -16,7 +16,7 @@ from flexneedle.cli import main as cli
 from flexneedle.errors import InputError, RunError
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
-from flexneedle.record.columns import COLUMNS
+from flexneedle.record.fields import COLUMNS
 from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE
 from flexneedle.record.results import insertion_result

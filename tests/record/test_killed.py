@@ -12,7 +12,7 @@ import pytest
 import flexneedle
 from counted_command import counted
 from flexneedle.cli import main as cli
-from flexneedle.record.columns import to_row
+from flexneedle.record.fields import to_row
 from flexneedle.record.reader import read_trace
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.types import Outcome

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
-from flexneedle.record.columns import COLUMNS, from_row, to_row, verdict_of
+from flexneedle.record.fields import COLUMNS, parse_verdict, to_row
 from flexneedle.record.messages import joints
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import TOPICS
@@ -196,29 +196,19 @@ def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, mea
 @pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.4 mm", "ref1: 0.09", ": "])
 def test_a_verdict_is_restored_from_its_text(kind, reason):
     verdict = Verdict(kind, reason)
-    assert verdict_of(str(verdict)) == verdict
+    assert parse_verdict(str(verdict)) == verdict
 
 
 def test_the_text_of_a_verdict_is_that_of_earlier_traces():
-    assert verdict_of("not a number") == Verdict(VerdictKind.NOT_A_NUMBER)
-    assert verdict_of("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
-    assert verdict_of("ok") == Verdict()
+    assert parse_verdict("not a number") == Verdict(VerdictKind.NOT_A_NUMBER)
+    assert parse_verdict("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
+    assert parse_verdict("ok") == Verdict()
 
 
 @pytest.mark.parametrize("text", ["fine", "", "okay", "missing the tip", "field"])
 def test_a_text_that_is_not_a_verdict_is_rejected(text):
     with pytest.raises(ValueError, match=f"'{text}' is not a valid VerdictKind"):
-        verdict_of(text)
-
-
-def test_a_row_of_an_earlier_version_is_read():
-    """There the columns of the measurement began with `sample_`."""
-    period = PERIODS[3]
-    earlier = {name.replace("measured_", "sample_"): text for name, text in to_row(period).items()}
-    assert {name for name in earlier if name not in COLUMNS} == {
-        f"sample_{part}" for part in ("time_s", "x_mm", "y_mm", "z_mm")
-    }
-    assert to_row(from_row(earlier, period.shape, period.durations)) == to_row(period)
+        parse_verdict(text)
 
 
 def test_a_period_does_not_have_the_readings_of_the_previous_one(tmp_path):

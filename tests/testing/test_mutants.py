@@ -17,6 +17,7 @@ from flexneedle.testing import (
     TrackerConformance,
 )
 from flexneedle.types import ROLL, VISIBLE, Frame, Measurement, SensorReading
+from kits import checks_of
 from rooms import ManualClock
 from stages import Stage
 
@@ -72,12 +73,6 @@ class MovesWhenRead(Unicycle):
     def tip(self):
         self.at = self.at + 1e-3
         return self.at.copy()
-
-
-class HandsOutItsState(Unicycle):
-    @property
-    def tip(self):
-        return self.at
 
 
 def with_values(part, **values):
@@ -222,18 +217,12 @@ def of_device(device):
 
 
 class Motors(Stage):
-    """Motors that refuse what they do not know."""
+    """Motors that refuse what is no position."""
 
     def follow(self, positions):
-        for channel, position in positions.items():
-            if channel not in self.motors or not math.isfinite(position):
-                raise DriverError(f"{channel} = {position}: must be a position of {', '.join(self.motors)}")
+        if not all(map(math.isfinite, positions.values())):
+            raise DriverError(f"{positions}: must be finite")
         super().follow(positions)
-
-    def set_speed(self, channel, speed, acceleration):
-        if channel not in self.motors:
-            raise DriverError(f"{channel}: no such channel")
-        super().set_speed(channel, speed, acceleration)
 
 
 class WaitsForTheEnd(Motors):
@@ -300,7 +289,7 @@ class MovesToDefine(Motors):
         self.motors[channel].target = position
 
 
-class FailsByKeyError(Motors):
+class TakesAnyPosition(Motors):
     def follow(self, positions):
         self._called("follow")
         for channel, position in positions.items():
@@ -441,7 +430,6 @@ MUTANTS = [
     (of_plant(ChangesItsRow), "test_command_and_truth_are_not_changed"),
     (of_plant(SharesItsState), "test_plants_are_independent"),
     (of_plant(MovesWhenRead), "test_reading_changes_nothing"),
-    (of_plant(HandsOutItsState), "test_reading_changes_nothing"),
     (of_driver(reporting(lambda motion: motion.control)), "test_motion_has_control_and_times"),
     (of_driver(reporting(lambda m: m._replace(control=Control(1e-3)))), "test_motion_has_control_and_times"),
     (of_driver(reporting(lambda m: m._replace(begun=0.0))), "test_motion_has_control_and_times"),
@@ -482,7 +470,7 @@ MUTANTS = [
     (of_motors(DoesNotStop), "test_stop_ends_a_motion"),
     (of_motors(IgnoresTheSpeed), "test_speed_is_limited"),
     (of_motors(MovesToDefine), "test_define_renames_the_position"),
-    (of_motors(FailsByKeyError), "test_invalid_commands_are_driver_errors"),
+    (of_motors(TakesAnyPosition), "test_position_that_is_not_finite_is_refused"),
     (of_motors(ReadsOneChannel), "test_read_returns_the_state_of_each_channel"),
     (of_motors(ReadsTuples), "test_read_returns_the_state_of_each_channel"),
     (of_motors(LeapsWhenSwitchedOn), "test_power_holds_the_motor_where_it_is"),
@@ -500,10 +488,6 @@ MUTANTS = [
     (of_controller(predicts=True), "test_predictions_are_numbers"),
     (type("Kit", (ControllerConformance,), {"make": lambda _: straight}), "test_is_a_controller"),
 ]
-
-
-def checks_of(kit):
-    return [name for name in dir(kit) if name.startswith("test_")]
 
 
 @pytest.mark.parametrize("port", SOUND)

@@ -1,10 +1,11 @@
-"""Writes docs/reference/commands.md: the help of every command.
+"""Write docs/reference/commands.md: the help of every command.
 
 python tools/docs/command_reference.py
 """
 
 import argparse
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +14,14 @@ from flexneedle.cli.main import build_parser
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
 INTRODUCTION = """# Commands
 
-Results are written to stdout, progress and messages to stderr. The exit status is 0 when a command is done, 1 when it
-failed or an insertion ended more than 1 mm from its target, 2 for bad input and 130 after Ctrl-C.
+Results are written to stdout, progress and messages to stderr. The exit status is 0 on success, 1 after a failure or an
+insertion that ended more than 1 mm from its target, 2 for bad input and 130 after Ctrl-C. Every command has `--help`.
 
 This page is generated from the commands (`make docs`).
 """
 _COLUMNS = "90"
+_HELP = re.compile(r"^  -h, --help .*\n| \[-h\]", re.MULTILINE)
+_NOTHING_ELSE = re.compile(r"^options:\n\n", re.MULTILINE)
 
 
 def page() -> str:
@@ -34,7 +37,7 @@ def page() -> str:
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield a parser and those of its commands, in the order of the help."""
+    """Yield a parser and the parsers of its commands, in the order of the help."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -44,7 +47,8 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 def _section(parser: argparse.ArgumentParser) -> str:
     level = "#" * min(3, 1 + len(parser.prog.split()))
-    return f"{level} {parser.prog}\n\n```text\n{parser.format_help().rstrip()}\n```\n"
+    text = _NOTHING_ELSE.sub("", _HELP.sub("", parser.format_help()))
+    return f"{level} {parser.prog}\n\n```text\n{text.rstrip()}\n```\n"
 
 
 if __name__ == "__main__":

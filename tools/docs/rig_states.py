@@ -5,7 +5,7 @@ python tools/docs/rig_states.py
 
 from pathlib import Path
 
-from flexneedle.lab.rig.supervisor.machine import MOVING, Event, State, after
+from flexneedle.lab.rig.supervisor.machine import MOVING, RigEvent, SupervisorState, next_state
 
 PAGE = Path(__file__).parents[2] / "docs" / "safety.md"
 BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
@@ -13,10 +13,10 @@ BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
 
 def table() -> str:
     """Return the table in Markdown: the state after each event, empty if it is refused."""
-    heads = " | ".join(str(event) for event in Event)
-    lines = [f"| state | {heads} |", "|---" * (1 + len(Event)) + "|"]
-    for state in State:
-        cells = " | ".join(str(after(state, event) or "") for event in Event)
+    heads = " | ".join(str(event) for event in RigEvent)
+    lines = [f"| state | {heads} |", "|---" * (1 + len(RigEvent)) + "|"]
+    for state in SupervisorState:
+        cells = " | ".join(str(next_state(state, event) or "") for event in RigEvent)
         lines.append(f"| {f'**{state}**' if state in MOVING else state} | {cells} |")
     return "\n".join(lines) + "\n"
 

@@ -66,9 +66,9 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action=_Target,
         metavar=("X Y", "Z"),
-        help="depth and lateral offset of the target in mm, in space both offsets (default: as in the scenario)",
+        help="depth and lateral offset of the target in mm, in space both offsets (default: scenario)",
     )
-    add_seed(parser, "random seed; the same seed gives the same result")
+    add_seed(parser, "random seed")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<date>-<scenario>-<seed>)"
     )

@@ -39,9 +39,9 @@ class Connection:
     """
 
     def __init__(self, args: argparse.Namespace) -> None:
-        from flexneedle.loop.parts import SCENARIO_TRACKER
         from flexneedle.loop.virtual import VirtualRig
         from flexneedle.phantom.plants import DEFAULT_PLANT
+        from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER
 
         self.args = args
         self.source: RigSource = VirtualRig(args.phantom or DEFAULT_PLANT, args.tracker or SCENARIO_TRACKER)
@@ -94,8 +94,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm, and do not hold if the predicted miss "
-        "exceeds control.miss_limit_mm",
+        help="insert even if the plan misses by more than 1 mm, and do not hold for control.miss_limit_mm",
     )
 
 
@@ -104,18 +103,18 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--controller",
         metavar="NAME",
-        help="controller: a name from --list, or module:CONTROLLER for your own (default: adaptive-mpc)",
+        help="controller: name from --list or module:CONTROLLER (default: adaptive-mpc)",
     )
     parser.add_argument(
         "--phantom",
         metavar="KIND",
-        help="plant: exact, a separate finer formulation with the imperfections of a rig; model, the controller's "
-        "formulation with other parameters; or module:NAME for your own (default: exact)",
+        help="plant: exact, a separate finer formulation with imperfections; model, the controller's "
+        "formulation with other parameters; or module:NAME (default: exact)",
     )
     parser.add_argument(
         "--tracker",
         metavar="NAME",
-        help="tracker: scenario for that of the scenario, or module:NAME for your own (default: scenario)",
+        help="tracker: scenario or module:NAME (default: scenario)",
     )
     parser.add_argument(
         "--registration",

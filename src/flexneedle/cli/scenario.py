@@ -56,8 +56,8 @@ def _add_check(commands: Commands) -> None:
         _check,
         "flexneedle scenario check mine.toml --strict",
         "flexneedle scenario check mine.toml --controller follow_path:METHOD",
-        about="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
-        "for each value that is not used, or is an order of magnitude outside the usual range.",
+        about="Check a scenario. Prints one line per problem (exit status 2) and a warning for each unused "
+        "or implausible value (exit status 0).",
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(parser)
@@ -81,7 +81,7 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="module:METHOD",
-        help="your own controller, whose table the scenario may contain; repeatable",
+        help="custom controller whose table the scenario may contain; repeatable",
     )
 
 
@@ -120,11 +120,10 @@ def _check(args: argparse.Namespace) -> int:
 
 def _checked(args: argparse.Namespace) -> Scenario:
     """Return the scenario with all defaults, including those of the controllers."""
-    from flexneedle.control.controllers import checked
-    from flexneedle.loop.parts import controller_of
+    from flexneedle.control.controllers import checked, find_controller
     from flexneedle.scenario.files import load_scenario
 
-    own = [controller_of(name)[1] for name in args.controller]
+    own = [find_controller(name)[1] for name in args.controller]
     return checked(load_scenario(args.scenario), *own, source=args.scenario)
 
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexneedle.arguments import check_whole, make_refusal
-from flexneedle.control.controllers import DEFAULT
+from flexneedle.control.controllers import DEFAULT, find_controller
 from flexneedle.control.interface import Controller
-from flexneedle.loop.parts import controller_of
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.virtual import VirtualRig
 
@@ -15,7 +14,7 @@ _PARTS_OF_SOURCE = ("names", "moves", "check", "open", "results")
 
 @dataclass(frozen=True, eq=False)
 class Choices:
-    """Seed, controller with its name in the record, rig, and the options of `insert`."""
+    """Seed, controller with its name in the record, rig, and options of an insertion."""
 
     seed: int
     name: str
@@ -35,7 +34,7 @@ class Choices:
         threads: int | None = None,
     ) -> "Choices":
         """Return the resolved choices. Raises InputError for an unknown controller, and for anything but a rig."""
-        name, resolved = controller_of(controller)
+        name, resolved = find_controller(controller)
         source = VirtualRig() if rig is None else rig
         if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
             wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"
@@ -44,5 +43,5 @@ class Choices:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Fields of `Insertion` that name what the insertion is made with."""
+        """Fields of `Insertion` that name controller, phantom, tracker and rig."""
         return {"controller": self.name, **self.rig.names}

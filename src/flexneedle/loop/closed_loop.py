@@ -1,4 +1,4 @@
-"""Closed-loop insertion with a driver and a tracker, by default those of the virtual phantom."""
+"""The closed loop: decide, move, measure, until the needle rests at its target."""
 
 import itertools
 import math
@@ -14,10 +14,10 @@ from flexneedle.errors import CommandError, DriverError, RefusedError, StoppedEr
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.loop.events import PeriodEnded
+from flexneedle.loop.loop_state import LoopState, hold_after
 from flexneedle.loop.measuring import Observation, observe, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.loop.progress import Progress, hold_after
-from flexneedle.loop.record import record
+from flexneedle.loop.period import make_period
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
@@ -54,7 +54,7 @@ def run(steering: Steering, rig: Rig) -> Insertion:
 
 
 def _run_to_end(steering: Steering, rig: Rig) -> tuple[list[Period], _Ending]:
-    """All periods, and (outcome, reason), once the driver is stopped.
+    """Return all periods, and (outcome, reason), once the driver is stopped.
 
     Raises DriverError if the driver cannot be stopped after another error or an interrupt.
     """
@@ -72,15 +72,15 @@ def _run_to_end(steering: Steering, rig: Rig) -> tuple[list[Period], _Ending]:
     except StoppedError as error:
         ending = Outcome.INTERRUPTED, one_line(error)
     except BaseException as error:  # also after an interrupt or another error no motor goes on
-        _, still_on = _stopped(rig.driver, (Outcome.INTERRUPTED, ""))
+        _, still_on = _stop_driver(rig.driver, (Outcome.INTERRUPTED, ""))
         if still_on:
             raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error
         raise
-    return periods, _stopped(rig.driver, ending)
+    return periods, _stop_driver(rig.driver, ending)
 
 
-def _stopped(driver: Driver, ending: _Ending) -> _Ending:
-    """The ending once the driver is stopped: failed if it cannot be."""
+def _stop_driver(driver: Driver, ending: _Ending) -> _Ending:
+    """Stop the driver and return the ending: failed if it cannot be stopped."""
     try:
         driver.stop()
     except DriverError as error:
@@ -98,57 +98,65 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
     task = steering.task
     start, indices = time.perf_counter(), itertools.count()
     memory, estimate = steering.controller.begin(task), steering.controller.observer.begin(task)
-    progress = _before_start(task.scenario, memory, estimate, rig)
-    if (first := _first_step(progress)) is not None:
-        clocks, observation = [start, start, start, time.perf_counter()], progress.observation
-        yield record(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks), None
+    state = _measure_before_start(task.scenario, memory, estimate, rig)
+    if (first := _first_step(state)) is not None:
+        clocks, observation = [start, start, start, time.perf_counter()], state.observation
+        yield (
+            make_period(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks),
+            None,
+        )
     for index in indices:
-        if progress.moves == _MOST_MOVES * len(task.plan.controls):
+        if state.moves == _MOST_MOVES * len(task.plan.controls):
             return
         clocks, begun = [time.perf_counter()], rig.clock.now()
-        step, decided = steering.next_step(progress, rig, begun)
+        step, decided = steering.next_step(state, rig, begun)
         clocks.append(time.perf_counter())
         if rig.expect is not None:
-            rig.expect(progress.observation.estimate, step.decision.command)
+            rig.expect(state.observation.estimate, step.decision.command)
         motion = _carry_out(task.scenario, rig, step, begun)
         clocks.append(time.perf_counter())
-        observation = _observed(progress.observation, task.scenario, rig, motion, begun)
+        observation = _observe_after(state.observation, task.scenario, rig, motion, begun)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
         if motion.held:
-            decided, step = decided.withheld(motion.held, progress), step.withheld(motion.held)
-        progress = _progress_after(decided, step, observation, steering, begun, now)
-        ending = _ending(task, progress)
-        period = record(index, now, task.plan, rig, step, motion.control, observation, clocks)
-        yield replace(period, warning=warning(step.decision, progress.in_a_row)), ending
+            decided, step = decided.hold_back(motion.held, state), step.hold_back(motion.held)
+        state = _advance(decided, step, observation, steering, begun, now)
+        ending = _ending(task, state)
+        period = make_period(index, now, task.plan, rig, step, motion.control, observation, clocks)
+        yield replace(period, warning=warning(step.decision, state.in_a_row)), ending
         if ending is not None:
             return
 
 
-def _before_start(scenario: Scenario, memory: Any, estimate: Estimate, rig: Rig) -> Progress:
-    """The progress after the measurement before the first motion."""
+def _measure_before_start(scenario: Scenario, memory: Any, estimate: Estimate, rig: Rig) -> LoopState:
+    """Return the state after the measurement before the first motion."""
     monitor = Monitor(scenario.monitor, scenario.setup.axes)
     observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
-    return Progress(observation, memory, hold_after(None, observation, rig.clock.now()))
+    return LoopState(observation, memory, hold_after(None, observation, rig.clock.now()))
 
 
-def _first_step(progress: Progress) -> Step | None:
-    """The step of the measurement before the first motion; None for a good reading of a tip alone: not recorded."""
-    if progress.hold is None and progress.observation.measurement.frame is None:
+def _first_step(state: LoopState) -> Step | None:
+    """Return the step of the measurement before the first motion.
+
+    None for a good reading of a tip alone, which is not recorded.
+    """
+    if state.hold is None and state.observation.measurement.frame is None:
         return None
     return Step(Action.MEASURE, Decision(STILL, "measurement before the first motion"))
 
 
-def _observed(before: Observation, scenario: Scenario, rig: Rig, motion: Motion, begun: float) -> Observation:
-    """The observation after the motion of a period that began at `begun` (s)."""
+def _observe_after(
+    before: Observation, scenario: Scenario, rig: Rig, motion: Motion, begun: float
+) -> Observation:
+    """Return the observation after the motion of a period that began at `begun` (s)."""
     predicted = before.estimate.move(motion)
     return observe(scenario, predicted, before.monitor, begun, rig.clock.now(), rig.tracker)
 
 
-def _progress_after(
-    decided: Progress, step: Step, observation: Observation, steering: Steering, begun: float, now: float
-) -> Progress:
-    """The progress after a period from `begun` to `now` (s)."""
+def _advance(
+    decided: LoopState, step: Step, observation: Observation, steering: Steering, begun: float, now: float
+) -> LoopState:
+    """Return the state after a period from `begun` to `now` (s)."""
     arrived_at, arrived = decided.arrived_at, steering.controller.arrived
     if (
         arrived_at is None
@@ -160,14 +168,14 @@ def _progress_after(
         decided,
         observation=observation,
         hold=hold_after(decided.hold, observation, now),
-        refused=decided.refused.extended(now - begun) if decided.decides else decided.refused,
+        refused=decided.refused.extend(now - begun) if decided.decides else decided.refused,
         arrived_at=arrived_at,
         held_in_all=decided.held_in_all + (now - begun if step.action is Action.HOLD else 0.0),
     )
 
 
 def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion:
-    """Move, the travel in the time of its slowest axis, rounded up to whole tracker periods; or wait.
+    """Move, in the time of the slowest axis rounded up to whole tracker periods; or wait.
 
     begun: start of the period (s), from which a needle that does not move is at rest.
     """
@@ -190,26 +198,26 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
     return motion
 
 
-def _ending(task: Task, progress: Progress) -> _Ending | None:
-    """Outcome and reason if the insertion ends with this period."""
-    estimate = progress.observation.estimate
+def _ending(task: Task, state: LoopState) -> _Ending | None:
+    """Return outcome and reason if the insertion ends with this period."""
+    estimate = state.observation.estimate
     if not estimate.state.converged:
         return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    if not progress.measured_at_rest:
-        return _held_too_long(task.scenario, progress)
+    if not state.measured_at_rest:
+        return _hold_ending(task.scenario, state)
     short = task.plan.target[0] - float(estimate.tip[X])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
     return Outcome.DONE, ""
 
 
-def _held_too_long(scenario: Scenario, progress: Progress) -> _Ending | None:
-    """Outcome and reason if the needle has been held for as long as it may be, at once or in all."""
-    observation, held, refused = progress.observation, progress.held, progress.refused
+def _hold_ending(scenario: Scenario, state: LoopState) -> _Ending | None:
+    """Return outcome and reason once a hold has reached its limit, alone or all holds together."""
+    observation, held, refused = state.observation, state.held, state.refused
     limit, total = observation.hold_limit(scenario), scenario.control.hold_total_s
     if held is not None and held > limit - 1e-9:
         return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
-    if progress.held_in_all > total - 1e-9 and (held is not None or progress.asked or refused.reason):
-        why = progress.asked or refused.reason if held is None else observation.verdict
-        return Outcome.HELD, f"held for {progress.held_in_all:.2f} s in all (limit {total:g} s): {why}"
+    if state.held_in_all > total - 1e-9 and (held is not None or state.asked or refused.reason):
+        why = state.asked or refused.reason if held is None else observation.verdict
+        return Outcome.HELD, f"held for {state.held_in_all:.2f} s in all (limit {total:g} s): {why}"
     return refused.ending(scenario.control.hold_limit_s)

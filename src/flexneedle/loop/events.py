@@ -18,7 +18,7 @@ class Event:
 
 @dataclass(frozen=True, eq=False)
 class Iterated(Event):
-    """An iteration of the planner. info: as for the argument `progress` of `flexneedle.plan`."""
+    """An iteration of the planner; info as for the argument `progress` of `flexneedle.plan`."""
 
     strategy: str
     info: Mapping[str, Any]
@@ -33,7 +33,7 @@ class Planned(Event):
 
 @dataclass(frozen=True, eq=False)
 class Decided(Event):
-    """A decision of the controller, before anything moves, and the estimate that it is based on."""
+    """A decision of the controller, before anything moves, with the estimate that it is based on."""
 
     decision: Decision
     estimate: Estimate
@@ -54,14 +54,14 @@ class Ended(Event):
 
 
 Listener = Callable[[Event], None]
-"""Receives the events in the thread of the insertion, those of a rig's ticks in a thread of its supervisor.
+"""Receives the events in the thread of the insertion, and the ticks of a rig in a thread of its supervisor.
 
 An exception of a listener ends the insertion; raise StoppedError to interrupt it.
 """
 
 
 class Gate:
-    """Decides when motors may move. This one never holds; override what you need."""
+    """Permission to move: this one never holds. Override what you need."""
 
     def confirm(self, rig: Any) -> None:
         """Return once the motors may be armed; raise an error to end the insertion before anything moves.
@@ -94,7 +94,7 @@ class AllGates(Gate):
 
 @dataclass(frozen=True)
 class Stream:
-    """Where the events of an insertion go, and the gate that holds it."""
+    """Listeners and gate of an insertion."""
 
     listeners: tuple[Listener, ...] = ()
     gate: Gate = Gate()  # noqa: RUF009  it has no state

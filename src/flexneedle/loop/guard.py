@@ -1,4 +1,4 @@
-"""The guard between loop and driver: no command is carried out after which needle or tissue would exceed a limit.
+"""The guard between loop and driver: it refuses commands that would exceed a limit of needle or tissue.
 
 The state after the command is predicted with the model of the estimate. The guard knows nothing of planners and
 controllers, and no option of an insertion switches it off. Limits: section `guard` of the scenario (decision 0021).
@@ -22,7 +22,7 @@ _ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest
 
 @dataclass(frozen=True)
 class Excess:
-    """How far a quantity of a state is beyond its limit, below 0 within it, and both as text."""
+    """Distance of a quantity beyond its limit, negative within it, and both values as text."""
 
     beyond: float
     text: str
@@ -30,8 +30,10 @@ class Excess:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), and
-    distance (mm) of the tip past the target, at `depth` (mm).
+    """Limits of an insertion.
+
+    Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), and
+    distance (mm) of the tip past the target, which is at `depth` (mm).
     """
 
     compression: Floats
@@ -42,7 +44,7 @@ class Guard:
 
     @staticmethod
     def of(scenario: Scenario, plan: Plan) -> "Guard":
-        """The limits of a scenario, and the target of a plan."""
+        """Return the limits of a scenario with the target of a plan."""
         settings, laws = scenario.guard, laws_of(scenario.tissue)[0]
         least = settings.least_stretch
         compression = [_SHARE_OF_LAW * law.limit if least is None else 1.0 - least for law in laws]
@@ -51,9 +53,9 @@ class Guard:
         return Guard(np.array(compression), strain, force, past, plan.target[0])
 
     def refusal(self, estimate: Estimate, command: Control) -> str:
-        """Why a command must not be carried out, or "".
+        """Return the reason to refuse a command, "" for none.
 
-        Beyond a limit, as an estimate may come to be by a reading, a command may lead back but not on.
+        Beyond a limit, which a reading may reveal, a command may lead back but not further.
         """
         now = estimate.state
         then = after(estimate.simulator, now, command)
@@ -64,7 +66,7 @@ class Guard:
         return next((f"guard: {excess.text}" for excess in worse), "")
 
     def _excesses(self, state: State) -> Iterator[Excess]:
-        yield self._compressed(state)
+        yield self._compression_excess(state)
         strain = bending_strain(state)
         yield Excess(strain - self.strain, f"needle strain {1e2 * strain:.3f} % > {1e2 * self.strain:g} %")
         force = math.hypot(*state.reactions.guide_force)
@@ -72,8 +74,8 @@ class Guard:
         past = float(state.tip[X]) - self.depth
         yield Excess(past - self.past, f"tip {past:.2f} mm past the target > {self.past:g} mm")
 
-    def _compressed(self, state: State) -> Excess:
-        """Of the contact that is most beyond the limit of its law."""
+    def _compression_excess(self, state: State) -> Excess:
+        """Return the excess of the contact that is most beyond the limit of its law."""
         contacts = state.contacts
         if not contacts.active.any():
             return Excess(-math.inf, "")
@@ -84,7 +86,10 @@ class Guard:
 
 
 def bending_strain(state: State) -> float:
-    """Largest strain M d/2EI of the needle's surface by bending; moments are largest where a force acts."""
+    """Return the largest strain M d/2EI of the needle's surface by bending.
+
+    Moments are largest where a force acts.
+    """
     needle = state.scenario.needle
     moments = np.append(np.abs(state.mesh["moment"]), math.hypot(*state.reactions.base_moment))
     return float(moments.max() * needle.outer_diameter / (2.0 * needle.bending_stiffness))

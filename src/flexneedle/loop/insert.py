@@ -91,7 +91,7 @@ def carry_out(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) 
 
 
 def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) -> Steering:
-    """Return what the steps of an insertion follow from. Raises as `insert`, before any rig is opened."""
+    """Return everything that the steps of an insertion need. Raises as `insert`, before any rig is opened."""
     check_origin(plan, scenario)
     chosen = choices.controller
     check_choices(scenario, plan.strategy, choices)

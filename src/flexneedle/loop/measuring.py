@@ -16,10 +16,10 @@ _NO_MEASUREMENT = Measurement(0.0, None, None)
 
 @dataclass(frozen=True)
 class Observation:
-    """The estimate after a period, the period's readings with their verdicts, and the verdict on the period.
+    """The estimate after a period, and the readings with their verdicts.
 
-    measurement: the reading to which the verdict refers, an empty one without any; field: whether the verdict is on
-    the field and not on a reading.
+    measurement: the reading to which the verdict of the period refers, an empty one without any; field: true if that
+    verdict is about the field rather than a reading.
     """
 
     estimate: Estimate
@@ -30,29 +30,32 @@ class Observation:
     field: bool = False
 
     def has_good_reading_after(self, time: float) -> bool:
-        """Whether a good reading was taken after `time` (s)."""
+        """Return whether a good reading was taken after `time` (s)."""
         return any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
 
     def hold_limit(self, scenario: Scenario) -> float:
-        """Longest hold (s) for such a verdict."""
+        """Return the longest hold (s) for the verdict of this period."""
         return scenario.monitor.abort_after_s if self.field else scenario.control.hold_limit_s
 
 
 def observe_before_start(
     scenario: Scenario, estimate: Estimate, monitor: Monitor, now: float, tracker: TipTracker
 ) -> Observation:
-    """Read the tracker and check readings and field before the first motion. The estimate is not corrected."""
+    """Read the tracker and check readings and field before the first motion.
+
+    The estimate is not corrected.
+    """
     measurements = tracker.read()
     stale_after = scenario.control.stale_after_s
     if not measurements:
-        return _without_readings(estimate, monitor, now, stale_after, tracker.status)
+        return _keep_last_reading(estimate, monitor, now, stale_after, tracker.status)
     # The tracker may have run for long, so that older readings are accepted; the newest one must not be stale.
     max_ages = [math.inf] * (len(measurements) - 1) + [stale_after]
-    monitor, readings = _checked(scenario, estimate, monitor, measurements, max_ages, now)
+    monitor, readings = _check_readings(scenario, estimate, monitor, measurements, max_ages, now)
     monitor, field = monitor.check_field()
     newest = readings[-1]
     if not field.ok:
-        rejected = _rejected(readings, field)
+        rejected = _reject_readings(readings, field)
         return Observation(estimate, monitor, rejected, newest.measurement, field, field=True)
     if (last_good := monitor.last_good_before_dropout(newest.measurement, newest.verdict)) is not None:
         return Observation(estimate, monitor, readings, last_good)
@@ -64,25 +67,25 @@ def observe(
 ) -> Observation:
     """Read the tracker, check readings and field, and correct the prediction by the good readings.
 
-    begun, now: start and end of the move that `predicted` ends with (s). While the field is distorted or in doubt no
+    begun, now: start and end (s) of the move after which `predicted` holds. While the field is distorted or in doubt no
     reading is used.
     """
     stale_after = scenario.control.stale_after_s
     measurements = tracker.read()
     if not measurements:
-        return _without_readings(predicted, monitor, now, stale_after, tracker.status)
+        return _keep_last_reading(predicted, monitor, now, stale_after, tracker.status)
     # All but the newest were in transit while the needle moved.
     max_ages = [stale_after + now - begun] * (len(measurements) - 1) + [stale_after]
-    monitor, readings = _checked(scenario, predicted, monitor, measurements, max_ages, now)
+    monitor, readings = _check_readings(scenario, predicted, monitor, measurements, max_ages, now)
     newest = readings[-1]
     monitor, field = monitor.check_field()
     if not field.ok:
-        rejected = _rejected(readings, field)
+        rejected = _reject_readings(readings, field)
         return Observation(
             predicted.without_reading(), monitor, rejected, newest.measurement, field, field=True
         )
     if not (doubt := monitor.field_in_doubt()).ok:
-        readings = _rejected(readings, doubt)
+        readings = _reject_readings(readings, doubt)
     good = [reading.measurement for reading in readings if reading.verdict.ok]
     corrected = predicted.observe(good)
     estimate = corrected if good else corrected.without_reading()
@@ -93,12 +96,13 @@ def observe(
     return Observation(corrected.without_reading(), monitor, readings, newest.measurement, newest.verdict)
 
 
-def _without_readings(
+def _keep_last_reading(
     predicted: Estimate, monitor: Monitor, now: float, stale_after: float, status: str
 ) -> Observation:
-    """A period without a new frame: the last verdict on the field and the last good reading hold until they are stale.
+    """Observe a period without a new frame.
 
-    status: of the tracker, the reason if no frames arrive.
+    The last verdict on the field and the last good reading hold until they are stale. status: of the tracker, the
+    reason if no frames arrive.
     """
     if not monitor.field.ok and monitor.has_reading(now, stale_after):
         return Observation(predicted.without_reading(), monitor, verdict=monitor.field, field=True)
@@ -110,12 +114,14 @@ def _without_readings(
     )
 
 
-def _rejected(readings: Sequence[CheckedMeasurement], field: Verdict) -> tuple[CheckedMeasurement, ...]:
-    """The readings of a period, all rejected: the good ones get the verdict on the field."""
+def _reject_readings(
+    readings: Sequence[CheckedMeasurement], field: Verdict
+) -> tuple[CheckedMeasurement, ...]:
+    """Return the readings of a period, all rejected: the good ones with the verdict on the field."""
     return tuple(replace(one, verdict=field) if one.verdict.ok else one for one in readings)
 
 
-def _checked(
+def _check_readings(
     scenario: Scenario,
     predicted: Estimate,
     monitor: Monitor,

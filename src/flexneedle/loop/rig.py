@@ -1,4 +1,4 @@
-"""A rig: clock, driver and tracker of the closed loop, and where an insertion gets them."""
+"""A rig: clock, driver and tracker of the closed loop, and the sources that provide it."""
 
 import math
 from collections.abc import Callable, Collection
@@ -16,7 +16,7 @@ from flexneedle.types import Control, Plan
 
 
 class RigSource(Protocol):
-    """Source of the ports of an insertion: a virtual rig, the rig of a rig file, or a `Rig` with ports of your own."""
+    """Source of the ports of an insertion: a virtual rig, the rig of a rig file, or a `Rig` of the caller."""
 
     @property
     def names(self) -> dict[str, Any]:
@@ -44,7 +44,7 @@ class RigSource(Protocol):
 
 @dataclass(frozen=True)
 class Rig:
-    """Ports of the closed loop, and a `RigSource` that gives them.
+    """Ports of the closed loop; also the `RigSource` that provides them.
 
     Args:
         clock: Time of the insertion.

@@ -1,4 +1,4 @@
-"""What the needle does in a control period: it moves as decided, rests, or is held."""
+"""The step of a control period: the needle moves as decided, rests, or is held."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +14,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Decided, Stream
 from flexneedle.loop.guard import Guard
-from flexneedle.loop.progress import Late, Progress
+from flexneedle.loop.loop_state import LateDecision, LoopState
 from flexneedle.loop.rig import Rig
 from flexneedle.types import STILL, Action
 
@@ -23,7 +23,7 @@ from flexneedle.types import STILL, Action
 class Step:
     """Action of a period, its decision, and the time (s) to wait in place of a move; None: a move.
 
-    late: whether the decision took longer than the deadline.
+    late: true if the decision took longer than the deadline.
     """
 
     action: Action
@@ -31,14 +31,14 @@ class Step:
     wait: float | None = None
     late: bool = False
 
-    def withheld(self, reason: str) -> "Step":
-        """As the rig has not carried it out to its end."""
+    def hold_back(self, reason: str) -> "Step":
+        """Return this step with the reason of the rig, which has not carried it out to its end."""
         return replace(self, decision=replace(self.decision, why=f"held by the rig: {reason}"))
 
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """What the steps of an insertion follow from.
+    """Task, choices, guard and randomness of an insertion, and the stream of its events.
 
     With `choices.force` it continues although a miss is predicted; the guard's limits hold in any case. Each decision
     of the controller, and the estimate that it is based on, goes to the stream before anything moves.
@@ -55,53 +55,53 @@ class Steering:
         """Controller that decides."""
         return self.choices.controller
 
-    def next_step(self, progress: Progress, rig: Rig, begun: float) -> tuple[Step, Progress]:
-        """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
+    def next_step(self, state: LoopState, rig: Rig, begun: float) -> tuple[Step, LoopState]:
+        """Return the step of the period that begins at `begun` (s), and the state with the controller's decision."""
         reading = self.task.scenario.tracker.period
-        if progress.hold is not None:
-            why = f"held: measurement {progress.observation.verdict}"
-            held = Decision(STILL, why, predicted=progress.predicted)
-            return Step(Action.HOLD, held, reading), replace(progress, late=None)
-        if progress.arrived_at is not None:
-            delay = begun - progress.observation.measurement.time
-            waiting = Decision(STILL, "waiting for the last reading", predicted=progress.predicted)
-            return Step(Action.REST, waiting, max(reading, delay)), progress
+        if state.hold is not None:
+            why = f"held: measurement {state.observation.verdict}"
+            held = Decision(STILL, why, predicted=state.predicted)
+            return Step(Action.HOLD, held, reading), replace(state, late=None)
+        if state.arrived_at is not None:
+            delay = begun - state.observation.measurement.time
+            waiting = Decision(STILL, "waiting for the last reading", predicted=state.predicted)
+            return Step(Action.REST, waiting, max(reading, delay)), state
         asked = self.stream.gate.hold()
         if not asked:
-            step, decided = self._decided(replace(progress, asked=""), rig, begun)
+            step, decided = self._decide(replace(state, asked=""), rig, begun)
             asked = self.stream.gate.hold()  # which may have come up while the controller decided
             if not asked:
                 return step, decided
-        held = Decision(STILL, f"held: {asked}", predicted=progress.predicted)
-        return Step(Action.HOLD, held, reading), replace(progress, late=None, asked=asked)
+        held = Decision(STILL, f"held: {asked}", predicted=state.predicted)
+        return Step(Action.HOLD, held, reading), replace(state, late=None, asked=asked)
 
-    def _decided(self, progress: Progress, rig: Rig, begun: float) -> tuple[Step, Progress]:
-        """The step of a decision: of the one that came late in the period before, if it still holds, or of a new one.
+    def _decide(self, state: LoopState, rig: Rig, begun: float) -> tuple[Step, LoopState]:
+        """Return the step of a late decision that still holds, or of a new decision.
 
         While the controller decides, the needle rests. A decision later than the deadline ends the period, so that the
         tracker is read again before the needle moves.
         """
-        estimate, late = progress.observation.estimate, progress.late
+        estimate, late = state.observation.estimate, state.late
         if late is not None and late.holds_for(estimate):
-            return self._carried_out(replace(progress, late=None), late.decision, late.memory)
-        decision, memory = _decision(self.controller, self.task, progress.memory, estimate, self.rng)
+            return self._act_on(replace(state, late=None), late.decision, late.memory)
+        decision, memory = _ask_controller(self.controller, self.task, state.memory, estimate, self.rng)
         self.stream.send(Decided(decision, estimate))
-        counted, taken = replace(progress, late=None, moves=progress.moves + 1), rig.clock.now() - begun
+        counted, taken = replace(state, late=None, moves=state.moves + 1), rig.clock.now() - begun
         if rig.deadline is None or taken <= rig.deadline:
-            return self._carried_out(counted, decision, memory)
+            return self._act_on(counted, decision, memory)
         why = f"late: decided in {taken:.3f} s, limit {rig.deadline:g} s"
         resting = Step(Action.REST, replace(decision, command=STILL, why=why), 0.0, late=True)
-        return resting, replace(counted, late=Late.of(decision, memory, estimate))
+        return resting, replace(counted, late=LateDecision.of(decision, memory, estimate))
 
-    def _carried_out(self, progress: Progress, decision: Decision, memory: Any) -> tuple[Step, Progress]:
-        """The step of a decision that is in time: a move, a rest, or a hold if it must not be carried out."""
-        reason = self._refusal(progress.observation.estimate, decision)
+    def _act_on(self, state: LoopState, decision: Decision, memory: Any) -> tuple[Step, LoopState]:
+        """Return the step of a decision that is in time: a move, a rest, or a hold if it must not be carried out."""
+        reason = self._refusal(state.observation.estimate, decision)
         decided = replace(
-            progress,
+            state,
             memory=memory,
-            refused=progress.refused.after(reason),
-            moves=progress.moves - bool(reason),
-            in_a_row=likely_misses(decision, progress.in_a_row),
+            refused=state.refused.after(reason),
+            moves=state.moves - bool(reason),
+            in_a_row=likely_misses(decision, state.in_a_row),
             predicted=decision.predicted,
         )
         resting = replace(decision, command=STILL)
@@ -113,25 +113,25 @@ class Steering:
         return Step(Action.MOVE, decision), decided
 
     def _refusal(self, estimate: Estimate, decision: Decision) -> str:
-        """Why a decision must not be carried out, or ""."""
+        """Return the reason to refuse a decision, "" for none."""
         reason = "" if self.choices.force else hopeless(decision, self.task.scenario.control)
         if reason or decision.rest > 0.0:
             return reason
         return self.guard.refusal(estimate, decision.command)
 
 
-def _decision(
+def _ask_controller(
     chosen: Controller, task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Any]:
-    """The controller's decision and its memory. Raises InputError if `decide` returns anything else."""
+    """Return the controller's decision and its memory. Raises InputError if `decide` returns anything else."""
     match chosen.decide(task, memory, estimate, rng):
         case (Decision() as decision, after):
-            return _with_shape(decision, task, estimate), after
+            return _with_predicted_shape(decision, task, estimate), after
     raise InputError(f"controller {chosen.name}: decide must return a Decision and the memory after it")
 
 
-def _with_shape(decision: Decision, task: Task, estimate: Estimate) -> Decision:
-    """The decision with a predicted shape: its own, or that at the end of the plan."""
+def _with_predicted_shape(decision: Decision, task: Task, estimate: Estimate) -> Decision:
+    """Return the decision with a predicted shape: its own, or the shape at the end of the plan."""
     return (
         decision
         if decision.predicted is not None

@@ -11,11 +11,11 @@ import numpy as np
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.registration import Rigid, fit_rigid, identity
 from flexneedle.loop.events import Stream
-from flexneedle.loop.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
+from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, TipTrackerFactory, find_tracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
 from flexneedle.phantom.tracking.field.tracker import FieldTracker
@@ -33,7 +33,7 @@ _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
 @dataclass(frozen=True)
 class Seeds:
-    """Seeds of a virtual rig: of the phantom, the tracker's noise, and the tracker's room."""
+    """Seeds of a virtual rig: phantom, noise of the tracker, and the tracker's room."""
 
     phantom: np.random.SeedSequence
     tracker: np.random.SeedSequence
@@ -52,7 +52,7 @@ class Seeds:
 
 
 def _spawned(seed: int) -> list[np.random.SeedSequence]:
-    """Seeds of phantom, tracker, controller and room."""
+    """Return the seeds of phantom, tracker, controller and room."""
     return np.random.SeedSequence(seed).spawn(4)
 
 
@@ -70,10 +70,10 @@ class VirtualRig:
     moves = False
 
     def __init__(
-        self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TrackerFactory = SCENARIO_TRACKER
+        self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TipTrackerFactory = SCENARIO_TRACKER
     ) -> None:
-        self._phantom, self._plant = plant_of(phantom)
-        self._tracker, self._factory = tracker_of(tracker)
+        self._phantom, self._plant = find_plant(phantom)
+        self._tracker, self._factory = find_tracker(tracker)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def virtual_rig(
     seeds: Seeds,
     phantom: str | PlantFactory = DEFAULT_PLANT,
     *,
-    tracker: TrackerFactory | None = None,
+    tracker: TipTrackerFactory | None = None,
     plate_distance_at: Callable[[float], float | None] | None = None,
 ) -> Rig:
     """Return a virtual phantom with the ports of a rig.
@@ -167,7 +167,7 @@ class _Errors:
 def _noisy_tracker(
     scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
 ) -> NoisyTracker:
-    """The tracker with white noise only."""
+    """Return the tracker with white noise only."""
 
     def tip_at(time: float) -> Point:
         tip = tank.tip_at(time)
@@ -206,7 +206,7 @@ def _field_tracker(
     rng: np.random.Generator,
     plate_distance_at: Callable[[float], float | None] | None,
 ) -> OnStage:
-    """The tracker in its environment; around: room and references."""
+    """Return the tracker in its environment; around: room and references."""
     (room, references), settings = around, scenario.tracker
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
     registered = to_stage(settings.registration)
@@ -236,13 +236,13 @@ def _field_tracker(
 
 
 def _delay(scenario: Scenario) -> float:
-    """Age (s) of a reading on arrival: `delay_periods` control periods at full step and speed."""
+    """Return the age (s) of a reading on arrival: `delay_periods` control periods at full step and speed."""
     step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
     return scenario.phantom.delay_periods * step
 
 
 def registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
-    """Error of a registration, drawn from its fiducials and their localisation error."""
+    """Return the error of a registration, drawn from its fiducials and their localisation error."""
     if registration is None or registration.localisation_mm == 0.0:
         return identity()
     rng = np.random.default_rng(seed).spawn(1)[0]

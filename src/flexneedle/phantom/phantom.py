@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexneedle.phantom.draw import Truth
-from flexneedle.phantom.plants import Plant, PlantFactory, plant
+from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
 from flexneedle.simulator.control import MOVES, Limits, half_turned
 from flexneedle.simulator.pace import roll_time
 from flexneedle.types import (
@@ -55,7 +55,7 @@ class Phantom:
     """The true needle. It moves on command; its clock advances by the duration of each command."""
 
     def __init__(self, truth: Truth, roll: float, kind: str | PlantFactory = "exact") -> None:
-        self._plant = plant(kind, truth, roll)
+        self._plant = make_plant(kind, truth, roll)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
         self._moved, self._rolled = np.zeros(MOVES), roll

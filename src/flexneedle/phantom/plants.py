@@ -12,7 +12,7 @@ from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.equilibrium import step
 from flexneedle.phantom.space import roll_about_x, tilt_of, turn, vector
-from flexneedle.plugins import missing_parts, parts_of
+from flexneedle.plugins import find_part, function_rule, missing_parts, parts_of
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import along_entry
@@ -240,20 +240,31 @@ PLANTS: dict[str, PlantFactory] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
 
 
-def plant(kind: str | PlantFactory, truth: Truth, roll: float) -> Plant:
+def find_plant(given: str | PlantFactory) -> tuple[str, PlantFactory]:
+    """Return the name of a plant in records, and its factory.
+
+    Args:
+        given: A name in `PLANTS`, `module:NAME`, or a factory.
+
+    Raises:
+        InputError: There is no such plant.
+    """
+    return find_part("phantom", given, PLANTS, lambda found: function_rule(found, "truth", "roll"))
+
+
+def make_plant(kind: str | PlantFactory, truth: Truth, roll: float) -> Plant:
     """Return the plant of a name or a factory in its start state.
 
-    Raises InputError for an unknown name, or if the factory returns no plant.
+    Args:
+        kind: As for `find_plant`.
+        truth: The true phantom.
+        roll: The roll of the needle (rad).
+
+    Raises:
+        InputError: The name is unknown, or the factory returns no plant.
     """
-    if not isinstance(kind, str):
-        return _made(kind, truth, roll)
-    if kind not in PLANTS:
-        raise InputError(f"phantom = {kind!r}: must be one of {', '.join(PLANTS)}")
-    return PLANTS[kind](truth, roll)
-
-
-def _made(factory: PlantFactory, truth: Truth, roll: float) -> Plant:
-    made, name = factory(truth, roll), getattr(factory, "__name__", type(factory).__name__)
+    name, factory = find_plant(kind)
+    made = factory(truth, roll)
     if missing := missing_parts(made, parts_of(Plant)):
         raise InputError(f"phantom = {name}: {type(made).__name__} is not a plant, missing: {missing}")
     if np.shape(made.tip) != (5,):

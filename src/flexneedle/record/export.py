@@ -4,7 +4,7 @@ import csv
 from collections.abc import Iterable
 from typing import IO, Any
 
-from flexneedle.record.columns import COLUMNS, to_row
+from flexneedle.record.fields import COLUMNS, to_row
 from flexneedle.record.readings import OPTIONAL, to_values
 from flexneedle.types import Insertion, Period
 

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 from flexneedle.arguments import check_instance
 from flexneedle.errors import InputError
-from flexneedle.record.columns import COLUMNS, to_values
 from flexneedle.record.export import marks
+from flexneedle.record.fields import COLUMNS, to_values
 from flexneedle.types import Insertion
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.record.planar import plan_in_space
 from flexneedle.types import COLUMNS, Plan
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
@@ -40,7 +39,6 @@ def plan_values(plan: Plan) -> dict[str, Any]:
 
 def plan_from_values(values: Mapping[str, Any]) -> Plan:
     """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError for other values."""
-    values = values if "roll" in values else plan_in_space(values)
     given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
     given["controls"] = given["controls"].reshape(-1, len(COLUMNS))
     x, y, z = values["target"]

@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 
 from flexneedle.errors import InputError
-from flexneedle.record.columns import from_row, verdict_of
+from flexneedle.record.fields import PREDICTED, PREDICTED_SD, SHAPE, TRUE_SHAPE, from_row, parse_verdict
 from flexneedle.record.messages import (
     STORE,
     DiagnosticArray,
@@ -24,16 +24,7 @@ from flexneedle.record.messages import (
 )
 from flexneedle.record.messages import Path as PathMessage
 from flexneedle.record.readings import from_values
-from flexneedle.record.topics import (
-    PREDICTED,
-    PREDICTED_SD,
-    READINGS,
-    SHAPE,
-    STATUS,
-    TIMING,
-    TOPICS,
-    TRUE_SHAPE,
-)
+from flexneedle.record.topics import READINGS, STATUS, TIMING, TOPICS
 from flexneedle.types import CheckedMeasurement, Floats, Period, Shape, Z
 
 
@@ -115,7 +106,7 @@ class _Collector:
             self._durations = {name[:-2]: float(value) for name, value in _pairs(message.status[0])}
         elif isinstance(message, DiagnosticArray) and topic == READINGS:
             self._readings = tuple(
-                from_values(dict(_pairs(status)), verdict_of(status.message)) for status in message.status
+                from_values(dict(_pairs(status)), parse_verdict(status.message)) for status in message.status
             )
         elif isinstance(message, DiagnosticArray):
             row = dict(_pairs(message.status[0]))

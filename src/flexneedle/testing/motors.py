@@ -248,15 +248,13 @@ class MotorsConformance:
             self.wait(10 * _POLL_S)
             self._require_at("a motor without power", self._read(motors).position, begin)
 
-    def test_invalid_commands_are_driver_errors(self) -> None:
-        """Require DriverError for a position that is not finite and an unknown channel, and no motion."""
+    def test_position_that_is_not_finite_is_refused(self) -> None:
+        """Require DriverError for positions of infinity and NaN, and no motion."""
         with self._open(on=True) as motors:
             begin = self._read(motors).position
-            for positions in ({self._channel: math.nan}, {"no such channel": 0.0}):
-                with require_error(f"follow({positions})", DriverError):
-                    motors.follow(positions)
-            with require_error("set_speed of an unknown channel", DriverError):
-                motors.set_speed("no such channel", self.speed, self.acceleration)
+            for position in (math.nan, math.inf):
+                with require_error(f"follow({position})", DriverError):
+                    motors.follow({self._channel: position})
             self._require_at("a motor after a refusal", self._rest(motors).position, begin)
 
     def test_reconnect_moves_nothing(self) -> None:

@@ -16,8 +16,8 @@ from flexneedle.lab.page.rigs import usable_rig
 from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
 from flexneedle.lab.page.worker.rig_insertion import RigGate, check
 from flexneedle.lab.page.worker.task import Cancelled, JobControl
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.loop.events import Stream
 from flexneedle.record import recording
 from flexneedle.scenario.files import load_scenario
@@ -240,20 +240,20 @@ def test_states_of_the_supervisor_are_reported_when_they_change():
     for state, why in [
         ("armed", ""), ("armed", ""), ("inserting", ""), ("holding", "missing"), ("stopped", "the controller"),
     ]:  # fmt: skip
-        made.take(Report(0.0, State(state), why))
+        made.take(TickReport(0.0, SupervisorState(state), why))
     found = [(news.state, news.why) for news in one.report.rig]
     assert found == [("armed", ""), ("inserting", ""), ("holding", "missing"), ("ended", "")]
-    made.take(Report(0.0, State.STOPPED, "person 2"))
+    made.take(TickReport(0.0, SupervisorState.STOPPED, "person 2"))
     assert one.report.rig[-1].state == "stopped"
 
 
 def test_a_rig_is_stopped_once_when_the_server_is_silent():
     made, one = follower()
-    made.take(Report(0.0, State.INSERTING))
+    made.take(TickReport(0.0, SupervisorState.INSERTING))
     assert made._supervisor.stops == []
     one.control.heard -= SILENT_S + 0.1
     for _ in range(2):
-        made.take(Report(0.0, State.INSERTING))
+        made.take(TickReport(0.0, SupervisorState.INSERTING))
     (why,) = made._supervisor.stops
     assert why.startswith("no signal of the page's server for 1.")
 
@@ -262,7 +262,7 @@ def test_a_beat_is_a_signal():
     made, one = follower()
     one.control.heard -= SILENT_S + 0.1
     one.control.take(JobChange(1))
-    made.take(Report(0.0, State.INSERTING))
+    made.take(TickReport(0.0, SupervisorState.INSERTING))
     assert made._supervisor.stops == []
 
 

@@ -7,10 +7,11 @@ import tomllib
 
 import pytest
 
-from bench_rig import Clock
 from commands import run
-from flexneedle.errors import DriverError, RigError
+from flexneedle.errors import RigError
+from kits import run_kits
 from markdown_examples import ROOT, blocks
+from rooms import ManualClock
 
 PAGE = (ROOT / "docs" / "rig" / "own-devices.md").read_text(encoding="utf-8")
 FILES = {block.title: block.code for block in blocks(PAGE) if block.title}
@@ -24,24 +25,16 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
-    sys.modules.pop("mylab", None)
+    for name in ("stage", "optical", "test_devices"):
+        sys.modules.pop(name, None)
 
 
-@pytest.fixture
-def mylab(folder):  # noqa: ARG001 - the module is in it
-    return importlib.import_module("mylab")
-
-
-@pytest.fixture
-def now(mylab, monkeypatch):
-    """The time of the page's stage, in a list."""
-    time = [100.0]
-    monkeypatch.setattr(mylab.time, "monotonic", lambda: time[0])
-    return time
+def load(name):
+    return importlib.import_module(name)
 
 
 def test_the_page_has_its_files():
-    assert list(FILES) == ["mylab.py", "rig.toml", "pyproject.toml"]
+    assert list(FILES) == ["stage.py", "optical.py", "rig.toml", "test_devices.py", "pyproject.toml"]
 
 
 def test_an_installed_package_is_used_by_the_names_of_the_page(folder, capsys, monkeypatch):
@@ -55,9 +48,10 @@ def test_an_installed_package_is_used_by_the_names_of_the_page(folder, capsys, m
         for group, points in project["entry-points"].items()
     )
     (installed / "entry_points.txt").write_text("\n".join(groups))
-    (folder / "mylab.py").rename(folder / "site" / "mylab.py")
+    for name in ("stage.py", "optical.py"):
+        (folder / name).rename(folder / "site" / name)
     monkeypatch.syspath_prepend(folder / "site")
-    rig = FILES["rig.toml"].replace("mylab:open_stage", "stage").replace("mylab:open_camera", "camera")
+    rig = FILES["rig.toml"].replace("stage:open_stage", "stage").replace("optical:open_tracker", "optical")
     (folder / "rig.toml").write_text(rig)
     status, out, err = run(capsys, "rig", "check", "rig.toml", "--seconds", "0.2", "--json")
     assert status == 0, (out, err)
@@ -65,57 +59,20 @@ def test_an_installed_package_is_used_by_the_names_of_the_page(folder, capsys, m
     assert found["connection"] == "stage, simulated stage"
 
 
-def test_its_motors_move_to_where_they_are_sent_and_no_further(mylab, now):
-    stage = mylab.open_stage({"port": "/dev/x"}, ("X", "R"))
-    stage.set_speed("X", 1000.0, 1e4)
-    stage.power("X", True)
-    stage.follow({"X": 500.0})
-    now[0] += 0.25
-    half = stage.read()["X"]
-    assert (half.position, half.moving, half.on) == (pytest.approx(250.0), True, True)
-    now[0] += 100.0
-    end = stage.read()
-    assert (end["X"].position, end["X"].moving, end["R"].position) == (500.0, False, 0.0)
+@pytest.mark.usefixtures("folder")
+def test_its_devices_pass_their_kits(monkeypatch):
+    clock = ManualClock()
+    monkeypatch.setattr("time.monotonic", clock.now)
+    simulated = {"now": lambda _: clock.now(), "wait": lambda _, seconds: clock.wait(seconds)}
+    run_kits(vars(load("test_devices")), **simulated, make_clock=lambda _: ManualClock())
 
 
-def test_its_motors_go_back_stop_and_are_called_what_is_defined(mylab, now):
-    stage = mylab.open_stage({"port": "/dev/x"}, ("X",))
-    stage.set_speed("X", 100.0, 1e4)
-    stage.power("X", True)
-    stage.follow({"X": 500.0})
-    now[0] += 1.0
-    stage.follow({"X": -500.0})  # replaces the one before
-    now[0] += 3.0
-    stage.stop()
-    now[0] += 10.0
-    assert stage.read()["X"].position == pytest.approx(-200.0)
-    stage.define("X", 7.0)
-    now[0] += 10.0
-    assert (stage.read()["X"].position, stage.read()["X"].moving) == (7.0, False)
-
-
-def test_its_motors_refuse_to_move_when_off(mylab):
-    stage = mylab.open_stage({"port": "/dev/x"}, ("X", "Y"))
-    stage.power("X", True)
-    with pytest.raises(DriverError, match="Y: the motor is off"):
-        stage.follow({"X": 1.0, "Y": 1.0})
-    assert not stage.read()["X"].moving
-
-
-def test_it_refuses_settings_and_channels_that_it_does_not_know(mylab):
+@pytest.mark.usefixtures("folder")
+def test_they_refuse_settings_and_channels_that_they_do_not_know():
+    stage, optical = load("stage"), load("optical")
     with pytest.raises(RigError, match=r"prot = 3: unknown key; did you mean port\?"):
-        mylab.open_stage({"port": "/dev/x", "prot": 3}, ("X",))
+        stage.open_stage({"port": "/dev/x", "prot": 3}, ("X",))
     with pytest.raises(RigError, match="channel A: /dev/x has X, Y, R"):
-        mylab.open_stage({"port": "/dev/x"}, ("X", "A"))
+        stage.open_stage({"port": "/dev/x"}, ("X", "A"))
     with pytest.raises(RigError, match='rate_hz = "40": must be a number'):
-        mylab.open_camera({"rate_hz": "40"}, Clock())
-
-
-def test_its_camera_gives_each_frame_once_at_its_time(mylab):
-    clock = Clock()
-    clock.wait(3.0)
-    camera = mylab.open_camera({"rate_hz": 10.0}, clock)
-    assert [frame.number for frame in camera.read()] == [0]
-    assert camera.read() == ()
-    clock.wait(0.25)
-    assert [(frame.number, round(frame.time, 9)) for frame in camera.read()] == [(1, 3.1), (2, 3.2)]
+        optical.open_tracker({"rate_hz": "40"}, ManualClock())

@@ -20,9 +20,9 @@ from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.lab.rig.supervised import Columns, SupervisedDriver, SupervisedRig, Tick
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Done, Report, Step
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepRequest, TickReport
 from flexneedle.loop.closed_loop import _carry_out
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
@@ -58,7 +58,7 @@ def test_a_turn_of_the_base_is_an_axis_that_no_rig_has():
     assert travel == {"insertion": 1.0, "base_theta": 0.003, "base_psi": -0.002}
     for axis in ("base_theta", "base_psi"):
         bench = Bench().armed()
-        bench.core.request(Step(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
+        bench.core.request(StepRequest(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
         assert bench.sent[-1].why.startswith(f"the rig has no axis {axis}; axes: insertion, ")
 
 
@@ -73,7 +73,9 @@ class Axes:
     def step(self, roll, travel, duration, expected, roll_duration):
         self.steps.append((roll, dict(travel), duration, expected, roll_duration))
         turned = roll + travel.get("rotation", 0.0) + (self.more.pop(0) if self.more else 0.0)
-        return Done(len(self.steps), {**travel, "rotation": turned}, 1.0, 1.4, State.INSERTING, "", None)
+        return MotionResult(
+            len(self.steps), {**travel, "rotation": turned}, 1.0, 1.4, SupervisorState.INSERTING, "", None
+        )
 
 
 def test_half_turns_go_to_and_fro_and_do_not_drift():
@@ -317,7 +319,7 @@ def test_a_home_is_found_at_the_switch_of_the_emulated_rig_again_and_again(tmp_p
     path, truth = rig_file(tmp_path, **replaced, **{'kind = "galil"': f'kind = "galil"\nmode = "{mode}"'}), []
     with emulated_rig(path, "phantom", "--truth", tmp_path / "truth.csv") as rig:
         path.write_text(path.read_text().replace("127.0.0.1:0", rig.ready["ready"]["galil"]))
-        with Supervisor.of_operator(load_rig(path)) as supervisor:
+        with SupervisorClient.of_operator(load_rig(path)) as supervisor:
             for further in (0.37, 1.1, 0.0):
                 supervisor.arm()
                 supervisor.home("guide_y")
@@ -388,7 +390,7 @@ def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monk
 
 
 def test_a_listener_that_fails_keeps_no_event_from_the_others():
-    seen, event = [], Tick(Report(0.0, State.IDLE))
+    seen, event = [], Tick(TickReport(0.0, SupervisorState.IDLE))
 
     def fail(_event):
         raise OSError("no space left")

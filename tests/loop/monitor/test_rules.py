@@ -17,7 +17,7 @@ class Texts:
     """The rules, with verdicts as text."""
 
     def __getattr__(self, name):
-        rule = getattr(monitor_rules, name)
+        rule = getattr(monitor_rules, f"check_{name}", None) or getattr(monitor_rules, name)
 
         def text(*args, **options):
             result = rule(*args, **options)

@@ -1,12 +1,15 @@
 """The controllers by name, the default first. A new controller is a file here with a METHOD."""
 
 import warnings
+from collections.abc import Iterable
 from importlib import import_module
 from pkgutil import iter_modules
+from typing import Any
 
 from flexneedle.control.interface import Controller
 from flexneedle.control.tables import completed, unowned
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
+from flexneedle.plugins import find_part, is_own, missing_parts, name_kind
 from flexneedle.scenario.model import Scenario
 
 DEFAULT = "adaptive-mpc"
@@ -54,3 +57,27 @@ def used(scenario: Scenario, *own: Controller, source: str = "") -> Scenario:
 
 def _with(own: tuple[Controller, ...]) -> list[Controller]:
     return list(dict.fromkeys((*CONTROLLERS.values(), *own)))
+
+
+def find_controller(given: str | Controller) -> tuple[str, Controller]:
+    """Return the name of a controller in records, and the controller.
+
+    Args:
+        given: A name in `CONTROLLERS`, `module:NAME`, or a Controller.
+
+    Raises:
+        InputError: There is no such controller.
+    """
+    return find_part("controller", given, CONTROLLERS, _controller_rule)
+
+
+def find_own_controllers(given: Iterable[object]) -> tuple[Controller, ...]:
+    """Return the controllers given as `module:NAME`, without duplicates. Raises InputError as `find_controller`."""
+    return tuple(dict.fromkeys(find_controller(str(name))[1] for name in given if is_own(name)))
+
+
+def _controller_rule(found: Any) -> str:
+    if isinstance(found, Controller):
+        return ""
+    missing = missing_parts(found, ("name", "summary", "decide"))
+    return f"is {name_kind(found)}, not a flexneedle.Controller{missing and f', missing: {missing}'}"

@@ -41,8 +41,8 @@ def _add_aurora(commands: Commands) -> None:
         _emulate_aurora,
         "flexneedle emulate aurora --link /tmp/aurora",
         "flexneedle emulate aurora --still --sensors 2 --seed 3",
-        about="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
-        "The tip moves along an arc; a line X Y Z on stdin (mm, tracker frame) stops it at that position.",
+        about="Print the path of the emulated device and serve it until Ctrl-C. The tip moves along an "
+        "arc; a line X Y Z on stdin (mm, tracker frame) stops it there.",
     )
     aurora.add_argument(
         "--link",
@@ -72,8 +72,8 @@ def _add_galil(commands: Commands) -> None:
         _emulate_galil,
         "flexneedle emulate galil --port 2323",
         "flexneedle emulate galil --port 2323 --fault stall=A@5",
-        about="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
-        "Its four motors move in real time.",
+        about="Print the address of the emulated controller and serve it until Ctrl-C. Its four motors "
+        "move in real time.",
     )
     galil.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
@@ -93,18 +93,18 @@ def _add_rig(commands: Commands) -> None:
         _emulate_rig,
         "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
         "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
-        about="Emulate the controller and the tracker of a rig file, with the virtual phantom of a scenario "
-        "between them, in three processes, until interrupted (Ctrl-C). Print one line when all are ready, and one for "
-        "each event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all.",
+        about="Emulate the controller and tracker of a rig file, with the virtual phantom of a scenario "
+        "between them, in three processes. Prints one line when all are ready, and one per event. A "
+        "line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
     )
-    rig.add_argument("rig", metavar="RIG", help="rig file: its path, or emulated for the one of the package")
+    rig.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
     rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
-    add_seed(rig, "seed of phantom and noise: the same phantom as flexneedle insert --seed N")
+    add_seed(rig, "seed of phantom and noise, as in flexneedle insert --seed N")
     rig.add_argument(
         "--plan",
         type=Path,
         metavar="DIR",
-        help="folder with the plan, where the scenario leaves the entry to it",
+        help="folder of a plan, if the scenario has a free entry",
     )
     rig.add_argument("--truth", type=Path, metavar="FILE", help="write the true states to a new CSV file")
     _add_fault(

@@ -31,20 +31,19 @@ def add_options(commands: Commands) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="rig file (its path, or emulated for the one of the package), on whose motors and tracker the plan is "
-        "executed, from where the motors are (default: the virtual phantom)",
+        help="path of a rig file, or emulated: insert with its motors and tracker, from the present motor "
+        "positions (default: virtual phantom)",
     )
     parser.add_argument(
         "--dry-run",
         action="store_true",
-        help="with --rig: read motors and tracker, go through all motions, and send none; the needle is the virtual "
-        "phantom's",
+        help="with --rig: read motors and tracker, but move only the virtual phantom",
     )
     parser.add_argument(
         "--ros",
         metavar="PROFILE",
-        help="publish an insertion without --rig to ROS 2, and let its topic stop it: name or path of a profile of "
-        "topics (with --rig: section [ros] of the rig file)",
+        help="publish an insertion without --rig to ROS 2 and subscribe to its stop topic: name or path of "
+        "a profile (with --rig: section [ros] of the rig file)",
     )
     parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
 

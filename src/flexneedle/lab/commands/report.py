@@ -18,9 +18,8 @@ def add_parser(commands: Commands) -> None:
         _report,
         "flexneedle report runs/accuracy",
         "flexneedle report runs/mine --out mine --json",
-        about="Write the report of a study: an HTML page and its figures. The study may be complete or "
-        "interrupted (Ctrl-C). A study that is running or was killed (kill -9) may have no tables yet: after kill -9, "
-        "run `flexneedle study` with --resume first.",
+        about="Write the report of a study: an HTML page and its figures. The study may be interrupted; "
+        "after kill -9, run `flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
     parser.add_argument(

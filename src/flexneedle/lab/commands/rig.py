@@ -62,9 +62,9 @@ class Operator(Protocol):
 
 def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
     """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
-    from flexneedle.lab.rig.supervisor.client import Supervisor
+    from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
-    return Supervisor.of_operator(rig)
+    return SupervisorClient.of_operator(rig)
 
 
 def add_parser(commands: Commands) -> None:
@@ -87,9 +87,9 @@ def _add_check(commands: Commands) -> None:
         _check,
         "flexneedle rig check rig.toml",
         "flexneedle rig check rig.toml --scenario phantom --json",
-        about="Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
-        "sensors of the tracker, publishers of ROS topics. Moves, powers, publishes and changes nothing. One line "
-        "for each thing that was checked; exit status 1 if there is a problem.",
+        about="Connect to each device and compare it with the rig file: motors, positions, limit switches, "
+        "tracker frames and sensors, ROS publishers. Moves, powers, publishes and changes nothing. "
+        "Exit status 1 if there is a problem.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -116,8 +116,7 @@ def _add_jog(commands: Commands) -> None:
         _jog,
         "flexneedle rig jog rig.toml insertion -5mm",
         "flexneedle rig jog rig.toml rotation 180deg --speed 90",
-        about="Move one axis by a distance from where it is, within its soft limits. Prints what would move and asks "
-        "for confirmation; Ctrl-C stops.",
+        about="Move one axis by a distance within its soft limits. Asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -140,8 +139,8 @@ def _add_home(commands: Commands) -> None:
         _home,
         "flexneedle rig home rig.toml",
         "flexneedle rig home rig.toml insertion --yes",
-        about="Find the zero of axes by the key home of the rig file, one after the other, the insertion first. "
-        "Only without a needle in tissue. Prints what would move and asks for confirmation; Ctrl-C stops.",
+        about="Find the zero of axes by the key home of the rig file, one after the other, insertion "
+        "first. Only without a needle in tissue. Asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -158,16 +157,16 @@ def _add_retract(commands: Commands) -> None:
         _retract,
         "flexneedle rig retract rig.toml",
         "flexneedle rig retract rig.toml --to 10 --speed 1 --yes",
-        about="Move the insertion axis backwards, within its soft limits and short of the limit switch of its home; "
-        "rotation and guide stay where they are. Prints what would move and asks for confirmation; Ctrl-C stops.",
+        about="Move the insertion axis backwards, within its soft limits and short of its home switch; "
+        "rotation and guide rest. Asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
         "--to",
         type=finite,
         metavar="MM",
-        help="position at which the retraction ends (default: where rig home leaves the axis, or without a limit "
-        "switch behind it the lowest of range_mm)",
+        help="final position (default: the position after rig home, or without a limit switch the lowest "
+        "of range_mm)",
     )
     _add_speed(parser, "mm/s")
     _add_yes(parser)
@@ -190,8 +189,8 @@ def _add_off(commands: Commands) -> None:
         _off,
         "flexneedle rig off rig.toml",
         "flexneedle rig off rig.toml --yes",
-        about="Stop all axes and switch their motors off, as before something is freed by hand. A vertical axis may "
-        "fall. Asks for confirmation; the next motion switches the motors on again.",
+        about="Stop all axes and switch their motors off. A vertical axis may fall. Asks for confirmation; "
+        "the next motion switches the motors on.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -203,7 +202,7 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "rig",
         metavar="RIG",
-        help="rig file: its path, or emulated for the one of the package (docs/rig/file.md)",
+        help="path of a rig file, or emulated",
     )
 
 

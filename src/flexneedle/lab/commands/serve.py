@@ -31,8 +31,8 @@ def add_parser(commands: Commands) -> None:
         _serve,
         "flexneedle serve",
         "flexneedle serve mine.toml --rig rig.toml",
-        about="Serve a page on which insertions are planned, watched and replayed, on this computer, without internet "
-        "access. Prints its address; Ctrl-C ends it. One page at a time is in control; any may watch, and stop.",
+        about="Serve a page to plan, insert and replay in a browser, without internet access. One client "
+        "at a time is in control; every client may watch and stop.",
     )
     parser.add_argument(
         "scenario",
@@ -44,8 +44,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="rig file (its path, or emulated for the one of the package), on which the page can insert once it is "
-        "prepared and armed there; nothing moves before (default: virtual rigs alone)",
+        help="path of a rig file, or emulated; nothing moves before the rig is armed on the page (default: "
+        "virtual phantom)",
     )
     parser.add_argument(
         "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
@@ -54,8 +54,8 @@ def add_parser(commands: Commands) -> None:
         "--host",
         default=_HOST,
         metavar="HOST",
-        help="address to listen on; with another than this computer's own, the page needs the token in the printed "
-        f"address (default: {_HOST})",
+        help="address to listen on; other addresses than loopback require the token in the printed address "
+        "(default: 127.0.0.1)",
     )
     parser.add_argument(
         "--port",

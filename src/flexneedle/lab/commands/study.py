@@ -28,7 +28,7 @@ def add_parser(commands: Commands) -> None:
     parser = add_command(
         commands,
         "study",
-        "run many insertions and write their results to tables",
+        "run many insertions and write tables",
         _study,
         "flexneedle study phantom --out runs/accuracy",
         "flexneedle study mine.toml --workers 4 --out runs/mine --resume",

@@ -28,7 +28,7 @@ def add_options(commands: Commands) -> None:
         "--row",
         type=int,
         metavar="INDEX",
-        help="compute this row of the study again, keep it as a run, and draw that",
+        help="compute this row of the study again, and save and draw the run",
     )
     parser.add_argument(
         "--out",
@@ -41,8 +41,8 @@ def add_options(commands: Commands) -> None:
         nargs="?",
         const="",
         metavar="FILE",
-        help="instead of figures, write one file that replays a finished insertion by itself in any browser, without "
-        f"network; {_STDOUT}: stdout (default: {_REPLAY} in the folder of the run)",
+        help="write one HTML file that replays a finished insertion offline in any browser; -: stdout "
+        "(default: RUN/replay.html)",
     )
     parser.add_argument(
         "--compare",

@@ -9,7 +9,7 @@ from flexneedle.arguments import shorten as text_of
 from flexneedle.errors import InputError, RefusedError
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import STILL
-from flexneedle.lab.rig.supervisor.homes import homed_at, homing_reach, homing_speed
+from flexneedle.lab.rig.supervisor.drives import homing_reach, homing_speed, position_after_homing
 from flexneedle.scenario.sections.axes import Axis
 
 _SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
@@ -62,12 +62,12 @@ class Homing:
         home = _with_unit(axis, axis.at_home)
         if axis.to_home == 0:
             return f"{self.name}: stays where it is, and its position is called {home}"
-        reach, back = homing_reach(axis), homed_at(axis) - axis.at_home
+        reach, back = homing_reach(axis), position_after_homing(axis) - axis.at_home
         speed = f"at {_with_unit(axis, homing_speed(axis))}/s"
         search = f"in its {_direction(reach)} direction to the {_switch(axis)}"
         there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
         off = f"in its {_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
-        to = f"off the switch to {_with_unit(axis, homed_at(axis))}"
+        to = f"off the switch to {_with_unit(axis, position_after_homing(axis))}"
         return f"{self.name}: {search}, {there}; then {off}, {to}. If the switch is active now, first {off}"
 
 
@@ -143,7 +143,7 @@ def withdrawn(rig: RigFile) -> float:
     """Return where a retraction ends (mm): where homing leaves the base off a switch behind it, else its lowest
     position."""
     axis = rig.axes.insertion
-    return homed_at(axis) if axis.to_home < 0 else axis.limits[0]
+    return position_after_homing(axis) if axis.to_home < 0 else axis.limits[0]
 
 
 def retraction(

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.trajectory import between, shortest
+from flexneedle.lab.rig.supervisor.trajectory import plan_trajectory, shortest_duration
 from flexneedle.ports import MotorPaces
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.axes import Axis
@@ -27,9 +27,9 @@ def attained(axis: Axis, loop: LoopSettings, speed: float) -> float:
 def step_time(axis: Axis, loop: LoopSettings, way: float, duration: float) -> float:
     """Return the time (s) in which an axis does a step (mm or rad) that is planned for a duration (s)."""
     channel, drive = axis.channel, Drive("", axis)
-    made = between({channel: drive}, {channel: 0.0}, {channel: drive.counts(way)}, duration)
+    made = plan_trajectory({channel: drive}, {channel: 0.0}, {channel: drive.to_counts(way)}, duration)
     fastest = made.speeds[channel] / abs(axis.scale)
-    return max(made.duration, shortest(way, attained(axis, loop, fastest), axis.acceleration))
+    return max(made.duration, shortest_duration(way, attained(axis, loop, fastest), axis.acceleration))
 
 
 def kept(rig: RigFile) -> list[tuple[str, str]]:

@@ -17,8 +17,8 @@ from flexneedle.lab.rig.dry_run import in_memory
 from flexneedle.lab.rig.fit import fit_problems, start_problems
 from flexneedle.lab.rig.rig_file import RigFile, load_rig
 from flexneedle.lab.rig.start import checked_start, deepest, needed
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.messages import Done, Expectation, Report, Task
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.protocol import Expectation, MotionResult, SupervisorTask, TickReport
 from flexneedle.loop.events import Event, Stream
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
@@ -101,7 +101,7 @@ class Ticks:
     states: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
     queued: dict[str, float] = field(default_factory=dict)
 
-    def add(self, report: Report) -> None:
+    def add(self, report: TickReport) -> None:
         """Add the tick of a report."""
         time = self.started + report.time
         self.late.append(report.late)
@@ -138,13 +138,13 @@ def _with_unit(axis: str, way: float) -> tuple[str, float]:
 class Tick(Event):
     """A tick of the supervisor; sent in a thread of its client, so that a listener must return at once."""
 
-    report: Report
+    report: TickReport
 
 
 class SupervisedDriver:
     """The port `Driver` of a supervisor that is armed."""
 
-    def __init__(self, supervisor: Supervisor, scenario: Scenario, roll: float) -> None:
+    def __init__(self, supervisor: SupervisorClient, scenario: Scenario, roll: float) -> None:
         self._supervisor, self._scenario = supervisor, scenario
         self._columns = Columns(scenario.entry.slope)
         self._limits = Limits.of(scenario)
@@ -178,7 +178,7 @@ class SupervisedDriver:
         self._rolled += row.roll + row.spin
         return Motion(row, done.begun, done.ended, done.turned, done.why)
 
-    def _rotation(self, done: Done, command: Control, roll: float) -> tuple[float, float]:
+    def _rotation(self, done: MotionResult, command: Control, roll: float) -> tuple[float, float]:
         """Roll and spin of what was turned.
 
         A half turn was confirmed by its position and counts as one, so that half turns to and fro do not drift. Else
@@ -203,7 +203,9 @@ class SupervisedDriver:
         self._supervisor.stop()
 
 
-def start_advance(supervisor: Supervisor, scenario: Scenario, plan: Plan, *, dry: bool = False) -> float:
+def start_advance(
+    supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, dry: bool = False
+) -> float:
     """How far the base may advance (mm) for a plan, from where it is and the tip is measured now.
 
     dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
@@ -270,7 +272,7 @@ class SupervisedRig:
                 "ros: nothing listens to the stop of this section: add a Bridge(rig.ros) to the listeners"
             )
         scenario = registered(rig, scenario)
-        task = Task(
+        task = SupervisorTask(
             rig,
             monotonic(),
             scenario.setup.axes,
@@ -282,11 +284,11 @@ class SupervisedRig:
         )
         self.ticks.started = task.started
 
-        def report(found: Report) -> None:
+        def report(found: TickReport) -> None:
             self.ticks.add(found)
             stream.send(Tick(found))
 
-        with Supervisor(task, report) as supervisor:
+        with SupervisorClient(task, report) as supervisor:
             # What cannot begin is refused before anybody is asked.
             start_advance(supervisor, scenario, plan, dry=self.dry_run)
             stream.gate.confirm(supervisor)

@@ -14,9 +14,9 @@ from flexneedle.errors import RigError, RunError, StoppedError, describe_error
 from flexneedle.interrupts import uninterrupted
 from flexneedle.lab.rig.rig_file import RosSettings
 from flexneedle.lab.rig.supervised import Tick
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import Profile, load_profile
 from flexneedle.lab.ros.records import Arm, Lost, Refused, Request, RigState, Stop, Target
@@ -29,7 +29,7 @@ POLL_S = 0.01
 _STATE_S = 1.0  # the state is published at least this often
 _CHECK_S = 0.05  # while an arm or a target is awaited
 _MOST_EVENTS = 1000  # that others cause, in the record
-_BAD = frozenset({State.HOLDING, State.STOPPED, State.FAULT})
+_BAD = frozenset({SupervisorState.HOLDING, SupervisorState.STOPPED, SupervisorState.FAULT})
 
 
 def profile_of(settings: RosSettings) -> Profile:
@@ -64,7 +64,7 @@ class Bridge(Gate):
         }
         self._lock, self._ended, self._armed = Lock(), threading.Event(), threading.Event()
         self._unprinted = SimpleQueue[str]()
-        self._supervisor: Supervisor | None = None
+        self._supervisor: SupervisorClient | None = None
         self._stopped = self._lost = self._awaited = ""
         self._others = 0  # events that other nodes may cause without end
         self._target: Point | None = None
@@ -158,9 +158,11 @@ class Bridge(Gate):
             self.check()
         self._awaited = ""
 
-    def _publish_state(self, report: Report) -> None:
+    def _publish_state(self, report: TickReport) -> None:
         """Publish the state of the rig when it changes, and once a second."""
-        waiting = f"waits for {self._awaited}" if self._awaited and report.state is State.IDLE else ""
+        waiting = (
+            f"waits for {self._awaited}" if self._awaited and report.state is SupervisorState.IDLE else ""
+        )
         values = {"tracker": report.tracker, "ticks missed": str(report.missed)}
         changed = self._state != (state := (str(report.state), report.why or waiting))
         if changed or self._now() - self._published_at >= _STATE_S:
@@ -229,8 +231,8 @@ class Bridge(Gate):
         why = "" if supervisor is None else supervisor.ended
         if why is None:
             return
-        if why and self._state[0] not in (State.STOPPED, State.FAULT):
-            self._announce(State.FAULT, f"the supervisor has ended: {why}", good=False)
+        if why and self._state[0] not in (SupervisorState.STOPPED, SupervisorState.FAULT):
+            self._announce(SupervisorState.FAULT, f"the supervisor has ended: {why}", good=False)
         elif self._now() - self._published_at >= _STATE_S:
             self._announce(*self._state, good=self._good)
 

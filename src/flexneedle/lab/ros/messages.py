@@ -30,7 +30,7 @@ from flexneedle.record.messages import (
     pose,
     statuses,
 )
-from flexneedle.record.topics import READINGS, STATUS, TIMING, period_messages, plan_message
+from flexneedle.record.topics import READINGS, STATUS, TIMING, plan_message, status_messages
 from flexneedle.types import Floats, Measurement, Period, Plan, Pose, X, Z
 
 PoseArray = ros.geometry_msgs__msg__PoseArray
@@ -248,7 +248,7 @@ def _rig_diagnostics(composer: Composer, record: RigState) -> DiagnosticArray:
 
 
 def _period_diagnostics(composer: Composer, period: Period) -> DiagnosticArray:
-    found: dict[str, Any] = {one.topic: one.message for one in period_messages(period)}
+    found: dict[str, Any] = dict(status_messages(period))
     every = [status for topic in (STATUS, READINGS, TIMING) for status in found[topic].status]
     named = [replace(status, name=f"flexneedle: {status.name}") for status in every]
     return replace(

@@ -9,7 +9,13 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from flexneedle.control.controllers import CONTROLLERS, DEFAULT, checked
+from flexneedle.control.controllers import (
+    CONTROLLERS,
+    DEFAULT,
+    checked,
+    find_controller,
+    find_own_controllers,
+)
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError, ScenarioError, make_printable
@@ -30,14 +36,8 @@ from flexneedle.lab.study.spec import (
     read_study,
     settings_of,
 )
-from flexneedle.loop.parts import (
-    SCENARIO_TRACKER,
-    controller_of,
-    own_controllers,
-    plant_of,
-    tracker_of,
-)
-from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, find_plant
+from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, find_tracker
 from flexneedle.planning.planner import STRATEGIES
 from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
@@ -62,7 +62,7 @@ _CHOICES = {
     WORLD_RIG: RIGS,
 }
 _DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
-_OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
+_OWN = {"controller": find_controller, "plant": find_plant, "tracker": find_tracker}
 _MAX_INSERTIONS = 1_000_000
 _KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
 _FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {WORLD}"
@@ -207,7 +207,7 @@ def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
     """The study of a definition, which may lack what follows from the rest of it. base: its scenario."""
     fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
     names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
-    own = own_controllers(names["controller"])
+    own = find_own_controllers(names["controller"])
     base = checked(base, *own)
     _check_without(settings["without"], base)
     left_out, targets, reaching = (settings[key] for key in ("without", "targets", "reach"))
@@ -348,13 +348,14 @@ def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> G
 def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
     """Whether a world has another guide than the rig, or none that this case or the controller needs."""
     return not has_rig(scenario, world_rig) or (
-        not scenario.setup.has_guide and (world_case == STRUCTURE or controller_of(controller)[1].needs_guide)
+        not scenario.setup.has_guide
+        and (world_case == STRUCTURE or find_controller(controller)[1].needs_guide)
     )
 
 
 def _check_guide(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
     try:
-        check_guide(controller_of(run["controller"])[1], scenario.setup, run["strategy"])
+        check_guide(find_controller(run["controller"])[1], scenario.setup, run["strategy"])
     except InputError as error:
         raise InputError(f"{error}{_suffix(at)}") from None
 

@@ -7,10 +7,9 @@ import numpy as np
 
 from flexneedle.control.guide import guide_axes
 from flexneedle.costs.terms import PLAN
-from flexneedle.loop.parts import plant_of
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
 from flexneedle.planning.planner import plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
@@ -46,7 +45,7 @@ def reach(
     axes = setup.axes if base_moves else guide_axes(setup, strategy)
     if axes == setup.axes:
         return _best_miss(truth)
-    ends = [straight_end(truth, roll, plant_of(phantom)[1], depth) for roll in _rolls(setup)]
+    ends = [straight_end(truth, roll, find_plant(phantom)[1], depth) for roll in _rolls(setup)]
     if any(math.isnan(x) for x, *_ in ends):
         return math.nan
     _, *lateral = scenario.target.position

@@ -1,4 +1,4 @@
-"""The monitor of the tracker: recent readings and the verdicts on new readings and on the field."""
+"""The monitor of the tracker: recent readings, and verdicts on new readings and on the field."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +16,11 @@ TipAt = Callable[[float], Point]
 
 
 def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False) -> Verdict:
-    """Check the field by all sensors of `frames` (oldest first) except the tip; enough of them must be references.
+    """Check the field by all sensors of `frames` (oldest first) except the tip.
 
-    Only the frames of the last window count, and only sensors with an indicator in at least half of them: a median over
-    a few readings would be no better than a single one. distorted: whether the field was distorted before, so that the
-    indicators must fall below the lower limit.
+    Enough of them must be references. Only the frames of the last window count, and only sensors with an indicator in
+    at least half of them: a median over a few readings would be no better than a single one. distorted: true after a
+    distorted field, for which the indicators must fall below the lower limit.
     """
     window = settings.indicator_window_s
     recent = _within(frames, window)
@@ -28,20 +28,20 @@ def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted:
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
     return rules.first_bad(
         (
-            rules.missing_references(indicators, settings.references, window, recent[-1].readings),
-            rules.too_short(_covered(recent), window / 2, settings.references),
-            rules.distortion(indicators, limit, window, distorted),
+            rules.check_missing_references(indicators, settings.references, window, recent[-1].readings),
+            rules.check_too_short(_covered_time(recent), window / 2, settings.references),
+            rules.check_distortion(indicators, limit, window, distorted),
         )
     )
 
 
 def is_distorted(verdict: Verdict, before: bool) -> bool:
-    """Whether the field counts as distorted after a verdict: once distorted, until a verdict is OK."""
+    """Return whether the field is still distorted after a verdict: once distorted, until a verdict is OK."""
     return verdict.kind is VerdictKind.FIELD_DISTORTED or (before and not verdict.ok)
 
 
-def _covered(frames: Sequence[Frame]) -> float:
-    """Time (s) that frames cover; a gap counts as one frame period."""
+def _covered_time(frames: Sequence[Frame]) -> float:
+    """Return the time (s) that frames cover; a gap counts as one frame period."""
     steps = [later.time - earlier.time for earlier, later in pairwise(frames)]
     return len(steps) * median(steps) if steps else 0.0
 
@@ -52,7 +52,7 @@ def _within(frames: Sequence[Frame], window: float) -> list[Frame]:
 
 
 def _indicators(frames: Sequence[Frame]) -> dict[str, list[float]]:
-    """Indicators by sensor, the tip excluded, of the sensors that have one in at least half of the frames."""
+    """Return the indicators of each sensor that has one in at least half of the frames, except the tip."""
     found: dict[str, list[float]] = {}
     for frame in frames:
         for name, reading in frame.readings.items():
@@ -63,35 +63,39 @@ def _indicators(frames: Sequence[Frame]) -> dict[str, list[float]]:
 
 @dataclass(frozen=True)
 class _Repeats:
-    """Successive readings with the same position: their number, the time of the newest (s), and the predicted travel of
-    the tip since the first (mm)."""
+    """Successive readings with the same position.
+
+    Their number, the time (s) of the newest, and the predicted travel of the tip (mm) since the first.
+    """
 
     position: rules.Position
     time: float
     count: int = 1
     travel: float = 0.0
 
-    def extended(self, time: float, tip_at: TipAt) -> "_Repeats":
-        """With one more reading. Both ends of the travel are of one estimate, so that corrections do not count."""
+    def extend(self, time: float, tip_at: TipAt) -> "_Repeats":
+        """Return the repeats with one more reading.
+
+        Both ends of the travel are from one estimate, so that corrections do not count.
+        """
         travel = self.travel + math.dist(tip_at(self.time), tip_at(time))
         return _Repeats(self.position, time, self.count + 1, travel)
 
 
 @dataclass(frozen=True)
 class _Jump:
-    """A jump that has not been taken back: the largest distance (mm) from the last good reading that was allowed at its
-    time (s).
+    """A jump that no later reading has revoked: the largest distance (mm) from the last good reading at its time (s).
 
-    The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew with it, a
-    sensor that has slipped would soon be accepted. Only the travel that is still predicted adds to it. A reading that
-    is as near to its prediction, which no reading has corrected since, shows that the last good one was wrong.
+    The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew over time, a
+    sensor that has slipped would soon be accepted. Only the travel that is still predicted adds to it. A reading as
+    close to its prediction, which no reading has corrected since, shows that the last good one was wrong.
     """
 
     time: float
     limit: float
 
     def limit_at(self, time: float, tip_at: TipAt) -> float:
-        """The largest distance (mm) of a later reading from the last good one."""
+        """Return the largest distance (mm) of a later reading from the last good one."""
         return self.limit + math.dist(tip_at(self.time), tip_at(time))
 
 
@@ -100,8 +104,8 @@ class Monitor:
     """State of the monitor. Frozen: `check` and `check_field` return the next state.
 
     axes: lateral axes of the needle; recent: readings within the window; repeats: the newest readings with the same
-    position; good: the last good reading; rejected: whether one was rejected since then for more than a missing tip;
-    jumped: the jump since then, if any; field: the last verdict on the field; distorted: whether the field counts as
+    position; good: the last good reading; rejected: true if a reading was rejected since then for more than a missing
+    tip; jumped: the jump since then, if any; field: the last verdict on the field; distorted: true while the field is
     distorted.
     """
 
@@ -118,25 +122,25 @@ class Monitor:
     def check(
         self, measurement: Measurement, tip_at: TipAt, now: float, max_age: float, max_innovation: float
     ) -> "tuple[Monitor, Verdict]":
-        """Return the state after a reading, and the verdict on it. Readings with an invalid time are not stored.
+        """Return the state after a reading, and the verdict on it.
 
-        tip_at: prediction of the present estimate; now (s); max_age (s); max_innovation: largest distance (mm) from the
-        prediction.
+        Readings with an invalid time are not stored. tip_at: prediction of the present estimate; now (s); max_age (s);
+        max_innovation: largest distance (mm) from the prediction.
         """
         previous = self.recent[-1].frame if self.recent else None
         verdict = rules.first_bad(
             (
-                rules.not_a_number(measurement),
-                rules.repeated(measurement.frame, previous),
-                rules.stale(measurement.time, now, max_age),
+                rules.check_not_a_number(measurement),
+                rules.check_repeated(measurement.frame, previous),
+                rules.check_stale(measurement.time, now, max_age),
             )
         )
         if not verdict.ok:
             return replace(self, rejected=True), verdict
         since = measurement.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(one for one in self.recent if one.time > since)
-        monitor = replace(self, recent=(*kept, measurement), repeats=self._repeats_with(measurement, tip_at))
-        monitor, jump = monitor._after_jump(measurement, tip_at)
+        monitor = replace(self, recent=(*kept, measurement), repeats=self._count_repeats(measurement, tip_at))
+        monitor, jump = monitor._check_jump(measurement, tip_at)
         verdict = rules.first_bad(
             monitor._verdicts(measurement, tip_at(measurement.time), max_innovation, jump)
         )
@@ -144,18 +148,18 @@ class Monitor:
             return replace(monitor, good=measurement, rejected=False, jumped=None), verdict
         return replace(monitor, rejected=self.rejected or verdict.kind is not VerdictKind.MISSING), verdict
 
-    def _after_jump(self, measurement: Measurement, tip_at: TipAt) -> "tuple[Monitor, Verdict]":
-        """The state after the check of a reading for a jump, and its verdict."""
+    def _check_jump(self, measurement: Measurement, tip_at: TipAt) -> "tuple[Monitor, Verdict]":
+        """Return the state after the check of a reading for a jump, and its verdict."""
         if self.good is None:
             return self, OK
         settings, time = self.settings, measurement.time
         limit = settings.speed_limit_mm_s * abs(time - self.good.time) + settings.jump_margin_mm
         if self.jumped is not None:
             limit = min(limit, self.jumped.limit_at(time, tip_at))
-        verdict = rules.jump(measurement, self.good, limit)
+        verdict = rules.check_jump(measurement, self.good, limit)
         if self.jumped is not None and not verdict.ok:
             predicted = Measurement(time, *tip_at(time))
-            verdict = verdict if not rules.jump(measurement, predicted, self.jumped.limit).ok else OK
+            verdict = verdict if not rules.check_jump(measurement, predicted, self.jumped.limit).ok else OK
         if verdict.ok or self.jumped is not None or not settings.enabled:
             return self, verdict
         return replace(self, jumped=_Jump(time, limit)), verdict
@@ -181,10 +185,10 @@ class Monitor:
         if not settings.enabled or not frames:
             return OK
         window = settings.doubt_window_s
-        return rules.in_doubt(_indicators(_within(frames, window)), settings.indicator_limit, window)
+        return rules.check_in_doubt(_indicators(_within(frames, window)), settings.indicator_limit, window)
 
     def has_reading(self, now: float, max_age: float) -> bool:
-        """Whether the newest reading, good or bad, is at most `max_age` (s) old."""
+        """Return whether the newest reading, good or bad, is at most `max_age` (s) old."""
         return bool(self.recent) and now - self.recent[-1].time <= max_age + 1e-9
 
     def last_good(self, now: float, max_age: float) -> Measurement | None:
@@ -213,28 +217,28 @@ class Monitor:
         settings = self.settings
         measured = (measurement.x, measurement.y, measurement.z)[: 1 + self.axes]
         tip = tuple(value for value in measured if value is not None)
-        yield rules.missing(measurement, self.axes)
+        yield rules.check_missing(measurement, self.axes)
         if len(tip) == len(measured):
-            yield rules.innovation(tip, predicted[: 1 + self.axes], max_innovation)
+            yield rules.check_innovation(tip, predicted[: 1 + self.axes], max_innovation)
         if settings.enabled:
             if self.axes == 1:
-                yield rules.out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
+                yield rules.check_out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
             yield jump
             if self.repeats is not None:
-                yield rules.frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
+                yield rules.check_frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
 
-    def _repeats_with(self, newest: Measurement, tip_at: TipAt) -> _Repeats | None:
+    def _count_repeats(self, newest: Measurement, tip_at: TipAt) -> _Repeats | None:
         """Return the readings with the newest one's position; a reading without a tip changes nothing."""
         position = _reported_position(newest)
         if position is None:
             return self.repeats
         if self.repeats is None or self.repeats.position != position:
             return _Repeats(position, newest.time)
-        return self.repeats.extended(newest.time, tip_at)
+        return self.repeats.extend(newest.time, tip_at)
 
 
 def _reported_position(measurement: Measurement) -> rules.Position | None:
-    """Position of the tip as the tracker reported it: a changed map to the stage does not move a frozen sensor."""
+    """Return the position of the tip as reported: a new map to the stage does not move a frozen sensor."""
     reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
     if reading is not None:
         return reading.position

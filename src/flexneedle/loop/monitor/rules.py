@@ -28,8 +28,8 @@ def first_bad(verdicts: Iterable[Verdict]) -> Verdict:
     return next((verdict for verdict in verdicts if not verdict.ok), OK)
 
 
-def missing(measurement: Measurement, axes: int = 1) -> Verdict:
-    """A reading without a tip, which has z, too, with two lateral axes; with the tracker's reason if it gives one."""
+def check_missing(measurement: Measurement, axes: int = 1) -> Verdict:
+    """Require a tip, with z if there are two lateral axes; the verdict has the tracker's reason if it gives one."""
     if None not in (measurement.x, measurement.y, measurement.z)[: 1 + axes]:
         return OK
     reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
@@ -42,8 +42,8 @@ def missing(measurement: Measurement, axes: int = 1) -> Verdict:
     return Verdict(VerdictKind.MISSING, f"tip not measured ({reason})")
 
 
-def not_a_number(measurement: Measurement) -> Verdict:
-    """The time, a coordinate, the direction, a point or a covariance is not finite; the verdict names each of them."""
+def check_not_a_number(measurement: Measurement) -> Verdict:
+    """Require finite time, coordinates, direction, points and covariances; the verdict names the others."""
     bad = [
         f"{name} {wrong[0]}"
         for name, values in _reported(measurement)
@@ -52,8 +52,8 @@ def not_a_number(measurement: Measurement) -> Verdict:
     return Verdict(VerdictKind.NOT_A_NUMBER, ", ".join(bad)) if bad else OK
 
 
-def stale(time: float, now: float, limit: float) -> Verdict:
-    """The time stamp is more than `limit` (s) in the past or in the future."""
+def check_stale(time: float, now: float, limit: float) -> Verdict:
+    """Require a time stamp at most `limit` (s) in the past or in the future."""
     if now - time > limit:
         return Verdict(VerdictKind.STALE, f"{now - time:.3f} s old, limit {limit:g} s")
     if time > now + limit:
@@ -61,61 +61,64 @@ def stale(time: float, now: float, limit: float) -> Verdict:
     return OK
 
 
-def repeated(frame: Frame | None, previous: Frame | None) -> Verdict:
-    """The frame number is not above the previous one, whatever the time stamp."""
+def check_repeated(frame: Frame | None, previous: Frame | None) -> Verdict:
+    """Require a frame number above the previous one, whatever the time stamp."""
     if frame is None or previous is None or frame.number > previous.number:
         return OK
     return Verdict(VerdictKind.STALE, f"frame {frame.number} after frame {previous.number}")
 
 
-def innovation(measured: Position, predicted: Position, limit: float) -> Verdict:
-    """The measured tip is more than `limit` (mm) from the predicted one."""
+def check_innovation(measured: Position, predicted: Position, limit: float) -> Verdict:
+    """Require a tip at most `limit` (mm) from the predicted one."""
     distance = math.dist(measured, predicted)
     if distance <= limit:
         return OK
     return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:g} mm")
 
 
-def out_of_plane(z: float | None, limit: float) -> Verdict:
-    """The tip is more than `limit` (mm) from the plane of the insertion; OK for a tracker without z."""
+def check_out_of_plane(z: float | None, limit: float) -> Verdict:
+    """Require a tip at most `limit` (mm) from the plane of the insertion; OK for a tracker without z."""
     if z is None or abs(z) <= limit:
         return OK
     return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:g} mm")
 
 
-def jump(measurement: Measurement, previous: Measurement, limit: float) -> Verdict:
-    """The tip is more than `limit` (mm) from the previous good reading."""
+def check_jump(measurement: Measurement, previous: Measurement, limit: float) -> Verdict:
+    """Require a tip at most `limit` (mm) from the previous good reading."""
     travel = math.dist(*_common_coordinates(measurement, previous))
     if travel <= limit:
         return OK
     return Verdict(VerdictKind.JUMP, f"{travel:.2f} mm, limit {limit:.2f} mm")
 
 
-def frozen(count: int, travel: float, travel_limit: float) -> Verdict:
-    """`count` identical readings while the predicted tip travelled by `travel`, more than `travel_limit` (mm)."""
+def check_frozen(count: int, travel: float, travel_limit: float) -> Verdict:
+    """Refuse `count` identical readings while the predicted tip travelled more than `travel_limit` (mm)."""
     if travel <= travel_limit:
         return OK
     return Verdict(VerdictKind.FROZEN, f"{count} identical readings while the tip travelled {travel:.2f} mm")
 
 
 def has_indicator(reading: SensorReading) -> bool:
-    """Whether a sensor is measured and has a valid indicator: a finite number from 0, no error code such as −1."""
+    """Return whether a sensor is measured and has a valid indicator.
+
+    Valid is a finite number from 0; trackers report −1 as an error code.
+    """
     indicator = reading.indicator
     measured = reading.status == VISIBLE and reading.position is not None
     return measured and indicator is not None and 0.0 <= indicator < math.inf
 
 
-def too_short(duration: float, least: float, needed: int) -> Verdict:
-    """The frames cover less than `least` (s), if any reference sensors are `needed`."""
+def check_too_short(duration: float, least: float, needed: int) -> Verdict:
+    """Require frames that cover at least `least` (s), if any reference sensors are `needed`."""
     if needed == 0 or duration >= least - 1e-9:
         return OK
     return Verdict(VerdictKind.FIELD_UNKNOWN, f"observed for {duration:.2f} s, {least:g} s needed")
 
 
-def missing_references(
+def check_missing_references(
     indicators: Mapping[str, Sequence[float]], needed: int, window: float, newest: Mapping[str, SensorReading]
 ) -> Verdict:
-    """Fewer than `needed` reference sensors have an indicator within the window (s).
+    """Require `needed` reference sensors with an indicator within the window (s).
 
     newest: the newest readings by sensor; their status explains the verdict. Only a sensor with the name of a reference
     counts, not a second one in the needle, for example.
@@ -132,12 +135,13 @@ def missing_references(
     return Verdict(VerdictKind.FIELD_UNKNOWN, reason)
 
 
-def distortion(
+def check_distortion(
     indicators: Mapping[str, Sequence[float]], limit: float, window: float, resuming: bool = False
 ) -> Verdict:
-    """A sensor's median indicator over the window (s) is above the limit; the verdict names the largest one.
+    """Require medians of the indicators over the window (s) at most at the limit.
 
-    resuming: whether the field was distorted before, so that `limit` is the lower one of the hysteresis.
+    The verdict names the sensor with the largest median. resuming: true after a distorted field, with `limit` the lower
+    one of the hysteresis.
     """
     name, value = _largest_median(indicators)
     if value <= limit:
@@ -147,8 +151,11 @@ def distortion(
     return Verdict(VerdictKind.FIELD_DISTORTED, reason)
 
 
-def in_doubt(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> Verdict:
-    """As `distortion`, over a window (s) too short for a hold: readings of this time must not correct the estimate."""
+def check_in_doubt(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> Verdict:
+    """Check as `check_distortion`, over a window (s) too short for a hold.
+
+    Readings of this time must not correct the estimate.
+    """
     name, value = _largest_median(indicators)
     if value <= limit:
         return OK
@@ -157,13 +164,13 @@ def in_doubt(indicators: Mapping[str, Sequence[float]], limit: float, window: fl
 
 
 def _largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
-    """The sensor with the largest median indicator, and that median; 0 without any indicator."""
+    """Return the sensor with the largest median indicator, and the median; 0 without any indicator."""
     medians = {name: median(values) for name, values in indicators.items() if values}
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
 
 
 def _reported(measurement: Measurement) -> Iterator[tuple[str, Iterable[float | None]]]:
-    """The numbers of a reading by name, None if not measured; those of the frame's sensors excluded."""
+    """Return the numbers of a reading by name, None if not measured, without the sensors of its frame."""
     yield "time", (measurement.time,)
     yield "x", (measurement.x,)
     yield "y", (measurement.y,)
@@ -175,7 +182,7 @@ def _reported(measurement: Measurement) -> Iterator[tuple[str, Iterable[float | 
 
 
 def _common_coordinates(one: Measurement, other: Measurement) -> tuple[Position, Position]:
-    """Positions of two readings in the coordinates that both have."""
+    """Return the positions of two readings in the coordinates that both have."""
     pairs = ((one.x, other.x), (one.y, other.y), (one.z, other.z))
     known = [(a, b) for a, b in pairs if a is not None and b is not None]
     return tuple(a for a, _ in known), tuple(b for _, b in known)

@@ -9,10 +9,9 @@ import pytest
 from flexneedle.errors import RefusedError
 from flexneedle.geometry.registration import identity
 from flexneedle.lab.process import MessageChannel
-from flexneedle.lab.rig.supervisor import client
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import client, protocol
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from stages import rig_file
 
@@ -38,7 +37,9 @@ class Scripted:
         self.channel.close()
 
     def _report(self, requests, *, rests):
-        self._line.send(say.Report(0.0, State.STOPPED, "the test", requests=requests, at_rest=rests))
+        self._line.send(
+            protocol.TickReport(0.0, SupervisorState.STOPPED, "the test", requests=requests, at_rest=rests)
+        )
 
     def _take(self):
         request = self._line.receive_first()
@@ -48,26 +49,28 @@ class Scripted:
     def _serve(self):
         self._line.receive_first()
         self._report(0, rests=True)
-        while not isinstance(request := self._take(), say.Close):
+        while not isinstance(request := self._take(), protocol.CloseRequest):
             self._answer(request)
-        self._line.send(say.Ended())
+        self._line.send(protocol.SupervisorEnded())
         self._line.close()
 
     def _answer(self, request):
         match request:
-            case say.Stop():
+            case protocol.StopRequest():
                 self._report(self._requests - 1, rests=True)  # an earlier one, that was under way
                 self._next = [(self._requests, rests) for rests in (False, False, True)]
-            case say.Heartbeat() if self._next:
+            case protocol.Heartbeat() if self._next:
                 requests, rests = self._next.pop(0)
                 self._report(requests, rests=rests)
-            case say.Reset() if self._next:
-                self._line.send(say.Refused(0, "motors have not come to rest yet", State.STOPPED))
+            case protocol.ResetRequest() if self._next:
+                self._line.send(
+                    protocol.RequestRefused(0, "motors have not come to rest yet", SupervisorState.STOPPED)
+                )
                 self._report(self._requests, rests=False)
                 # As the supervisor's own, its number of requests never falls, also if a late client sends heartbeats.
                 self._next = [(self._requests, rests) for _, rests in self._next]
-            case say.Reset():
-                self._line.send(say.Report(0.0, State.IDLE, requests=self._requests))
+            case protocol.ResetRequest():
+                self._line.send(protocol.TickReport(0.0, SupervisorState.IDLE, requests=self._requests))
 
 
 @pytest.fixture
@@ -78,7 +81,7 @@ def scripted(monkeypatch):
 
 @pytest.fixture
 def supervisor(scripted):  # noqa: ARG001  it has to be there first
-    with Supervisor.of_operator(rig_file()) as made:
+    with SupervisorClient.of_operator(rig_file()) as made:
         yield made
 
 
@@ -91,8 +94,10 @@ def test_what_a_follower_raises_is_raised_where_the_client_waits_and_the_rig_can
         seen.append(report)
         raise error
 
-    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
-    with Supervisor(task, fails) as made:
+    task = protocol.SupervisorTask(
+        rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False
+    )
+    with SupervisorClient(task, fails) as made:
         with pytest.raises(type(error), match=str(error)):
             made.wait(5.0)
         assert made.ended is None
@@ -118,8 +123,10 @@ def test_what_a_follower_raises_after_the_last_wait_is_printed(monkeypatch, wait
         if fails:
             raise OSError("no space left")
 
-    task = say.Task(rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False)
-    with Supervisor(task, follower) as made:
+    task = protocol.SupervisorTask(
+        rig_file(), 0.0, 2, MonitorSettings(enabled=False), identity(), 0.0, 1.0, tracked=False
+    )
+    with SupervisorClient(task, follower) as made:
         fails.append(True)
         made.stop()
         if waits:
@@ -131,7 +138,7 @@ def test_what_a_follower_raises_after_the_last_wait_is_printed(monkeypatch, wait
 def test_after_a_stop_a_reset_is_accepted(supervisor):
     supervisor.stop()
     supervisor.reset()
-    assert supervisor.report.state is State.IDLE
+    assert supervisor.report.state is SupervisorState.IDLE
 
 
 def test_a_request_that_is_refused_has_the_reason(supervisor):

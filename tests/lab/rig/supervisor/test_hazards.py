@@ -4,17 +4,17 @@ import math
 
 import pytest
 
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Frame, SensorReading
 from stages import TICK_S, Bench, rig_file
 
-AHEAD = say.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
+AHEAD = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 
 
 def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
-    return say.Step(number, roll, travel or {"insertion": 1.0}, duration, expected)
+    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, duration, expected)
 
 
 @pytest.fixture
@@ -29,10 +29,10 @@ def bench():
 
 @pytest.mark.parametrize("stall", [0.1, 0.3, 0.45])
 def test_after_late_ticks_no_more_than_the_queue_is_commanded(bench, stall):
-    bench.core.request(say.Go(1, "insertion", 30.0, 5.0))
+    bench.core.request(protocol.MoveRequest(1, "insertion", 30.0, 5.0))
     bench.tick(20)
     bench.clock.wait(stall)
-    bench.core.request(say.Heartbeat())
+    bench.core.request(protocol.Heartbeat())
     bench.core.tick()
     motor = bench.stage.motors["A"]
     assert motor.target - motor.commanded <= 0.075 * 5000.0 + 1.0
@@ -41,13 +41,13 @@ def test_after_late_ticks_no_more_than_the_queue_is_commanded(bench, stall):
 
 
 def test_after_a_long_time_without_ticks_a_motion_is_not_taken_up_again(bench):
-    bench.core.request(say.Go(1, "insertion", 30.0, 5.0))
+    bench.core.request(protocol.MoveRequest(1, "insertion", 30.0, 5.0))
     bench.tick(20)
     bench.clock.wait(0.6)
     bench.core.tick()
-    assert bench.core.state is State.STOPPED
+    assert bench.core.state is SupervisorState.STOPPED
     assert bench.core.why == "no tick for 0.60 s, limit 0.5 s"
-    assert bench.until(1).state is State.STOPPED
+    assert bench.until(1).state is SupervisorState.STOPPED
     assert bench.position("insertion") < 4.0
 
 
@@ -59,7 +59,7 @@ def test_a_motor_that_runs_past_its_target_with_its_controller_is_a_fault(bench)
     bench.tick(2)
     bench.stage.motors["A"].fault = "runaway"
     done = bench.until(1)
-    assert done.state is State.FAULT
+    assert done.state is SupervisorState.FAULT
     assert done.why.startswith("insertion: 0.2")
     assert "beyond its target, limit 0.200 mm" in done.why
     assert bench.position("insertion") < 1.3
@@ -76,11 +76,11 @@ def test_a_motor_that_runs_past_its_target_with_its_controller_is_a_fault(bench)
 def test_a_stall_is_found_by_what_is_left_of_the_step(bench, travel, steps, seconds, why):
     bench.stage.motors["A"].fault = "stall"
     for number in range(1, steps + 1):
-        assert bench.core.state is not State.FAULT
+        assert bench.core.state is not SupervisorState.FAULT
         begun = bench.clock.time
         bench.core.request(step(number, insertion=travel))
         bench.until(number)
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     assert bench.core.why.startswith(why)
     assert seconds - 3 * TICK_S <= bench.clock.time - begun <= seconds
 
@@ -88,30 +88,30 @@ def test_a_stall_is_found_by_what_is_left_of_the_step(bench, travel, steps, seco
 def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything_else(bench):
     bench.stage.motors["C"].on = False
     bench.tick(20)
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     bench.stage.lost = True
     bench.tick(4)
-    bench.core.request(say.Reset())
-    assert isinstance(bench.sent[-1], say.Refused)
+    bench.core.request(protocol.ResetRequest())
+    assert isinstance(bench.sent[-1], protocol.RequestRefused)
     assert not bench.reports[-1].at_rest
     bench.stage.lost = False
     bench.tick(20)
     assert ("reconnect",) in bench.stage.calls
-    bench.core.request(say.Reset())
-    assert bench.core.state is State.IDLE
+    bench.core.request(protocol.ResetRequest())
+    assert bench.core.state is SupervisorState.IDLE
 
 
 def test_a_driver_that_leaves_a_motor_out_is_a_fault(bench):
     read = bench.stage.read
     bench.stage.read = lambda: {channel: state for channel, state in read().items() if channel != "C"}
     bench.tick(2)
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     assert "no state of channel C" in bench.core.why
 
 
 @pytest.mark.parametrize("how", ["stop", "fault"])
 def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
-    bench.core.request(say.Stop("the test"))
+    bench.core.request(protocol.StopRequest("the test"))
     if how == "fault":
         bench.stage.motors["A"].stopped = "abort"
     bench.tick(10)
@@ -125,10 +125,10 @@ def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
 
 
 def test_a_second_stop_is_sent_too(bench):
-    bench.core.request(say.Stop("one"))
+    bench.core.request(protocol.StopRequest("one"))
     bench.tick(10)
     before = bench.stage.calls.count(("stop",))
-    bench.core.request(say.Stop("two"))
+    bench.core.request(protocol.StopRequest("two"))
     assert bench.stage.calls.count(("stop",)) == before + 1
     assert bench.core.why == "one"
 
@@ -138,9 +138,9 @@ def test_a_stop_without_effect_is_a_fault_and_is_reported(bench):
     bench.tick(3)
     bench.stage.deaf = True
     bench.stage.motors["A"].target = 90_000.0
-    bench.core.request(say.Stop("the test"))
+    bench.core.request(protocol.StopRequest("the test"))
     done = bench.until(1, most=60)
-    assert (done.state, done.why) == (State.FAULT, "the test")
+    assert (done.state, done.why) == (SupervisorState.FAULT, "the test")
     assert bench.core.why == "the motors do not stop"
 
 
@@ -151,37 +151,37 @@ def test_motors_that_do_not_stop_are_a_fault_also_if_the_stop_is_repeated(bench,
     bench.stage.deaf = True
     bench.stage.motors["A"].target = 90_000.0
     for _ in range(60 // every):
-        bench.core.request(say.Stop("the test"))
+        bench.core.request(protocol.StopRequest("the test"))
         bench.tick(every)
-    assert (bench.core.state, bench.core.why) == (State.FAULT, "the motors do not stop")
+    assert (bench.core.state, bench.core.why) == (SupervisorState.FAULT, "the motors do not stop")
 
 
 def test_a_later_stop_has_its_own_time(bench):
-    bench.core.request(say.Stop("one"))
+    bench.core.request(protocol.StopRequest("one"))
     bench.tick(100)
-    bench.core.request(say.Reset())
+    bench.core.request(protocol.ResetRequest())
     bench.armed()
     bench.core.request(step(expected=AHEAD, duration=2.0))
     bench.tick(3)
-    bench.core.request(say.Stop("two"))
+    bench.core.request(protocol.StopRequest("two"))
     bench.tick(20)
-    assert (bench.core.state, bench.core.why) == (State.STOPPED, "two")
+    assert (bench.core.state, bench.core.why) == (SupervisorState.STOPPED, "two")
 
 
 def test_a_position_that_is_no_number_is_a_fault(bench):
     bench.stage.motors["C"].position = math.nan
     bench.tick()
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     assert bench.core.why.startswith("guide_y: the motor controller reports position nan")
 
 
 def test_a_motor_beyond_its_range_is_a_fault():
     bench = Bench().armed(deepest=1e6)
-    bench.core.request(say.Go(1, "insertion", 110.0, 10.0))
+    bench.core.request(protocol.MoveRequest(1, "insertion", 110.0, 10.0))
     bench.tick(100)
     bench.stage.motors["A"].commanded = bench.stage.motors["A"].position = 110_250.0
     bench.tick()
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
 
 
 # Rolls
@@ -238,14 +238,14 @@ def test_a_hold_of_a_servo_that_lags_is_no_fault(bench):
     bench.core.request(step(expected=AHEAD))
     bench.tick(4)
     bench.camera.tip = lambda _: (math.nan, 0.0, 0.0)
-    assert bench.until(1).state is State.HOLDING
+    assert bench.until(1).state is SupervisorState.HOLDING
     bench.tick(40)
-    assert bench.core.state is State.HOLDING
+    assert bench.core.state is SupervisorState.HOLDING
 
 
 def test_a_held_step_has_ended_by_the_time_it_is_reported(bench):
     bench.camera.tip = lambda time: (0.5 * time, 0.0, 0.01 * time)
-    slow = say.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
+    slow = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
     bench.core.request(step(expected=slow, duration=2.0))
     bench.tick(20)
     bench.camera.tip = lambda _: (math.nan, 0.0, 0.0)
@@ -280,14 +280,14 @@ def test_times_of_readings_are_those_of_the_motors_and_not_of_a_slow_tracker():
 
 
 def test_a_jog_is_no_faster_than_asked(bench):
-    bench.core.request(say.Go(1, "guide_y", 1.0, 2.0))
+    bench.core.request(protocol.MoveRequest(1, "guide_y", 1.0, 2.0))
     speeds = [call[2] for call in bench.stage.calls if call[0] == "set_speed"]
     assert speeds == pytest.approx([2.0 * 500.0])
 
 
 def test_a_speed_that_is_refused_has_the_unit_of_the_file(bench):
     for axis, speed in (("rotation", 4.0 * math.pi), ("guide_y", 12.5)):
-        bench.core.request(say.Go(1, axis, 1.0, speed))
+        bench.core.request(protocol.MoveRequest(1, axis, 1.0, speed))
         expected = {
             "rotation": "speed of rotation = 720 deg/s: must be above 0, at most 360 deg/s",
             "guide_y": "speed of guide_y = 12.5 mm/s: must be above 0, at most 10 mm/s",
@@ -305,22 +305,22 @@ def test_an_axis_beyond_its_range_is_armed_for_the_operator_alone_and_may_only_b
     if tracked:
         assert "guide_y = -16.000 mm: must be within -15.000 mm and 15.000 mm" in bench.sent[-1].why
         return
-    bench.core.request(say.Go(1, "guide_y", -16.5, 5.0))
+    bench.core.request(protocol.MoveRequest(1, "guide_y", -16.5, 5.0))
     assert bench.sent[-1].why.startswith("guide_y = -16.500 mm: must be within")
-    bench.core.request(say.Go(2, "guide_y", -15.5, 5.0))
+    bench.core.request(protocol.MoveRequest(2, "guide_y", -15.5, 5.0))
     assert bench.until(2).why == ""
-    bench.core.request(say.Go(3, "guide_y", 0.0, 5.0))
+    bench.core.request(protocol.MoveRequest(3, "guide_y", 0.0, 5.0))
     assert bench.until(3).why == ""
 
 
 def test_a_jog_may_not_go_deeper_than_the_insertion_may():
     bench = Bench().armed(deepest=20.0)
-    bench.core.request(say.Go(1, "insertion", 20.1, 5.0))
+    bench.core.request(protocol.MoveRequest(1, "insertion", 20.1, 5.0))
     assert "as far as this insertion may go" in bench.sent[-1].why
 
 
 def test_after_homing_the_rig_is_not_armed(bench):
-    bench.core.request(say.Home(1, "rotation"))
+    bench.core.request(protocol.HomeRequest(1, "rotation"))
     bench.until(1)
     bench.core.request(step(2))
     assert bench.sent[-1].why.startswith("step: refused while idle")
@@ -328,9 +328,9 @@ def test_after_homing_the_rig_is_not_armed(bench):
 
 def test_a_home_that_cannot_be_defined_is_a_fault(bench):
     bench.stage.define = lambda *_: bench.stage._called("define") or setattr(bench.stage, "lost", True)
-    bench.core.request(say.Home(1, "rotation"))
+    bench.core.request(protocol.HomeRequest(1, "rotation"))
     done = bench.until(1)
-    assert done.state is State.FAULT
+    assert done.state is SupervisorState.FAULT
     assert done.why == "no reply within 100 ms"
 
 
@@ -373,10 +373,10 @@ def test_late_readings_and_a_distorted_field_hold_the_needle(bad, why):
     bench.camera.read = read
     bench.tick(60)
     begin = 0.5 * bench.clock.now()
-    ahead = say.Expectation((begin, 0.0, 0.0), (begin + 2.0, 0.0, 0.0), 2.0)
+    ahead = protocol.Expectation((begin, 0.0, 0.0), (begin + 2.0, 0.0, 0.0), 2.0)
     bench.core.request(step(expected=ahead, duration=4.0, insertion=2.0))
     bench.tick(10)
-    assert bench.core.state is State.INSERTING
+    assert bench.core.state is SupervisorState.INSERTING
     state[bad] = {"late": 0.4, "indicator": 0.2}[bad]
     done = bench.until(1)
     assert done.why.startswith(why)

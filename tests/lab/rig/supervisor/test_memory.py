@@ -7,7 +7,7 @@ from itertools import count
 
 import pytest
 
-from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import protocol
 from stages import Bench
 
 WARM, MANY = 20, 200
@@ -33,7 +33,9 @@ def moved(bench, numbers, steps):
     """Move forth and back in steps, and forget what the bench has of them."""
     for number, _ in zip(numbers, range(steps), strict=False):
         way = 0.5 if number % 2 else -0.5
-        bench.core.request(say.Step(number, 0.0, {"insertion": way, "guide_y": 0.2 * way}, 0.1, None))
+        bench.core.request(
+            protocol.StepRequest(number, 0.0, {"insertion": way, "guide_y": 0.2 * way}, 0.1, None)
+        )
         bench.until(number)
         for kept in (bench.sent, bench.reports, bench.stage.calls):
             kept.clear()

@@ -19,9 +19,9 @@ from flexneedle.errors import DriverError, RefusedError, RigError, RunError, Sto
 from flexneedle.geometry.registration import identity
 from flexneedle.interrupts import SIGNALS
 from flexneedle.lab.rig.rig_file import Part
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from stages import rig_file
 
@@ -32,7 +32,7 @@ def task(driver="stages:real_motors", tracker="stages:Still", **settings):
     rig = rig_file().model_copy(
         update={"driver": Part(kind=driver, **settings), "tracker": Part(kind=tracker)}
     )
-    return say.Task(rig, monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
+    return protocol.SupervisorTask(rig, monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +42,7 @@ def in_the_folder_of_the_stage(monkeypatch):
 
 @pytest.fixture
 def supervisor():
-    with Supervisor(task()) as made:
+    with SupervisorClient(task()) as made:
         yield made
 
 
@@ -63,7 +63,7 @@ def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
 def test_its_process_collects_no_garbage_and_runs_ahead_of_others(tmp_path):
     """Where the system permits it: as root here, else with an rtprio limit."""
     notes = tmp_path / "notes"
-    with Supervisor(task("stages:reporting_motors", notes=str(notes))) as supervisor:
+    with SupervisorClient(task("stages:reporting_motors", notes=str(notes))) as supervisor:
         supervisor.wait(0.1)
     collects, policy = notes.read_text().split()
     assert collects == "False"
@@ -77,7 +77,7 @@ def test_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor
 
 
 def test_a_tip_that_is_not_measured_is_none():
-    with Supervisor(task(tracker="stages:Blind")) as supervisor:
+    with SupervisorClient(task(tracker="stages:Blind")) as supervisor:
         assert supervisor.tip(0.2) is None
 
 
@@ -98,7 +98,7 @@ def test_operators_move_axes(supervisor):
 def test_the_positions_after_a_motion_are_reported_before_its_end():
     """A home shifts them; who reads them as soon as it has ended gets the new ones."""
 
-    class Received(Supervisor):
+    class Received(SupervisorClient):
         def _take(self, message):
             super()._take(message)
             received.append(message)
@@ -111,11 +111,11 @@ def test_the_positions_after_a_motion_are_reported_before_its_end():
         supervisor.home("rotation")
     at = None
     for message in received:
-        if isinstance(message, say.Report):
+        if isinstance(message, protocol.TickReport):
             at = message.axes["rotation"].position
-        elif isinstance(message, say.Done):
+        elif isinstance(message, protocol.MotionResult):
             assert at == pytest.approx(0.5 if message.number == 1 else 0.0, abs=0.02)
-    assert [message.number for message in received if isinstance(message, say.Done)] == [1, 2]
+    assert [message.number for message in received if isinstance(message, protocol.MotionResult)] == [1, 2]
 
 
 def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
@@ -128,7 +128,7 @@ def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     with pytest.raises(RunError, match="not confirmed"):
         refuse(supervisor)
     assert shown == [{"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}]
-    assert supervisor.report.state is State.IDLE
+    assert supervisor.report.state is SupervisorState.IDLE
     supervisor.stop("the test")
     with pytest.raises(StoppedError, match="stopped: the test"):
         refuse(supervisor)
@@ -142,12 +142,12 @@ def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
         supervisor.step(0.0, {"insertion": 1.0}, 0.2)
     supervisor.reset()
     supervisor.arm()
-    assert supervisor.report.state is State.ARMED
+    assert supervisor.report.state is SupervisorState.ARMED
 
 
 def test_arming_that_ends_in_a_fault_has_its_reason():
     with (
-        Supervisor(task(off=-300.0)) as supervisor,
+        SupervisorClient(task(off=-300.0)) as supervisor,
         pytest.raises(DriverError, match=r"insertion: the motor does not follow: 0\.300 mm off"),
     ):
         supervisor.arm()
@@ -164,7 +164,7 @@ def test_a_signal_stops_the_motors(supervisor):
 def test_a_signal_to_the_client_stops_the_motors_before_the_client_has_handled_it(number):
     before = signal.set_wakeup_fd(-1)
     with ExitStack() as stack:
-        supervisor = stack.enter_context(Supervisor(task()))
+        supervisor = stack.enter_context(SupervisorClient(task()))
         stack.callback(signal.signal, number, signal.signal(number, lambda *_: None))
         supervisor.take_signals()
         supervisor.arm()
@@ -181,7 +181,7 @@ def test_another_signal_to_the_client_stops_nothing(supervisor):
     os.kill(os.getpid(), signal.SIGUSR1)
     supervisor.wait(0.1)
     signal.signal(signal.SIGUSR1, before)
-    assert supervisor.report.state is State.ARMED
+    assert supervisor.report.state is SupervisorState.ARMED
 
 
 def test_an_interrupt_that_falls_on_the_taking_of_a_lock_leaves_it_unlocked(supervisor, monkeypatch):
@@ -228,10 +228,10 @@ def test_a_stop_from_another_thread_ends_a_motion(supervisor):
 
 
 def test_a_stop_after_the_end_does_nothing():
-    with Supervisor(task()) as made:
+    with SupervisorClient(task()) as made:
         made.arm()
     made.request_stop("too late")
-    assert made.report.state is State.ARMED
+    assert made.report.state is SupervisorState.ARMED
 
 
 def test_a_supervisor_that_is_killed_is_an_error(supervisor):
@@ -245,19 +245,19 @@ def test_motors_are_moved_by_one_program_at_a_time(tmp_path):
     """The second one is refused before it sends anything; the end of the first, however it ends, releases them."""
     file = tmp_path / "calls"
     of_motors = {"driver": "stages:noting_motors", "file": str(file), "address": str(tmp_path)}
-    first = Supervisor(task(**of_motors))
+    first = SupervisorClient(task(**of_motors))
     with first:
         holder = re.escape(f"{tmp_path}: in use by pid {os.getpid()} (")
         with pytest.raises(DriverError, match=f"^{holder}.*: end it first$"):
-            Supervisor(task(**of_motors, tracker="stages:missing"))  # which the first one uses
+            SupervisorClient(task(**of_motors, tracker="stages:missing"))  # which the first one uses
         assert not file.exists()
-        with Supervisor(replace(task(**of_motors), dry=True)) as dry:
-            assert dry.report.state is State.IDLE
-        with Supervisor(task(**(of_motors | {"address": "another"}))):
+        with SupervisorClient(replace(task(**of_motors), dry=True)) as dry:
+            assert dry.report.state is SupervisorState.IDLE
+        with SupervisorClient(task(**(of_motors | {"address": "another"}))):
             pass
         os.kill(first.pid, signal.SIGKILL)
         until(lambda: ended(first.pid))
-        with Supervisor(task(**of_motors)) as second:
+        with SupervisorClient(task(**of_motors)) as second:
             second.arm()
 
 
@@ -265,12 +265,12 @@ def test_a_device_that_does_not_open_is_the_reason():
     with pytest.raises(
         DriverError, match=r"^driver stages:real_motors: ValueError: could not convert .*stages"
     ):
-        Supervisor(task(position="nowhere"))
+        SupervisorClient(task(position="nowhere"))
 
 
 def test_what_a_driver_prints_is_kept_from_standard_output(capfd):
     """There `insert --json` prints its result."""
-    with Supervisor(task(driver="stages:printing_motors")):
+    with SupervisorClient(task(driver="stages:printing_motors")):
         pass
     found = capfd.readouterr()
     assert found.out == ""
@@ -295,7 +295,7 @@ def test_a_motion_longer_than_the_heartbeat_is_kept_alive_by_its_client(supervis
 
 def test_after_a_suspended_computer_nothing_goes_on_by_itself():
     """The monotonic clock stands still meanwhile: no heartbeat is missed, and no tick late."""
-    with Supervisor(task("stages:suspended_motors")) as supervisor:
+    with SupervisorClient(task("stages:suspended_motors")) as supervisor:
         supervisor.arm()
         with pytest.raises(StoppedError, match=r"the computer was suspended for 3600\.0 s"):
             supervisor.step(0.0, {"insertion": 1.0}, 0.2)
@@ -305,7 +305,7 @@ def test_after_a_suspended_computer_nothing_goes_on_by_itself():
 
 def test_motors_of_a_dry_run_get_no_command(tmp_path):
     made = replace(task("stages:noting_motors", file=str(tmp_path / "calls")), dry=True)
-    with Supervisor(made) as supervisor:
+    with SupervisorClient(made) as supervisor:
         supervisor.arm()
         done = supervisor.step(0.0, {"insertion": 1.0}, 0.2)
         assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
@@ -366,4 +366,4 @@ else:
 )
 def test_a_rig_that_cannot_be_opened_is_refused_with_its_reason(given, why):
     with pytest.raises((DriverError, RigError), match=why):
-        Supervisor(task(**given))
+        SupervisorClient(task(**given))

@@ -12,9 +12,9 @@ from emulated import emulator
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.rig_file import Part
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.client import Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from stages import Bench, rig_file
 
 HELD = r"^insertion: was 0\.\d+ mm from its commanded position, now held where it is$"
@@ -35,9 +35,9 @@ def test_arming_holds_a_motor_where_it_is_if_it_rests_away_from_its_commanded_po
     bench.armed()
     assert powered(bench) == [("A", True), ("B", True), ("C", False), ("C", True)]
     bench.tick(20)
-    assert bench.core.state is State.ARMED
+    assert bench.core.state is SupervisorState.ARMED
     assert bench.reports[-1].why == "guide_y: was 0.400 mm from its commanded position, now held where it is"
-    bench.core.request(say.Go(1, "guide_y", 1.0, 5.0))
+    bench.core.request(protocol.MoveRequest(1, "guide_y", 1.0, 5.0))
     assert bench.until(1).why == ""
     assert bench.position("guide_y") == pytest.approx(1.0, abs=2e-3)
 
@@ -49,7 +49,7 @@ def test_what_no_check_at_rest_allows_is_held_where_it_is():
     bench.tick(2)
     bench.armed().tick(20)
     assert ("A", False) in powered(bench)
-    assert bench.core.state is State.ARMED
+    assert bench.core.state is SupervisorState.ARMED
 
 
 def test_a_motor_that_still_moves_is_not_switched_off_by_arming():
@@ -62,24 +62,24 @@ def test_a_motor_that_still_moves_is_not_switched_off_by_arming():
     bench.armed()
     assert ("C", False) not in powered(bench)
     bench.tick()
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
 
 
 def test_motors_are_switched_off_after_a_stop_only():
     bench = Bench().armed()
-    bench.core.request(say.Off())
+    bench.core.request(protocol.OffRequest())
     assert bench.sent[-1].why.startswith("off: refused while armed")
-    bench.core.request(say.Stop("the test"))
-    bench.core.request(say.Off())
+    bench.core.request(protocol.StopRequest("the test"))
+    bench.core.request(protocol.OffRequest())
     assert "motors have not come to rest yet" in bench.sent[-1].why
     bench.tick(2)
-    bench.core.request(say.Off())
+    bench.core.request(protocol.OffRequest())
     assert not any(motor.on for motor in bench.stage.motors.values())
     bench.tick(20)
-    assert bench.core.state is State.STOPPED
-    bench.core.request(say.Reset())
+    assert bench.core.state is SupervisorState.STOPPED
+    bench.core.request(protocol.ResetRequest())
     bench.armed().tick(5)
-    assert bench.core.state is State.ARMED
+    assert bench.core.state is SupervisorState.ARMED
 
 
 def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
@@ -94,11 +94,11 @@ def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
         kept(channel, on)
 
     bench.stage.power = power
-    bench.core.request(say.Stop("the test"))
+    bench.core.request(protocol.StopRequest("the test"))
     bench.tick(2)
-    bench.core.request(say.Off())
+    bench.core.request(protocol.OffRequest())
     assert [motor.on for motor in bench.stage.motors.values()] == [True, True, False]
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     assert bench.core.why == "insertion: A is in motion; rotation: the motor is still on"
 
 
@@ -114,7 +114,7 @@ def controller():
 
 def supervised(address):
     driver = Part(kind="galil", address=address, reply_timeout_ms=1000.0)
-    return Supervisor.of_operator(rig_file().model_copy(update={"driver": driver}))
+    return SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver}))
 
 
 def set_up(address, line):

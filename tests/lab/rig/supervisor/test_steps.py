@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.ports import MotorPaces
 from stages import TICK_S, Bench, Moves, Stage, rig_file
 
 
 def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
-    return say.Step(number, roll, travel or {"insertion": 1.0}, duration, expected)
+    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, duration, expected)
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def test_a_step_moves_all_axes_together_and_reports_what_was_done(bench):
     bench.core.request(step(insertion=1.0, guide_y=-0.3))
     done = bench.until(1)
     assert done.why == ""
-    assert done.state is State.INSERTING
+    assert done.state is SupervisorState.INSERTING
     assert done.travelled["insertion"] == pytest.approx(1.0, abs=1e-3)
     assert done.travelled["guide_y"] == pytest.approx(-0.3, abs=2e-3)
     assert done.travelled["rotation"] == 0.0
@@ -121,7 +121,7 @@ def test_counts_of_a_metre_have_the_speed_of_the_step_too():
 
 
 def test_a_roll_takes_its_own_time_before_the_travel(bench):
-    bench.core.request(say.Step(1, math.pi, {"insertion": 1.0}, 0.2, None, 2.0))
+    bench.core.request(protocol.StepRequest(1, math.pi, {"insertion": 1.0}, 0.2, None, 2.0))
     done = bench.until(1)
     assert done.turned == pytest.approx(2.0, abs=0.1)
     assert done.ended == pytest.approx(2.2, abs=0.15)
@@ -156,7 +156,7 @@ def test_a_roll_that_does_not_arrive_is_a_fault_and_the_needle_does_not_advance(
     bench.tick(3)
     bench.stage.motors["B"].fault = "stall"
     done = bench.until(1)
-    assert done.state is State.FAULT
+    assert done.state is SupervisorState.FAULT
     assert "rotation: the motor does not follow" in done.why
     assert bench.position("insertion") == 0.0
 
@@ -178,7 +178,7 @@ def test_a_step_that_moves_nothing_ends_at_once(bench):
 )
 def test_a_step_beyond_a_limit_is_refused_and_nothing_moves(bench, travel, why):
     bench.core.request(step(**travel))
-    assert [type(one) for one in bench.sent] == [say.Refused]
+    assert [type(one) for one in bench.sent] == [protocol.RequestRefused]
     assert bench.sent[0].why.startswith(why)
     bench.tick(10)
     assert not [call for call in bench.stage.calls if call[0] == "follow"]
@@ -205,7 +205,7 @@ def test_before_the_first_motion_a_position_is_uncertain_by_half_the_backlash_an
     bench.tick(2)
     found = bench.armed().position("guide_y")
     assert abs(found - axis) == pytest.approx(0.1)
-    bench.core.request(say.Go(1, "guide_y", 5.0, 2.0))
+    bench.core.request(protocol.MoveRequest(1, "guide_y", 5.0, 2.0))
     assert bench.until(1).why == ""
     assert motor.position / -500.0 - 0.1 == pytest.approx(5.0, abs=2e-3), "the axis, pushed by its motor"
     assert bench.position("guide_y") == pytest.approx(5.0, abs=2e-3)
@@ -214,20 +214,28 @@ def test_before_the_first_motion_a_position_is_uncertain_by_half_the_backlash_an
 def test_a_second_step_is_refused_while_one_is_under_way(bench):
     bench.core.request(step(1))
     bench.core.request(step(2))
-    assert bench.sent == [say.Refused(2, "step: refused: motors have not come to rest yet", State.INSERTING)]
+    assert bench.sent == [
+        protocol.RequestRefused(
+            2, "step: refused: motors have not come to rest yet", SupervisorState.INSERTING
+        )
+    ]
 
 
 def test_before_arming_a_step_is_refused():
     bench = Bench()
     bench.core.request(step())
-    assert bench.sent == [say.Refused(1, "step: refused while idle; accepted: arm, stop, fault", State.IDLE)]
+    assert bench.sent == [
+        protocol.RequestRefused(
+            1, "step: refused while idle; accepted: arm, stop, fault", SupervisorState.IDLE
+        )
+    ]
 
 
 def test_arming_beyond_a_range_is_refused():
     bench = Bench()
     bench.stage.motors["A"].position = -6000.0
     bench.armed()
-    assert bench.core.state is State.IDLE
+    assert bench.core.state is SupervisorState.IDLE
     assert bench.sent[0].why.startswith("arm: refused: insertion = -6.000 mm: must be within")
 
 
@@ -240,7 +248,7 @@ def test_a_rig_is_armed_where_lost_motion_may_have_left_it_and_refused_with_its_
     motor.position = motor.commanded = motor.target = 1000.0 * (low - beyond)
     bench.tick()
     bench.armed()
-    assert (bench.core.state is State.ARMED) == armed
+    assert (bench.core.state is SupervisorState.ARMED) == armed
     assert motor.on == armed
     if armed:
         bench.core.request(step())
@@ -254,5 +262,5 @@ def test_ticks_go_on_while_the_controller_thinks(bench):
     bench.tick(10, beat=False)
     assert len(bench.reports) == before + 10
     assert all(report.measurements for report in bench.reports[before:])
-    assert bench.core.state is State.INSERTING
+    assert bench.core.state is SupervisorState.INSERTING
     assert bench.reports[-1].time - bench.reports[-2].time == pytest.approx(TICK_S)

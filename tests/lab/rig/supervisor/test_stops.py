@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 
-from flexneedle.lab.rig.supervisor import messages as say
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from stages import Bench, rig_file
 
-FAR = say.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
+FAR = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 
 
 def step(number=1, roll=0.0, expected=None, **travel):
-    return say.Step(number, roll, travel or {"insertion": 1.0}, 0.2, expected)
+    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, 0.2, expected)
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def fail_on_the_way(bench, change):
     assert 0.1 < at < 0.9
     change(bench.stage)
     done = bench.until(1)
-    assert done.state is bench.core.state is State.FAULT
+    assert done.state is bench.core.state is SupervisorState.FAULT
     bench.tick(20)
     bench.stage.lost = False
     assert_rests(bench)
@@ -81,7 +81,7 @@ def test_an_overshoot_is_found_at_the_end_of_the_step(bench):
     bench.stage.motors["A"].fault = "overshoot"
     bench.core.request(step(insertion=0.5))
     done = bench.until(1)
-    assert done.state is State.FAULT
+    assert done.state is SupervisorState.FAULT
     assert done.why == "the motors have not arrived: insertion 0.100 mm from the goal"
 
 
@@ -90,7 +90,7 @@ def test_a_lost_controller_is_stopped_as_soon_as_it_can_be_reached_again(bench):
     bench.tick(2)
     bench.stage.lost = True
     bench.tick(20)
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     before = bench.stage.calls.count(("stop",))
     bench.stage.lost = False
     bench.tick(12)
@@ -103,7 +103,7 @@ def test_a_motor_that_goes_on_after_a_stop_is_stopped_again(bench):
     bench.core.request(step())
     bench.tick(2)
     kept, bench.stage.stop = bench.stage.stop, lambda: bench.stage.calls.append(("ignored",))
-    bench.core.request(say.Stop("the test"))
+    bench.core.request(protocol.StopRequest("the test"))
     bench.stage.motors["A"].target = 90_000.0
     bench.tick(5)
     assert bench.stage.calls.count(("ignored",)) == 1
@@ -120,9 +120,9 @@ def test_an_axis_that_moves_without_a_command_is_a_fault(bench):
         bench.tick()
 
     drift(19.0)
-    assert bench.core.state is State.ARMED  # 0.038 mm, twice the tolerance of a goal is 0.04 mm
+    assert bench.core.state is SupervisorState.ARMED  # 0.038 mm, twice the tolerance of a goal is 0.04 mm
     drift(25.0)
-    assert bench.core.state is State.FAULT
+    assert bench.core.state is SupervisorState.FAULT
     assert bench.core.why == "guide_y: moved by 0.050 mm without a command"
 
 
@@ -137,7 +137,7 @@ def test_a_limit_switch_that_becomes_active_while_its_motor_rests_is_a_fault(ben
     motor.low, motor.high = low, high
     bench.tick()
     assert bench.core.why == f"guide_y: at rest, {names} limit switch active"
-    assert bench.until(1).state is State.FAULT
+    assert bench.until(1).state is SupervisorState.FAULT
     assert bench.position("insertion") < 1.0
     assert_rests(bench)
 
@@ -168,7 +168,7 @@ def test_a_limit_switch_that_becomes_active_during_a_hold_is_a_fault(bench):
     bench.tick(2)
     bench.camera.tip = lambda _: (9.0, 9.0, 9.0)
     bench.tick()
-    assert bench.core.state is State.HOLDING
+    assert bench.core.state is SupervisorState.HOLDING
     assert not bench.reports[-1].at_rest
     bench.stage.motors["C"].low = 0.0
     bench.tick()
@@ -180,7 +180,7 @@ def test_a_channel_of_no_axis_that_a_driver_begins_to_report_changes_nothing(ben
     bench.stage.read = lambda: read() | {"X": replace(read()["A"], forward_limit=True)}
     bench.core.request(step())
     assert bench.until(1).travelled["insertion"] == pytest.approx(1.0, abs=0.02)
-    assert bench.core.state is State.INSERTING
+    assert bench.core.state is SupervisorState.INSERTING
 
 
 @pytest.mark.parametrize("side", ["low", "high"])
@@ -189,7 +189,7 @@ def test_an_operator_may_move_an_axis_whose_limit_switch_is_active(side):
     setattr(bench.stage.motors["C"], side, 0.0)
     bench.tick()
     bench.armed().tick(20)
-    assert bench.core.state is State.ARMED
+    assert bench.core.state is SupervisorState.ARMED
 
 
 AWAY = ", but the home is at 15.000 mm"
@@ -222,7 +222,7 @@ def test_no_insertion_begins_at_a_limit_switch_but_that_of_the_home_and_there(ho
     motor.low, motor.high = low, high
     bench.tick()
     bench.armed()
-    assert bench.core.state is (State.IDLE if problem else State.ARMED)
+    assert bench.core.state is (SupervisorState.IDLE if problem else SupervisorState.ARMED)
     if problem:
         assert bench.sent[-1].why == f"arm: refused: guide_y: {problem}"
         assert ("power", "C", True) not in bench.stage.calls
@@ -233,26 +233,26 @@ def test_after_a_stop_nothing_moves_until_the_rig_is_reset_and_armed(bench, stat
     if state == "inserting":
         bench.core.request(step())
         bench.tick(3)
-    bench.core.request(say.Stop("the keyboard"))
+    bench.core.request(protocol.StopRequest("the keyboard"))
     if state == "inserting":
         done = bench.until(1)
-        assert (done.state, done.why) == (State.STOPPED, "the keyboard")
+        assert (done.state, done.why) == (SupervisorState.STOPPED, "the keyboard")
         assert 0.0 < done.travelled["insertion"] < 1.0
     assert_rests(bench)
     bench.core.request(step(2))
-    bench.core.request(say.Arm(10.0))
-    assert [type(one) for one in bench.sent[-2:]] == [say.Refused, say.Refused]
+    bench.core.request(protocol.ArmRequest(10.0))
+    assert [type(one) for one in bench.sent[-2:]] == [protocol.RequestRefused, protocol.RequestRefused]
     assert bench.sent[-1].why == "arm: refused while stopped: the keyboard; accepted: stop, fault, reset, off"
-    bench.core.request(say.Reset())
-    assert bench.core.state is State.IDLE
-    bench.core.request(say.Arm(10.0))
-    assert bench.core.state is State.ARMED
+    bench.core.request(protocol.ResetRequest())
+    assert bench.core.state is SupervisorState.IDLE
+    bench.core.request(protocol.ArmRequest(10.0))
+    assert bench.core.state is SupervisorState.ARMED
 
 
 def test_without_a_heartbeat_a_motion_is_stopped(bench):
-    bench.core.request(say.Go(1, "insertion", 20.0, 2.0))
+    bench.core.request(protocol.MoveRequest(1, "insertion", 20.0, 2.0))
     bench.tick(30, beat=False)
-    assert bench.core.state is State.STOPPED
+    assert bench.core.state is SupervisorState.STOPPED
     assert bench.core.why.startswith("no heartbeat of the controller for 0.5")
     assert bench.position("insertion") < 1.3
     assert_rests(bench)
@@ -262,9 +262,9 @@ def test_without_a_command_the_insertion_is_stopped(bench):
     bench.core.request(step())
     bench.until(1)
     bench.tick(79, beat=False)
-    assert bench.core.state is State.INSERTING
+    assert bench.core.state is SupervisorState.INSERTING
     bench.tick(5, beat=False)
-    assert bench.core.state is State.STOPPED
+    assert bench.core.state is SupervisorState.STOPPED
     assert bench.core.why.startswith("no command of the controller for 2.0")
 
 
@@ -278,15 +278,15 @@ def test_without_a_command_the_insertion_is_stopped(bench):
     ],
 )
 def test_a_bad_reading_holds_the_needle(bench, tip, seconds, why):
-    expected = say.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
+    expected = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
     bench.camera.tip = lambda time: (min(1.0, 0.5 * time), 0.0, 0.01 * time)
-    bench.core.request(say.Step(1, 0.0, {"insertion": 1.0}, 2.0, expected))
+    bench.core.request(protocol.StepRequest(1, 0.0, {"insertion": 1.0}, 2.0, expected))
     bench.tick(8)
     bench.camera.tip = tip
     begun = bench.clock.now()
     done = bench.until(1)
     assert bench.clock.now() - begun <= seconds + 0.3
-    assert done.state is State.HOLDING
+    assert done.state is SupervisorState.HOLDING
     assert done.why.startswith(why)
     assert 0.0 < done.travelled["insertion"] < 1.0
     assert_rests(bench)
@@ -294,7 +294,7 @@ def test_a_bad_reading_holds_the_needle(bench, tip, seconds, why):
 
 def test_a_short_dropout_does_not_hold_the_needle(bench):
     bench.camera.tip = lambda time: (time, 0.0, 0.01 * time)
-    bench.core.request(step(expected=say.Expectation((0.1, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)))
+    bench.core.request(step(expected=protocol.Expectation((0.1, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)))
     bench.tick(2)
     seen, bench.camera.tip = bench.camera.tip, lambda _: None
     bench.tick(3)
@@ -312,11 +312,11 @@ def test_a_held_needle_moves_on_only_by_a_new_step_and_only_with_good_readings(b
     assert (done.why[:10], done.travelled["insertion"]) == ("innovation", 0.0)
     bench.camera.tip = lambda time: (0.5, 0.0, 1e-3 * time)
     bench.tick(200)
-    assert bench.core.state is State.HOLDING
+    assert bench.core.state is SupervisorState.HOLDING
     assert_rests(bench)
     bench.core.request(step(3, expected=FAR))
     assert bench.until(3).why == ""
-    assert bench.core.state is State.INSERTING
+    assert bench.core.state is SupervisorState.INSERTING
 
 
 def test_a_reading_is_judged_again_by_what_the_next_step_expects(bench):
@@ -325,7 +325,7 @@ def test_a_reading_is_judged_again_by_what_the_next_step_expects(bench):
     bench.camera.tip = lambda time: (0.5, min(5.0, 10.0 * time), 1e-3 * time)
     assert bench.until(1).why.startswith("innovation: 2.")
     bench.tick(60)
-    there = say.Expectation((0.5, 5.0, 0.0), (1.5, 5.0, 0.0), 2.0)
+    there = protocol.Expectation((0.5, 5.0, 0.0), (1.5, 5.0, 0.0), 2.0)
     bench.core.request(step(2, expected=there))
     assert bench.until(2).why == ""
 
@@ -343,23 +343,23 @@ def test_a_roll_is_completed_when_the_needle_is_held(bench):
 
 
 def test_jogging_homing_and_retracting(bench):
-    bench.core.request(say.Go(1, "guide_y", 3.0, 5.0))
-    assert bench.core.state is State.JOGGING
-    assert bench.until(1).state is State.ARMED
+    bench.core.request(protocol.MoveRequest(1, "guide_y", 3.0, 5.0))
+    assert bench.core.state is SupervisorState.JOGGING
+    assert bench.until(1).state is SupervisorState.ARMED
     assert bench.position("guide_y") == pytest.approx(3.0, abs=2e-3)
-    bench.core.request(say.Go(2, "insertion", 1.0, 5.0, retract=True))
+    bench.core.request(protocol.MoveRequest(2, "insertion", 1.0, 5.0, retract=True))
     assert "must withdraw the base, which is at 0.000 mm" in bench.sent[-1].why
-    bench.core.request(say.Go(3, "insertion", -2.0, 5.0, retract=True))
-    assert bench.core.state is State.RETRACTING
+    bench.core.request(protocol.MoveRequest(3, "insertion", -2.0, 5.0, retract=True))
+    assert bench.core.state is SupervisorState.RETRACTING
     bench.until(3)
     assert bench.position("insertion") == pytest.approx(-2.0)
     for bad in (
-        say.Go(4, "insertion", 120.0, 5.0),
-        say.Go(5, "insertion", 1.0, 50.0),
-        say.Go(6, "x", 1.0, 5.0),
+        protocol.MoveRequest(4, "insertion", 120.0, 5.0),
+        protocol.MoveRequest(5, "insertion", 1.0, 50.0),
+        protocol.MoveRequest(6, "x", 1.0, 5.0),
     ):
         bench.core.request(bad)
-        assert isinstance(bench.sent[-1], say.Refused)
+        assert isinstance(bench.sent[-1], protocol.RequestRefused)
 
 
 def test_a_state_that_is_repeated_does_not_show_that_a_motor_rests(bench):
@@ -380,8 +380,8 @@ def test_a_state_that_is_repeated_does_not_show_that_a_motor_rests(bench):
     bench.tick(4)
     bench.camera.tip = lambda _: (9.0, 9.0, 9.0)
     done = bench.until(1)
-    assert done.state is State.HOLDING
+    assert done.state is SupervisorState.HOLDING
     assert done.travelled["insertion"] == pytest.approx(1e-3 * bench.stage.motors["A"].position, abs=2e-3)
     bench.tick(40)
-    assert bench.core.state is State.HOLDING
+    assert bench.core.state is SupervisorState.HOLDING
     assert bench.reports[-1].at_rest

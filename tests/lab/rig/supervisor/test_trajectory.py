@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.measured import span
-from flexneedle.lab.rig.supervisor.trajectory import between
+from flexneedle.lab.rig.supervisor.trajectory import fit_span, plan_trajectory
 from stages import rig_file
 
 DRIVES = {axis.channel: Drive(name, axis) for name, axis in rig_file().axes.items()}
@@ -20,7 +19,7 @@ def travelling(ways, duration):
     """The motion from 7 counts by ways in mm or rad."""
     start = dict.fromkeys(ways, 7.0)
     goal = {channel: 7.0 + way * DRIVES[channel].axis.scale for channel, way in ways.items()}
-    return between({channel: DRIVES[channel] for channel in ways}, start, goal, duration)
+    return plan_trajectory({channel: DRIVES[channel] for channel in ways}, start, goal, duration)
 
 
 @given(WAYS, st.floats(0.0, 30.0))
@@ -66,12 +65,12 @@ def test_the_measured_begin_and_end_are_those_of_the_constant_speed_inside_the_r
     """A trapezoid with ramps h covers its middle like a motion at constant speed from h/2 to T − h/2."""
     made = travelling({"A": way}, duration)
     samples = [(late + time, made.share(time)) for time in np.arange(0.0, made.duration, 0.01)]
-    begun, ended = span(samples, -9.0, 9.0)
+    begun, ended = fit_span(samples, -9.0, 9.0)
     if begun != -9.0:
         assert begun == pytest.approx(late + 0.5 * made.ramp, abs=0.35 * made.ramp + 1e-6)
         assert ended == pytest.approx(late + made.duration - 0.5 * made.ramp, abs=0.35 * made.ramp + 1e-6)
 
 
 def test_too_few_samples_on_the_way_give_the_times_of_the_command():
-    assert span([(0.0, 0.0), (0.1, 0.5), (0.2, 1.0)], 0.0, 0.2) == (0.0, 0.2)
-    assert span([(0.1, 0.5), (0.2, 0.5), (0.3, 0.5)], 0.0, 0.2) == (0.0, 0.2)
+    assert fit_span([(0.0, 0.0), (0.1, 0.5), (0.2, 1.0)], 0.0, 0.2) == (0.0, 0.2)
+    assert fit_span([(0.1, 0.5), (0.2, 0.5), (0.3, 0.5)], 0.0, 0.2) == (0.0, 0.2)

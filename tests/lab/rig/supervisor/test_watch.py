@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from flexneedle.lab.rig.supervisor.messages import Expectation
-from flexneedle.lab.rig.supervisor.watch import Watch
+from flexneedle.lab.rig.supervisor.protocol import Expectation
+from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, VerdictKind
@@ -22,10 +22,10 @@ def measured(number, time=NOW, x=0.0):
 
 def watched(*readings):
     """The verdict at the begin of the first step after these readings, each of one tick."""
-    watch = Watch(Monitor(MonitorSettings(references=0)), 0.25, 0.0)
+    watch = TipWatch(Monitor(MonitorSettings(references=0)), 0.25, 0.0)
     for reading in readings:
-        watch = watch.after([reading], NOW, VISIBLE)
-    return watch.expecting(AT_TIP, NOW, NOW + 1.0).verdict
+        watch = watch.with_readings([reading], NOW, VISIBLE)
+    return watch.with_expectation(AT_TIP, NOW, NOW + 1.0).verdict
 
 
 @pytest.mark.parametrize(
@@ -48,10 +48,12 @@ def test_a_good_reading_ends_the_rejection():
 
 
 def test_while_a_motion_waits_for_its_motors_so_does_what_is_expected_of_the_tip():
-    watch = Watch(Monitor(MonitorSettings(references=0)), 0.25, 0.0).expecting(AT_TIP, NOW, NOW + 1.0)
-    assert watch.waiting(NOW + 0.5, 1.0).ended == NOW + 2.0
-    assert watch.waiting(NOW + 1.5, 1.0).ended == NOW + 1.0
-    halfway = replace(
-        watch.waiting(NOW + 0.5, 1.0), expected=Expectation((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1)
+    watch = TipWatch(Monitor(MonitorSettings(references=0)), 0.25, 0.0).with_expectation(
+        AT_TIP, NOW, NOW + 1.0
     )
-    assert halfway.after([measured(4, NOW + 1.0, 4.5)], NOW + 1.0, VISIBLE).verdict.ok
+    assert watch.with_later_end(NOW + 0.5, 1.0).ended == NOW + 2.0
+    assert watch.with_later_end(NOW + 1.5, 1.0).ended == NOW + 1.0
+    halfway = replace(
+        watch.with_later_end(NOW + 0.5, 1.0), expected=Expectation((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1)
+    )
+    assert halfway.with_readings([measured(4, NOW + 1.0, 4.5)], NOW + 1.0, VISIBLE).verdict.ok

@@ -22,9 +22,9 @@ from flexneedle.lab.rig.check import Wanted, check_rig
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.start import announced
 from flexneedle.lab.rig.supervised import SupervisedRig, Tick
-from flexneedle.lab.rig.supervisor.client import CONTROLLER, Supervisor
-from flexneedle.lab.rig.supervisor.machine import State
-from flexneedle.lab.rig.supervisor.messages import Report
+from flexneedle.lab.rig.supervisor.client import CONTROLLER, SupervisorClient
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.check import check_ros
 from flexneedle.loop.choices import Choices
@@ -88,9 +88,9 @@ class RigGate(Gate):
     def __init__(self, reporter: InsertionReporter, scenario: Scenario) -> None:
         self._reporter, self._scenario = reporter, scenario
         self._control = reporter.task.control
-        self._supervisor: Supervisor | None = None
+        self._supervisor: SupervisorClient | None = None
         self._lock = Lock()
-        self._state, self._why = str(State.IDLE), ""
+        self._state, self._why = str(SupervisorState.IDLE), ""
         self._waits, self._moves, self._last = 0, list[str](), RigReport(state="")
         self._count = 0
         self._control.on_stop = self.stop
@@ -102,7 +102,7 @@ class RigGate(Gate):
 
     def confirm(self, rig: Any) -> None:
         """Report the motions, and wait for "go". Raises StoppedError after a stop, DriverError after a fault."""
-        supervisor: Supervisor = rig
+        supervisor: SupervisorClient = rig
         self._supervisor = supervisor
         if self._control.stopped:
             raise StoppedError(f"stopped: {self._control.stopped}")
@@ -122,13 +122,13 @@ class RigGate(Gate):
             self._go()
         return held
 
-    def take(self, report: Report) -> None:
+    def take(self, report: TickReport) -> None:
         """Report the new state of the rig; stop it if the server is silent."""
         silent = monotonic() - self._control.heard
         if silent > SILENT_S and not self._control.stopped:
             self._control.stopped = f"no signal of the page's server for {silent:.1f} s"
             self.stop(self._control.stopped)
-        ended = report.state is State.STOPPED and report.why == CONTROLLER
+        ended = report.state is SupervisorState.STOPPED and report.why == CONTROLLER
         self._state, self._why = ("ended", "") if ended else (str(report.state), report.why)
         self._report()
 
@@ -138,7 +138,7 @@ class RigGate(Gate):
             self._supervisor.request_stop(why)
 
     @property
-    def _opened(self) -> Supervisor:
+    def _opened(self) -> SupervisorClient:
         if self._supervisor is None:
             raise RuntimeError("the rig is not open")
         return self._supervisor
@@ -155,8 +155,8 @@ class RigGate(Gate):
 
     def _report(self) -> None:
         with self._lock:
-            holds = self._waits and self._state == State.INSERTING
-            state, why = (State.HOLDING, self._control.held) if holds else (self._state, self._why)
+            holds = self._waits and self._state == SupervisorState.INSERTING
+            state, why = (SupervisorState.HOLDING, self._control.held) if holds else (self._state, self._why)
             report = RigReport(str(state), why, self._waits, tuple(self._moves))
             if report != self._last:
                 self._last = report

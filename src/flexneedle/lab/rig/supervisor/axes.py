@@ -1,17 +1,22 @@
-"""The axes of a rig over their motors: what was read of them last, and where they were last sent."""
+"""Axes of a rig over their motors: the last readings, and the goals of the motors."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import isfinite
 
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.supervisor.checks import at_home, at_switch, misplaced, rests, switches
-from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.messages import AxisState
-from flexneedle.lab.rig.supervisor.motion import Leg, leg_of, positions
+from flexneedle.lab.rig.supervisor.checks import (
+    active_switches,
+    is_at_home,
+    is_at_rest,
+    is_at_switch,
+    is_misplaced,
+)
+from flexneedle.lab.rig.supervisor.drives import Drive, MotorReading
+from flexneedle.lab.rig.supervisor.motion import Leg, make_leg
+from flexneedle.lab.rig.supervisor.protocol import AxisState
 from flexneedle.ports import Clock, MotorPaces, Motors, MotorState
 
 _SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller takes
@@ -20,26 +25,11 @@ _REST_S = (
 )
 
 
-@dataclass(frozen=True)
-class Reading:
-    """The states of the motors by channel, and when they were asked for and known (s): they are of a time between."""
-
-    states: Mapping[str, MotorState]
-    asked: float
-    known: float
-
-    @property
-    def time(self) -> float:
-        """When they most likely were (s)."""
-        return 0.5 * (self.asked + self.known)
-
-
 class RigAxes:
-    """Drives by axis, their motors, the last reading and the one before it, where motors were last sent (counts by
-    channel), and limit switches by channel that were active as positions were taken, and still are.
+    """Axes of a rig over their motors: drives by axis, readings, goals (counts by channel) and known limit switches.
 
-    lost: whether the motors could not be reached, so that they are not known to
-    rest, until they are stopped. Calls of motors raise DriverError.
+    lost: the motors could not be reached, so that they are not known to rest until they are stopped. A switch is
+    known if it was active when positions were taken, and still is. Calls of motors raise DriverError.
     """
 
     def __init__(self, rig: RigFile, motors: Motors, clock: Clock) -> None:
@@ -62,69 +52,70 @@ class RigAxes:
     @property
     def at_rest(self) -> bool:
         """Whether all motors are known to rest."""
-        return not self.lost and all(map(self.rests, self.drives.values()))
+        return not self.lost and all(map(self.is_at_rest, self.drives.values()))
 
-    def rests(self, drive: Drive) -> bool:
-        """Whether an axis rests, its servo included, as far as readings show that are long enough apart."""
+    def is_at_rest(self, drive: Drive) -> bool:
+        """Return whether an axis rests, its servo included, as far as readings show that are long enough apart."""
         past, channel = self._past[0], drive.axis.channel
         apart = self.newest.asked - past.known >= _REST_S
-        return apart and rests(drive, self.newest.states[channel], past.states[channel])
+        return apart and is_at_rest(drive, self.newest.states[channel], past.states[channel])
 
     @property
     def positions(self) -> dict[str, float]:
         """Measured positions (mm or rad) by axis."""
-        return positions(self.drives, self.states)
+        return positions_of(self.drives, self.states)
 
     @property
     def slowing(self) -> float:
         """Longest time (s) in which an axis slows down from its largest speed."""
         return max(drive.axis.speed / drive.axis.acceleration for drive in self.drives.values())
 
-    def shown(self, leg: Leg | None) -> dict[str, AxisState]:
-        """Position, motor, and motion in the queue by axis, for reports. leg: under way."""
-        at, queued = self.positions, {} if leg is None else leg.queued(self.states)
+    def axis_states(self, leg: Leg | None) -> dict[str, AxisState]:
+        """Return position, motor, and motion in the queue by axis, for reports. leg: under way."""
+        at, queued = self.positions, {} if leg is None else leg.queued_distances(self.states)
         return {
             name: AxisState(at[name], self.state(drive), queued.get(name, 0.0))
             for name, drive in self.drives.items()
         }
 
     def state(self, drive: Drive) -> MotorState:
-        """The state of an axis's motor."""
+        """Return the state of an axis's motor."""
         return self.newest.states[drive.axis.channel]
 
-    def at_home(self, drive: Drive) -> bool:
-        """Whether an axis is at the limit switch of its home, and rests there, its servo included."""
-        return at_home(drive, self.state(drive)) and self.rests(drive)
+    def is_at_home(self, drive: Drive) -> bool:
+        """Return whether an axis is at the limit switch of its home, and rests there, its servo included."""
+        return is_at_home(drive, self.state(drive)) and self.is_at_rest(drive)
 
-    def at_switch(self, drive: Drive) -> bool:
-        """Whether the limit switch of an axis's home is active; the axis may not be at rest yet."""
-        return at_switch(drive, self.state(drive))
+    def is_at_switch(self, drive: Drive) -> bool:
+        """Return whether the limit switch of an axis's home is active; the axis may not be at rest yet."""
+        return is_at_switch(drive, self.state(drive))
 
     def goal(self, name: str) -> float:
-        """Where an axis was last sent, or where it was when it last was stopped (mm or rad)."""
+        """Return the last goal of an axis, or its position when it was last stopped (mm or rad)."""
         drive = self.drives[name]
-        return drive.position(self.goals[drive.axis.channel])
+        return drive.to_position(self.goals[drive.axis.channel])
 
     # Where the axes are taken to be
 
     def settle(self, *drives: Drive) -> None:
-        """Take where motors rest as where they were sent: those of axes, without any all.
+        """Set goals to current positions, for the given axes or all.
 
-        A servo that lags still moves to where its controller has it.
+        A servo that lags still moves to its controller's commanded position.
         """
         for drive in drives or self.drives.values():
             state = self.state(drive)
             self.goals[drive.axis.channel] = state.commanded if state.on else state.position
 
     def take_positions(self) -> None:
-        """Take where the motors are as where they were sent, and as reported."""
+        """Set goals and reported positions to current positions."""
         self.settle()
         self._reported = self.positions
-        self.switches = {drive.axis.channel: switches(self.state(drive)) for drive in self.drives.values()}
+        self.switches = {
+            drive.axis.channel: active_switches(self.state(drive)) for drive in self.drives.values()
+        }
 
     def take_travel(self) -> dict[str, float]:
-        """The travel (mm or rad) by axis from where the motion before was reported to have ended, so that what motors
-        settle since then counts, too."""
+        """Return the travel (mm or rad) by axis since the reported end of the motion before, settling included."""
         at, before = self.positions, self._reported
         self._reported = at
         return {name: at[name] - before[name] for name in at}
@@ -133,27 +124,28 @@ class RigAxes:
 
     def read(self) -> None:
         """Read the states of all motors."""
-        with self._reached():
+        with self._mark_lost_on_error():
             self.before, self.newest = self.newest, self._read()
         self._past.append(self.newest)
         while len(self._past) > 1 and self.newest.asked - self._past[1].known >= _REST_S:
             self._past.popleft()
         self.switches = {
-            channel: active & switches(self.states[channel]) for channel, active in self.switches.items()
+            channel: active & active_switches(self.states[channel])
+            for channel, active in self.switches.items()
         }
 
     def power_on(self) -> str:
-        """Switch all motors on, and read them; return what else was changed, or "".
+        """Switch all motors on, and read them; return a note of further changes, or "".
 
-        A motor that is on, and rests away from where its controller has it, is switched off before: switched on again,
-        it is held where it is.
+        A motor that is on, and rests away from its commanded position, is switched off before, so that it is held at
+        its position.
         """
         changed = []
-        with self._reached():
+        with self._mark_lost_on_error():
             for drive in self.drives.values():
                 if self._is_misplaced(drive):
                     self._motors.power(drive.axis.channel, False)
-                    off = drive.shown(abs(drive.error(self.state(drive))))
+                    off = drive.shown(abs(drive.error_of(self.state(drive))))
                     changed.append(
                         f"{drive.name}: was {off} from its commanded position, now held where it is"
                     )
@@ -162,9 +154,9 @@ class RigAxes:
         return "; ".join(changed)
 
     def _is_misplaced(self, drive: Drive) -> bool:
-        """Whether a motor is on, and rests too far from where its controller has it."""
+        """Return whether a motor is on, and rests too far from its commanded position."""
         state, before = self.state(drive), self.before.states[drive.axis.channel]
-        return state.on and rests(drive, state, before) and misplaced(drive, state)
+        return state.on and is_at_rest(drive, state, before) and is_misplaced(drive, state)
 
     def power_off(self) -> None:
         """Switch all motors off, the others also where one cannot be; raise DriverError with all problems."""
@@ -180,18 +172,18 @@ class RigAxes:
         if problems:
             raise DriverError("; ".join(problems.values()))
 
-    def from_home(self, drive: Drive) -> float:
-        """What is missing in the position of a motor (counts) whose axis is at its home now."""
+    def home_offset(self, drive: Drive) -> float:
+        """Return the correction of a motor's position (counts) whose axis is at its home now."""
         now = self.drives[drive.name]
-        return now.counts(now.axis.at_home) - self.state(now).position
+        return now.to_counts(now.axis.at_home) - self.state(now).position
 
     def shift(self, drive: Drive, counts: float) -> None:
-        """Shift the position of a motor where it rests, and with it where it was sent, and what was reported."""
+        """Shift the position of a motor at rest, and with it its goal and its reported position."""
         self.read()  # a servo may have settled since
         position = self.state(drive).position + counts
         if not isfinite(position):
             raise DriverError(f"{drive.name}: its home cannot be set at position {position:g}")
-        with self._reached():
+        with self._mark_lost_on_error():
             self._motors.define(drive.axis.channel, position)
         self.read()
         self.settle(drive)
@@ -199,15 +191,15 @@ class RigAxes:
 
     def stop(self) -> None:
         """Stop all motors; those that were lost are connected again before."""
-        with self._reached():
+        with self._mark_lost_on_error():
             if self.lost:
                 self._motors.reconnect()
             self._motors.stop()
             self.lost = False
 
     def leg(self, travel: Mapping[str, float], duration: float, now: float) -> Leg | None:
-        """The leg of a travel (mm or rad by axis) from where the axes were last sent; None where nothing moves."""
-        leg = leg_of(self.drives, self.goals, travel, duration, now)
+        """Return the leg of a travel (mm or rad by axis) from the present goals; None if nothing moves."""
+        leg = make_leg(self.drives, self.goals, travel, duration, now)
         if leg is not None:
             self.drives |= {drive.name: drive for drive in leg.drives.values()}
         return leg
@@ -227,23 +219,28 @@ class RigAxes:
         self._motors.follow(leg.targets(now, self._loop, self.states))
 
     def keep_goal(self, leg: Leg) -> None:
-        """Take the goal of a leg as where its motors were sent."""
+        """Set the goals of motors to the end of a leg."""
         self.goals |= leg.trajectory.goal
 
-    def _read(self) -> Reading:
+    def _read(self) -> MotorReading:
         begun = self._clock.now()
         states = dict(self._motors.read())
         if missing := [
             drive.axis.channel for drive in self.drives.values() if drive.axis.channel not in states
         ]:
             raise DriverError(f"the driver reports no state of channel {', '.join(missing)}")
-        return Reading(states, begun, self._clock.now())
+        return MotorReading(states, begun, self._clock.now())
 
     @contextmanager
-    def _reached(self) -> Iterator[None]:
-        """A call without which nothing is known of the motors."""
+    def _mark_lost_on_error(self) -> Iterator[None]:
+        """Mark the motors as lost if the block raises DriverError."""
         try:
             yield
         except DriverError:
             self.lost = True
             raise
+
+
+def positions_of(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> dict[str, float]:
+    """Return the measured positions (mm or rad) by axis."""
+    return {name: drive.to_position(states[drive.axis.channel].position) for name, drive in drives.items()}

@@ -1,9 +1,11 @@
 """Checks of motors at each tick: pure functions that return a problem in one line, or ""."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.homes import homed_at, may_be_at_switch
+from flexneedle.lab.rig.supervisor.drives import Drive, MotorReading, is_near_switch, position_after_homing
+from flexneedle.lab.rig.supervisor.motion import CommandedMotion
 from flexneedle.ports import MotorState
 
 STILL = 2.0
@@ -13,17 +15,17 @@ _CREEP = 0.1  # of the tolerance a servo that still follows moves at least betwe
 
 
 def number_problem(drive: Drive, state: MotorState) -> str:
-    """A position that is not a number."""
-    if math.isfinite(drive.error(state)):
+    """Report a position that is not a number."""
+    if math.isfinite(drive.error_of(state)):
         return ""
     return f"{drive.name}: the motor controller reports position {state.position:g}, commanded {state.commanded:g}"
 
 
 def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
-    """A motor that is off, was stopped by the motor controller since the reading before, or does not follow."""
-    error = drive.error(state)
+    """Report a motor that is off, was stopped by the motor controller since the reading before, or does not follow."""
+    error = drive.error_of(state)
     if not state.on:
-        return f"{drive.name}: the motor is off{_because(state.stopped)}"
+        return f"{drive.name}: the motor is off{_format_reason(state.stopped)}"
     if state.stopped and state.stopped != before.stopped:
         return f"{drive.name}: stopped by the motor controller: {state.stopped}"
     if abs(error) > drive.axis.max_error:
@@ -35,29 +37,32 @@ def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
 def position_problem(
     drive: Drive, state: MotorState, before: MotorState, seconds: float, *, unlimited: bool = False
 ) -> str:
-    """A position that jumped since the reading before, `seconds` ago, or goes further beyond a soft limit.
+    """Report a position that jumped since the reading before, `seconds` ago, or moves further beyond a soft limit.
 
-    unlimited: the position counts from nowhere, as during homing, so that limits mean nothing.
+    unlimited: positions have no origin yet, as during homing, so that limits have no meaning.
     """
     moved = abs((state.position - before.position) / drive.axis.scale)
     most = _HASTE * drive.axis.speed * seconds + drive.axis.max_error
     if moved > most:
         return f"{drive.name}: the position jumped by {drive.shown(moved)} in {seconds:.3f} s"
-    outside, further = _outside(drive, state), _outside(drive, before) + drive.axis.tolerance
+    outside, further = (
+        _distance_outside(drive, state),
+        _distance_outside(drive, before) + drive.axis.tolerance,
+    )
     if not unlimited and outside > drive.axis.max_error and outside > further:
         low, high = map(drive.shown, drive.axis.limits)
-        return f"{drive.name}: at {drive.shown(drive.position(state.position))}, beyond its range {low} to {high}"
+        return f"{drive.name}: at {drive.shown(drive.to_position(state.position))}, beyond its range {low} to {high}"
     return ""
 
 
-def _outside(drive: Drive, state: MotorState) -> float:
-    """How far a position is beyond the range (mm or rad)."""
-    position, (low, high) = drive.position(state.position), drive.axis.limits
+def _distance_outside(drive: Drive, state: MotorState) -> float:
+    """Return the distance of a position beyond the range (mm or rad)."""
+    position, (low, high) = drive.to_position(state.position), drive.axis.limits
     return max(low - position, position - high, 0.0)
 
 
 def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: float) -> str:
-    """A motor that went back on its way (counts, signed) since the reading before: its position was reset.
+    """Report a motor that moved back on its way (counts, signed) since the reading before: its position was reset.
 
     A jump within what its speed allows is found by its direction alone.
     """
@@ -68,7 +73,7 @@ def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: f
 
 
 def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -> str:
-    """A motor that is beyond the target that was last sent, or behind where it began (counts).
+    """Report a motor that is beyond its last target, or behind the start of its motion (counts).
 
     The controller's own profile may be wrong, too, and its position error small.
     """
@@ -81,8 +86,9 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
     return ""
 
 
-def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
-    """Whether a motor rests, its servo included, which may follow on when the controller's profile has ended.
+def is_at_rest(drive: Drive, state: MotorState, before: MotorState) -> bool:
+    """Return whether a motor rests, its servo included, which may still follow after the end of the controller's
+    profile.
 
     before: long enough ago that a servo that follows on has moved. A state that is repeated does not show it.
     """
@@ -93,21 +99,21 @@ def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
     return not state.moving and moved <= max(_CREEP * tolerance, min(count, tolerance))
 
 
-def at_switch(drive: Drive, state: MotorState) -> bool:
-    """Whether an axis is at the limit switch of its home, where the motor controller stops it."""
+def is_at_switch(drive: Drive, state: MotorState) -> bool:
+    """Return whether an axis is at the limit switch of its home, where the motor controller stops it."""
     return state.reverse_limit if drive.axis.home == "reverse-limit" else state.forward_limit
 
 
-def at_home(drive: Drive, state: MotorState) -> bool:
-    """Whether an axis is at the limit switch of its home, and rests there."""
-    return at_switch(drive, state) and not state.moving
+def is_at_home(drive: Drive, state: MotorState) -> bool:
+    """Return whether an axis is at the limit switch of its home, and rests there."""
+    return is_at_switch(drive, state) and not state.moving
 
 
 def switch_problem(drive: Drive, state: MotorState) -> str:
-    """An axis that has left the limit switch of its home, which is still active."""
-    if not at_home(drive, state):
+    """Report that the limit switch of the home is still active after an axis has left it."""
+    if not is_at_home(drive, state):
         return ""
-    way = abs(homed_at(drive.axis) - drive.axis.at_home)
+    way = abs(position_after_homing(drive.axis) - drive.axis.at_home)
     why = "it is stuck, or needs more room: a home further beyond the range"
     return (
         f"{drive.name}: the {drive.axis.home} switch is still active {drive.shown(way)} away from it: {why}"
@@ -115,57 +121,104 @@ def switch_problem(drive: Drive, state: MotorState) -> str:
 
 
 def stuck_problem(drive: Drive, state: MotorState) -> str:
-    """Limit switches of both ends, of which no axis can be at both."""
+    """Report active limit switches of both ends: no axis can be at both."""
     both = state.reverse_limit and state.forward_limit
     return f"{drive.name}: both limit switches are active: check their wiring and polarity" if both else ""
 
 
 def resting_switch_problem(drive: Drive, state: MotorState) -> str:
-    """A limit switch that is active at an axis at rest, but for that of its home where the axis is there."""
+    """Report an active limit switch of an axis at rest, except the switch of its home if the axis is there."""
     if problem := stuck_problem(drive, state):
         return problem
-    active, at = switches(state), drive.position(state.position)
-    is_home = drive.axis.to_home != 0 and at_switch(drive, state)
-    if not active or (is_home and may_be_at_switch(drive.axis, at)):
+    active, at = active_switches(state), drive.to_position(state.position)
+    is_home = drive.axis.to_home != 0 and is_at_switch(drive, state)
+    if not active or (is_home and is_near_switch(drive.axis, at)):
         return ""
     home = f", but the home is at {drive.shown(drive.axis.at_home)}" if is_home else ""
     return f"{drive.name}: the {' '.join(active)} limit switch is active at {drive.shown(at)}{home}"
 
 
 def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
-    """A motor that is not where it was left; goal: that position (counts)."""
+    """Report a motor that has left its goal (counts) without a command."""
     off = abs((state.position - goal) / drive.axis.scale)
     if off > STILL * drive.axis.tolerance:
         return f"{drive.name}: moved by {drive.shown(off)} without a command"
     return ""
 
 
-def switches(state: MotorState) -> frozenset[str]:
-    """Which limit switches of an axis are active: "reverse", "forward"."""
+def active_switches(state: MotorState) -> frozenset[str]:
+    """Return the active limit switches of an axis: "reverse", "forward"."""
     sides = {"reverse": state.reverse_limit, "forward": state.forward_limit}
     return frozenset(side for side, is_active in sides.items() if is_active)
 
 
 def new_switch_problem(drive: Drive, state: MotorState, known: frozenset[str]) -> str:
-    """A limit switch that became active at a motor that rests, where its controller has nothing to stop.
+    """Report a limit switch that became active at a motor that rests, where its controller has nothing to stop.
 
-    known: those that were active as the rig was armed, and still are.
+    known: switches that were active when the rig was armed, and still are.
     """
-    new = switches(state) - known
+    new = active_switches(state) - known
     if state.moving or not new:
         return ""
     return f"{drive.name}: at rest, {' and '.join(sorted(new, reverse=True))} limit switch active"
 
 
-def misplaced(drive: Drive, state: MotorState) -> bool:
-    """Whether a motor at rest is further from where its controller has it than the checks at rest allow."""
-    return abs(drive.error(state)) > min(drive.axis.max_error, STILL * drive.axis.tolerance)
+def is_misplaced(drive: Drive, state: MotorState) -> bool:
+    """Return whether a motor at rest is further from its commanded position than the checks at rest allow."""
+    return abs(drive.error_of(state)) > min(drive.axis.max_error, STILL * drive.axis.tolerance)
 
 
-def arrived(drive: Drive, state: MotorState, goal: float) -> bool:
-    """Whether a motor is at rest within the tolerance of its goal (counts)."""
-    return not state.moving and abs((state.position - goal) / drive.axis.scale) <= drive.axis.tolerance
-
-
-def _because(reason: str) -> str:
+def _format_reason(reason: str) -> str:
     return f" ({reason})" if reason else ""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Check of all motors at a tick, by their present motion.
+
+    motion: under way, or None; goals: counts by channel; stopping: motors are being stopped; newest, before: this
+    reading and the one before; known_switches: limit switches by channel that were active before.
+    """
+
+    motion: CommandedMotion | None
+    goals: Mapping[str, float]
+    stopping: bool
+    newest: MotorReading
+    before: MotorReading
+    known_switches: Mapping[str, frozenset[str]]
+
+    def first_problem(self, drives: Mapping[str, Drive]) -> str:
+        """Return the problem of the first drive (by axis) that has one, or ""."""
+        return next(filter(None, map(self._problem, drives.values())), "")
+
+    def _problem(self, drive: Drive) -> str:
+        channel, motion = drive.axis.channel, self.motion
+        state, last = self.newest.states[channel], self.before.states[channel]
+        seconds = self.newest.time - self.before.time
+        unlimited = motion is not None and motion.unlimited
+        problem = number_problem(drive, state)
+        if not self._is_stopped_at_home(drive):
+            problem = problem or motor_problem(drive, state, last)
+        problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
+        if not self._is_at_its_home(drive):
+            problem = problem or new_switch_problem(drive, state, self.known_switches[channel])
+        if problem or self.stopping:
+            return problem
+        leg = None if motion is None else motion.leg
+        if leg is None or channel not in leg.drives:
+            return rest_problem(drive, state, self.goals[channel])
+        problem = reversal_problem(drive, state, last, leg.way(channel))
+        start = leg.trajectory.start[channel]  # where it still is, if its first target was refused
+        return problem or target_problem(drive, state, start, leg.sent.get(channel, start))
+
+    def _is_at_its_home(self, drive: Drive) -> bool:
+        """Return whether the axis searches or leaves its home, whose switch may then change several times."""
+        motion = self.motion
+        homes = () if motion is None else (motion.home, motion.released)
+        return any(home is not None and home.name == drive.name for home in homes)
+
+    def _is_stopped_at_home(self, drive: Drive) -> bool:
+        """Return whether the axis has reached the limit switch of its home, where the motor controller stops it."""
+        home = None if self.motion is None else self.motion.home
+        state = self.newest.states[drive.axis.channel]
+        return home is not None and home.name == drive.name and is_at_switch(drive, state)

@@ -1,4 +1,4 @@
-"""The supervisor without its process: requests, ticks, and what they make of motors and tracker.
+"""The supervisor without its process: it acts on requests and ticks, with motors and tracker.
 
 Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Motors get targets at most
 the queue of `loop` ahead, so that they stop by themselves where ticks end. Nothing here waits but for replies of the
@@ -9,39 +9,56 @@ from collections.abc import Callable
 from typing import Any
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.axes import RigAxes
-from flexneedle.lab.rig.supervisor.checks import resting_switch_problem, stuck_problem, switch_problem
+from flexneedle.lab.rig.supervisor.checks import (
+    Inspection,
+    resting_switch_problem,
+    stuck_problem,
+    switch_problem,
+)
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.inspection import Inspection
-from flexneedle.lab.rig.supervisor.machine import Event, State, after, refusal
-from flexneedle.lab.rig.supervisor.motion import SETTLE_S, Leg, Motion, beyond
-from flexneedle.lab.rig.supervisor.requested import back_off, going, homing, stepping
-from flexneedle.lab.rig.supervisor.room import Room
-from flexneedle.lab.rig.supervisor.stopping import Stopping
-from flexneedle.lab.rig.supervisor.tip import TrackedTip
+from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
+from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
+from flexneedle.lab.rig.supervisor.requests import (
+    RequestRules,
+    back_off_leg,
+    make_homing,
+    make_move,
+    make_step,
+    range_problem,
+)
+from flexneedle.lab.rig.supervisor.watch import TrackedTip
 from flexneedle.ports import Clock, Motors, Tracker
 
 HEARTBEAT_S = 0.5
 """Longest time (s) without a message of the client during a motion."""
 
 _STALL_S = 0.5  # without a tick, after which a motion under way is not taken up again
-_UNCHECKED = frozenset({State.IDLE, State.STOPPED, State.FAULT})
+_UNCHECKED = frozenset({SupervisorState.IDLE, SupervisorState.STOPPED, SupervisorState.FAULT})
 """States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
 
 
 class Supervisor:
-    """State of a rig, and what its motors are to do. send: called with each message to the client but reports."""
+    """State machine of a rig: requests and ticks change the state and move the motors.
+
+    send: called with each message to the client except reports.
+    """
 
     def __init__(
-        self, task: say.Task, motors: Motors, tracker: Tracker, clock: Clock, send: Callable[[Any], None]
+        self,
+        task: protocol.SupervisorTask,
+        motors: Motors,
+        tracker: Tracker,
+        clock: Clock,
+        send: Callable[[Any], None],
     ) -> None:
         self._task, self._clock, self._send = task, clock, send
-        self.state, self.why = State.IDLE, ""
+        self.state, self.why = SupervisorState.IDLE, ""
         self._heard = self._ticked_at = now = clock.now()
         self._axes, self._tip = RigAxes(task.rig, motors, clock), TrackedTip(task, tracker, now)
-        self._motion: Motion | None = None
-        self._stopping: Stopping | None = None  # until the motors rest
+        self._motion: CommandedMotion | None = None
+        self._stopping: StopUnderWay | None = None  # until the motors rest
         self._deepest, self._requests = 0.0, 0
 
     @property
@@ -51,140 +68,142 @@ class Supervisor:
 
     # Requests
 
-    def request(self, request: say.Request) -> None:
+    def request(self, request: protocol.Request) -> None:
         """Act on a message of the client."""
         self._heard = self._clock.now()
         self._requests += 1
         match request:
-            case say.Stop(who):
+            case protocol.StopRequest(who):
                 self.stop(who)
-            case say.Reset():
-                if self._allowed(Event.RESET):
-                    self._enter(Event.RESET)
-            case say.Off():
-                self._off()
-            case say.Arm(deepest):
+            case protocol.ResetRequest():
+                if self._allow(RigEvent.RESET):
+                    self._change_state(RigEvent.RESET)
+            case protocol.OffRequest():
+                self._power_off()
+            case protocol.ArmRequest(deepest):
                 self._arm(deepest)
-            case say.Step():
-                self._step(request)
-            case say.Go():
-                self._go(request)
-            case say.Home():
-                self._home(request)
+            case protocol.StepRequest():
+                self._begin_step(request)
+            case protocol.MoveRequest():
+                self._begin_move(request)
+            case protocol.HomeRequest():
+                self._begin_homing(request)
 
     def stop(self, who: str) -> None:
-        """Stop all motors, in any state: what rests may have been moved by somebody else."""
-        if self.state not in (State.STOPPED, State.FAULT):
-            self._enter(Event.STOP, who)
-        self._halt(who)
+        """Stop all motors, in any state: a motor at rest may have been moved by another program."""
+        if self.state not in (SupervisorState.STOPPED, SupervisorState.FAULT):
+            self._change_state(RigEvent.STOP, who)
+        self._halt_motors(who)
 
-    def _enter(self, event: Event, why: str = "") -> None:
+    def _change_state(self, event: RigEvent, why: str = "") -> None:
         """Change the state by an event that it accepts."""
-        new = after(self.state, event)
+        new = next_state(self.state, event)
         if new is not None:
             self.state, self.why = new, why
 
-    def _allowed(self, event: Event, number: int = 0) -> bool:
-        """Whether the state accepts an event and nothing moves; else the request is refused with the reason."""
-        return self._possible(refusal(self.state, event, self.why, moving=self._busy), number)
+    def _allow(self, event: RigEvent, number: int = 0) -> bool:
+        """Return whether the state accepts an event and nothing moves; otherwise refuse the request with the reason."""
+        return self._accept(refusal_reason(self.state, event, self.why, moving=self._is_busy), number)
 
     @property
-    def _busy(self) -> bool:
+    def _is_busy(self) -> bool:
         """Whether a motion or a stop is under way."""
         return self._motion is not None or self._stopping is not None
 
-    def _possible(self, problem: str, number: int = 0) -> bool:
-        """Whether a request has no problem; else it is refused."""
+    def _accept(self, problem: str, number: int = 0) -> bool:
+        """Return whether a request has no problem; otherwise refuse it."""
         if problem:
-            self._send(say.Refused(number, problem, self.state, self.why))
+            self._send(protocol.RequestRefused(number, problem, self.state, self.why))
         return not problem
 
     @property
-    def _room(self) -> Room:
-        """Where the axes may go from here."""
+    def _rules(self) -> RequestRules:
+        """Rules of requests from the present goals."""
         drives = self._axes.drives
-        return Room(drives, {name: self._axes.goal(name) for name in drives}, self._deepest)
+        return RequestRules(drives, {name: self._axes.goal(name) for name in drives}, self._deepest)
 
     def _arm(self, deepest: float) -> None:
-        if not self._allowed(Event.ARM):
+        if not self._allow(RigEvent.ARM):
             return
-        if not self._possible(self._outside):  # as it most often is, before any motor is switched on
+        if not self._accept(self._start_problem):  # as it most often is, before any motor is switched on
             return
         try:
             changed = self._axes.power_on()
         except DriverError as error:
-            self._unreachable(str(error))
+            self._handle_lost_motors(str(error))
             return
-        if not self._possible(self._outside):
+        if not self._accept(self._start_problem):
             return
         self._axes.take_positions()
         self._deepest = self._axes.positions["insertion"] + deepest
-        self._enter(Event.ARM, changed)
+        self._change_state(RigEvent.ARM, changed)
 
     @property
-    def _outside(self) -> str:
+    def _start_problem(self) -> str:
         """A problem with where an axis rests as an insertion begins, or ""; an operator may move it back."""
         if not self._task.tracked:
             return ""
         axes = self._axes
-        problems = [beyond(axes.drives, list(axes.positions.items()), resting=True)]
+        problems = [range_problem(axes.drives, list(axes.positions.items()), resting=True)]
         problems += [resting_switch_problem(drive, axes.state(drive)) for drive in axes.drives.values()]
         return next((f"arm: refused: {problem}" for problem in problems if problem), "")
 
-    def _off(self) -> None:
-        if not self._allowed(Event.OFF):
+    def _power_off(self) -> None:
+        if not self._allow(RigEvent.OFF):
             return
         try:
             self._axes.power_off()
         except DriverError as error:
-            self._enter(Event.FAULT, str(error))
-            self._unreachable(str(error))
+            self._change_state(RigEvent.FAULT, str(error))
+            self._handle_lost_motors(str(error))
 
-    def _step(self, step: say.Step) -> None:
-        if self.state is State.HOLDING and self._stopping is not None:
-            self._nothing_done(step.number)
+    def _begin_step(self, step: protocol.StepRequest) -> None:
+        if self.state is SupervisorState.HOLDING and self._stopping is not None:
+            self._report_nothing_done(step.number)
             return
-        if not self._allowed(Event.STEP, step.number):
+        if not self._allow(RigEvent.STEP, step.number):
             return
-        if not self._possible(self._room.step_problem(step), step.number):
+        if not self._accept(self._rules.step_problem(step), step.number):
             return
         if step.expected is not None:  # until the travel begins the tip is where it is
             self._tip.expect_start(step.expected, self._clock.now())
         if not self._tip.verdict.ok:  # still, or again: nothing moves
-            self._nothing_done(step.number)
+            self._report_nothing_done(step.number)
             return
-        self._begin(Event.STEP, stepping(step))
+        self._begin(RigEvent.STEP, make_step(step))
 
-    def _nothing_done(self, number: int) -> None:
+    def _report_nothing_done(self, number: int) -> None:
         now, why = self._clock.now(), self.why if self._tip.verdict.ok else str(self._tip.verdict)
-        self._send(say.Done(number, dict.fromkeys(self._axes.drives, 0.0), now, now, self.state, why))
+        self._send(
+            protocol.MotionResult(number, dict.fromkeys(self._axes.drives, 0.0), now, now, self.state, why)
+        )
 
-    def _go(self, go: say.Go) -> None:
-        event = Event.RETRACT if go.retract else Event.JOG
-        if self._allowed(event, go.number) and self._possible(self._room.go_problem(go), go.number):
-            self._begin(event, going(go, self._axes.drives[go.axis], self._axes.goal(go.axis)))
+    def _begin_move(self, go: protocol.MoveRequest) -> None:
+        event = RigEvent.RETRACT if go.retract else RigEvent.JOG
+        if self._allow(event, go.number) and self._accept(self._rules.move_problem(go), go.number):
+            self._begin(event, make_move(go, self._axes.drives[go.axis], self._axes.goal(go.axis)))
 
-    def _home(self, home: say.Home) -> None:
-        if not self._allowed(Event.HOME, home.number):
+    def _begin_homing(self, home: protocol.HomeRequest) -> None:
+        if not self._allow(RigEvent.HOME, home.number):
             return
-        if not self._possible(self._room.home_problem(home), home.number):
+        if not self._accept(self._rules.home_problem(home), home.number):
             return
         drive = self._axes.drives[home.axis]
-        if not self._possible(stuck_problem(drive, self._axes.state(drive)), home.number):
+        if not self._accept(stuck_problem(drive, self._axes.state(drive)), home.number):
             return
-        self._enter(Event.HOME)
-        self._motion = motion = homing(home.number, drive, at_switch=self._axes.at_switch(drive))
+        self._change_state(RigEvent.HOME)
+        self._motion = motion = make_homing(home.number, drive, at_switch=self._axes.is_at_switch(drive))
         now = self._clock.now()
         if motion.here is None:
-            self._next_leg(now)
+            self._begin_next_leg(now)
         else:
             motion.until = now + SETTLE_S
 
-    def _begin(self, event: Event, motion: Motion) -> None:
+    def _begin(self, event: RigEvent, motion: CommandedMotion) -> None:
         """Begin a motion at once, not at the next tick."""
-        self._enter(event)
+        self._change_state(event)
         self._motion, self._ticked_at = motion, self._clock.now()
-        self._next_leg(self._clock.now())
+        self._begin_next_leg(self._clock.now())
 
     # Ticks
 
@@ -193,44 +212,46 @@ class Supervisor:
         before, now = self._ticked_at, self._clock.now()
         self._ticked_at = now
         self._check_ticks(now - before)
-        self._measure(now)
+        self._read_tracker(now)
         self._check_motors()
         self._check_client(now)
         if self._stopping is not None:
             self._stop_motors(self._stopping, now)
         elif self._motion is not None and self._motion.leg is not None:
-            self._go_on(self._motion, self._motion.leg, now)
+            self._continue_leg(self._motion, self._motion.leg, now)
         elif self._motion is not None and self._motion.here is not None:
-            self._call_home(self._motion, self._motion.here, now)
+            self._define_home_here(self._motion, self._motion.here, now)
 
-    def report(self, late: float, work: float, missed: int) -> say.Report:
-        """What the last tick found, with the measurements since the last report."""
+    def report(self, late: float, work: float, missed: int) -> protocol.TickReport:
+        """Return the report of the last tick, with the measurements since the last report."""
         axes, tip = self._axes, self._tip
         leg = None if self._motion is None or self._stopping is not None else self._motion.leg
-        found = axes.shown(leg), tip.take(), tip.status, not self._busy
-        return say.Report(self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests)
+        found = axes.axis_states(leg), tip.take(), tip.status, not self._is_busy
+        return protocol.TickReport(
+            self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests
+        )
 
     def _check_ticks(self, seconds: float) -> None:
-        """Ticks were late: the motors have stopped, and after long nothing goes on by itself."""
+        """Stop after a long time without ticks: the motors have stopped at the end of their queue."""
         if self._motion is not None and self._motion.leg is not None and seconds > _STALL_S:
             self.stop(f"no tick for {seconds:.2f} s, limit {_STALL_S:g} s")
 
-    def _measure(self, now: float) -> None:
+    def _read_tracker(self, now: float) -> None:
         try:
             self._tip.read(now)
         except DriverError as error:
-            self._fault(str(error))
+            self._enter_fault(str(error))
             return
-        if not self._tip.verdict.ok and self.state is State.INSERTING:
+        if not self._tip.verdict.ok and self.state is SupervisorState.INSERTING:
             self._hold(str(self._tip.verdict))
 
     def _hold(self, why: str) -> None:
-        """Stop the insertion. A roll under way is completed: a bevel at any angle could not be steered."""
-        self._enter(Event.HOLD, why)
+        """Hold the needle. A roll under way is completed: a bevel at any other angle could not be steered."""
+        self._change_state(RigEvent.HOLD, why)
         if self._motion is not None and self._motion.rolls:
             self._motion.why, self._motion.legs = why, []
         else:
-            self._halt(why)
+            self._halt_motors(why)
 
     def _check_motors(self) -> None:
         axes = self._axes
@@ -239,7 +260,7 @@ class Supervisor:
         try:
             axes.read()
         except DriverError as error:
-            self._unreachable(str(error))
+            self._handle_lost_motors(str(error))
             return
         if self.state in _UNCHECKED:
             self._check_rest()
@@ -247,64 +268,64 @@ class Supervisor:
         stopping = self._stopping is not None
         inspection = Inspection(self._motion, axes.goals, stopping, axes.newest, axes.before, axes.switches)
         if problem := inspection.first_problem(axes.drives):
-            self._fault(problem)
+            self._enter_fault(problem)
 
     def _check_rest(self) -> None:
-        """After a stop or a fault motors rest; one that is moved by somebody else is stopped again."""
+        """Stop a motor again that moves after a stop or a fault."""
         moving = any(state.moving for state in self._axes.states.values())
-        if moving and self._stopping is None and self.state is not State.IDLE:
-            self._halt(self.why)
+        if moving and self._stopping is None and self.state is not SupervisorState.IDLE:
+            self._halt_motors(self.why)
 
     def _check_client(self, now: float) -> None:
         silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
         if self._motion is not None and silent > HEARTBEAT_S:
             self.stop(f"no heartbeat of the controller for {silent:.2f} s")
-        elif self.state in (State.INSERTING, State.HOLDING) and silent > limit:
+        elif self.state in (SupervisorState.INSERTING, SupervisorState.HOLDING) and silent > limit:
             self.stop(f"no command of the controller for {silent:.2f} s, limit {limit:g} s")
 
     # Faults and stops
 
-    def _fault(self, why: str) -> None:
-        if self.state is not State.FAULT:
-            self._enter(Event.FAULT, why)
-            self._halt(why)
+    def _enter_fault(self, why: str) -> None:
+        if self.state is not SupervisorState.FAULT:
+            self._change_state(RigEvent.FAULT, why)
+            self._halt_motors(why)
 
-    def _unreachable(self, why: str) -> None:
-        """The motors cannot be read or commanded: a fault, and they are stopped as soon as they can be."""
-        self._fault(why)
+    def _handle_lost_motors(self, why: str) -> None:
+        """Enter the fault state after a failed call of the motors, and stop them as soon as they can be reached."""
+        self._enter_fault(why)
         if self._stopping is None:
-            self._stopping = Stopping.at(self._clock.now())
+            self._stopping = StopUnderWay.at(self._clock.now())
 
-    def _halt(self, why: str) -> None:
+    def _halt_motors(self, why: str) -> None:
         """Stop the motors now, and end the motion under way once they rest."""
         if self._motion is not None:
             self._motion.why = self._motion.why or why
         now = self._clock.now()
         self._tip.stop(now)
         # A stop that is repeated does not begin anew: motors that do not stop would never be found.
-        self._stop_motors(Stopping.at(now) if self._stopping is None else self._stopping.due_at(now), now)
+        self._stop_motors(StopUnderWay.at(now) if self._stopping is None else self._stopping.due_at(now), now)
 
-    def _stop_motors(self, stopping: Stopping, now: float) -> None:
-        """Stop motors, again while they move or cannot be reached; once they rest, end the motion under way."""
+    def _stop_motors(self, stopping: StopUnderWay, now: float) -> None:
+        """Stop motors, repeatedly while they move or cannot be reached; once they rest, end the motion under way."""
         if now < stopping.due:
             if self.at_rest:
                 self._stopping = None
-                self._finish(now)
+                self._finish_motion(now)
                 self._axes.settle()
             return
-        self._stopping = stopping.again(now)
+        self._stopping = stopping.repeated_at(now)
         if stopping.has_failed(now, self._axes.slowing):
-            self._fault("the motors do not stop")
-            self._finish(now)
+            self._enter_fault("the motors do not stop")
+            self._finish_motion(now)
         try:
             self._axes.stop()
         except DriverError as error:
-            self._fault(str(error))
-            self._finish(now)
+            self._enter_fault(str(error))
+            self._finish_motion(now)
 
     # Motions
 
-    def _next_leg(self, now: float) -> None:
+    def _begin_next_leg(self, now: float) -> None:
         """Begin the next leg that moves anything, or end the motion."""
         motion = self._motion
         if motion is None:
@@ -313,89 +334,93 @@ class Supervisor:
         while motion.legs and motion.leg is None:
             motion.leg = self._axes.leg(*motion.legs.pop(0), now)
         if motion.leg is None:
-            self._finish(now)
+            self._finish_motion(now)
             return
         if motion.expected is not None and not motion.legs:
             self._tip.expect(motion.expected, now, now + motion.leg.trajectory.duration)
         try:
             self._axes.begin(motion.leg, now)
         except DriverError as error:
-            self._not_followed(motion, str(error))
+            self._handle_refused_target(motion, str(error))
 
-    def _go_on(self, motion: Motion, leg: Leg, now: float) -> None:
-        """Send the next targets, or go on to the next leg."""
+    def _continue_leg(self, motion: CommandedMotion, leg: Leg, now: float) -> None:
+        """Send the next targets, or begin the next leg."""
         axes = self._axes
-        leg.note(axes.states, axes.newest.time)
-        if motion.home is not None and axes.at_home(motion.home):
+        leg.record_progress(axes.states, axes.newest.time)
+        if motion.home is not None and axes.is_at_home(motion.home):
             self._leave_switch(motion, motion.home)
-            self._next_leg(now)
-        elif leg.has_arrived(axes.states, now) and self._may_be_defined(motion):
+            self._begin_next_leg(now)
+        elif leg.has_arrived(axes.states, now) and self._can_define_home(motion):
             if motion.home is not None:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
             motion.spans.append(leg.span(now, done=True))
             axes.keep_goal(leg)
             if motion.released is not None:
-                self._has_left(motion, motion.released)
-            self._next_leg(now)
-        elif leg.overdue(axes.states, now):
+                self._end_leaving_switch(motion, motion.released)
+            self._begin_next_leg(now)
+        elif leg.is_overdue(axes.states, now):
             restless = leg.has_arrived(axes.states, now) and motion.released
-            missing = f"the motors have not arrived: {leg.missing(axes.states)} from the goal"
-            self._fault(f"{restless.name}: does not rest" if restless else missing)
-        elif motion.home is not None and axes.at_switch(motion.home):
+            missing = f"the motors have not arrived: {leg.describe_missing(axes.states)} from the goal"
+            self._enter_fault(f"{restless.name}: does not rest" if restless else missing)
+        elif motion.home is not None and axes.is_at_switch(motion.home):
             pass  # the motor controller slows it down, and takes no target meanwhile
         else:
             waited = leg.waited
             try:
                 axes.follow(leg, now)
             except DriverError as error:
-                self._not_followed(motion, str(error))
+                self._handle_refused_target(motion, str(error))
             self._tip.wait(now, leg.waited - waited)  # while the trajectory waits for its motors
 
-    def _may_be_defined(self, motion: Motion) -> bool:
-        """Whether the position may be shifted after this leg: of an axis off its home, once its servo rests, too.
+    def _can_define_home(self, motion: CommandedMotion) -> bool:
+        """Return whether the position may be shifted after this leg: off its home an axis must rest, its servo
+        included.
 
-        Else the shift would count from a position that is no more true.
+        Otherwise the shift would be computed from an outdated position.
         """
-        return motion.released is None or self._axes.rests(motion.released)
+        return motion.released is None or self._axes.is_at_rest(motion.released)
 
-    def _not_followed(self, motion: Motion, why: str) -> None:
-        """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
+    def _handle_refused_target(self, motion: CommandedMotion, why: str) -> None:
+        """Enter the fault state after a refused target, except at the limit switch of the home, which the next tick
+        reads."""
         if motion.home is not None:
             self._check_motors()
-            if self._axes.at_switch(motion.home):
+            if self._axes.is_at_switch(motion.home):
                 return
-        self._fault(why)
+        self._enter_fault(why)
 
-    def _finish(self, now: float) -> None:
-        """End the motion under way, and report what was done."""
+    def _finish_motion(self, now: float) -> None:
+        """End the motion under way, and report its travel."""
         motion, self._motion = self._motion, None
         if motion is None:
             return
         if motion.leg is not None:
             motion.spans.append(motion.leg.span(now, done=False))
-        if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
-            self._enter(Event.ARRIVED)
+        if self.state in (SupervisorState.HOMING, SupervisorState.JOGGING, SupervisorState.RETRACTING):
+            self._change_state(RigEvent.ARRIVED)
         travelled, (begun, ended, turned) = self._axes.take_travel(), motion.times(now)
-        self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why, turned))
+        self._send(
+            protocol.MotionResult(motion.number, travelled, begun, ended, self.state, motion.why, turned)
+        )
 
-    def _leave_switch(self, motion: Motion, drive: Drive) -> None:
-        """At rest at the switch that was searched: note where that is, and move off it."""
-        motion.shift = self._axes.from_home(drive)
+    def _leave_switch(self, motion: CommandedMotion, drive: Drive) -> None:
+        """Record the position of the switch that was searched, and begin to move off it."""
+        motion.shift = self._axes.home_offset(drive)
         self._axes.settle(drive)
-        motion.home, motion.released, motion.legs = None, drive, [back_off(drive)]
+        motion.home, motion.released, motion.legs = None, drive, [back_off_leg(drive)]
 
-    def _call_home(self, motion: Motion, drive: Drive, now: float) -> None:
-        """Call where an axis is its home, once it rests there."""
-        if self._axes.rests(drive):
-            self._set_home(drive, self._axes.from_home(drive))
-            self._finish(now)
+    def _define_home_here(self, motion: CommandedMotion, drive: Drive, now: float) -> None:
+        """Define the present position of an axis as its home, once the axis rests."""
+        if self._axes.is_at_rest(drive):
+            self._define_home(drive, self._axes.home_offset(drive))
+            self._finish_motion(now)
         elif now > motion.until:
-            self._fault(f"{drive.name}: does not rest")
+            self._enter_fault(f"{drive.name}: does not rest")
 
-    def _has_left(self, motion: Motion, drive: Drive) -> None:
-        """Off the switch of the home, which must be released by now: it is searched, or the home is where it was.
+    def _end_leaving_switch(self, motion: CommandedMotion, drive: Drive) -> None:
+        """Search the home, or define it, once the axis has left the switch, which must be released by now.
 
-        A switch that is stuck shows no home, and then positions stay as they were.
+        A switch that is stuck shows no home, and positions are left unchanged.
         """
         motion.why = switch_problem(drive, self._axes.state(drive))
         if motion.why:
@@ -403,11 +428,11 @@ class Supervisor:
         elif motion.legs:
             motion.home, motion.released = drive, None
         else:
-            self._set_home(drive, motion.shift)
+            self._define_home(drive, motion.shift)
 
-    def _set_home(self, drive: Drive, shift: float) -> None:
-        """Shift the positions of an axis (counts), so that its home is where that was found."""
+    def _define_home(self, drive: Drive, shift: float) -> None:
+        """Shift the positions of an axis (counts), so that its home is at its position in the rig file."""
         try:
             self._axes.shift(drive, shift)
         except DriverError as error:
-            self._unreachable(str(error))
+            self._handle_lost_motors(str(error))

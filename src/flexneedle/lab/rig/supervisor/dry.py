@@ -1,4 +1,4 @@
-"""Motors of a dry run: the real ones are read, never commanded; motions happen in memory."""
+"""Motors of a dry run: the real motors are read, never commanded; motions are simulated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -7,8 +7,8 @@ from flexneedle.ports import Clock, Motors, MotorState
 
 
 @dataclass(frozen=True)
-class _Imagined:
-    """A motor that follows exactly: its position at a time (s), its target and its speed (counts/s)."""
+class _SimulatedMotor:
+    """Motor that follows exactly: its position at a time (s), its target and its speed (counts/s)."""
 
     position: float
     target: float
@@ -16,13 +16,13 @@ class _Imagined:
     speed: float = 0.0
 
     def at(self, time: float) -> float:
-        """Position at a later time."""
+        """Return the position at a later time."""
         left, way = self.target - self.position, self.speed * (time - self.time)
         return self.target if abs(left) <= way else self.position + (way if left > 0.0 else -way)
 
 
-class DryMotors:
-    """The port `Motors` on others of which only `read`, `reconnect` and `close` are called.
+class DryRunMotors:
+    """The port `Motors` over real motors, which are only read, reconnected and closed.
 
     A motor starts where the real one is, and then follows its targets at its set speed.
     """
@@ -31,12 +31,12 @@ class DryMotors:
         self._motors, self._clock = motors, clock
         now = clock.now()
         self._imagined = {
-            channel: _Imagined(state.position, state.position, now)
+            channel: _SimulatedMotor(state.position, state.position, now)
             for channel, state in motors.read().items()
         }
 
     def read(self) -> Mapping[str, MotorState]:
-        """The state of the real motors, each on and at its imagined position."""
+        """Return the states of the real motors, each on and at its simulated position."""
         now = self._clock.now()
         found = {}
         for channel, state in self._motors.read().items():
@@ -48,26 +48,26 @@ class DryMotors:
         return found
 
     def set_speed(self, channel: str, speed: float, _acceleration: float) -> None:
-        """Set the speed of the imagined motor."""
+        """Set the speed of the simulated motor."""
         self._change(channel, speed=speed)
 
     def follow(self, positions: Mapping[str, float]) -> None:
-        """Let imagined motors follow."""
+        """Set the targets of the simulated motors."""
         for channel, target in positions.items():
             self._change(channel, target=target)
 
     def stop(self) -> None:
-        """Stop the imagined motors."""
+        """Stop the simulated motors."""
         now = self._clock.now()
         for channel, one in self._imagined.items():
             self._change(channel, target=one.at(now))
 
     def define(self, channel: str, position: float) -> None:
-        """Call the imagined position so."""
+        """Set the simulated position."""
         self._change(channel, position=position, target=position)
 
     def power(self, channel: str, on: bool) -> None:
-        """Do nothing: an imagined motor is on."""
+        """Do nothing: a simulated motor is always on."""
 
     def reconnect(self) -> None:
         """Connect again to the real controller."""

@@ -1,9 +1,9 @@
-"""The states of a rig and the events that change them: the table that the supervisor runs from (docs/safety.md)."""
+"""States of a rig and the events that change them: the table that the supervisor follows (docs/safety.md)."""
 
 from enum import StrEnum
 
 
-class State(StrEnum):
+class SupervisorState(StrEnum):
     """State of a rig."""
 
     IDLE = "idle"  # connected; nothing moves, motors may be off
@@ -17,8 +17,8 @@ class State(StrEnum):
     FAULT = "fault"  # by a device; needs a reset
 
 
-class Event(StrEnum):
-    """What changes the state."""
+class RigEvent(StrEnum):
+    """Event that changes the state."""
 
     HOME = "home"
     JOG = "jog"
@@ -33,47 +33,57 @@ class Event(StrEnum):
     OFF = "off"  # motors are switched off
 
 
-TABLE: dict[tuple[State, Event], State] = {
-    (State.IDLE, Event.ARM): State.ARMED,
-    (State.ARMED, Event.HOME): State.HOMING,
-    (State.ARMED, Event.JOG): State.JOGGING,
-    (State.ARMED, Event.RETRACT): State.RETRACTING,
-    (State.ARMED, Event.STEP): State.INSERTING,
-    (State.ARMED, Event.ARM): State.ARMED,
-    (State.HOMING, Event.ARRIVED): State.IDLE,  # positions are others now, and with them what armed has taken
-    (State.JOGGING, Event.ARRIVED): State.ARMED,
-    (State.RETRACTING, Event.ARRIVED): State.ARMED,
-    (State.INSERTING, Event.STEP): State.INSERTING,
-    (State.INSERTING, Event.HOLD): State.HOLDING,
-    (State.HOLDING, Event.HOLD): State.HOLDING,
-    (State.HOLDING, Event.STEP): State.INSERTING,
-    (State.STOPPED, Event.RESET): State.IDLE,
-    (State.FAULT, Event.RESET): State.IDLE,
-    (State.STOPPED, Event.OFF): State.STOPPED,
-    (State.FAULT, Event.OFF): State.FAULT,
-    **{(state, Event.STOP): State.STOPPED for state in State if state is not State.FAULT},
-    **{(state, Event.FAULT): State.FAULT for state in State},
-    (State.FAULT, Event.STOP): State.FAULT,
+TABLE: dict[tuple[SupervisorState, RigEvent], SupervisorState] = {
+    (SupervisorState.IDLE, RigEvent.ARM): SupervisorState.ARMED,
+    (SupervisorState.ARMED, RigEvent.HOME): SupervisorState.HOMING,
+    (SupervisorState.ARMED, RigEvent.JOG): SupervisorState.JOGGING,
+    (SupervisorState.ARMED, RigEvent.RETRACT): SupervisorState.RETRACTING,
+    (SupervisorState.ARMED, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.ARMED, RigEvent.ARM): SupervisorState.ARMED,
+    (
+        SupervisorState.HOMING,
+        RigEvent.ARRIVED,
+    ): SupervisorState.IDLE,  # positions are others now, and with them what armed has taken
+    (SupervisorState.JOGGING, RigEvent.ARRIVED): SupervisorState.ARMED,
+    (SupervisorState.RETRACTING, RigEvent.ARRIVED): SupervisorState.ARMED,
+    (SupervisorState.INSERTING, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.INSERTING, RigEvent.HOLD): SupervisorState.HOLDING,
+    (SupervisorState.HOLDING, RigEvent.HOLD): SupervisorState.HOLDING,
+    (SupervisorState.HOLDING, RigEvent.STEP): SupervisorState.INSERTING,
+    (SupervisorState.STOPPED, RigEvent.RESET): SupervisorState.IDLE,
+    (SupervisorState.FAULT, RigEvent.RESET): SupervisorState.IDLE,
+    (SupervisorState.STOPPED, RigEvent.OFF): SupervisorState.STOPPED,
+    (SupervisorState.FAULT, RigEvent.OFF): SupervisorState.FAULT,
+    **{
+        (state, RigEvent.STOP): SupervisorState.STOPPED
+        for state in SupervisorState
+        if state is not SupervisorState.FAULT
+    },
+    **{(state, RigEvent.FAULT): SupervisorState.FAULT for state in SupervisorState},
+    (SupervisorState.FAULT, RigEvent.STOP): SupervisorState.FAULT,
 }
 """The state after an event. What is not listed is refused, and changes nothing."""
 
-MOVING = frozenset({State.HOMING, State.JOGGING, State.INSERTING, State.RETRACTING})
+MOVING = frozenset(
+    {SupervisorState.HOMING, SupervisorState.JOGGING, SupervisorState.INSERTING, SupervisorState.RETRACTING}
+)
 """The states in which motors may move."""
 
 
-def after(state: State, event: Event) -> State | None:
-    """The state after an event; None if the event is refused in this state."""
+def next_state(state: SupervisorState, event: RigEvent) -> SupervisorState | None:
+    """Return the state after an event; None if the event is refused in this state."""
     return TABLE.get((state, event))
 
 
-def accepted(state: State) -> tuple[Event, ...]:
-    """The events that a state accepts, for messages."""
-    return tuple(event for event in Event if (state, event) in TABLE)
+def accepted_events(state: SupervisorState) -> tuple[RigEvent, ...]:
+    """Return the events that a state accepts, for messages."""
+    return tuple(event for event in RigEvent if (state, event) in TABLE)
 
 
-def refusal(state: State, event: Event, why: str, *, moving: bool) -> str:
-    """Why an event is refused in this state, or "". why: the reason of the state; moving: whether motors still move."""
+def refusal_reason(state: SupervisorState, event: RigEvent, why: str, *, moving: bool) -> str:
+    """Return the reason why an event is refused in this state, or "". why: reason of the state; moving: motors still
+    move."""
     because = f": {why}" if why else ""
-    if after(state, event) is None:
-        return f"{event}: refused while {state}{because}; accepted: {', '.join(accepted(state))}"
+    if next_state(state, event) is None:
+        return f"{event}: refused while {state}{because}; accepted: {', '.join(accepted_events(state))}"
     return f"{event}: refused: motors have not come to rest yet{because}" if moving else ""

@@ -1,15 +1,13 @@
-"""A motion under way: its legs one after the other, where its motors shall be, and what they really did."""
+"""Motions under way: legs one after another, the targets of their motors, and their measured progress; and stops."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from flexneedle.lab.rig.rig_file import LoopSettings
-from flexneedle.lab.rig.supervisor.checks import arrived
-from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.measured import span
-from flexneedle.lab.rig.supervisor.messages import Expectation
-from flexneedle.lab.rig.supervisor.trajectory import Trajectory, between
+from flexneedle.lab.rig.supervisor.drives import Drive, has_arrived
+from flexneedle.lab.rig.supervisor.protocol import Expectation
+from flexneedle.lab.rig.supervisor.trajectory import Trajectory, fit_span, plan_trajectory
 from flexneedle.ports import MotorState
 
 SETTLE_S = 0.5
@@ -38,45 +36,48 @@ class Leg:
     def targets(
         self, now: float, loop: LoopSettings, states: Mapping[str, MotorState]
     ) -> Mapping[str, float]:
-        """Where the motors shall go now (counts by channel). Kept as `sent`.
+        """Return the present targets of the motors (counts by channel), kept as `sent`.
 
-        They shall be there a queue later, but no target is further from its motor than the motor goes in that time at
-        the speed of the motion: for motors that are behind the trajectory waits.
+        Motors reach them a queue later, but no target is further from its motor than the motor moves in that time at
+        the speed of the motion: the trajectory waits for motors that are behind.
         """
         wanted = self.trajectory.share(now - self.begun - self.waited + loop.queue)
-        most = self._most(loop, states)
+        most = self._largest_share(loop, states)
         self.waited += max(0.0, wanted - most) * self.trajectory.cruise
         self.share = max(self.share, min(wanted, most))
         self.sent = self.trajectory.at(self.share)
         return self.sent
 
-    def _most(self, loop: LoopSettings, states: Mapping[str, MotorState]) -> float:
-        """Largest share of the way at which no target is too far from its motor."""
+    def _largest_share(self, loop: LoopSettings, states: Mapping[str, MotorState]) -> float:
+        """Return the largest share of the way at which no target is too far from its motor."""
         speeds, shares = self.trajectory.speeds, [1.0]
         for name, drive in self.drives.items():
             if way := abs(self.way(name) / drive.axis.scale):
                 free = loop.queue_of(drive.axis, speeds[name] / abs(drive.axis.scale))
-                shares.append((self._gone(name, states) + free) / way)
+                shares.append((self._travelled(name, states) + free) / way)
         return min(shares)
 
-    def _gone(self, channel: str, states: Mapping[str, MotorState]) -> float:
-        """How far a motor has gone on its way (mm or rad)."""
+    def _travelled(self, channel: str, states: Mapping[str, MotorState]) -> float:
+        """Return the distance that a motor has moved on its way (mm or rad)."""
         gone = (states[channel].position - self.trajectory.start[channel]) / abs(
             self.drives[channel].axis.scale
         )
         return gone if self.way(channel) > 0.0 else -gone
 
-    def queued(self, states: Mapping[str, MotorState]) -> dict[str, float]:
-        """How far each axis is from the target that was last sent (mm or rad): what it does without another one."""
+    def queued_distances(self, states: Mapping[str, MotorState]) -> dict[str, float]:
+        """Return the distance of each axis from its last target (mm or rad): its motion without another target."""
         return {
             drive.name: abs((self.sent[name] - states[name].position) / drive.axis.scale)
             for name, drive in self.drives.items()
             if name in self.sent
         }
 
-    def note(self, states: Mapping[str, MotorState], now: float) -> None:
-        """Keep how much of the way is done, by the motor with the longest, and when the motors have gone on."""
-        gone = sum(self._gone(name, states) / drive.axis.tolerance for name, drive in self.drives.items())
+    def record_progress(self, states: Mapping[str, MotorState], now: float) -> None:
+        """Record the share of the way that is done, by the motor with the longest way, and the time of the last
+        progress."""
+        gone = sum(
+            self._travelled(name, states) / drive.axis.tolerance for name, drive in self.drives.items()
+        )
         if gone > self.marked[0] + 1.0:
             self.marked = gone, now
         channel = max(self.drives, key=self._seconds)
@@ -84,24 +85,25 @@ class Leg:
             self.samples.append((now, (states[channel].position - self.trajectory.start[channel]) / way))
 
     def way(self, channel: str) -> float:
-        """A motor's way (counts, signed)."""
+        """Return a motor's way (counts, signed)."""
         return self.trajectory.goal[channel] - self.trajectory.start[channel]
 
     def _seconds(self, channel: str) -> float:
-        """Duration (s) of a motor's way at its largest speed."""
+        """Return the duration (s) of a motor's way at its largest speed."""
         axis = self.drives[channel].axis
         return abs(self.way(channel) / axis.scale) / axis.speed
 
     def has_arrived(self, states: Mapping[str, MotorState], now: float) -> bool:
-        """Whether the last target was sent, and every motor is at rest there."""
+        """Return whether the last target was sent, and every motor is at rest there."""
         if now < self.begun + self.waited + self.trajectory.duration or self.share < 1.0:
             return False
         return all(
-            arrived(drive, states[name], self.trajectory.goal[name]) for name, drive in self.drives.items()
+            has_arrived(drive, states[name], self.trajectory.goal[name])
+            for name, drive in self.drives.items()
         )
 
-    def overdue(self, states: Mapping[str, MotorState], now: float) -> bool:
-        """Whether the motors should have arrived long ago, or rest away from their targets."""
+    def is_overdue(self, states: Mapping[str, MotorState], now: float) -> bool:
+        """Return whether the motors are far beyond the time of their arrival, or rest away from their targets."""
         duration = self.trajectory.duration
         latest = self.begun + min(self.waited, _MOST_WAITED * duration) + duration
         stuck = now > max(self.begun, self.marked[1]) + _STUCK_S and any(
@@ -110,8 +112,8 @@ class Leg:
         )
         return now > latest + SETTLE_S or stuck
 
-    def missing(self, states: Mapping[str, MotorState]) -> str:
-        """How far each motor is from its goal, for messages."""
+    def describe_missing(self, states: Mapping[str, MotorState]) -> str:
+        """Return the distance of each motor from its goal, for messages."""
         goal = self.trajectory.goal
         return ", ".join(
             f"{drive.name} {drive.shown(abs((goal[name] - states[name].position) / drive.axis.scale))}"
@@ -119,16 +121,16 @@ class Leg:
         )
 
     def span(self, now: float, done: bool) -> tuple[float, float]:
-        """When it began and ended, as measured (s). done: whether it reached its goal; else it ended by now."""
+        """Return the measured begin and end (s). done: it reached its goal; otherwise it ended by now."""
         ramp, duration = 0.5 * self.trajectory.ramp, self.trajectory.duration
         last = 1.0 if done or not self.samples else self.samples[-1][1]
         ending = self.begun + self.waited + duration - ramp
-        begun, ended = span(self.samples, self.begun + ramp, ending, last)
+        begun, ended = fit_span(self.samples, self.begun + ramp, ending, last)
         return min(begun, now), min(ended, now)
 
 
 @dataclass
-class Motion:
+class CommandedMotion:
     """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
 
     expected: of the tip; roll: whether the first leg is a roll alone; spans: begin and end of each leg that is done;
@@ -159,7 +161,7 @@ class Motion:
         return self.roll and not self.spans
 
     def times(self, now: float) -> tuple[float, float, float | None]:
-        """When it began and ended, and when the travel began after a roll (None: no roll) (s).
+        """Return begin and end, and the begin of the travel after a roll (None: no roll) (s).
 
         `now` where nothing has moved.
         """
@@ -171,44 +173,57 @@ class Motion:
         return begun, ended, self.spans[1][0] if len(self.spans) > 1 else ended
 
 
-def leg_of(
+def make_leg(
     drives: Mapping[str, Drive],
     goals: Mapping[str, float],
     travel: Mapping[str, float],
     duration: float,
     now: float,
 ) -> Leg | None:
-    """The leg of a travel (mm or rad by axis) from the present goals (counts by channel); None where nothing moves.
+    """Return the leg of a travel (mm or rad by axis) from the present goals (counts by channel); None if nothing
+    moves.
 
     drives: by axis, as they are before. Positions are absolute, so that rounding does not add up.
     """
-    moved = {name: drives[name].towards(way) for name, way in travel.items() if way != 0.0}
+    moved = {name: drives[name].in_direction(way) for name, way in travel.items() if way != 0.0}
     if not moved:
         return None
     by_channel = {drive.axis.channel: drive for drive in moved.values()}
     start = {channel: goals[channel] for channel in by_channel}
     goal = {
-        drive.axis.channel: drive.counts(drives[name].position(goals[drive.axis.channel]) + travel[name])
+        drive.axis.channel: drive.to_counts(
+            drives[name].to_position(goals[drive.axis.channel]) + travel[name]
+        )
         for name, drive in moved.items()
     }
-    return Leg(by_channel, between(by_channel, start, goal, duration), now)
+    return Leg(by_channel, plan_trajectory(by_channel, start, goal, duration), now)
 
 
-def positions(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> dict[str, float]:
-    """Measured positions (mm or rad) by axis."""
-    return {name: drive.position(states[drive.axis.channel].position) for name, drive in drives.items()}
+_AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
+_RESTING_S = 0.5  # longest time from the first stop, besides that of slowing down, until motors must rest
 
 
-def beyond(drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]], *, resting: bool = False) -> str:
-    """A problem with the first of these positions by axis that is outside the axis's range, or "".
+@dataclass(frozen=True)
+class StopUnderWay:
+    """Stop under way: the times (s) of the first and of the next command."""
 
-    By less than the tolerance of a goal it is not: a motor may rest there. resting: nor by what the lost motion adds,
-    for positions of motors that were sent within the range.
-    """
-    for name, position in ends:
-        axis = drives[name].axis
-        (low, high), slack = axis.limits, axis.uncertainty if resting else axis.tolerance
-        if not low - slack <= position <= high + slack:
-            shown = drives[name].shown
-            return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
-    return ""
+    since: float
+    due: float
+
+    @classmethod
+    def at(cls, now: float) -> "StopUnderWay":
+        """Return a stop that begins now."""
+        return cls(now, now)
+
+    def repeated_at(self, now: float) -> "StopUnderWay":
+        """Return the stop after motors have been stopped now."""
+        return replace(self, due=now + _AGAIN_S)
+
+    def due_at(self, now: float) -> "StopUnderWay":
+        """Return the stop with a command due now."""
+        return replace(self, due=now)
+
+    def has_failed(self, now: float, slowing: float) -> bool:
+        """Return whether the time in which motors must come to rest is over; slowing: longest deceleration (s) of
+        one."""
+        return now - self.since > _RESTING_S + slowing

@@ -1,9 +1,9 @@
-"""The process of the supervisor: `python -m flexneedle.lab.rig.supervisor.process DESCRIPTORS`.
+"""Process of the supervisor: `python -m flexneedle.lab.rig.supervisor.process CHANNEL SIGNALS SIGNALS`.
 
-Its sockets come from the client, which starts it: for requests, and for signals that the client gets. It ticks on the
-monotonic clock: a tick that comes too late for the next one is counted, and left out. It is a process because a planner
-that keeps Python busy would delay ticks, and so that either one may be killed: without the client it stops the motors
-and ends, and without it motors stop at the end of what is queued.
+The client starts it, with the descriptors of a channel for requests and of both ends of a socket for signals. It
+ticks on the monotonic clock; a tick that is later than the next one is counted and left out. As a separate process it
+is not delayed by a planner that keeps Python busy, and either process may be killed: without the client the
+supervisor stops the motors and ends, and without the supervisor motors stop at the end of their queue.
 """
 
 import gc
@@ -16,30 +16,30 @@ from typing import Any
 
 from flexneedle.errors import FlexneedleError, describe_error, one_line
 from flexneedle.lab.process import MessageChannel, open_channel
-from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.clock import Suspension, WallClock
 from flexneedle.lab.rig.devices.lock import held
 from flexneedle.lab.rig.devices.opening import address_of, open_motors, open_tracker
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
-from flexneedle.lab.rig.supervisor import messages as say
+from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.core import Supervisor
-from flexneedle.lab.rig.supervisor.dry import DryMotors
-from flexneedle.lab.rig.supervisor.signals import listen, named
-from flexneedle.lab.rig.supervisor.suspension import LONGEST_S, Suspension
+from flexneedle.lab.rig.supervisor.dry import DryRunMotors
+from flexneedle.lab.rig.supervisor.signals import name_signals, open_signal_socket
 from flexneedle.types import Frame
 
 _MOST_WAITING = 400  # messages that a client has not taken: 10 s of reports
 _REST_S = 2.0  # longest wait for motors to rest before the end
 _FLUSH_S = 1.0  # longest wait for a client that does not read, at the end
+_LONGEST_SUSPENSION_S = 0.5  # after a longer one no motion continues, as after ticks that were late
 _CLOSED = "closed"
 
 
-class Untracked:
-    """No tracker, for motions of the operator."""
+class NoTracker:
+    """The port `Tracker` without a tracker, for motions of the operator."""
 
     status = "not opened"
 
     def read(self) -> tuple[Frame, ...]:
-        """No frames."""
+        """Return no frames."""
         return ()
 
     def close(self) -> None:
@@ -48,7 +48,7 @@ class Untracked:
 
 def main(requests: int, received: int, sent: int) -> None:
     """Serve the client until it closes or ends. received, sent: the ends of the socket of signals."""
-    channel, signals = open_channel(requests, most_waiting=_MOST_WAITING), listen(received, sent)
+    channel, signals = open_channel(requests, most_waiting=_MOST_WAITING), open_signal_socket(received, sent)
     task = channel.receive_first()
     why = "the supervisor failed"
     try:
@@ -59,19 +59,19 @@ def main(requests: int, received: int, sent: int) -> None:
         why = f"the supervisor failed: {describe_error(error)}"
         raise
     finally:
-        channel.send(say.Ended(why))
+        channel.send(protocol.SupervisorEnded(why))
         channel.flush(_FLUSH_S)
 
 
-def _serve(channel: MessageChannel, task: say.Task, signals: socket.socket) -> str:
+def _serve(channel: MessageChannel, task: protocol.SupervisorTask, signals: socket.socket) -> str:
     """Open the devices, tick until the end, and return its reason."""
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
         if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
             stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
-        tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
+        tracked = open_tracker(task.rig, clock) if task.tracked else NoTracker()
         tracker = stack.enter_context(closing(tracked))
-        motors = DryMotors(connected, clock) if task.dry else connected
+        motors = DryRunMotors(connected, clock) if task.dry else connected
         answers: list[Any] = []
         core = Supervisor(task, motors, tracker, clock, answers.append)
         set_realtime_priority()
@@ -91,19 +91,21 @@ def _tick(
     signals: socket.socket,
     period: float,
 ) -> str:
-    """Tick until the client ends; return why.
+    """Tick until the client ends; return the reason.
 
-    answers: what the core has to say. The report of a tick is sent before them: a client that gets the end of a motion
-    has the positions after it.
+    answers: messages of the core. The report of a tick is sent before them, so that a client that receives the end of
+    a motion has the positions after it.
     """
     due, missed, ending, why = monotonic(), 0, None, ""
     suspension = Suspension()
     while ending is None or (monotonic() < ending and not core.at_rest):
         sources: list[Any] = [signals] if ending is not None else [signals, channel]
         ready: list[Any] = wait(sources, max(0.0, due - monotonic()))
-        if (seconds := suspension.since()) > LONGEST_S:  # before anything that was requested is done
+        if (
+            seconds := suspension.since()
+        ) > _LONGEST_SUSPENSION_S:  # before anything that was requested is done
             core.stop(f"the computer was suspended for {seconds:.1f} s")
-        if signals in ready and (names := named(signals.recv(64))):
+        if signals in ready and (names := name_signals(signals.recv(64))):
             core.stop(f"signal {names}")
         if channel in ready and (closed := _act_on_requests(channel, core)):
             core.stop(closed)
@@ -123,7 +125,7 @@ def _tick(
 def _act_on_requests(channel: MessageChannel, core: Supervisor) -> str:
     """Act on what the client has sent; return why the supervisor shall end, "" if it shall continue."""
     for request in channel.receive():
-        if isinstance(request, say.Close):
+        if isinstance(request, protocol.CloseRequest):
             return _CLOSED
         core.request(request)
     return "the controller has ended" if channel.ended else ""

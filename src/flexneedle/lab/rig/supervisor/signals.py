@@ -1,6 +1,6 @@
 """Signals of client and supervisor: the system writes them into one socket, which the supervisor reads.
 
-So a signal to the client alone stops the motors, too, whatever that process is busy with.
+So a signal to the client alone also stops the motors, even while that process is busy.
 """
 
 import signal
@@ -20,16 +20,16 @@ class SignalLine:
 
     @property
     def descriptors(self) -> tuple[int, int]:
-        """Of the ends, for `listen`."""
+        """Of the ends, for `open_signal_socket`."""
         return self._received.fileno(), self._sent.fileno()
 
     def take(self) -> None:
-        """Have each signal of this process that has a handler of Python written. Call it in the main thread."""
+        """Write each signal of this process that has a Python handler to the socket. Call it in the main thread."""
         with uninterrupted():
             self._before = signal.set_wakeup_fd(self._sent.fileno(), warn_on_full_buffer=False)
 
     def close(self) -> None:
-        """End that. Call it in the thread of `take`."""
+        """Close the socket, and restore the signals. Call it in the thread of `take`."""
         with uninterrupted():
             if self._before is not None:
                 signal.set_wakeup_fd(self._before)
@@ -38,14 +38,15 @@ class SignalLine:
             self._sent.close()
 
 
-def listen(received: int, sent: int) -> socket.socket:
-    """The supervisor's side: a socket with a byte for each signal of this process, and of a client that takes them."""
+def open_signal_socket(received: int, sent: int) -> socket.socket:
+    """Return the supervisor's side: a socket with a byte for each signal of this process, and of a client that takes
+    them."""
     signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
     for number in SIGNALS:
         signal.signal(number, lambda *_: None)
     return socket.socket(fileno=received)
 
 
-def named(received: bytes) -> str:
-    """Names of those that shall stop the motors, or "": the client may get others."""
+def name_signals(received: bytes) -> str:
+    """Return the names of the received signals that stop the motors, or "": the client may receive others."""
     return ", ".join(number.name for number in SIGNALS if number in received)

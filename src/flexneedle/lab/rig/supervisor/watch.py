@@ -1,22 +1,25 @@
-"""The tick's check of the tracker: the loop's monitor, with the path that is expected during a step."""
+"""Watch over the tip: the tracker's readings, checked by the loop's monitor against the expected path of a step."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from flexneedle.lab.rig.supervisor.messages import Expectation
+from flexneedle.lab.rig.supervisor.protocol import Expectation, SupervisorTask
 from flexneedle.loop.monitor import rules
 from flexneedle.loop.monitor.monitor import Monitor, TipAt
+from flexneedle.phantom.tracking.stage import tip_on_stage
+from flexneedle.ports import Tracker
 from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKind
 
 _NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # whatever is expected
 
 
 @dataclass(frozen=True)
-class Watch:
-    """The monitor, what is expected from `begun` to `ended` (s) and at rest before and after, and the last verdict.
+class TipWatch:
+    """State of the check: the monitor, the expectation from `begun` to `ended` (s), and the last verdict.
 
-    Frozen: `after` returns the next one. since: when the newest readings came, at first when it began to watch.
+    Before and after these times the tip is expected at rest. since: time of the newest readings, at first the begin
+    of the watch. Each change returns a new state.
     """
 
     monitor: Monitor
@@ -28,31 +31,31 @@ class Watch:
     newest: Measurement | None = None
     verdict: Verdict = OK
 
-    def expecting(self, expected: Expectation, begun: float, ended: float) -> "Watch":
-        """With another expectation, by which the newest reading is judged if it was far from the one before."""
+    def with_expectation(self, expected: Expectation, begun: float, ended: float) -> "TipWatch":
+        """Return the watch with another expectation; after an innovation it judges the newest reading again."""
         watch = replace(self, expected=expected, begun=begun, ended=ended)
         if self.verdict.kind is not VerdictKind.INNOVATION or self.newest is None:
             return watch
         place = [value for value in (self.newest.x, self.newest.y, self.newest.z) if value is not None]
         axes = min(len(place), 1 + self.monitor.axes)
-        again = rules.innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
+        again = rules.check_innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
         return replace(watch, verdict=again)
 
-    def waiting(self, now: float, seconds: float) -> "Watch":
-        """With the end of what is expected now later by `seconds`."""
+    def with_later_end(self, now: float, seconds: float) -> "TipWatch":
+        """Extend the expected motion by `seconds`."""
         return replace(self, ended=self.ended + seconds) if now < self.ended and seconds > 0.0 else self
 
-    def at_rest(self, now: float) -> "Watch":
-        """With the needle stopped where it is expected now."""
+    def with_rest(self, now: float) -> "TipWatch":
+        """Return the watch with the needle stopped at its expected position."""
         if self.expected is None:
             return self
         here = self._tip_at(now)
         return replace(self, expected=replace(self.expected, begin=here, end=here))
 
-    def after(self, measurements: Sequence[Measurement], now: float, status: str) -> "Watch":
-        """After the readings of a tick, oldest first. status: of the tracker."""
+    def with_readings(self, measurements: Sequence[Measurement], now: float, status: str) -> "TipWatch":
+        """Return the watch after the readings of a tick, oldest first. status: of the tracker."""
         if self.expected is None:
-            return self._before(measurements, now)
+            return self._with_first_readings(measurements, now)
         monitor, verdict = self.monitor, OK
         for one in measurements:
             monitor, verdict = monitor.check(one, self._tip_at, now, self.stale_after, self.expected.most_off)
@@ -62,16 +65,17 @@ class Watch:
             monitor, field = monitor.check_field()
             verdict = field if not field.ok else verdict
             return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1], since=now)
-        return replace(self, verdict=self._without(now, status))
+        return replace(self, verdict=self._verdict_without_readings(now, status))
 
-    def _before(self, measurements: Sequence[Measurement], now: float) -> "Watch":
-        """Before the first step nothing is expected: the readings fill the monitor's windows.
+    def _with_first_readings(self, measurements: Sequence[Measurement], now: float) -> "TipWatch":
+        """Return the watch after readings before the first step: they fill the monitor's windows.
 
-        Only a newest reading that is not a number, repeated or stale is rejected, so that a step does not begin on it.
+        Nothing is expected yet, and only a newest reading that is not a number, repeated or stale is rejected, so
+        that no step begins on it.
         """
         monitor, verdict = self.monitor, OK
         for one in measurements:
-            here = _always((one.x or 0.0, one.y or 0.0, one.z or 0.0))
+            here = _fixed_tip((one.x or 0.0, one.y or 0.0, one.z or 0.0))
             monitor, verdict = monitor.check(one, here, now, self.stale_after, math.inf)
         if measurements:
             monitor, _ = monitor.check_field()
@@ -79,8 +83,8 @@ class Watch:
             return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1], since=now)
         return self
 
-    def _without(self, now: float, status: str) -> Verdict:
-        """The verdict of a tick without a new reading: the one before, until the last one came too long ago."""
+    def _verdict_without_readings(self, now: float, status: str) -> Verdict:
+        """Return the verdict of a tick without a new reading: unchanged until the last reading is too old."""
         if not self.verdict.ok or now - self.since <= self.stale_after:
             return self.verdict
         reason = "" if status == VISIBLE else f" ({status})"
@@ -99,6 +103,54 @@ class Watch:
         return x, y, z
 
 
-def _always(place: Point) -> TipAt:
-    """A tip that is expected at one place at any time."""
+def _fixed_tip(place: Point) -> TipAt:
+    """Return a tip that is expected at one position at any time."""
     return lambda _: place
+
+
+class TrackedTip:
+    """Tracker of a task, its measurements since the last report, and their watch. now: s on the run's clock."""
+
+    def __init__(self, task: SupervisorTask, tracker: Tracker, now: float) -> None:
+        self._task, self._tracker = task, tracker
+        self._watch = TipWatch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
+        self._measurements: tuple[Measurement, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the last readings, or of their absence."""
+        return self._watch.verdict
+
+    @property
+    def status(self) -> str:
+        """Of the tracker."""
+        return self._tracker.status
+
+    def read(self, now: float) -> None:
+        """Read the tracker, and check its readings. Raises DriverError."""
+        task = self._task
+        found = tuple(tip_on_stage(frame, task.to_stage, task.tip_offset) for frame in self._tracker.read())
+        self._measurements += found
+        self._watch = self._watch.with_readings(found, now, self.status)
+
+    def take(self) -> tuple[Measurement, ...]:
+        """Return the measurements since the last call, oldest first."""
+        found, self._measurements = self._measurements, ()
+        return found
+
+    def expect(self, expected: Expectation, begun: float, ended: float) -> None:
+        """Expect a travel from `begun` to `ended` (s)."""
+        self._watch = self._watch.with_expectation(expected, begun, ended)
+
+    def expect_start(self, expected: Expectation, now: float) -> None:
+        """Expect the tip at the start of a travel, and check the newest reading again."""
+        there = replace(expected, end=expected.begin)
+        self._watch = self._watch.with_expectation(there, now, now).with_readings((), now, self.status)
+
+    def wait(self, now: float, seconds: float) -> None:
+        """Delay the end of the travel under way by `seconds`."""
+        self._watch = self._watch.with_later_end(now, seconds)
+
+    def stop(self, now: float) -> None:
+        """Expect the tip to rest from now on."""
+        self._watch = self._watch.with_rest(now)

@@ -37,8 +37,8 @@ def add_columns(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=COLUMN",
-        help="column of another name in the table, such as --columns X=x_mm, or a TOML file with lines such as "
-        'X = "x_mm"; may be repeated',
+        help="different column name, such as --columns X=x_mm, or a TOML file with lines such as X = "
+        '"x_mm"; repeatable',
     )
 
 

@@ -27,8 +27,9 @@ def add_parser(commands: Commands) -> None:
         _check,
         "flexneedle em check power.csv",
         "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
-        about="Compare the distortion indicator of two environments in one table: power of the rig off and on. "
-        "The exit status is 1 if the mean indicator of any sensor exceeds the threshold with power on.",
+        about="Compare the distortion indicator with the power of the rig off and on, two environments of "
+        "one table. Exit status 1 if the mean indicator of a sensor with power on exceeds the "
+        "threshold.",
     )
     parser.add_argument(
         "data", metavar="DATA", type=Path, help="table with both environments (CSV or Parquet)"

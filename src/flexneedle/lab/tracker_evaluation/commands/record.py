@@ -26,8 +26,8 @@ def add_parser(commands: Commands) -> None:
         _record,
         "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid cube --out ideal.csv",
         "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid mine.toml --out noisy.csv --dwell 5",
-        about="Prompt for the stage to be moved to each point of the grid and record the tracker there. After an "
-        "interruption, run the command again with the same --out to resume at the next point.",
+        about="Record the tracker at each point of a grid, after a prompt to move the stage there. To "
+        "resume after an interruption, repeat the command with the same --out.",
     )
     parser.add_argument(
         "--tracker", required=True, metavar="SPEC", help="tracker, such as aurora:/dev/ttyUSB0"
@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
         "--dwell",
         type=within(0),
         metavar="S",
-        help="for a motorised stage: wait S seconds for it to reach each point (default: prompt for Enter)",
+        help="time for a motorised stage to reach each point (default: prompt for Enter)",
     )
     parser.add_argument(
         "--force",

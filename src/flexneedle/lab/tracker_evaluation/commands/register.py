@@ -42,8 +42,8 @@ def add_parser(commands: Commands) -> None:
         action="append",
         default=[],
         metavar=("X", "Y", "Z"),
-        help="point in the stage's frame (mm) at which to report the expected error; may be repeated "
-        "(default: the centroid of the points)",
+        help="point in the stage's frame (mm) for the expected error; repeatable (default: centroid of the "
+        "points)",
     )
     add_columns(parser)
     parser.add_argument(

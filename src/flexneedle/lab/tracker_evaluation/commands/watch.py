@@ -34,8 +34,8 @@ def add_parser(commands: Commands) -> None:
         _watch,
         "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
         "flexneedle em watch --tracker replay:frames.csv@4 --json",
-        about="Show a live table at a terminal; otherwise print one line per second and at each change of the "
-        "verdict. Ends with Ctrl-C or at the end of a replay.",
+        about="Show a live table at a terminal; elsewhere print one line per second and per change of the "
+        "verdict. Ends with Ctrl-C or the end of a replay.",
     )
     parser.add_argument(
         "--tracker",

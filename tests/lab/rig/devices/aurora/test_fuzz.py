@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.rig.devices.aurora.incoming import Incoming
 from flexneedle.lab.rig.devices.aurora.messages import parse
-from flexneedle.lab.rig.supervisor.watch import Watch
+from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.types import OK, VISIBLE, Frame, SensorReading
 
 sys.path.append(str(Path(__file__).parents[5] / "campaigns"))  # behind the tests: both have an `emulated`
@@ -111,7 +111,7 @@ def test_the_fuzz_notices_tracking_that_nothing_began():
 
 
 def test_the_fuzz_notices_a_verdict_that_does_not_reject(monkeypatch):
-    monkeypatch.setattr(Watch, "after", lambda watch, *_: replace(watch, verdict=OK))
+    monkeypatch.setattr(TipWatch, "with_readings", lambda watch, *_: replace(watch, verdict=OK))
     with pytest.raises(fuzz_aurora.Failure):
         fuzzing.run(fuzz_aurora.watch_inputs, 1000, SECONDS, seed=0)
 

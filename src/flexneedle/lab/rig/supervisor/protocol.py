@@ -1,4 +1,4 @@
-"""Messages between the supervisor and its client, pickled on a socket pair of one machine.
+"""Messages between the supervisor and its client, pickled on a channel of one machine.
 
 Positions of axes are in mm or rad, times in s on the run's clock.
 """
@@ -9,20 +9,20 @@ from dataclasses import dataclass, field
 from flexneedle.geometry.registration import Rigid
 from flexneedle.lab.rig.devices.lock import this_program
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.supervisor.machine import State
+from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Measurement, Point
 
 
 @dataclass(frozen=True)
-class Task:
-    """What the supervisor works with, its first message.
+class SupervisorTask:
+    """Task of a supervisor, its first message.
 
     started: zero of the run's clock on the monotonic clock (s); lateral_axes: of the needle; to_stage: map from the
-    tracker's frame to that of the insertion; tip_offset: from the sensor to the tip (mm); stale_after: age (s) above
-    which a reading is stale; dry: motors are read, and never moved; tracked: whether the tracker is opened;
-    client: the program that the motors are held for, for the message to another one.
+    tracker's frame to the frame of the insertion; tip_offset: from the sensor to the tip (mm); stale_after: age (s)
+    above which a reading is stale; dry: motors are read, and never moved; tracked: the tracker is opened; client:
+    program that the motors are held for, for the message to another one.
     """
 
     rig: RigFile
@@ -39,8 +39,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Expectation:
-    """Where the tip is expected during a step: positions (mm) at its begin and end, and how far from it a reading may
-    be (mm)."""
+    """Expected positions (mm) of the tip at begin and end of a step, and the largest distance of a reading from them
+    (mm)."""
 
     begin: Point
     end: Point
@@ -52,18 +52,18 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """The client is there."""
+    """A sign of life of the client."""
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmRequest:
     """Switch motors on and take their positions as the start. deepest: largest advance (mm) from there."""
 
     deepest: float
 
 
 @dataclass(frozen=True)
-class Step:
+class StepRequest:
     """A step of an insertion: the roll (rad) in `roll_duration` s, confirmed by its position; then `travel` by axis in
     `duration` s. An axis that cannot do that takes longer."""
 
@@ -76,7 +76,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Go:
+class MoveRequest:
     """Move one axis alone to a position, at most at `speed` (mm/s or rad/s).
 
     retract: as a withdrawal of the base, and not as a motion of the operator.
@@ -90,7 +90,7 @@ class Go:
 
 
 @dataclass(frozen=True)
-class Home:
+class HomeRequest:
     """Find the home of an axis."""
 
     number: int
@@ -98,28 +98,38 @@ class Home:
 
 
 @dataclass(frozen=True)
-class Stop:
+class StopRequest:
     """Stop all motors. who: the keyboard, a service, a signal."""
 
     who: str
 
 
 @dataclass(frozen=True)
-class Reset:
+class ResetRequest:
     """Leave the states stopped and fault; nothing moves."""
 
 
 @dataclass(frozen=True)
-class Off:
+class OffRequest:
     """Switch all motors off, after a stop."""
 
 
 @dataclass(frozen=True)
-class Close:
+class CloseRequest:
     """Stop, and end the supervisor."""
 
 
-Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Off | Close
+Request = (
+    Heartbeat
+    | ArmRequest
+    | StepRequest
+    | MoveRequest
+    | HomeRequest
+    | StopRequest
+    | ResetRequest
+    | OffRequest
+    | CloseRequest
+)
 
 
 # From the supervisor
@@ -127,7 +137,7 @@ Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Off | Close
 
 @dataclass(frozen=True)
 class AxisState:
-    """An axis: its measured position, its motor, and how far from there its last target is (mm or rad)."""
+    """Measured position of an axis, its motor, and the distance to its last target (mm or rad)."""
 
     position: float
     motor: MotorState
@@ -135,24 +145,24 @@ class AxisState:
 
 
 @dataclass(frozen=True)
-class Done:
-    """A motion has ended: what was really done by axis, from `begun` to `ended` (s).
+class MotionResult:
+    """End of a motion, and the travel by axis, from `begun` to `ended` (s).
 
-    turned: when the travel began after a roll, None without one;
-    why: why it was ended before its goal, or ""; state: of the rig after it.
+    turned: begin of the travel after a roll, None without a roll; why: reason why it ended before its goal, or "";
+    state: of the rig after it.
     """
 
     number: int
     travelled: Mapping[str, float]
     begun: float
     ended: float
-    state: State
+    state: SupervisorState
     why: str = ""
     turned: float | None = None
 
 
 @dataclass(frozen=True)
-class Refused:
+class RequestRefused:
     """A request that the state does not allow, or that breaks a limit; nothing moved.
 
     number: of the motion, or 0; state, cause: of the rig, and the reason of a stop or fault.
@@ -160,23 +170,22 @@ class Refused:
 
     number: int
     why: str
-    state: State
+    state: SupervisorState
     cause: str = ""
 
 
 @dataclass(frozen=True)
-class Report:
-    """What one tick found.
+class TickReport:
+    """Report of one tick.
 
-    time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault, or what arming has changed;
-    axes: by name; measurements: since the last report, oldest first; tracker: its status; at_rest: whether no motion
-    and no stop is under way; late, work: how much later than scheduled the tick began, and how long it took (s);
-    missed: ticks left out since the start; requests: how many the rig had acted on, so that a client can wait for what
-    its request has changed.
+    time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault, or a note of what arming
+    has changed; axes: by name; measurements: since the last report, oldest first; tracker: its status; at_rest: no
+    motion and no stop is under way; late, work: delay and duration of the tick (s); missed: ticks left out since the
+    start; requests: number of requests acted on, so that a client can wait for the effect of its request.
     """
 
     time: float
-    state: State
+    state: SupervisorState
     why: str = ""
     axes: Mapping[str, AxisState] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
@@ -189,7 +198,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Ended:
-    """The supervisor ends; why: the reason, "" at a request."""
+class SupervisorEnded:
+    """End of the supervisor; why: the reason, "" at a request."""
 
     why: str = ""

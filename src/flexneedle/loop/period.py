@@ -10,7 +10,7 @@ from flexneedle.loop.step import Step
 from flexneedle.types import UNKNOWN, Control, Lateral, Period, Plan, Pose, X
 
 
-def record(
+def make_period(
     index: int,
     now: float,
     plan: Plan,
@@ -20,7 +20,7 @@ def record(
     observation: Observation,
     clocks: list[float],
 ) -> Period:
-    """The period that ended at `now` (s).
+    """Return the period that ended at `now` (s).
 
     clocks: wall clock (s) at its start and after decision, motion and measurement.
     """
@@ -66,5 +66,5 @@ def record(
 
 
 def _pair(miss: float | complex) -> Lateral:
-    """y, z of a miss (mm); z is 0 in the plane."""
+    """Return y, z of a miss (mm); z is 0 in the plane."""
     return UNKNOWN if cmath.isnan(miss) else (complex(miss).real, complex(miss).imag)

@@ -8,13 +8,13 @@ import pytest
 
 import flexneedle
 from flexneedle.cli import main as cli
-from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.control.controllers import CONTROLLERS, find_controller
 from flexneedle.errors import InputError
-from flexneedle.loop.parts import controller_of, plant_of, tracker_of
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import PLANTS
+from flexneedle.phantom.plants import PLANTS, find_plant
+from flexneedle.phantom.tracking.factory import find_tracker
 from flexneedle.types import STILL
 from synthetic import make_plan
 
@@ -70,13 +70,13 @@ def lab(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("lab")
 def test_parts_are_found_by_name_module_and_object():
     for name, method in CONTROLLERS.items():
-        assert controller_of(name) == controller_of(method) == (name, method)
+        assert find_controller(name) == find_controller(method) == (name, method)
     for name, factory in PLANTS.items():
-        assert plant_of(name) == (name, factory)
-    assert tracker_of("scenario") == ("scenario", None)
-    name, own = controller_of("lab_parts:FINE")
+        assert find_plant(name) == (name, factory)
+    assert find_tracker("scenario") == ("scenario", None)
+    name, own = find_controller("lab_parts:FINE")
     assert (name, own.name) == ("lab_parts:FINE", "fine")
-    assert controller_of(own) == ("fine", own)
+    assert find_controller(own) == ("fine", own)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What the closed loop keeps from one control period to the next: holds of the needle, and progress to the target."""
+"""State of the closed loop between two control periods: holds of the needle, and progress to the target."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +15,7 @@ _CHANGED_SDS = 3.0  # standard deviations of an estimate beyond which a decision
 
 @dataclass(frozen=True)
 class Hold:
-    """A hold of the needle: its time (s) on account of the field and of readings, and its present cause since `at`."""
+    """A hold of the needle: time (s) held for the field and for readings, and its present cause since `at`."""
 
     at: float
     field: bool
@@ -23,37 +23,37 @@ class Hold:
     for_readings: float = 0.0
 
     def duration(self, field: bool) -> float:
-        """Time (s) held on account of the field or of readings."""
+        """Return the time (s) held for the field or for readings."""
         return self.for_field if field else self.for_readings
 
 
 @dataclass(frozen=True)
-class Refused:
-    """Why decisions are not carried out, empty if they are, and the time (s) held for it.
+class Refusal:
+    """Reason to carry out no decision, "" for none, and the time (s) held for it.
 
-    No path reaches the target, the command would exceed a limit, or the rig, whose checks may differ from those of the
-    loop, ends motions before their goal. The time does not run while the needle is held on account of the tracker; a
-    decision that is carried out resets it.
+    No path reaches the target, the command would exceed a limit, or the rig, whose checks may differ from the loop's,
+    ends motions before their goal. The time does not run while the needle is held for the tracker; a decision that is
+    carried out resets it.
     """
 
     reason: str = ""
     duration: float = 0.0
 
-    def after(self, reason: str) -> "Refused":
-        """After a decision."""
-        return Refused(reason, self.duration) if reason else Refused()
+    def after(self, reason: str) -> "Refusal":
+        """Return the refusal after a decision."""
+        return Refusal(reason, self.duration) if reason else Refusal()
 
-    def extended(self, seconds: float) -> "Refused":
-        """After a period of this length."""
-        return Refused(self.reason, self.duration + seconds) if self.reason else self
+    def extend(self, seconds: float) -> "Refusal":
+        """Return the refusal after a period of this length."""
+        return Refusal(self.reason, self.duration + seconds) if self.reason else self
 
     def ending(self, limit: float) -> tuple[Outcome, str] | None:
-        """Outcome and reason once the hold has lasted for `limit` (s)."""
+        """Return outcome and reason once the hold has lasted for `limit` (s)."""
         return (Outcome.HELD, self.reason) if self.reason and self.duration > limit - 1e-9 else None
 
 
 def hold_after(hold: Hold | None, observation: Observation, now: float) -> Hold | None:
-    """The hold after a verdict; None: not held.
+    """Return the hold after a verdict; None: not held.
 
     Each of the two causes has its own clock and limit. A clock stops while the needle is held for the other cause, and
     only a good verdict resets it, so that alternating causes cannot hold the needle forever.
@@ -72,9 +72,10 @@ def hold_after(hold: Hold | None, observation: Observation, now: float) -> Hold 
 
 
 @dataclass(frozen=True, eq=False)
-class Late:
-    """A decision that came after its deadline, the memory after it, and the estimate of the tip on which it was made:
-    pose (5,) and standard deviation (mm).
+class LateDecision:
+    """A decision that came after its deadline, with the memory after it.
+
+    tip, sd: the estimate on which it was made, as pose (5,) and standard deviation (mm).
     """
 
     decision: Decision
@@ -83,39 +84,39 @@ class Late:
     sd: float
 
     @staticmethod
-    def of(decision: Decision, memory: Any, estimate: Estimate) -> "Late":
-        """A decision on an estimate."""
-        return Late(decision, memory, estimate.tip, estimate.tip_sd)
+    def of(decision: Decision, memory: Any, estimate: Estimate) -> "LateDecision":
+        """Return a late decision on an estimate."""
+        return LateDecision(decision, memory, estimate.tip, estimate.tip_sd)
 
     def holds_for(self, estimate: Estimate) -> bool:
-        """Whether the readings since then have moved the estimated tip by no more than it was uncertain."""
+        """Return whether new readings moved the estimated tip by no more than its uncertainty."""
         moved = np.linalg.norm(estimate.tip[: Z + 1] - self.tip[: Z + 1])
         return bool(moved <= _CHANGED_SDS * self.sd)
 
 
 @dataclass(frozen=True)
-class Progress:
-    """An insertion between two periods.
+class LoopState:
+    """State of an insertion between two periods.
 
     arrived_at: time (s) at which the needle arrived at its depth; moves: number of moves; in_a_row: number of
     consecutive decisions with a likely miss; predicted: the last predicted shape; late: a decision of the last period
-    that came late; held_in_all: time (s) of all holds; asked: why somebody has it held, "" if nobody has.
+    that came late; held_in_all: time (s) of all holds; asked: reason of the gate to hold the needle, "" for none.
     """
 
     observation: Observation
     memory: Any  # of the controller
     hold: Hold | None
-    refused: Refused = Refused()
+    refused: Refusal = Refusal()
     arrived_at: float | None = None
     moves: int = 0
     in_a_row: int = 0
     predicted: Shape | None = None
-    late: Late | None = None
+    late: LateDecision | None = None
     held_in_all: float = 0.0
     asked: str = ""
 
-    def withheld(self, reason: str, before: "Progress") -> "Progress":
-        """With a decision, on the progress before, that the rig has not carried out to its end."""
+    def hold_back(self, reason: str, before: "LoopState") -> "LoopState":
+        """Return this state with a decision that the rig has not carried out to its end; before: the earlier state."""
         return replace(self, refused=before.refused.after(reason), moves=before.moves)
 
     @property

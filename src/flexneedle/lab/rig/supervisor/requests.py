@@ -1,0 +1,133 @@
+"""Requests: the rules that they must keep, and the motions that they make. Pure functions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from flexneedle.lab.rig.supervisor.drives import Drive, homing_reach, homing_speed, position_after_homing
+from flexneedle.lab.rig.supervisor.motion import CommandedMotion
+from flexneedle.lab.rig.supervisor.protocol import HomeRequest, MoveRequest, StepRequest
+from flexneedle.lab.rig.supervisor.trajectory import shortest_duration
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class RequestRules:
+    """Limits of requests from the present goals.
+
+    drives: axes by name; at: their goals (mm or rad); deepest: largest position of the insertion (mm).
+    """
+
+    drives: Mapping[str, Drive]
+    at: Mapping[str, float]
+    deepest: float
+
+    def step_problem(self, step: StepRequest) -> str:
+        """Return the problem of a step, the end of its roll included, or ""."""
+        spin = step.travel.get("rotation", 0.0)
+        problem = self._travel_problem({**step.travel, "rotation": step.roll + spin})
+        return problem or self._travel_problem({"rotation": step.roll})
+
+    def move_problem(self, go: MoveRequest) -> str:
+        """Return the problem of a motion of one axis, or "". From beyond its range it may move back towards it."""
+        if go.axis not in self.drives:
+            return self._missing_axes([go.axis])
+        drive, now = self.drives[go.axis], self.at[go.axis]
+        problem = self._travel_problem({go.axis: go.position - now})
+        if problem and not self._leads_back(drive, now, go.position):
+            return problem
+        if go.retract and not (go.axis == "insertion" and go.position <= now):
+            return f"retract to {drive.shown(go.position)}: must withdraw the base, which is at {drive.shown(now)}"
+        if not 0.0 < go.speed <= drive.axis.speed * (1.0 + _ROUNDING):
+            speed, fastest = (
+                f"{drive.axis.shown(one)} {drive.axis.unit}/s" for one in (go.speed, drive.axis.speed)
+            )
+            return f"speed of {go.axis} = {speed}: must be above 0, at most {fastest}"
+        return ""
+
+    def home_problem(self, home: HomeRequest) -> str:
+        """Return the problem of the search of a home, or ""."""
+        if home.axis not in self.drives:
+            return self._missing_axes([home.axis])
+        absolute = self.drives[home.axis].axis.home == "absolute"
+        return f"{home.axis}: has an absolute encoder, and no home to search" if absolute else ""
+
+    def _travel_problem(self, travel: Mapping[str, float]) -> str:
+        """Return the problem of a travel by axis, or "": an unknown axis, an end outside a range, or a position too
+        deep."""
+        moved = {name: way for name, way in travel.items() if way}
+        if missing := [name for name in moved if name not in self.drives]:
+            return self._missing_axes(missing)
+        ends = {name: self.at[name] + way for name, way in moved.items()}
+        problem = range_problem(self.drives, list(ends.items()))
+        if not problem and moved.get("insertion", 0.0) > 0.0 and ends["insertion"] > self.deepest + _ROUNDING:
+            deepest = f"{self.deepest:.3f} mm, as far as this insertion may go"
+            return f"insertion = {ends['insertion']:.3f} mm: must be at most {deepest}"
+        return problem
+
+    def _missing_axes(self, names: list[str]) -> str:
+        return f"the rig has no axis {', '.join(names)}; axes: {', '.join(self.drives)}"
+
+    @staticmethod
+    def _leads_back(drive: Drive, now: float, goal: float) -> bool:
+        """Return whether a motion that begins beyond the range ends nearer to it."""
+        low, high = drive.axis.limits
+        return now < goal <= high if now < low else low <= goal < now if now > high else False
+
+
+def make_step(step: StepRequest) -> CommandedMotion:
+    """Return the motion of a step of an insertion: its roll, then its travel."""
+    legs = [(step.travel, step.duration)]
+    if step.roll:
+        legs.insert(0, ({"rotation": step.roll}, step.roll_duration))
+    return CommandedMotion(step.number, legs, step.expected, roll=bool(step.roll))
+
+
+def make_move(go: MoveRequest, drive: Drive, at: float) -> CommandedMotion:
+    """Return the motion of one axis alone, from its goal `at` (mm or rad)."""
+    travel = go.position - at
+    return CommandedMotion(
+        go.number, [({go.axis: travel}, shortest_duration(abs(travel), go.speed, drive.axis.acceleration))]
+    )
+
+
+def make_homing(number: int, drive: Drive, *, at_switch: bool) -> CommandedMotion:
+    """Return the search of a home: `home` is the axis, or `here` for an axis whose home is its present position.
+
+    From an active switch the axis first moves away, and is `released` then: a switch that is stuck is no home.
+    """
+    if not drive.axis.to_home:
+        return CommandedMotion(number, [], here=drive, unlimited=True)
+    search = _homing_leg(drive, homing_reach(drive.axis))
+    if at_switch:
+        return CommandedMotion(number, [back_off_leg(drive), search], released=drive, unlimited=True)
+    return CommandedMotion(number, [search], home=drive, unlimited=True)
+
+
+def back_off_leg(drive: Drive) -> tuple[Mapping[str, float], float]:
+    """Return the leg from the limit switch of the home into the range, as (travel by axis, duration)."""
+    return _homing_leg(drive, position_after_homing(drive.axis) - drive.axis.at_home)
+
+
+def _homing_leg(drive: Drive, travel: float) -> tuple[Mapping[str, float], float]:
+    """Return the leg of a travel (mm or rad) at the speed of homing."""
+    return {drive.name: travel}, shortest_duration(
+        abs(travel), homing_speed(drive.axis), drive.axis.acceleration
+    )
+
+
+def range_problem(
+    drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]], *, resting: bool = False
+) -> str:
+    """Return the problem of the first position (by axis) that is outside the axis's range, or "".
+
+    A position beyond it by less than the tolerance is accepted: a motor may rest there. resting: the lost motion is
+    accepted, too, for positions of motors whose goals were within the range.
+    """
+    for name, position in ends:
+        axis = drives[name].axis
+        (low, high), slack = axis.limits, axis.uncertainty if resting else axis.tolerance
+        if not low - slack <= position <= high + slack:
+            shown = drives[name].shown
+            return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
+    return ""
