@@ -35,7 +35,7 @@ MOVES = [
 ]
 
 
-class Supervisor:
+class SupervisorClient:
     """A supervisor of a rig that rests. on_wait: called each time that its client waits."""
 
     rig, positions = rig(), POSITIONS
@@ -79,7 +79,7 @@ def calls(monkeypatch):
         held = Stream((wait_while_held, *stream.listeners))
         return fake_engine.carry_out(scenario, plan, choices, held)
 
-    supervisor = inserted.supervisor = Supervisor()
+    supervisor = inserted.supervisor = SupervisorClient()
     monkeypatch.setattr(recording, "carry_out", inserted)
     return SimpleNamespace(found=found, supervisor=supervisor)
 
@@ -231,7 +231,7 @@ def test_a_needle_at_its_target_is_left_in_too(calls, in_tmp):
 def follower(**more):
     one = order("", **more)
     made = RigGate(SimpleNamespace(task=one, announce=lambda *_: None), None)
-    made._supervisor = Supervisor()
+    made._supervisor = SupervisorClient()
     return made, one
 
 
