@@ -147,7 +147,7 @@ class PhantomSettings(Section):
     """Standard deviation of the base's slope dz/dx. Not set: as dy/dx in space, 0 in the plane."""
     start_axial_sd_mm: NonNegative = 1.0
     """Standard deviation of the axial position of base and tip at the start. The error is at most half of the
-    distance to the skin, to the guide, and to full stroke."""
+    distance to the skin, half of the distance to the guide, and half of the remaining stroke."""
     youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
     """Largest relative deviation of the needle's E, drawn uniformly."""
     initial_bend_mm: NonNegative = 0.5
