@@ -301,7 +301,7 @@ def test_a_failure_during_the_insertion_keeps_the_periods(engine, capsys, in_tmp
     status, out, err = run(capsys, "insert", "--out", "here")
     assert (status, out) == (1, "")
     assert err.splitlines()[-2:] == [
-        "flexneedle: the record so far is in here",
+        "flexneedle: incomplete record: here",
         "flexneedle: the driver is gone",
     ]
     assert names(in_tmp / "here") == INSERTION_FILES

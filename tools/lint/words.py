@@ -19,13 +19,17 @@ CHECKED = (
     "README.md",
     "docs",
     "src/flexneedle/arguments.py",
+    "src/flexneedle/cli",
     "src/flexneedle/errors.py",
     "src/flexneedle/files.py",
     "src/flexneedle/interrupts.py",
+    "src/flexneedle/lab/commands",
     "src/flexneedle/lab/commands/serve.py",
     "src/flexneedle/lab/emulators",
     "src/flexneedle/lab/page",
     "src/flexneedle/lab/process.py",
+    "src/flexneedle/loop",
+    "src/flexneedle/record",
 )
 # Construction, pattern (a space matches any white space), what to write.
 SENTENCES = (

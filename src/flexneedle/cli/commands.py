@@ -1,4 +1,4 @@
-"""Parsers of commands: each has a help that ends with example command lines, and a handler or commands of its own."""
+"""Parsers of commands: each has a help that ends with example command lines, and a handler or subcommands."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """The commands of a parser, to which others are added; argparse has no public name for them."""
 Handler = Callable[[argparse.Namespace], int]
-"""What a command does with its arguments; returns the exit status."""
+"""Carries out a command with its arguments; returns the exit status."""
 
 
 def add_command(
@@ -23,8 +23,8 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Add a command, and return its parser without arguments yet.
 
-    summary: its line in the help of the parser above; about: text before its arguments; notes: after them, before the
-    examples.
+    summary: its line in the help of the parser above; about: text before its arguments; notes: text after them, before
+    the examples.
     """
     parser = commands.add_parser(name, help=summary, **help_texts(*examples, about=about, notes=notes))
     parser.set_defaults(handler=handler)
@@ -39,7 +39,7 @@ def add_group(
     *examples: str,
     title: str = "commands",
 ) -> None:
-    """Add a command with commands of its own, which `adders` add to it. title: plural of what these are."""
+    """Add a command with subcommands, which `adders` add to it; title: their plural."""
     parser = commands.add_parser(name, help=summary, **help_texts(*examples))
     inner = parser.add_subparsers(title=title, metavar=title.upper().removesuffix("S"), required=True)
     for add in adders:
@@ -53,7 +53,7 @@ def help_texts(*examples: str, about: str | None = None, notes: str = "") -> dic
 
 
 class _HelpFormatter(argparse.HelpFormatter):
-    """Wraps single-line texts and keeps the line breaks of others, such as those of examples."""
+    """Wraps single-line texts and keeps the line breaks of others, such as the examples."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         if "\n" not in text:

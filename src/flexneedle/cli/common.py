@@ -22,11 +22,11 @@ SWITCHED_ON = (
     "The motors of all axes are switched on first. One that rests away from its commanded position is switched off "
     "and on again, and held where it is: support a vertical axis."
 )
-"""What precedes any motion of a rig."""
+"""Notice before any motion of a rig."""
 ARMS = f"{SWITCHED_ON} Ctrl-C stops."
 """Printed before any motion of a rig."""
 STILL_IN = "the needle stays where it is: withdraw it by flexneedle rig retract {rig}"
-"""How a needle that was left in is withdrawn; rig: as the user gave it."""
+"""Notice of a needle that is left in; rig: as the user gave it."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""
 
@@ -76,12 +76,12 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_seed(parser: argparse.ArgumentParser, meaning: str) -> None:
-    """Add the seed (default: 0). meaning: for the help."""
+    """Add the seed (default: 0); meaning: text of its help."""
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help=f"{meaning} (default: 0)")
 
 
 def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> None:
-    """Add the planning strategy. meaning: of the strategies, for the help; more: choices besides the two."""
+    """Add the planning strategy; meaning: text of its help; more: choices besides the two."""
     parser.add_argument(
         "--strategy",
         choices=(*STRATEGIES, *more),
@@ -90,7 +90,7 @@ def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> N
     )
 
 
-def chosen_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
+def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
     from flexneedle.control.controllers import used
     from flexneedle.scenario.files import load_scenario
@@ -112,7 +112,7 @@ def target_row(scenario: Scenario, target: Sequence[float]) -> tuple[str, str]:
 
 
 def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
-    """Return the rows of a table for the entry that a plan has chosen; none where the scenario fixes it."""
+    """Return the rows of a table for the entry that a plan has chosen; none if the scenario fixes it."""
     if plan.scenario is None or not scenario.entry.free:
         return []
     entry, axes = plan.scenario.entry, scenario.setup.axes
@@ -168,15 +168,15 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 
 @contextmanager
-def problems_printed(folder: Folder) -> Iterator[None]:
-    """At the end, print a line on stderr for each file that could not be written, and figure not drawn.
+def print_problems(folder: Folder) -> Iterator[None]:
+    """Print a line on stderr at the end for each file not written and each figure not drawn.
 
-    After an error or an interrupt also where the record so far is, which no table names then.
+    After an error or an interrupt, also print the folder of the record, since no table names it then.
     """
     try:
         yield
     except BaseException:
-        print(f"flexneedle: the record so far is in {folder.path}", file=sys.stderr)
+        print(f"flexneedle: incomplete record: {folder.path}", file=sys.stderr)
         raise
     finally:
         for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
@@ -190,7 +190,7 @@ def require_terminal() -> None:
 
 
 def confirm_motions(lines: Iterable[str], question: str) -> None:
-    """Print what would move, and ask on stderr; "": do not ask.
+    """Print the motions, and ask on stderr; question "": do not ask.
 
     Raises RunError for any answer but yes, InputError without a terminal.
     """

@@ -25,7 +25,7 @@ _COLUMN_HELP = """
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame
 Unknown values are empty. A tracker without frames has no sensor columns. All
-rows of a dry run (insert --dry-run) have a last column dry_run, those of an
+rows of a dry run (insert --dry-run) have a last column dry_run, rows of an
 insertion that was disturbed on the page (serve) one called disturbed.
 
 """

@@ -12,13 +12,13 @@ from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import (
     add_run_arguments,
     add_strategy,
-    chosen_scenario,
+    choose_scenario,
     compile_first,
     print_json,
-    problems_printed,
+    print_problems,
     run_name,
 )
-from flexneedle.cli.inserted import report
+from flexneedle.cli.insertion_report import report
 from flexneedle.cli.values import seed
 from flexneedle.errors import FlexneedleError, StoppedError, one_line
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 class Connection:
-    """What an insertion of the command is connected to: the virtual rig of `--phantom` and `--tracker`.
+    """Rig and listeners of the command's insertion: the virtual rig of `--phantom` and `--tracker`.
 
-    Another one, made from the arguments, can be set as the default of `connection` in the command's parser.
+    Another class, made from the arguments, can be set as the default of `connection` in the command's parser.
     """
 
     def __init__(self, args: argparse.Namespace) -> None:
@@ -46,7 +46,7 @@ class Connection:
         self.args = args
         self.source: RigSource = VirtualRig(args.phantom or DEFAULT_PLANT, args.tracker or SCENARIO_TRACKER)
 
-    def registered(self, scenario: Scenario) -> Scenario:
+    def with_registration(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the registration of the tracker."""
         if self.args.registration is None:
             return scenario
@@ -67,7 +67,7 @@ class Connection:
         return None
 
     def end(self) -> None:
-        """Print what the user must know of a needle that has moved."""
+        """Print how the user withdraws a needle that has moved."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -99,7 +99,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _add_parts(parser: argparse.ArgumentParser) -> None:
-    """Controller, plant and tracker."""
+    """Add controller, plant and tracker."""
     parser.add_argument(
         "--controller",
         metavar="NAME",
@@ -133,16 +133,16 @@ def _insert(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         connection: Connection = args.connection(args)
         choices = _choices(args, connection)
-        with _refusal_printed(args, choices):
-            scenario = connection.registered(chosen_scenario(args, choices.controller))
-        with _refusal_printed(args, choices, scenario):
+        with _print_refusal(args, choices):
+            scenario = connection.with_registration(choose_scenario(args, choices.controller))
+        with _print_refusal(args, choices, scenario):
             check_choices(scenario, args.strategy, choices)
             scenario = connection.start(stack, scenario)
             compile_first(scenario.setup.axes)
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
-        with problems_printed(folder):
+        with print_problems(folder):
             try:
-                with _refusal_printed(args, choices, scenario, folder):
+                with _print_refusal(args, choices, scenario, folder):
                     insertion = _execute(args, folder, scenario, choices, connection)
             except FlexneedleError:
                 if (folder.values["result"] or {}).get("outcome") == "failed":
@@ -184,7 +184,7 @@ def _execute(
 
 
 @contextmanager
-def _refusal_printed(
+def _print_refusal(
     args: argparse.Namespace,
     choices: Choices,
     scenario: Scenario | None = None,

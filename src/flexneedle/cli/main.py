@@ -24,7 +24,7 @@ _ORDER = ("plan", "insert", "serve", "study", "report", "view", "export", "scena
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that prints the usage of the command, not that of `flexneedle`, for an unknown argument."""
+    """A parser that prints the usage of the command, not the usage of `flexneedle`, for an unknown argument."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         known, unknown = super().parse_known_args(args, namespace)
@@ -51,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _adders() -> Iterator[Callable[[Commands], None]]:
-    """Yield the functions that add commands, or options to them: those of the core and of `flexneedle.commands`."""
+    """Yield the functions that add commands, or options to commands, of the core and of installed packages."""
     installed = {point.name: point for point in entry_points(group="flexneedle.commands")}
     for name in sorted({*_CORE, *installed}, key=_place):
         yield _CORE[name].add_parser if name in _CORE else installed[name].load()
@@ -64,7 +64,7 @@ def _place(name: str) -> tuple[int, str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; argparse raises SystemExit for --help and wrong arguments."""
-    return _guarded(lambda: _run(argv))
+    return _report_errors(lambda: _run(argv))
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -74,7 +74,7 @@ def _run(argv: Sequence[str] | None) -> int:
         )  # a name that the terminal cannot print is not an error
     try:
         args = build_parser().parse_args(argv)
-        with _warnings_in_lines():
+        with _print_warnings():
             status: int = args.handler(args)
         return status
     finally:
@@ -82,7 +82,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 @contextmanager
-def _warnings_in_lines() -> Iterator[None]:
+def _print_warnings() -> Iterator[None]:
     """Print each warning of the package once, in one line."""
     printed: set[str] = set()
     show = warnings.showwarning
@@ -100,7 +100,7 @@ def _warnings_in_lines() -> Iterator[None]:
         yield
 
 
-def _guarded(command: Callable[[], int]) -> int:
+def _report_errors(command: Callable[[], int]) -> int:
     """Convert errors that a user can cause to one line each and an exit status."""
     try:
         return command()

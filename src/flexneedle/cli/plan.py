@@ -11,12 +11,12 @@ from flexneedle.cli.common import (
     STRATEGIES,
     add_run_arguments,
     add_strategy,
-    chosen_scenario,
+    choose_scenario,
     compile_first,
     entry_rows,
     print_json,
+    print_problems,
     print_table,
-    problems_printed,
     run_name,
     target_row,
 )
@@ -48,11 +48,11 @@ def _plan(args: argparse.Namespace) -> int:
     from flexneedle.record.folder import Folder
     from flexneedle.record.recording import record_plans
 
-    scenario = chosen_scenario(args)
+    scenario = choose_scenario(args)
     compile_first(scenario.setup.axes)
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
-    with problems_printed(folder), Progress() as progress:
+    with print_problems(folder), Progress() as progress:
 
         def show(event: Event) -> None:
             if isinstance(event, Iterated):

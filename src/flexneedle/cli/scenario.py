@@ -119,7 +119,7 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _checked(args: argparse.Namespace) -> Scenario:
-    """Return the scenario with all defaults, including those of the controllers."""
+    """Return the scenario with all defaults, including the settings of the controllers."""
     from flexneedle.control.controllers import checked, find_controller
     from flexneedle.scenario.files import load_scenario
 

@@ -35,7 +35,7 @@ def positive(text: str) -> float:
 
 
 def _read(kind: Callable[[str], Number], text: str, rule: str) -> Number:
-    """The number of a text. Raises ArgumentTypeError, with the rule, for one that is none."""
+    """Return the number of a text. Raises ArgumentTypeError, with the rule, for any other text."""
     try:
         return kind(text)
     except ValueError:

@@ -12,7 +12,7 @@ _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
 
 
-def marks(insertion: Insertion) -> dict[str, Any]:
+def mark_columns(insertion: Insertion) -> dict[str, Any]:
     """Return the columns that mark every row of a dry run or a disturbed insertion; none for another."""
     found = {"dry_run": insertion.dry_run, "disturbed": bool(insertion.disturbed)}
     return {name: True for name, marked in found.items() if marked}
@@ -20,7 +20,7 @@ def marks(insertion: Insertion) -> dict[str, Any]:
 
 def write_csv(file: IO[str], insertion: Insertion) -> None:
     """Write periods to a text file opened with newline="". Wall-clock durations are only in the trace."""
-    marked = marks(insertion)
+    marked = mark_columns(insertion)
     writer = csv.DictWriter(file, [*COLUMNS, *marked], lineterminator="\n")
     writer.writeheader()
     writer.writerows(to_row(period) | marked for period in insertion.periods)
@@ -33,7 +33,7 @@ def write_readings(file: IO[str], insertion: Insertion) -> None:
     followed by each sensor in the tracker's frame, as reported: columns `NAME.x_mm` and so on, for all sensors of all
     frames. Missing values are empty.
     """
-    periods, marked = insertion.periods, marks(insertion)
+    periods, marked = insertion.periods, mark_columns(insertion)
     rows = [
         {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked) | marked
         for period in periods

@@ -209,7 +209,7 @@ FIELDS: dict[str, PeriodField] = {
     "converged": PeriodField((("converged", _flag),)),
 }
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
-knows. Durations and readings have topics of their own (`record.topics`)."""
+knows. `record.topics` has durations and readings."""
 
 COLUMNS: tuple[str, ...] = tuple(name for field in FIELDS.values() for name, _ in field.columns)
 """Names of the columns, in order."""

@@ -9,14 +9,14 @@ from flexneedle.figures.perspective import perspective_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import save
 from flexneedle.record.folder import TRACE_FILE, read_run
-from flexneedle.record.loading import insertion_of, unfinished
+from flexneedle.record.loading import insertion_of, unfinished_note
 
 
 def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -> list[Path]:
     """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
-    An insertion in space is drawn in perspective, too: `perspective.png` and `.svg`.
-    note: called with a line if the record lacks its end, or that of its trace.
+    An insertion in space is drawn in perspective, too: `perspective.png` and `.svg`. note: called with a line if the
+    record or its trace lacks its end.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
@@ -24,7 +24,7 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     if not run.plans:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
     is_traced = run.kind == "insertion" and (folder / TRACE_FILE).exists()
-    insertion, lacking = insertion_of(run) if is_traced else (None, unfinished(run))
+    insertion, lacking = insertion_of(run) if is_traced else (None, unfinished_note(run))
     if lacking:
         note(lacking)
     if insertion is not None and insertion.periods:

@@ -1,9 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
-`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller, phantom, tracker, rig, dry_run and disturbed. A plan that chose where
-the needle enters has its own section `entry`; the scenario of an insertion is the one with the entry of its plan.
-All except `timing`, the date and the wall-clock times, is the same for the same seed.
+`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and plans;
+for an insertion also controller, phantom, tracker, rig, dry_run and disturbed. A plan that chose where the needle
+enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All except `timing`, the
+date and the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -32,10 +32,10 @@ _FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class RunFile:
-    """Contents of `run.json`. status: "running" (or killed), "done", "held", "failed" or "interrupted".
+    """Contents of `run.json`; status: "running" (or killed), "done", "held", "failed" or "interrupted".
 
-    controller, phantom, tracker, rig: of an insertion, "" if not recorded; dry_run: whether the rig did not move;
-    disturbed: what a person disturbed and when.
+    controller, phantom, tracker, rig: of an insertion, "" if not recorded; dry_run: true if the rig did not move;
+    disturbed: disturbances by a person, with their times.
     """
 
     folder: Path
@@ -99,7 +99,7 @@ class Folder:
         replace_file(self.path / RUN_FILE, text.encode())
 
     def _chosen_entry(self, plan: Plan) -> dict[str, Any]:
-        """The section `entry` of a plan that has chosen another than that of the run's scenario."""
+        """Return the section `entry` of a plan if it differs from the entry of the run's scenario."""
         if plan.scenario is None:
             return {}
         entry = plan.scenario.values()["entry"]
@@ -177,7 +177,7 @@ def _checked(path: Path, values: Any) -> RunFile:
 
 
 def _plan(values: dict[str, Any], scenario: dict[str, Any]) -> Plan:
-    """The plan of a run, with the run's scenario, at the entry that the plan has chosen."""
+    """Return the plan of a run, with the run's scenario, at the entry that the plan has chosen."""
     chosen = {name: values[name] for name in ("entry",) if name in values}
     plan = plan_from_values({name: value for name, value in values.items() if name not in chosen})
     return replace(plan, scenario=Scenario.from_values(scenario | chosen))

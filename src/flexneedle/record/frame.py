@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from flexneedle.arguments import check_instance
 from flexneedle.errors import InputError
-from flexneedle.record.export import marks
+from flexneedle.record.export import mark_columns
 from flexneedle.record.fields import COLUMNS, to_values
 from flexneedle.types import Insertion
 
@@ -25,6 +25,6 @@ def to_dataframe(insertion: Insertion) -> "DataFrame":
         from pandas import DataFrame
     except ModuleNotFoundError:
         raise InputError("to_dataframe needs pandas, which is not installed: pip install pandas") from None
-    marked = marks(checked)
+    marked = mark_columns(checked)
     rows = [to_values(period) | marked for period in checked.periods]
     return DataFrame(rows, columns=[*COLUMNS, *marked])

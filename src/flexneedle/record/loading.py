@@ -25,7 +25,7 @@ def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
         found, note = insertion_of(run)
     else:
         found = next(iter(run.plans.values())) if len(run.plans) == 1 else run.plans
-        note = unfinished(run)
+        note = unfinished_note(run)
     if note:
         warnings.warn(note, RuntimeWarning, stacklevel=2)
     return found
@@ -47,7 +47,7 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
 
     Without a recorded end it has the periods of the trace and the outcome "interrupted".
     """
-    trace, lacking = read_trace(run.folder / TRACE_FILE), unfinished(run)
+    trace, lacking = read_trace(run.folder / TRACE_FILE), unfinished_note(run)
     outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if lacking else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))
     ending = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario, run.rig)
@@ -55,7 +55,7 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
     return done, "; ".join(filter(None, (lacking, trace.note)))
 
 
-def unfinished(run: RunFile) -> str:
+def unfinished_note(run: RunFile) -> str:
     """Return a line about a run whose end is not recorded, "" for another."""
     return f"{run.folder}: {_UNFINISHED}" if run.status == "running" else ""
 

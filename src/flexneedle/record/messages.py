@@ -2,7 +2,7 @@
 
 The frame `skin` has its origin at the intersection of the insertion axis with the skin, x into the tissue, y and z
 across it, right-handed. The orientation of a pose is the smallest rotation that turns the x axis into the needle's.
-Time is that of the run and starts at 0.
+Time is the run's and starts at 0.
 """
 
 from collections.abc import Iterable, Mapping
@@ -84,7 +84,7 @@ def joints(time: float, values: Iterable[float]) -> JointState:
 
 
 def number(value: float) -> Float64:
-    """Return a number; its time is that of the log."""
+    """Return a number; it has the time of the log."""
     return Float64(float(value))
 
 
@@ -129,7 +129,7 @@ def _header(time: float) -> Header:
 
 
 def _pose_stamped(header: Header, at: Pose) -> PoseStamped:
-    """The smallest rotation that turns the x axis into the needle's, `Pose.axis`: about an axis normal to x."""
+    """Return a pose with the smallest rotation that turns x into the needle's axis: about an axis normal to x."""
     position = PointMessage(at.x * 1e-3, at.y * 1e-3, at.z * 1e-3)
     tilt, toward_y, toward_z = _polar(at.theta, at.psi)
     y, z = -sin(tilt / 2) * toward_z, sin(tilt / 2) * toward_y
@@ -146,6 +146,6 @@ def _row(at: PoseMessage) -> list[float]:
 
 
 def _polar(y: float, z: float) -> tuple[float, float, float]:
-    """Length and direction of a lateral vector; of a zero vector the direction is zero."""
+    """Return length and direction of a lateral vector; the direction of a zero vector is zero."""
     length = hypot(y, z)
     return (length, y / length, z / length) if length else (length, y, z)

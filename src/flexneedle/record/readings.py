@@ -86,7 +86,7 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 
 
 def _matrix(values: Mapping[str, str], key: str) -> Any:
-    """The rows of a text, None without one; their number and length are for `Measurement` to check."""
+    """Return the rows of a text, None without one; `Measurement` checks their number and length."""
     if key not in values:
         return None
     rows: Matrix = tuple(tuple(map(float, row.split())) for row in values[key].split(";"))

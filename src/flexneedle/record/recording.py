@@ -39,7 +39,7 @@ def record_plans(
 
     An error or an interruption is recorded in `run.json` and re-raised.
     """
-    with _status_recorded(folder):
+    with _record_status(folder):
         for strategy in strategies:
             _plan(folder, scenario, strategy, seed, Stream(tuple(listeners)))
         finish_plans(folder)
@@ -73,7 +73,7 @@ def record_insertion(
         gate: As for `insert`.
     """
     folder.values |= dict.fromkeys(PARTS, "") | {"dry_run": False} | choices.parts
-    with _status_recorded(folder):
+    with _record_status(folder):
         check_choices(scenario, strategy, choices)
         stream = Stream(tuple(listeners), gate or Gate())
         seed = choices.seed if plan_seed is None else plan_seed
@@ -103,7 +103,7 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
         record = {**choices.parts, **choices.rig.results(), "scenario": scenario}
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, **record)
 
-    with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, parts)) as trace:
+    with _close_at_end(folder, open_trace(folder, scenario, plan, choices.seed, parts)) as trace:
 
         def keep(event: Event) -> None:
             if isinstance(event, PeriodEnded):
@@ -127,8 +127,11 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
 
 
 @contextmanager
-def _closed_at_the_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWriter]:
-    """A trace whose index may fail to be written, without which it is readable: then `folder.problems` has it."""
+def _close_at_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWriter]:
+    """Close a trace at the end.
+
+    Without its index, which may fail to be written, it is readable; then `folder.problems` has a line.
+    """
     try:
         yield trace
     finally:
@@ -139,7 +142,7 @@ def _closed_at_the_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWrit
 
 
 @contextmanager
-def _status_recorded(folder: Folder) -> Iterator[None]:
+def _record_status(folder: Folder) -> Iterator[None]:
     """If the block raises, record status and reason in the folder and draw the available figures."""
     try:
         yield

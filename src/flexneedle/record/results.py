@@ -60,17 +60,17 @@ def _true_tip(insertion: Insertion, axis: int) -> float | None:
 
 
 def _true_state(insertion: Insertion, name: str) -> Any:
-    """A `true_…` value of the last period."""
+    """Return a `true_…` value of the last period."""
     return getattr(_last(insertion), name, None)
 
 
 def sds_column(fraction: str, part: str, axis: str) -> str:
-    """Name of the column of a deviation from the prediction: a fraction of the depth, tip or middle, y or z."""
+    """Return the column of a deviation from the prediction: a fraction of the depth, tip or middle, y or z."""
     return f"predicted_{fraction}_{part}_{axis}_sds"
 
 
 def _prediction(insertion: Insertion, depth_fraction: float) -> Period | None:
-    """The first period with a prediction and the estimated tip at this fraction of the target depth."""
+    """Return the first period with a prediction and the estimated tip at this fraction of the target depth."""
     depth = depth_fraction * insertion.target[0]
     predicting = (p for p in insertion.periods if p.predicted is not None or not isnan(p.miss[0]))
     return next((period for period in predicting if period.estimate.x >= depth), None)
@@ -87,9 +87,9 @@ def _predicted_sd(insertion: Insertion, fraction: float) -> float | None:
 
 
 def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
-    """Deviation of the final true tip from the predicted one, in its standard deviations.
+    """Return the deviation of the final true tip from the predicted one, in its standard deviations.
 
-    It is predicted by the miss, or else by the end of the predicted shape.
+    The miss predicts it, or else the end of the predicted shape.
     """
     found, last = _prediction(insertion, fraction), _at_target(insertion)
     if found is None or last is None or last.true_tip is None:
@@ -104,7 +104,7 @@ def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
 
 
 def _middle_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
-    """As `_tip_sds`, of the needle at half of the target's depth."""
+    """Return as `_tip_sds` the deviation of the needle at half of the target's depth."""
     found, last = _prediction(insertion, fraction), _at_target(insertion)
     if found is None or found.predicted is None or last is None or last.true_shape is None:
         return None
@@ -117,19 +117,19 @@ def _middle_sds(insertion: Insertion, axis: int, fraction: float) -> float | Non
 
 
 def _at_target(insertion: Insertion) -> Period | None:
-    """The last period of an insertion that is done."""
+    """Return the last period of an insertion that is done."""
     return _last(insertion) if insertion.outcome is Outcome.DONE else None
 
 
 def _in_sds(insertion: Insertion, axis: int, deviation: float, sd: float) -> float | None:
-    """A deviation in standard deviations; None out of the plane of a needle in the plane."""
+    """Return a deviation in standard deviations; None out of the plane of a needle in the plane."""
     scenario = insertion.scenario or insertion.plan.scenario
     axes = 1 if scenario is None else scenario.setup.axes
     return deviation / sd if axis < axes and sd > 0.0 else None
 
 
 def _prediction_columns() -> dict[str, ResultColumn]:
-    """Predicted miss and its standard deviation, then the deviations from the prediction."""
+    """Yield predicted miss and its standard deviation, then the deviations from the prediction."""
     columns: dict[str, Callable[[Insertion], Any]] = {}
     for name, fraction in DEPTH_FRACTIONS.items():
         for k, axis in enumerate(LATERAL_AXES):

@@ -16,7 +16,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import Insertion, Plan, scenario_of
 
 PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
-"""What an insertion was made with, in `run.json` and `trace.mcap`: fields of `Insertion`."""
+"""Fields of `Insertion` that name its parts, in `run.json` and `trace.mcap`."""
 
 
 def save(record: Plan | Insertion, folder: str | Path) -> Path:

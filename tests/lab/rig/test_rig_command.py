@@ -84,7 +84,7 @@ def device(monkeypatch):
 @pytest.fixture
 def supervisor(monkeypatch):
     fake = Supervisor()
-    monkeypatch.setattr(command, "supervised", fake)
+    monkeypatch.setattr(command, "open_supervisor", fake)
     return fake
 
 

@@ -100,9 +100,7 @@ class RigConnection(RosConnection):
         from flexneedle.lab.rig.supervised import SupervisedRig
 
         if virtual := [f"--{name}" for name in ("phantom", "tracker") if getattr(args, name) is not None]:
-            raise InputError(
-                f"{' and '.join(virtual)}: not with --rig, which has a needle and a tracker of its own"
-            )
+            raise InputError(f"{' and '.join(virtual)}: not with --rig, which has its needle and tracker")
         self.args = args
         self.source = self._rig = SupervisedRig(args.rig, dry_run=args.dry_run)
 
@@ -112,7 +110,7 @@ class RigConnection(RosConnection):
 
     @property
     def _asks(self) -> bool:
-        """Whether motions are confirmed on the terminal: those of motors, unless --yes is given or ROS arms the rig."""
+        """Whether motions of motors are confirmed on the terminal: unless --yes is given or ROS arms the rig."""
         ros = self._file.ros
         return self._rig.moves and not (self.args.yes or (ros is not None and ros.arm))
 
@@ -121,17 +119,17 @@ class RigConnection(RosConnection):
             raise InputError("--ros: not with --rig, whose file has a section [ros] for it")
         return self._file.ros
 
-    def registered(self, scenario: Scenario) -> Scenario:
+    def with_registration(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the registration of the rig file. Raises InputError for a second one."""
-        from flexneedle.lab.rig.supervised import registered
+        from flexneedle.lab.rig.supervised import with_registration
 
         if self.args.registration is not None:
             if self._file.registration is not None:
                 raise InputError(
                     "--registration: not with a rig whose file has a section [registration]: remove one"
                 )
-            return super().registered(scenario)
-        return scenario if self._rig.dry_run else registered(self._file, scenario)
+            return super().with_registration(scenario)
+        return scenario if self._rig.dry_run else with_registration(self._file, scenario)
 
     def start(self, stack: ExitStack, scenario: Scenario) -> Scenario:
         """Let SIGTERM and SIGHUP act as Ctrl-C, so that the record is completed; require a terminal."""
@@ -142,7 +140,7 @@ class RigConnection(RosConnection):
         return started
 
     def gate(self, progress: Progress, scenario: Scenario) -> Gate:
-        """Return the gate of ROS, then that of the user."""
+        """Return the gate of ROS, followed by the user's."""
         asked = _UserGate(progress, scenario, moves=self._rig.moves, question="Insert?" if self._asks else "")
         return asked if self._bridge is None else AllGates(self._bridge, asked)
 

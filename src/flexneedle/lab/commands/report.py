@@ -29,7 +29,7 @@ def add_parser(commands: Commands) -> None:
         "--tuning",
         type=Path,
         metavar="DIR",
-        help="folder of the tuning records to show (default: those of the package)",
+        help="folder of the tuning records to show (default: the records of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
 

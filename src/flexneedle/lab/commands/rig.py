@@ -24,19 +24,19 @@ _FALLS = "A vertical axis falls unless something holds it: support it first."
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
-class Operator(Protocol):
+class RigOperator(Protocol):
     """The supervisor of a rig, for an operator's motions; each call returns when the motion has ended.
 
     Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
     """
 
     def arm(self) -> str:
-        """Switch the motors on; return what else that has changed, or ""."""
+        """Switch the motors on; return what else has changed, or ""."""
         ...
 
     @property
     def positions(self) -> Mapping[str, float]:
-        """Where the axes are (mm or rad) by name."""
+        """Positions of the axes (mm or rad) by name."""
         ...
 
     def move_to(self, axis: str, position: float, speed: float) -> object:
@@ -60,7 +60,7 @@ class Operator(Protocol):
         ...
 
 
-def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
+def open_supervisor(rig: RigFile) -> AbstractContextManager[RigOperator]:
     """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
@@ -271,8 +271,8 @@ def _jog(args: argparse.Namespace) -> int:
 
     rig = load_rig(args.rig)
     axis_of(rig, args.axis)
-    move = jog(rig, args.axis, args.distance, _positions(rig)[args.axis], args.speed)
-    return _carried_out(
+    move = jog(rig, args.axis, args.distance, _read_positions(rig)[args.axis], args.speed)
+    return _confirm_and_move(
         rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
     )
 
@@ -287,13 +287,13 @@ def _home(args: argparse.Namespace) -> int:
         print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
         return 0
 
-    def home(operator: Operator) -> None:
+    def home(operator: RigOperator) -> None:
         for number, homing in enumerate(chosen):
             if number > 0:
                 _arm(operator)
             operator.home(homing.name)
 
-    return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")
+    return _confirm_and_move(rig, chosen, args.yes, home, "Only without a needle in tissue.")
 
 
 def _retract(args: argparse.Namespace) -> int:
@@ -301,7 +301,7 @@ def _retract(args: argparse.Namespace) -> int:
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    position = _positions(rig)["insertion"]
+    position = _read_positions(rig)["insertion"]
     move = retraction(rig, position, args.to, args.speed)
     if move is None:
         at, end = map(rig.axes.insertion.shown, (position, withdrawn(rig)))
@@ -310,7 +310,7 @@ def _retract(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 0
-    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
+    return _confirm_and_move(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
 
 
 def _off(args: argparse.Namespace) -> int:
@@ -318,15 +318,18 @@ def _off(args: argparse.Namespace) -> int:
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    confirm_motions([*switched_off(rig, _positions(rig)), _FALLS], "" if args.yes else "Switch off?")
-    with supervised(rig) as operator, _stopped_on_error(operator):
+    confirm_motions([*switched_off(rig, _read_positions(rig)), _FALLS], "" if args.yes else "Switch off?")
+    with open_supervisor(rig) as operator, _stop_on_error(operator):
         operator.off()
     print("done", file=sys.stderr)
     return 0
 
 
-def _positions(rig: RigFile) -> dict[str, float]:
-    """Where the axes are, mm or rad. Raises DriverError if the driver has no such channel, or cannot be read."""
+def _read_positions(rig: RigFile) -> dict[str, float]:
+    """Return the positions of the axes (mm or rad).
+
+    Raises DriverError if the driver has no such channel, or cannot be read.
+    """
     from flexneedle.lab.rig.devices.opening import open_motors
 
     with closing(open_motors(rig)) as motors:
@@ -339,18 +342,18 @@ def _positions(rig: RigFile) -> dict[str, float]:
     return {name: states[axis.channel].position / axis.scale for name, axis in rig.axes.items()}
 
 
-def _carried_out(
+def _confirm_and_move(
     rig: RigFile,
     moves: Sequence[Move | Homing],
     yes: bool,
-    command: Callable[[Operator], object],
+    command: Callable[[RigOperator], object],
     *notes: str,
 ) -> int:
     """Print the motions, command them once they are confirmed, and return the exit status."""
     from flexneedle.lab.rig.moves import Move, require_start
 
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
-    with supervised(rig) as operator, _stopped_on_error(operator):
+    with open_supervisor(rig) as operator, _stop_on_error(operator):
         for move in moves:
             if isinstance(move, Move):
                 require_start(move, operator.positions[move.name])
@@ -360,14 +363,14 @@ def _carried_out(
     return 0
 
 
-def _arm(operator: Operator) -> None:
-    """Switch the motors on, and print what else that has changed."""
+def _arm(operator: RigOperator) -> None:
+    """Switch the motors on, and print what else has changed."""
     if changed := operator.arm():
         print(f"flexneedle: {changed}", file=sys.stderr)
 
 
 @contextmanager
-def _stopped_on_error(operator: Operator) -> Iterator[None]:
+def _stop_on_error(operator: RigOperator) -> Iterator[None]:
     """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
     from flexneedle.interrupts import uninterrupted
 

@@ -73,7 +73,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _port(text: str) -> int:
-    """A port. Raises ArgumentTypeError for anything else."""
+    """Return a port. Raises ArgumentTypeError for anything else."""
     if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to {_LAST_PORT}")
     return int(text)
@@ -102,13 +102,16 @@ def _setup(args: argparse.Namespace) -> PageSetup:
     from flexneedle.scenario.files import load_scenario
 
     session = PageSession.of(Path(args.scenario).name, load_scenario(args.scenario))
-    rig = None if args.rig is None else _connected(args.rig)
+    rig = None if args.rig is None else _load_rig(args.rig)
     workers = (_WORKER, "plans" if rig is None else "plans-beside-a-rig"), (_WORKER, "insertion")
     return PageSetup(session, args.runs, PageLimits() if rig is None else RIG_LIMITS, workers, rig)
 
 
-def _connected(source: str) -> RigReference:
-    """The rig of a file. Raises RigError for one that the page cannot insert on. No device is opened."""
+def _load_rig(source: str) -> RigReference:
+    """Return the rig of a file. No device is opened.
+
+    Raises RigError for a rig that the page cannot insert on.
+    """
     from flexneedle.lab.page.rigs import usable_rig
     from flexneedle.lab.page.server.connected_rig import RigReference
 

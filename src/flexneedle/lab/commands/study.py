@@ -102,7 +102,7 @@ def _study(args: argparse.Namespace) -> int:
 
 
 def _command(args: argparse.Namespace, folder: Path, *options: str) -> str:
-    """The command line, with the folder and further options."""
+    """Return the command line, with the folder and further options."""
     words = ["flexneedle", "study", args.study]
     words += ["--worlds", *map(str, args.worlds)] if args.worlds is not None else []
     words += ["--workers", str(args.workers)] if args.workers is not None else []
@@ -199,7 +199,7 @@ def _table(summary: Mapping[str, Any]) -> None:
         "periods, relative to the plan."
     )
     if summary["coverage"]["tip"]["half"] is not None:
-        shares = "; ".join(f"{part} {_percents(of)}" for part, of in summary["coverage"].items())
+        shares = "; ".join(f"{part} {_format_shares(of)}" for part, of in summary["coverage"].items())
         console.print(f"Within ±1.96 sd of the prediction at ¼, ½ and ¾ of the depth: {shares}.")
     if unconverged:
         console.print(
@@ -229,8 +229,8 @@ def _cells(part: Mapping[str, Any]) -> Sequence[str]:
     )
 
 
-def _percents(shares: Mapping[str, float | None]) -> str:
-    """Shares as text in one unit, "–" where unknown."""
+def _format_shares(shares: Mapping[str, float | None]) -> str:
+    """Return shares as text in one unit, "–" for unknown ones."""
     texts = ("–" if share is None else f"{100.0 * share:.0f}" for share in shares.values())
     return f"{', '.join(texts)} %"
 

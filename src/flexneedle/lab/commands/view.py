@@ -76,7 +76,7 @@ def _has_study(folder: Path) -> bool:
 
 
 def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
-    """The folder of a row's run, and the figures that were drawn with it: none if it was there before."""
+    """Return the folder of a row's run, and the figures drawn with it: none if it was computed before."""
     from flexneedle.cli.common import compile_first
     from flexneedle.lab.study.recompute import row_folder
     from flexneedle.record.folder import RUN_FILE

@@ -16,7 +16,7 @@ from flexneedle.lab.page.protocol import Recording, ServerMessage
 from flexneedle.lab.page.shape_frames import ShapeFrame, pack_frame
 from flexneedle.lab.page.worker.recordings import describe_recording
 from flexneedle.record.folder import read_run
-from flexneedle.record.loading import load_insertion, unfinished
+from flexneedle.record.loading import load_insertion, unfinished_note
 
 _STATIC = Path(__file__).with_name("static")
 _TEMPLATE = Path(__file__).with_name("replay.html")
@@ -144,7 +144,7 @@ def _license(path: Path) -> str:
 def _describe(
     folder: Path, of: Recording, note: Callable[[str], object]
 ) -> Iterator[ServerMessage | ShapeFrame]:
-    if line := unfinished(read_run(folder)):
+    if line := unfinished_note(read_run(folder)):
         raise RunError(f"{line}; a replay needs a finished run")
     insertion, lacking = load_insertion(folder)
     if not insertion.periods:

@@ -219,7 +219,7 @@ def start_advance(
     return deepest(scenario, depth, tip)
 
 
-def registered(rig: RigFile, scenario: Scenario) -> Scenario:
+def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
     """The scenario with the registration of the rig file, if that has one."""
     if rig.registration is None:
         return scenario
@@ -271,7 +271,7 @@ class SupervisedRig:
             raise RigError(
                 "ros: nothing listens to the stop of this section: add a Bridge(rig.ros) to the listeners"
             )
-        scenario = registered(rig, scenario)
+        scenario = with_registration(rig, scenario)
         task = SupervisorTask(
             rig,
             monotonic(),

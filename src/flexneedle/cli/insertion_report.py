@@ -1,4 +1,4 @@
-"""What `flexneedle insert` prints at the end of an insertion."""
+"""Report at the end of `flexneedle insert`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
-    """Print how an insertion ended, and where its record is; return the exit status."""
+    """Print how an insertion ended and the folder of its record; return the exit status."""
     from flexneedle.record.recording import BY_USER
     from flexneedle.record.results import insertion_result, insertion_timing
     from flexneedle.types import Outcome
@@ -62,14 +62,14 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
 
 
 def _needle(insertion: Insertion) -> tuple[str, str]:
-    """Row of what had the needle."""
+    """Return the row of the phantom, or of the rig."""
     if not insertion.rig:
         return "phantom", insertion.phantom
     return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 
 
 def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
-    """Rows of a rig: the times of its ticks."""
+    """Return the rows of a rig: the times of its ticks."""
     if not insertion.ticks:
         return []
     found = insertion.ticks
