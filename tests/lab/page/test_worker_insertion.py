@@ -18,7 +18,7 @@ from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
 from flexneedle.lab.page.worker.recordings import read_run, row_of
 from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.phantom.draw import draw
-from flexneedle.record.export import marks
+from flexneedle.record.export import mark_columns
 from flexneedle.record.saving import save
 from page_tasks import NO_WAIT, Reported, done, short, task
 
@@ -241,8 +241,8 @@ def test_the_record_of_a_disturbed_insertion_says_so(tmp_path, inserted):
     pushed, plain_one = flexneedle.load(tmp_path / "pushed"), flexneedle.load(tmp_path / "plain")
     assert (pushed.disturbed, plain_one.disturbed) == (disturbed_by, "")
     assert pushed.summary == one.report.of("insertion")[-1].summary
-    assert marks(pushed) == {"disturbed": True}
-    assert marks(plain_one) == {}
+    assert mark_columns(pushed) == {"disturbed": True}
+    assert mark_columns(plain_one) == {}
 
 
 def test_a_record_names_the_first_disturbances_and_counts_the_others():
