@@ -21,8 +21,8 @@ import rosbags.typesys.stores.ros2_humble as ros
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from flexneedle.lab.ros.client import NodeClient, open_node
-from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, Profile, load_profile
-from flexneedle.lab.ros.records import Stop
+from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, TopicProfile, load_profile
+from flexneedle.lab.ros.records import RosStop
 from flexneedle.types import Period, Plan, Shape
 from synthetic import make_periods, make_plan
 
@@ -60,7 +60,7 @@ def main() -> int:
     return 0
 
 
-def measure(profile: Profile, args: argparse.Namespace) -> dict[str, dict[str, float]]:
+def measure(profile: TopicProfile, args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """All measurements, in order, with one node."""
     plan = make_plan()
     periods = [replace(one, predicted=Shape(one.shape, one.shape[:, 1:3] ** 2)) for one in make_periods(plan)]
@@ -107,10 +107,10 @@ def _periods(node: NodeClient, plan: Plan, periods: list[Period], count: int) ->
     }
 
 
-def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict[str, float]:
-    from flexneedle.lab.ros.dds import Writer, participant
+def _stops(node: NodeClient, profile: TopicProfile, count: int, pause: float) -> dict[str, float]:
+    from flexneedle.lab.ros.dds import TopicWriter, join_domain
 
-    writer = Writer(participant(), profile.subscribe.stop.topic, "std_msgs/msg/Bool")
+    writer = TopicWriter(join_domain(), profile.subscribe.stop.topic, "std_msgs/msg/Bool")
     _await(lambda: writer.readers >= 2)
     rng, taken, arrived = np.random.default_rng(0), [], []
     for _ in range(count):
@@ -118,11 +118,11 @@ def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict
         node.poll()
         begun = time.monotonic()
         writer.write(ros.std_msgs__msg__Bool(True))
-        stops: list[Stop] = []
+        stops: list[RosStop] = []
         due = time.monotonic() + (float(rng.uniform(0.0, pause)) if pause else 0.0)  # ticks fall anywhere
         while not stops:
             time.sleep(max(0.0, due - time.monotonic()))
-            stops = [one for one in node.poll() if isinstance(one, Stop)]
+            stops = [one for one in node.poll() if isinstance(one, RosStop)]
             due += pause
         taken.append(time.monotonic() - begun)
         arrived.append(stops[0].time - begun)
@@ -135,15 +135,15 @@ def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict
     }
 
 
-def subscribe(profile: Profile, *, slow: bool) -> int:
+def subscribe(profile: TopicProfile, *, slow: bool) -> int:
     """Read all topics until the standard input ends, and print how many messages; a slow one pauses for seconds."""
     from select import select
 
-    from flexneedle.lab.ros.dds import Reader, participant
+    from flexneedle.lab.ros.dds import TopicReader, join_domain
 
-    domain = participant()
+    domain = join_domain()
     readers = [
-        Reader(domain, topic.topic, kind, latched=key in LATCHED)
+        TopicReader(domain, topic.topic, kind, latched=key in LATCHED)
         for key, kind in PUBLISHED.items()
         if (topic := getattr(profile.publish, key)) is not None and key != "joint_targets"
     ]

@@ -27,10 +27,11 @@ import flexneedle
 from flexneedle.errors import StoppedError
 from flexneedle.geometry.registration import identity
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
+from flexneedle.lab.rig.supervised import Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.protocol import SupervisorTask
 from flexneedle.lab.ros.bridge import Bridge
-from flexneedle.lab.ros.dds import Writer, participant
+from flexneedle.lab.ros.dds import TopicWriter, join_domain
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from stages import RIG
@@ -75,8 +76,11 @@ def measure(count: int) -> dict[str, dict[str, float]]:
         rig = RigFile.model_validate(RIG | parts)
         task = SupervisorTask(rig, time.monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
         command = [sys.executable, HERE, "--publisher"]
-        with Bridge(RosSettings()) as bridge, SupervisorClient(task, bridge.report) as supervisor:
-            bridge.opened(supervisor)
+        with (
+            Bridge(RosSettings()) as bridge,
+            SupervisorClient(task, lambda one: bridge(Tick(one))) as supervisor,
+        ):
+            bridge.confirm(supervisor)
             other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
             if not other.stdout.readline():
                 raise SystemExit("the nodes have not found each other")
@@ -147,9 +151,10 @@ def publish() -> int:
     """
     import rosbags.typesys.stores.ros2_humble as messages
 
-    domain = participant()
+    domain = join_domain()
     writers = {
-        key: Writer(domain, getattr(SUBSCRIBED, key).topic, "std_msgs/msg/Bool") for key in ("stop", "arm")
+        key: TopicWriter(domain, getattr(SUBSCRIBED, key).topic, "std_msgs/msg/Bool")
+        for key in ("stop", "arm")
     }
     deadline = time.monotonic() + 30.0
     # The node has a third reader of stops, for latched ones.

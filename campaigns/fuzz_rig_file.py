@@ -26,9 +26,9 @@ from flexneedle.errors import RigError
 from flexneedle.lab.rig.devices.galil.settings import checked as galil_settings
 from flexneedle.lab.rig.devices.trackers import AuroraSettings, ReplaySettings
 from flexneedle.lab.rig.rig_file import RigFile, check_settings, load_rig
-from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings, profile_with
-from flexneedle.lab.ros.settings import checked as ros_settings
+from flexneedle.lab.ros.motors import RosDriverSettings
+from flexneedle.lab.ros.profile import load_part, load_profile
+from flexneedle.lab.ros.tracker import RosTrackerSettings
 from fuzzing import Failure, main
 
 VALID = b"""\
@@ -256,19 +256,19 @@ def _read_settings(rig: RigFile) -> None:
     if driver.kind == "galil":
         galil_settings(driver.settings, [axis.channel for _, axis in rig.axes.items()])
     elif driver.kind == "ros":
-        profile_with(ros_settings(driver.settings, DriverSettings).profile, "publish.joint_targets")
+        load_part(check_settings(RosDriverSettings, driver.settings).profile, publish=("joint_targets",))
     if tracker.kind == "aurora":
         check_settings(AuroraSettings, tracker.settings)
     elif tracker.kind == "replay":
         check_settings(ReplaySettings, tracker.settings)
     elif tracker.kind == "ros":
-        given = ros_settings(tracker.settings, TrackerSettings)
-        profile_with(given.profile, f"subscribe.{given.source}")
+        given = check_settings(RosTrackerSettings, tracker.settings)
+        load_part(given.profile, subscribe=(given.source,))
 
 
 def read_profile(path: Path) -> str:
     """Read a profile; return what is wrong with it, or ""."""
-    names = [topic.topic for _, topic in load_profile(path).topics()]
+    names = [topic.topic for _, topic in load_profile(path).list_topics()]
     return "" if len(names) == len({*names}) else "a topic twice"
 
 

@@ -27,18 +27,17 @@ from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.frames import FARTHEST_MM
-from flexneedle.lab.ros.joints import JointLink
-from flexneedle.lab.ros.motors import RosMotors
+from flexneedle.lab.ros.motors import JointLink, RosMotors
 from flexneedle.lab.ros.parsing import Subscription
 from flexneedle.lab.ros.profile import SUBSCRIBED, load_profile
 from flexneedle.lab.ros.records import (
-    Arm,
     JointReading,
-    Refused,
-    Request,
+    Received,
+    RosArm,
+    RosRefusal,
+    RosStop,
+    RosTarget,
     ShapeReading,
-    Stop,
-    Target,
     TipReading,
 )
 from flexneedle.lab.ros.tracker import RosTracker
@@ -145,21 +144,21 @@ KINDS: dict[str, Bytes] = {"random": random_bytes, "damaged": damaged, "valid": 
 # What must hold
 
 
-def problem(key: str, data: bytes, record: Request | None) -> str:
+def problem(key: str, data: bytes, record: Received | None) -> str:
     """Why a record must not be made of these bytes, or ""."""
     match record:
         case None:
             nothing = key == "stop" and data[HEADER_BYTES : HEADER_BYTES + 1] == FALSE
             return "" if nothing else "no record"
-        case Arm():
+        case RosArm():
             fine = key == "arm" and len(data) >= 5 and data[4] == 1
             return "" if fine else "armed"
-        case Stop(reason=reason):
+        case RosStop(reason=reason):
             fine = key in ("stop", "arm")
             return "" if fine and reason == " ".join(reason.split()) else f"stop from {key}"
-        case Refused(reason=reason):
+        case RosRefusal(reason=reason):
             return "" if reason and reason.isprintable() and len(reason) < 300 else f"reason {reason!r}"
-        case Target(point=point):
+        case RosTarget(point=point):
             return _far([point])
         case ShapeReading(points=points, tip=tip):
             return _far(points) or problem("tip", data, tip)
@@ -168,8 +167,8 @@ def problem(key: str, data: bytes, record: Request | None) -> str:
                 return f"position {position}, status {status}"
             unit = turn is None or abs(math.hypot(*turn) - 1.0) < 1e-6
             return _far([position] if position else []) or ("" if unit else f"orientation {turn}")
-        case JointReading(positions=positions, velocities=velocities):
-            values = [*positions.values(), *velocities.values()]
+        case JointReading(positions=positions):
+            values = list(positions.values())
             return "" if all(map(math.isfinite, values)) else f"joints {values}"
     return f"a record of type {type(record).__name__}"
 
@@ -185,10 +184,10 @@ class SilentNode:
     status = VISIBLE
 
     def __init__(self) -> None:
-        self.records: list[Request] = []
+        self.records: list[Received] = []
         self.published: list[object] = []
 
-    def poll(self) -> list[Request]:
+    def poll(self) -> list[Received]:
         """The records."""
         found, self.records = self.records, []
         return found
@@ -204,16 +203,15 @@ class Consumers:
     def __init__(self) -> None:
         self.nodes = SilentNode(), SilentNode()
         self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
-        link, self.motors = JointLink.__new__(JointLink), RosMotors.__new__(RosMotors)
+        link = JointLink.__new__(JointLink)
         vars(link).update(
             _channels=("a", "b"), _stale=1e9, _topic="joints", _reading=None, _refused="", _node=self.nodes[1]
         )
-        vars(self.motors).update(
-            _profile=load_profile("neutral"), _channels=("a", "b"), _speeds={"a": 1.0, "b": 1.0},
-            _offsets={"a": 0.0, "b": 0.0}, _points={}, _link=link, _newest=None, _opening=None,
-        )  # fmt: skip
+        self.motors = RosMotors(("a", "b"), lambda: link)
+        for channel in ("a", "b"):
+            self.motors.set_speed(channel, 1.0, 1.0)
 
-    def take(self, record: Request) -> str:
+    def take(self, record: Received) -> str:
         """Why they must not do what they do with a record, or ""."""
         for node in self.nodes:
             node.records.append(record)
@@ -277,13 +275,13 @@ def live(random: Random) -> Iterator[str]:
     """Send bytes over DDS to a node, which must not arm, and still forward a stop after each hundred."""
     from cyclonedds.core import DDSException
 
-    from flexneedle.lab.ros.dds import Cdr, Writer, participant
+    from flexneedle.lab.ros.dds import CdrSample, TopicWriter, join_domain
 
     profile, rng = load_profile("neutral"), np.random.default_rng(random.getrandbits(64))
-    domain = participant()
+    domain = join_domain()
     with NodeClient(profile) as node:
         topics = {key: getattr(profile.subscribe, key).topic for key in SUBSCRIBED}
-        writers = {key: Writer(domain, topic, SUBSCRIBED[key]) for key, topic in topics.items()}
+        writers = {key: TopicWriter(domain, topic, SUBSCRIBED[key]) for key, topic in topics.items()}
         if not _within(20.0, lambda: all(writer.readers for writer in writers.values())):
             raise Failure("the node was not found")
         for count in itertools.count(1):
@@ -292,24 +290,24 @@ def live(random: Random) -> Iterator[str]:
             if key == "arm" and data[HEADER_BYTES : HEADER_BYTES + 1] not in (b"", FALSE):
                 continue  # true: Cyclone DDS hands on any other byte as 1
             with suppress(DDSException):  # less than a header, or no room
-                writers[key]._writer.write(Cdr(data))  # bytes that no message would give
+                writers[key]._writer.write(CdrSample(data))  # bytes that no message would give
             _requests(node)
             if count % 100 == 0 and not _within(20.0, lambda: _stops(writers["stop"], node)):
                 raise Failure(f"no stop is forwarded: {node.status}")
             yield ""
 
 
-def _requests(node: NodeClient) -> list[Request]:
+def _requests(node: NodeClient) -> list[Received]:
     """Return what was received. Raises Failure for an arm, which was not sent."""
     requests = node.poll()
-    if any(isinstance(one, Arm) for one in requests):
+    if any(isinstance(one, RosArm) for one in requests):
         raise Failure("armed")
     return requests
 
 
 def _stops(writer: Any, node: NodeClient) -> bool:
     writer.write(ros.std_msgs__msg__Bool(True))
-    return any(isinstance(one, Stop) for one in _requests(node))
+    return any(isinstance(one, RosStop) for one in _requests(node))
 
 
 def _within(seconds: float, condition: Callable[[], bool]) -> bool:

@@ -2,27 +2,25 @@
 
 import time
 from collections import defaultdict
+from contextlib import contextmanager
 from threading import Event, Thread
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 
 from emulated import until
-from flexneedle.lab.ros.dds import Reader, Writer, participant
+from flexneedle.lab.ros.dds import TopicReader, TopicWriter, join_domain
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED
 from flexneedle.record.messages import STORE
 
-Bool, JointState, PoseArray = (
-    ros.std_msgs__msg__Bool,
-    ros.sensor_msgs__msg__JointState,
-    ros.geometry_msgs__msg__PoseArray,
-)
-PointStamped, PoseStamped = ros.geometry_msgs__msg__PointStamped, ros.geometry_msgs__msg__PoseStamped
-Point, Pose, Quaternion = (
-    ros.geometry_msgs__msg__Point,
-    ros.geometry_msgs__msg__Pose,
-    ros.geometry_msgs__msg__Quaternion,
-)
+Bool = ros.std_msgs__msg__Bool
+JointState = ros.sensor_msgs__msg__JointState
+PoseArray = ros.geometry_msgs__msg__PoseArray
+PointStamped = ros.geometry_msgs__msg__PointStamped
+PoseStamped = ros.geometry_msgs__msg__PoseStamped
+Point = ros.geometry_msgs__msg__Point
+Pose = ros.geometry_msgs__msg__Pose
+Quaternion = ros.geometry_msgs__msg__Quaternion
 
 
 def header(stamp, frame="skin"):
@@ -58,25 +56,24 @@ def cdr(message, kind=None):
 
 
 PEERS = []
-"""All peers of a test, whose topics end with it (`tests/ros/conftest.py`): a test that fails keeps its variables."""
+"""All peers of a test, whose topics end with it (`lab/ros/conftest.py`): a test that fails keeps its variables."""
 
 
 class Peer:
     """Subscribes to what a profile publishes, publishes what it subscribes to."""
 
     def __init__(self, profile, publish=(), subscribe=()):
-        self.domain = participant()
+        self.domain, self.taken = join_domain(), defaultdict(list)
         self.readers = {
-            key: Reader(
+            key: TopicReader(
                 self.domain, getattr(profile.publish, key).topic, PUBLISHED[key], latched=key in LATCHED
             )
             for key in publish
         }
         self.writers = {
-            key: Writer(self.domain, getattr(profile.subscribe, key).topic, SUBSCRIBED[key])
+            key: TopicWriter(self.domain, getattr(profile.subscribe, key).topic, SUBSCRIBED[key])
             for key in subscribe
         }
-        self.taken = defaultdict(list)
         PEERS.append(self)
 
     def close(self):
@@ -84,31 +81,46 @@ class Peer:
         self.readers, self.writers, self.domain = {}, {}, None
 
     def await_node(self, node):
-        """Wait until the node and this peer have found each other on all topics."""
+        """Wait until the node has found this peer on all topics; return what it has received meanwhile.
+
+        The peer may not have found the node yet: another node in the domain matches its topics, too. What is sent only
+        once may be lost: use `ask`.
+        """
+        received = []
 
         def found():
-            node.poll()
-            return (
-                all(node.subscribers.get(key) for key in self.readers)
-                and all(reader.writers for reader in self.readers.values())
-                and all(writer.readers for writer in self.writers.values())
-                and all(node.publishers.get(key) for key in self.writers)
+            received.extend(node.poll())
+            return all(map(node.subscribers.get, self.readers)) and all(
+                map(node.publishers.get, self.writers)
             )
 
         until(found)
+        return received
 
     def send(self, key, message):
         self.writers[key].write(message)
 
+    def ask(self, key, make, node, kind):
+        """Send messages until the node returns a record of a kind; return all that it has returned."""
+        received = []
+
+        def answered():
+            self.send(key, make())
+            received.extend(node.poll())
+            return any(isinstance(one, kind) for one in received)
+
+        until(answered)
+        return received
+
     def received(self, key):
-        """All messages of a topic so far."""
+        """All messages of a topic until now."""
         found = (STORE.deserialize_cdr(data, PUBLISHED[key]) for data, _ in self.readers[key].take())
         self.taken[key] += found
         return self.taken[key]
 
 
 def await_requests(node, kind, count=1):
-    """The first `count` requests of a kind."""
+    """The first `count` records of a kind."""
     found = []
 
     def enough():
@@ -119,18 +131,43 @@ def await_requests(node, kind, count=1):
     return found
 
 
-class Joints(Thread):
-    """The other side of a rig of topics: joints that go at once to their targets, reported at 200 Hz.
+@contextmanager
+def publishing(*topics):
+    """Another participant that publishes (topic, make a message, options of its writer) at 50 Hz; latched ones once."""
+    domain, ended = join_domain(), Event()
+    made = [(TopicWriter(domain, topic, make().__msgtype__, **how), make, how) for topic, make, how in topics]
 
-    targets: all that were received. silent: while it is set nothing is reported.
+    def publish():
+        for writer, make, how in made:
+            if "latched" in how:
+                writer.write(make())
+        while not ended.wait(0.02):
+            for writer, make, how in made:
+                if "latched" not in how:
+                    writer.write(make())
+
+    thread = Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        made.clear()
+
+
+class Joints(Thread):
+    """The other side of a rig of topics: joints that go at once to their goals, reported at 200 Hz.
+
+    targets: all received goals. silent: while it is set nothing is reported. free: while it is set goals are ignored.
     """
 
     def __init__(self, profile, **positions):
         super().__init__(daemon=True)
         topics = profile.publish.joint_targets.topic, profile.subscribe.joint_states.topic
-        self.domain = participant()
-        self.reader = Reader(self.domain, topics[0], "sensor_msgs/msg/JointState")
-        self.writer = Writer(self.domain, topics[1], "sensor_msgs/msg/JointState")
+        self.domain = join_domain()
+        self.reader = TopicReader(self.domain, topics[0], "sensor_msgs/msg/JointState")
+        self.writer = TopicWriter(self.domain, topics[1], "sensor_msgs/msg/JointState")
         self.positions, self.targets = dict(positions), []
         self.silent, self.ended, self.free = Event(), Event(), Event()
 
@@ -138,11 +175,10 @@ class Joints(Thread):
         while not self.ended.wait(0.005):
             for data, _ in self.reader.take():
                 message = STORE.deserialize_cdr(data, "sensor_msgs/msg/JointState")
-                self.targets.append(
-                    (time.monotonic(), dict(zip(message.name, message.position.tolist(), strict=True)))
-                )
+                goals = dict(zip(message.name, message.position.tolist(), strict=True))
+                self.targets.append((time.monotonic(), goals))
                 if not self.free.is_set():
-                    self.positions |= self.targets[-1][1]
+                    self.positions |= goals
             if not self.silent.is_set():
                 self.writer.write(joints(time.time(), self.positions))
 

@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from flexneedle.lab.ros.dds import Writer
+from flexneedle.lab.ros.dds import TopicWriter
 from flexneedle.lab.ros.profile import load_profile
 from ros_peers import Joints, tip
 
@@ -29,7 +29,7 @@ def rig_of_page():
 def main():
     start, profile = 1e-3 * float(sys.argv[1]), load_profile("neutral")
     with Joints(profile, insertion_joint=0.0, roll_joint=0.0, guide_joint=0.0) as joints:
-        writer = Writer(joints.domain, profile.subscribe.tip.topic, "geometry_msgs/msg/PoseStamped")
+        writer = TopicWriter(joints.domain, profile.subscribe.tip.topic, "geometry_msgs/msg/PoseStamped")
         print("ready", flush=True)
         number = 0
         while not select.select([sys.stdin], [], [], PERIOD_S)[0]:

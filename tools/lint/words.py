@@ -30,6 +30,7 @@ CHECKED = (
     "src/flexneedle/lab/process.py",
     "src/flexneedle/loop",
     "src/flexneedle/record",
+    "src/flexneedle/lab/ros",
 )
 # Construction, pattern (a space matches any white space), what to write.
 SENTENCES = (

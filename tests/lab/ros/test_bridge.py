@@ -2,30 +2,38 @@
 
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
+from threading import Thread
 
 import numpy as np
 import pytest
+import tomli_w
 
 import flexneedle
-from emulated import until
+from commands import run
+from emulated import DEADLINE_S, until
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import RigError, StoppedError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
 from flexneedle.lab.rig.supervised import SupervisedRig
-from flexneedle.lab.ros import bridge
-from flexneedle.lab.ros.bridge import profile_of
+from flexneedle.lab.ros import bridge as module
+from flexneedle.lab.ros.bridge import Bridge, load_checked_profile
+from flexneedle.lab.ros.dds import TopicWriter
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import Arm, Refused, Stop, Target
+from flexneedle.lab.ros.records import NodeLoss, RosArm, RosRefusal, RosState, RosStop, RosTarget
+from flexneedle.loop.events import Ended, Iterated, PeriodEnded, Planned, Stream
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import READINGS
-from ros_peers import Bool, target
-from ros_rig import QUICK, quick_scenario, started
+from flexneedle.types import Period
+from ros_peers import Bool, Peer, target
+from ros_rig import quick_scenario, started
 from stages import RIG
+from synthetic import make_periods, make_plan
 from traces import contents
 
+SCENARIO = flexneedle.load_scenario("phantom")
 NEUTRAL = load_profile("neutral")
 STREAMED = ("shape", "tip", "joint_states", "diagnostics")
 
@@ -109,7 +117,7 @@ def test_a_rig_is_armed_on_its_topic_and_stopped_when_it_is_disarmed(tmp_path):
         status, _, errors = insertion.end()
     assert status == 130
     assert "stopped: ROS topic /flexneedle/arm (disarmed)" in errors[-2]
-    assert any("waits for an arm on /flexneedle/arm; nothing moves before" in line for line in errors)
+    assert any("an arm on /flexneedle/arm" in line for line in errors)
     assert insertion.calls("power")[0][1] < insertion.calls("follow")[0][1]
 
 
@@ -230,11 +238,8 @@ def test_a_target_out_of_reach_is_refused_as_on_the_command_line(tmp_path):
 
 @pytest.mark.long
 def test_a_stop_that_was_latched_before_the_start_ends_a_simulated_insertion(tmp_path):
-    from flexneedle.lab.ros.dds import Writer
-    from ros_peers import Peer
-
     peer = Peer(NEUTRAL)
-    writer = Writer(peer.domain, NEUTRAL.subscribe.stop.topic, "std_msgs/msg/Bool", latched=True)
+    writer = TopicWriter(peer.domain, NEUTRAL.subscribe.stop.topic, "std_msgs/msg/Bool", latched=True)
     writer.write(Bool(True))
     with started(tmp_path, NEUTRAL, "--ros", "neutral") as insertion:
         status, _, errors = insertion.end()
@@ -249,34 +254,48 @@ def test_a_stop_that_was_latched_before_the_start_ends_a_simulated_insertion(tmp
 def test_a_profile_without_the_topic_is_refused(tmp_path, monkeypatch, key):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text('name = "Mine"\n[subscribe]\nstop = { topic = "/stop" }\n')
-    with pytest.raises(RigError) as refused:
-        profile_of(RosSettings(profile="mine.toml", **{key: True}))
-    assert str(refused.value) == (
-        f'ros.profile = "mine.toml": must list subscribe.{key}, since ros.{key} = true'
-    )
+    with pytest.raises(RigError, match=rf'^ros\.profile = "mine\.toml": must list subscribe\.{key}'):
+        load_checked_profile(RosSettings(profile="mine.toml", **{key: True}))
 
 
 def test_from_python_a_rig_with_a_section_that_nothing_follows_is_refused():
-    scenario = flexneedle.load_scenario("phantom").with_values(QUICK)
-    plan = flexneedle.plan(scenario)
-    rig = RigFile.model_validate(RIG | {"ros": {"arm": True}})
-    with pytest.raises(RigError, match="ros: nothing listens to the stop of this section"):
-        flexneedle.insert(scenario, plan, rig=SupervisedRig(rig))
+    rig = SupervisedRig(RigFile.model_validate(RIG | {"ros": {"arm": True}}))
+    with pytest.raises(RigError, match=r"^ros: "), rig.open(SCENARIO, make_plan(), 0, Stream()):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        (("--rig", "rig.toml", "--dry-run", "--ros", "neutral"), "--ros"),
+        (("--rig", "rig.toml", "--dry-run", "--target", "35", "0"), "--target"),
+        (("--ros", "nonesuch"), "nonesuch"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(tmp_path, monkeypatch, capsys, options, key):
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(tomli_w.dumps(RIG | {"ros": {"target": True}}))
+    status, _, error = run(capsys, "insert", "phantom", *options)
+    (line,) = error.splitlines()
+    assert (status, line.startswith(f"flexneedle: {key}: ")) == (2, True), line
+
+
+# A bridge without its node's process
 
 
 class Node:
-    """Stands in for the node's process: brings requests, and then fails."""
+    """Stands in for the node's process: brings records, and then fails."""
 
-    def __init__(self, requests, error=None):
-        self.requests, self.error, self.published = [tuple(requests)], error, []
+    def __init__(self, records=(), error=None):
+        self.records, self.error, self.published = [tuple(records)], error, []
 
     def wait(self, seconds):
         time.sleep(min(seconds, 1e-3))
 
     def poll(self):
-        if not self.requests and self.error is not None:
+        if not self.records and self.error is not None:
             raise self.error
-        return self.requests.pop() if self.requests else ()
+        return self.records.pop() if self.records else ()
 
     def publish(self, record):
         self.published.append(record)
@@ -285,64 +304,111 @@ class Node:
         pass
 
 
-def followed(monkeypatch, node):
-    monkeypatch.setattr(bridge, "open_node", lambda *_args, **_options: node)
-    return bridge.Bridge(RosSettings())
+class Rig:
+    """Stands in for the client of a supervisor."""
+
+    ended = None
+
+    def __init__(self):
+        self.stops = []
+
+    def now(self):
+        return 0.0
+
+    def request_stop(self, why):
+        self.stops.append(why)
+
+    def wait(self, seconds):
+        time.sleep(seconds)
+
+
+@pytest.fixture
+def bridge(monkeypatch):
+    """Make a bridge on a node that stands in for a process."""
+    with ExitStack() as stack:
+
+        def make(node, **settings):
+            monkeypatch.setattr(module, "open_node", lambda *_args, **_options: node)
+            return stack.enter_context(Bridge(RosSettings(**settings)))
+
+        yield make
+
+
+def listed(bridge):
+    return [one["event"] for one in bridge.record["events"]]
+
+
+def test_events_are_published_and_a_stop_ends_the_insertion_at_the_next(bridge):
+    node, plan = Node(), make_plan()
+    made = bridge(node)
+    period = next(iter(make_periods(plan)))
+    made(Planned(plan))
+    made(PeriodEnded(period))
+    (sent,) = [one for one in node.published if isinstance(one, Period)]
+    assert sent.time > period.time - 60.0  # on the clock of the node
+    assert [one.state for one in node.published if isinstance(one, RosState)][-1] == "inserting"
+    node.records.append((RosStop(0.0, "/stop", "why"),))
+    until(lambda: listed(made))
+    for event in (Iterated("feedforward", {}), Planned(plan), PeriodEnded(period)):
+        with pytest.raises(StoppedError, match=r"^stopped: ROS topic /stop \(why\)$"):
+            made(event)
+    made(Ended(None))  # the record is complete
+
+
+def test_an_arm_counts_while_it_is_awaited_only(bridge):
+    node, rig = Node([RosArm(0.0, "/arm")]), Rig()
+    made = bridge(node, arm=True)
+    until(lambda: listed(made))
+    thread = Thread(target=made.confirm, args=(rig,))
+    thread.start()
+    until(lambda: len(listed(made)) == 2)
+    assert thread.is_alive()
+    node.records.append((RosArm(1.0, "/arm"),))
+    thread.join(DEADLINE_S)
+    assert not thread.is_alive()
+    ignored, waits, arm = listed(made)
+    assert "ignored" in ignored
+    assert "/flexneedle/arm" in waits
+    assert arm == "arm on /arm"
+
+
+@pytest.mark.parametrize("arm", [True, False])
+def test_a_lost_node_stops_a_rig_that_it_arms(bridge, arm):
+    rig, made = Rig(), bridge(node := Node(), arm=arm)
+    made.settings = RosSettings()  # the rig is armed
+    made.confirm(rig)
+    made.settings = RosSettings(arm=arm)
+    node.records.append((NodeLoss(0.0, "gone"),))
+    until(lambda: listed(made))
+    assert rig.stops == (["gone"] if arm else [])
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize("rig", [True, False])
-def test_a_connection_that_fails_is_a_stop(monkeypatch, rig):
-    """Nobody would hear one any more."""
-    stops = []
-    node = Node((), None if rig else ValueError("a bug"))
-    with followed(monkeypatch, node) as bridge_:
-        if rig:
-            supervisor = SimpleNamespace(now=lambda: 0.0, request_stop=stops.append, ended=None)
-            bridge_.confirm(supervisor)
-            node.error = ValueError("a bug")
-        until(lambda: bridge_.record["events"])
-        why = "the connection to ROS has failed: ValueError: a bug"
-        with pytest.raises(StoppedError, match=f"stopped: {why}"):
-            bridge_.check()
-        until(lambda: stops == [why] if rig else node.published)
-    assert [one["event"] for one in bridge_.record["events"]] == [f"stop: {why}"]
+@pytest.mark.parametrize("with_rig", [True, False])
+def test_a_connection_that_fails_is_a_stop(bridge, with_rig):
+    """No stop would be received any more."""
+    node, rig = Node(error=None if with_rig else ValueError("a bug")), Rig()
+    made = bridge(node)
+    if with_rig:
+        made.confirm(rig)
+        node.error = ValueError("a bug")
+    until(lambda: listed(made))
+    with pytest.raises(StoppedError, match=r"ValueError: a bug$"):
+        made.check()
+    until(lambda: rig.stops if with_rig else node.published)
+    (event,) = listed(made)
+    assert event.endswith("ValueError: a bug")
+    assert all(f"stop: {why}" == event for why in rig.stops)
 
 
-def test_a_stop_is_listed_however_much_was_refused_before(monkeypatch):
-    refused = [Refused(0.0, "/sensor/tip", "old data", count) for count in range(1, 1501)]
-    ignored = [Arm(0.0, "/flexneedle/arm"), Target(0.0, (35.0, 2.0, 0.0))] * 100
-    with followed(monkeypatch, Node([*ignored, *refused, Stop(0.0, "/flexneedle/stop")])) as bridge_:
-        until(lambda: bridge_._stopped)
-    listed = [one["event"] for one in bridge_.record["events"]]
-    assert len(listed) == 1001
-    assert listed[:2] == [
-        "arm on /flexneedle/arm: ignored, not awaited",
-        "target 35, 2, 0 mm: ignored, not awaited",
-    ]
-    assert listed[-2:] == [
-        "message 800 refused on /sensor/tip: old data; more of what is refused or ignored is not listed",
-        "stop: ROS topic /flexneedle/stop",
-    ]
-
-
-def test_options_that_contradict_each_other_are_refused(tmp_path, capsys):
-    import tomli_w
-
-    from commands import run
-
-    rig = tmp_path / "rig.toml"
-    rig.write_text(tomli_w.dumps(RIG | {"ros": {"target": True}}))
-    given = ("insert", "phantom", "--rig", str(rig), "--dry-run")
-    status, _, error = run(capsys, *given, "--ros", "neutral")
-    assert (status, error) == (
-        2,
-        "flexneedle: --ros: not with --rig, whose file has a section [ros] for it\n",
-    )
-    status, _, error = run(capsys, *given, "--target", "35", "0")
-    assert status == 2
-    assert "--target: not with target = true in [ros]" in error
-    status, _, error = run(capsys, "insert", "phantom", "--ros", "nonesuch")
-    assert status == 2
-    assert "nonesuch" in error
-    assert len(error.splitlines()) == 1
+def test_a_stop_is_listed_however_much_was_refused_before(bridge):
+    refused = [RosRefusal(0.0, "/sensor/tip", "old data", count) for count in range(1, 1501)]
+    ignored = [RosArm(0.0, "/flexneedle/arm"), RosTarget(0.0, (35.0, 2.0, 0.0))] * 100
+    made = bridge(Node([*ignored, *refused, RosStop(0.0, "/flexneedle/stop")]))
+    until(lambda: made._stopped)
+    until(lambda: "stop: ROS topic /flexneedle/stop" in listed(made))
+    found = listed(made)
+    assert len(found) == 1001
+    assert found[0].startswith("arm on /flexneedle/arm: ignored")
+    assert found[1].startswith("target 35, 2, 0 mm: ignored")
+    assert found[-2].startswith("message 800 refused on /sensor/tip: old data; ")

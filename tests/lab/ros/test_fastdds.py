@@ -12,10 +12,10 @@ import pytest
 import flexneedle
 from emulated import DEADLINE_S, until
 from flexneedle.lab.ros.client import NodeClient
-from flexneedle.lab.ros.dds import Reader, Writer
-from flexneedle.lab.ros.messages import Composer
+from flexneedle.lab.ros.composer import MessageComposer
+from flexneedle.lab.ros.dds import TopicReader, TopicWriter
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, load_profile
-from flexneedle.lab.ros.records import JointTargets, RigState, ShapeReading, Stop, TipReading
+from flexneedle.lab.ros.records import JointTargets, RosState, RosStop, ShapeReading, TipReading
 from flexneedle.types import Measurement, Shape
 from lab.ros.fastdds.build import build, label, missing
 from ros_peers import Bool, Peer, cdr
@@ -53,7 +53,7 @@ def fast_dds(program, *links):
 @pytest.mark.parametrize("profile", [NEUTRAL, SMARTNEEDLE], ids=["neutral", "smartneedle"])
 def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
     """Node to Fast DDS to a subscriber: decoded and encoded by the other vendor's code, equal to the last byte."""
-    own = profile.only([key for key in PUBLISHED if getattr(profile.publish, key)])
+    own = profile.select(publish=[key for key in PUBLISHED if getattr(profile.publish, key)])
     topics = {key: getattr(own.publish, key).topic for key in PUBLISHED if getattr(own.publish, key)}
     links = [
         f"{label(PUBLISHED[key])}:{topic}:/echo{topic}{':latched' if key in LATCHED else ''}"
@@ -62,15 +62,15 @@ def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
     records = [
         PLAN,
         PERIOD,
-        RigState(1.0, "armed"),
+        RosState(1.0, "armed"),
         JointTargets(time.monotonic() + 30.0, {"a": 1.0, "b": 2.0}),
     ]
-    composer = Composer(own)
-    expected = {one.key: cdr(one.message) for record in records for one in composer.messages(record)}
+    composer = MessageComposer(own)
+    expected = {one.key: cdr(one.message) for record in records for one in composer.compose(record)}
     with NodeClient(own) as node, fast_dds(program, *links):
         peer = Peer(own)
         readers = {
-            key: Reader(peer.domain, f"/echo{topic}", PUBLISHED[key], latched=key in LATCHED)
+            key: TopicReader(peer.domain, f"/echo{topic}", PUBLISHED[key], latched=key in LATCHED)
             for key, topic in topics.items()
         }
         until(lambda: all(reader.writers for reader in readers.values()))
@@ -101,7 +101,7 @@ def test_what_fast_dds_publishes_is_read(program):
     ]
     with NodeClient(NEUTRAL, epoch=1e9) as node, fast_dds(program, *links):
         peer = Peer(NEUTRAL)
-        button = Writer(peer.domain, "/button", "std_msgs/msg/Bool")
+        button = TopicWriter(peer.domain, "/button", "std_msgs/msg/Bool")
         until(lambda: button.readers)
         requests = []
 
@@ -109,7 +109,7 @@ def test_what_fast_dds_publishes_is_read(program):
             node.publish(replace(PERIOD, time=PERIOD.time + 0.01 * len(requests)))
             button.write(Bool(True))
             requests.extend(node.poll())
-            return {TipReading, ShapeReading, Stop} <= set(map(type, requests))
+            return {TipReading, ShapeReading, RosStop} <= set(map(type, requests))
 
         until(answered)
     tip = next(one for one in requests if isinstance(one, TipReading))

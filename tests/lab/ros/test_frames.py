@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import to_matrix, z_axis
 from flexneedle.lab.ros.frames import FrameMap
-from flexneedle.lab.ros.profile import FrameAxes, PlacedTopic, Profile, load_profile
+from flexneedle.lab.ros.profile import FrameAxes, PlacedTopic, TopicProfile, load_profile
 from flexneedle.record.messages import PointMessage, Quaternion, pose
 from flexneedle.types import Pose
 
@@ -30,7 +30,7 @@ POSES = st.builds(Pose, COORDINATES, COORDINATES, COORDINATES, SLOPES, SLOPES)
 
 def frame(axes, body=("x", "y", "z"), unit="m", origin=(0.0, 0.0, 0.0)):
     x, y, z = axes
-    profile = Profile(
+    profile = TopicProfile(
         name="a profile",
         needle=dict(zip("xyz", body, strict=True)),
         frames={"f": FrameAxes(id="f", x=x, y=y, z=z, origin_mm=origin)},
@@ -65,7 +65,7 @@ def test_there_are_24_right_handed_axes():
 )
 def test_a_pose_comes_back(at, axes, body, unit, origin):
     there = frame(axes, body, unit, origin)
-    sent = there.pose(pose(0.0, at).pose)
+    sent = there.map_pose(pose(0.0, at).pose)
     np.testing.assert_allclose(there.to_point(sent.position), at.point, atol=1e-9)
     np.testing.assert_allclose(z_axis(np.array(there.to_orientation(sent.orientation))), at.axis, atol=1e-12)
 
@@ -74,39 +74,39 @@ def test_a_pose_comes_back(at, axes, body, unit, origin):
 def test_the_needles_own_axis_points_along_it(at, axes, body):
     """In the topic's frame the pose's own axis along the needle is the tangent, turned into that frame."""
     there = frame(axes, body)
-    turn = to_matrix(wxyz(there.pose(pose(0.0, at).pose).orientation))
-    along = Profile(name="p", needle=dict(zip("xyz", body, strict=True))).needle.rotation[:, 0]
+    turn = to_matrix(wxyz(there.map_pose(pose(0.0, at).pose).orientation))
+    along = TopicProfile(name="p", needle=dict(zip("xyz", body, strict=True))).needle.rotation[:, 0]
     np.testing.assert_allclose(turn @ along, there.rotation @ np.array(at.axis), atol=1e-12)
 
 
 def test_metres_along_x_stay_as_they_are_to_the_last_bit():
     at = pose(0.0, Pose(1.1, -2.2, 3.3, 0.1, 0.2)).pose
-    assert frame(("x", "y", "z")).pose(at) == at
+    assert frame(("x", "y", "z")).map_pose(at) == at
 
 
 def test_a_point_40_mm_deep_is_at_z_of_the_needle_and_y_of_the_stage():
     deep = PointMessage(0.040, 0.003, -0.002)
-    np.testing.assert_allclose(xyz(smartneedle("needle").point(deep)), (2.0, 3.0, 40.0))
-    np.testing.assert_allclose(xyz(smartneedle("stage").point(deep)), (-2.0, 40.0, 3.0))
+    np.testing.assert_allclose(xyz(smartneedle("needle").map_point(deep)), (2.0, 3.0, 40.0))
+    np.testing.assert_allclose(xyz(smartneedle("stage").map_point(deep)), (-2.0, 40.0, 3.0))
 
 
 def test_a_straight_needle_has_no_rotation_in_its_own_frame():
     straight = pose(0.0, Pose(10.0, 0.0, 0.0, 0.0, 0.0)).pose
     np.testing.assert_allclose(
-        wxyz(smartneedle("needle").pose(straight).orientation), (1, 0, 0, 0), atol=1e-15
+        wxyz(smartneedle("needle").map_pose(straight).orientation), (1, 0, 0, 0), atol=1e-15
     )
-    turn = to_matrix(wxyz(smartneedle("stage").pose(straight).orientation))
+    turn = to_matrix(wxyz(smartneedle("stage").map_pose(straight).orientation))
     np.testing.assert_allclose(turn @ (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), atol=1e-15)  # z of the needle along y
 
 
 def test_an_origin_is_where_the_skin_is_entered():
     there = frame(("z", "y", "-x"), unit="mm", origin=(1.0, 2.0, 28.5))
-    np.testing.assert_allclose(xyz(there.point(PointMessage(0.0, 0.0, 0.0))), (1.0, 2.0, 28.5))
+    np.testing.assert_allclose(xyz(there.map_point(PointMessage(0.0, 0.0, 0.0))), (1.0, 2.0, 28.5))
     np.testing.assert_allclose(there.to_point(PointMessage(1.0, 2.0, 0.0)), (-28.5, 0.0, 0.0), atol=1e-12)
 
 
 def test_variances_take_the_unit_squared_and_their_axes():
-    turned = smartneedle("needle").covariance(np.diag([1.0, 4.0, 9.0]) * 1e-6)
+    turned = smartneedle("needle").map_covariance(np.diag([1.0, 4.0, 9.0]) * 1e-6)
     np.testing.assert_allclose(turned, np.diag([9.0, 4.0, 1.0]))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexneedle.lab.ros.records import Arm, JointReading, Refused, Stop, Target, TipReading
+from flexneedle.lab.ros.records import JointReading, RosArm, RosRefusal, RosStop, RosTarget, TipReading
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "campaigns"))
 import fuzz_ros
@@ -17,11 +17,11 @@ def test_what_is_received_may_be_anything():
     done, note = fuzzing.run(fuzz_ros.messages, 3000, 20.0, seed=7)
     assert done == 3000
     assert set(re.findall(r"(\w+)'", note)) >= {
-        "Arm",
+        "RosArm",
         "JointReading",
-        "Refused",
-        "Stop",
-        "Target",
+        "RosRefusal",
+        "RosStop",
+        "RosTarget",
         "TipReading",
     }
 
@@ -33,16 +33,16 @@ def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
 @pytest.mark.parametrize(
     ("key", "record", "found"),
     [
-        ("tip", Arm(0.0, "/t"), "armed"),
-        ("tip", Stop(0.0, "/t"), "stop from tip"),
+        ("tip", RosArm(0.0, "/t"), "armed"),
+        ("tip", RosStop(0.0, "/t"), "stop from tip"),
         ("tip", None, "no record"),
         ("stop", None, "no record"),
-        ("target", Target(0.0, (float("nan"), 0.0, 0.0)), "position"),
-        ("target", Target(0.0, (2e4, 0.0, 0.0)), "position"),
+        ("target", RosTarget(0.0, (float("nan"), 0.0, 0.0)), "position"),
+        ("target", RosTarget(0.0, (2e4, 0.0, 0.0)), "position"),
         ("tip", TipReading(0.0, 1, None, None), "position None"),
         ("tip", TipReading(0.0, 1, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0)), "orientation"),
-        ("tip", Refused(0.0, "/t", "two\nlines"), "reason"),
-        ("joint_states", JointReading(0.0, {"a": float("inf")}, {}), "joints"),
+        ("tip", RosRefusal(0.0, "/t", "two\nlines"), "reason"),
+        ("joint_states", JointReading(0.0, {"a": float("inf")}), "joints"),
     ],
 )
 def test_it_finds_what_must_not_be(key, record, found):

@@ -79,7 +79,7 @@ def test_rviz_shows_topics_of_the_neutral_profile_as_what_they_are():
         "Visualization Manager"
     ]
     assert config["Global Options"]["Fixed Frame"] == NEUTRAL.frames["skin"].id
-    keys = {topic.topic: key.removeprefix("publish.") for key, topic in NEUTRAL.topics()}
+    keys = {topic.topic: key.removeprefix("publish.") for key, topic in NEUTRAL.list_topics()}
     shown = [display for display in config["Displays"] if "Topic" in display]
     assert len(shown) == 6
     for display in shown:

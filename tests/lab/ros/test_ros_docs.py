@@ -9,11 +9,12 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, B
 from cyclonedds.core import Policy
 
 from emulated import until
-from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.lab.rig.rig_file import RigFile, check_settings
 from flexneedle.lab.ros.client import NodeClient
-from flexneedle.lab.ros.dds import participant
+from flexneedle.lab.ros.dds import join_domain
+from flexneedle.lab.ros.motors import RosDriverSettings
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, load_profile
-from flexneedle.lab.ros.settings import DriverSettings, TrackerSettings, checked
+from flexneedle.lab.ros.tracker import RosTrackerSettings
 from ros_topics_rig import rig_of_page
 
 PAGE = (Path(__file__).parents[3] / "docs" / "rig" / "ros.md").read_text(encoding="utf-8")
@@ -30,13 +31,15 @@ def row(key, topic, frames):
 
 def test_the_table_has_each_topic_of_the_neutral_profile():
     profile = load_profile("neutral")
-    expected = [row(key, topic, profile.frames) for key, topic in profile.topics()]
+    expected = [row(key, topic, profile.frames) for key, topic in profile.list_topics()]
     table = re.search(r"<!-- table: neutral -->\n\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
     assert table.splitlines()[2:] == expected
 
 
 def test_the_page_names_each_topic_of_smartneedle():
-    topics = [topic.topic.removeprefix("/flexneedle/") for _, topic in load_profile("smartneedle").topics()]
+    topics = [
+        topic.topic.removeprefix("/flexneedle/") for _, topic in load_profile("smartneedle").list_topics()
+    ]
     assert len(topics) == 15
     assert [topic for topic in topics if f"`{topic}`" not in PAGE and f"/{topic}`" not in PAGE] == []
 
@@ -92,9 +95,11 @@ def first_column(key):
     [("publish", BuiltinTopicDcpsPublication), ("subscribe", BuiltinTopicDcpsSubscription)],
 )
 def test_qualities_of_service_are_those_of_a_node(section, kind):
-    profile, page, domain = load_profile("neutral"), table_of_qualities(), participant()
+    profile, page, domain = load_profile("neutral"), table_of_qualities(), join_domain()
     wanted = {
-        topic.topic: page[first_column(key)] for key, topic in profile.topics() if key.startswith(section)
+        topic.topic: page[first_column(key)]
+        for key, topic in profile.list_topics()
+        if key.startswith(section)
     }
     with NodeClient(profile):
         found = announced(domain, kind, {topic: len(qualities) for topic, qualities in wanted.items()})
@@ -104,7 +109,7 @@ def test_qualities_of_service_are_those_of_a_node(section, kind):
 def test_the_rig_file_is_one():
     rig = RigFile.model_validate(tomllib.loads(rig_of_page()))
     assert (rig.driver.kind, rig.tracker.kind) == ("ros", "ros")
-    checked(rig.driver.settings, DriverSettings)
-    checked(rig.tracker.settings, TrackerSettings)
+    check_settings(RosDriverSettings, rig.driver.settings)
+    check_settings(RosTrackerSettings, rig.tracker.settings)
     assert rig.axes.insertion.scale == 0.001
     assert rig.axes.rotation.scale == pytest.approx(1.0)

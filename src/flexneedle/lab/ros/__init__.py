@@ -1,1 +1,1 @@
-"""ROS 2 over DDS, without a ROS installation: a node of its own process, and a rig of topics."""
+"""ROS 2 over DDS without a ROS installation: the node of an insertion, and motors and trackers on topics."""

@@ -1,4 +1,4 @@
-"""The rig's end of its ROS node. No call waits, but for the start."""
+"""Client of the ROS node. Only its start waits."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,44 +9,51 @@ from typing import Self
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.ros.profile import OF_THE_LOOP, Profile
-from flexneedle.lab.ros.records import Beat, Lost, Published, Request, RigState, Setup, Target
+from flexneedle.lab.ros.profile import INSERTION_KEYS, TopicProfile
+from flexneedle.lab.ros.records import (
+    NodeHeartbeat,
+    NodeLoss,
+    NodeSetup,
+    Published,
+    Received,
+    RosState,
+    RosTarget,
+)
 from flexneedle.types import VISIBLE, Period, Plan
 
 _START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
 
 
 def check_installed() -> None:
-    """Raises InputError if cyclonedds is not installed."""
+    """Raise InputError if cyclonedds is not installed."""
     if find_spec("cyclonedds") is None:
         raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
 
 
-def open_node(profile: Profile, *, epoch: float = 0.0) -> "NodeClient":
-    """Start the node of an insertion: it publishes what the profile lists, and reads stop, arm and target.
+def open_node(profile: TopicProfile, *, epoch: float = 0.0) -> "NodeClient":
+    """Start the node of an insertion, which publishes the topics of the profile and reads stop, arm and target.
 
     epoch: Unix time (s) of the records' time 0, for the stamps of messages (default: stamps are the records' times).
     Raises InputError if cyclonedds is not installed or ROS_DOMAIN_ID is invalid, RunError if the node does not start.
     """
-    publish, subscribe = OF_THE_LOOP
-    return NodeClient(profile.only(publish, subscribe), epoch=epoch)
+    return NodeClient(profile.select(**INSERTION_KEYS), epoch=epoch)
 
 
 class NodeClient:
-    """A node that publishes and reads all that its profile lists. Use it as a context manager, or call `close`.
+    """A node that publishes and reads all topics of a profile. Use it as a context manager, or call `close`.
 
-    subscribers, publishers: how many nodes have each topic, by key of `publish` and `subscribe`, as of the last `poll`.
+    subscribers, publishers: number of nodes of each topic, by key of `publish` and `subscribe`, at the last `poll`.
     """
 
-    def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
+    def __init__(self, profile: TopicProfile, *, epoch: float = 0.0) -> None:
         check_installed()
         self._process = ChildProcess(f"{__package__}.node", keep_printed=True)
         self._channel, self._lost = self._process.channel, ""
-        self._beat_at: float | None = None
-        self._early: list[Request] = []
+        self._heard_at: float | None = None
+        self._early: list[Received] = []
         self.subscribers: Mapping[str, int] = {}
         self.publishers: Mapping[str, int] = {}
-        self._channel.send(Setup(profile, epoch))
+        self._channel.send(NodeSetup(profile, epoch))
         try:
             self._await_ready()
         except BaseException:  # also on Ctrl-C: the process must end
@@ -60,33 +67,33 @@ class NodeClient:
         self.close()
 
     def publish(self, record: Plan | Period | Published) -> None:
-        """Publish a record. Where the node does not keep up, the oldest periods and joint targets are dropped."""
+        """Publish a record. If the node does not keep up, the oldest periods and joint targets are dropped."""
         light = replace(record, shapes=record.shapes[:0], history=()) if isinstance(record, Plan) else record
-        self._channel.send(light, keep=isinstance(record, Plan | Target | RigState))
+        self._channel.send(light, keep=isinstance(record, Plan | RosTarget | RosState))
 
-    def poll(self) -> list[Request]:
-        """What was received since the last call, oldest first. A `Lost` is the last record of all."""
+    def poll(self) -> list[Received]:
+        """Return the records received since the last call, oldest first. No record follows a `NodeLoss`."""
         self._channel.flush()
-        requests, self._early = self._early, []
+        received, self._early = self._early, []
         for record in self._channel.receive():
-            if isinstance(record, Beat):
-                self._beat_at = record.time
+            if isinstance(record, NodeHeartbeat):
+                self._heard_at = record.time
                 self.subscribers, self.publishers = record.subscribers, record.publishers
             else:
-                requests.append(record)
-        if not self._lost and (reason := self._silent()):
-            requests.append(Lost(monotonic(), reason))
-        self._lost = next((one.reason for one in requests if isinstance(one, Lost)), self._lost)
-        return requests
+                received.append(record)
+        if not self._lost and (reason := self._find_loss()):
+            received.append(NodeLoss(monotonic(), reason))
+        self._lost = next((one.reason for one in received if isinstance(one, NodeLoss)), self._lost)
+        return received
 
     def wait(self, seconds: float) -> None:
-        """Wait until something is received, at most for `seconds`."""
+        """Wait until a record arrives, at most for `seconds`."""
         select([self._channel], [], [], seconds)
 
     @property
     def status(self) -> str:
-        """VISIBLE while the node shows signs of life, else the reason in a few words."""
-        return self._lost or self._silent() or VISIBLE
+        """VISIBLE while the node shows signs of life, otherwise the reason in a few words."""
+        return self._lost or self._find_loss() or VISIBLE
 
     @property
     def pid(self) -> int:
@@ -95,7 +102,7 @@ class NodeClient:
 
     @property
     def dropped(self) -> int:
-        """Records that were not published, because the node did not keep up."""
+        """Number of records that were not published because the node did not keep up."""
         return self._channel.dropped
 
     def close(self) -> None:
@@ -103,17 +110,17 @@ class NodeClient:
         self._process.end(_STOP_S)
         self._process.close()
 
-    def _silent(self) -> str:
-        """Why nothing is received any more, or ""."""
+    def _find_loss(self) -> str:
+        """Return the reason why nothing is received any more, or ""."""
         if self._channel.ended:
-            words = self._process.last_line()
-            return f"the ROS node has ended: {words}" if words else "the ROS node has ended"
-        silent = 0.0 if self._beat_at is None else monotonic() - self._beat_at
+            line = self._process.last_line()
+            return f"the ROS node has ended: {line}" if line else "the ROS node has ended"
+        silent = 0.0 if self._heard_at is None else monotonic() - self._heard_at
         return f"the ROS node does not answer for {silent:.1f} s" if silent > _SILENT_S else ""
 
     def _await_ready(self) -> None:
         deadline = monotonic() + _START_S
-        while self._beat_at is None:
+        while self._heard_at is None:
             if monotonic() > deadline:
                 raise RunError(f"the ROS node has not started within {_START_S:g} s")
             self.wait(0.1)

@@ -1,52 +1,118 @@
-"""Writers and readers of ROS topics over Cyclone DDS. Samples are CDR, as in a trace; the type is for discovery.
+"""ROS topics over Cyclone DDS: names and types, writers and readers.
 
-The domain is ROS_DOMAIN_ID (default: 0); network interfaces and discovery are those of CYCLONEDDS_URI.
+ROS 2 names the DDS type of `geometry_msgs/msg/Pose` `geometry_msgs::msg::dds_::Pose_` and the DDS topic of `/tip`
+`rt/tip`, and announces the hash of a type (REP 2011) in the user data of each writer and reader. Samples are CDR, as in
+a trace; DDS needs the type for discovery only. The domain is ROS_DOMAIN_ID (default: 0); CYCLONEDDS_URI sets network
+interfaces and discovery.
 """
 
 import os
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any, Self
 
+import cyclonedds.idl.types
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.core import InstanceState as Instances
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from rosbags.interfaces import Nodetype
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.ros.idl import dds_topic, idl_type, user_data
 from flexneedle.record.messages import STORE
 
-_HIGHEST_DOMAIN = 232  # beyond it the ports of RTPS would not exist
+_HIGHEST_DOMAIN = 232  # a higher one has no RTPS ports
 _DEPTH, _TAKEN = 5, 32
 _MOST_KNOWN = 10_000  # participants and publishers of a domain
 _ANY = SampleState.Any | ViewState.Any | Instances.Any
+_types: Any = cyclonedds.idl.types
+_NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+_BASIC: dict[str, Any] = {
+    "bool": bool,
+    "string": str,
+    "byte": _types.byte,
+    **{name: getattr(_types, name) for name in _NUMBERS},
+}
+
+# Names and types
 
 
-class Cdr:
-    """A sample as bytes of CDR with its header; takes the place of a structure in writers and readers."""
+def to_dds_name(name: str) -> str:
+    """Return the name of the DDS type of a ROS type."""
+    package, folder, kind = name.split("/")
+    return f"{package}::{folder}::dds_::{kind}_"
+
+
+def to_ros_name(name: str) -> str:
+    """Return the name of the ROS type of a DDS type, or the name itself if it has no ROS type."""
+    package, *folder, kind = name.split("::")
+    return f"{package}/{folder[0]}/{kind[:-1]}" if folder[1:] == ["dds_"] else name
+
+
+def to_dds_topic(topic: str) -> str:
+    """Return the DDS topic of a ROS topic such as `/tip`."""
+    return f"rt{topic}"
+
+
+@cache
+def get_type_hash(name: str) -> str:
+    """Return the hash of a ROS type, `RIHS01_` and 64 hexadecimal digits."""
+    return STORE.hash_rihs01(name)
+
+
+def make_user_data(name: str) -> bytes:
+    """Return the user data of a writer or reader of a ROS type."""
+    return f"typehash={get_type_hash(name)};".encode()
+
+
+@cache
+def make_idl_type(name: str) -> type[IdlStruct]:
+    """Return the DDS type of a ROS type such as `geometry_msgs/msg/Pose`. Raises KeyError for an unknown one."""
+    package, folder, kind = name.split("/")
+    fields = {field: _make_field(definition) for field, definition in STORE.fielddefs[name][1]}
+    return make_idl_struct(f"{kind}_", f"{package}.{folder}.dds_.{kind}_", fields, dataclassify=False)
+
+
+def _make_field(definition: Any) -> Any:
+    """Return the DDS type of a field: a basic type, a structure, or an array or sequence of either."""
+    kind, detail = definition
+    if kind is Nodetype.BASE:
+        return _BASIC[detail[0]]
+    if kind is Nodetype.NAME:
+        return make_idl_type(detail)
+    element, length = _make_field(detail[0]), detail[1]
+    return _types.array[element, length] if kind is Nodetype.ARRAY else _types.sequence[element]
+
+
+class CdrSample:
+    """A sample as bytes of CDR with its header, in place of a structure."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.sample_info = data, None
 
     def serialize(self, **_how: object) -> bytes:
-        """The bytes."""
+        """Return the bytes."""
         return self.data
 
     @classmethod
     def deserialize(cls, data: bytes, **_how: object) -> Self:
-        """A sample of these bytes."""
+        """Return a sample of these bytes."""
         return cls(bytes(data))
 
     @classmethod
     def deserialize_key(cls, data: bytes, **_how: object) -> Self:
-        """A sample without data: that a writer ended."""
+        """Return a sample without data, which a writer sends when it ends."""
         return cls(bytes(data))
 
 
-def participant() -> DomainParticipant:
+# Endpoints
+
+
+def join_domain() -> DomainParticipant:
     """Join the domain. Raises InputError for an invalid ROS_DOMAIN_ID, RunError if DDS cannot be started."""
     given = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not given.isdecimal() or int(given) > _HIGHEST_DOMAIN:
@@ -57,11 +123,11 @@ def participant() -> DomainParticipant:
         raise RunError(f"ROS 2: no DDS participant in domain {given}: {error.msg or error}") from error
 
 
-class Writer:
-    """Publishes messages of one type. It never waits: without a reader that keeps up, old samples are replaced.
+class TopicWriter:
+    """Publishes messages of one type without waiting: if a reader does not keep up, old samples are replaced.
 
-    Reliable, so that reliable and best-effort subscribers both match, with a short history: a slow subscriber misses
-    samples. latched: the last message is also delivered to later subscribers. quality: policies in place of these.
+    Reliable, so that reliable and best-effort subscribers match, with a short history: a slow subscriber misses
+    samples. latched: later subscribers receive the last message, too. quality: policies in place of these.
     """
 
     def __init__(
@@ -74,25 +140,17 @@ class Writer:
         latched: bool = False,
     ) -> None:
         self._kind = kind
-        usual = Qos(
-            Policy.Reliability.Reliable(max_blocking_time=0),
-            Policy.History.KeepLast(1 if latched else _DEPTH),
-            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-            *_common(kind),
-        )
-        self._writer: Any = DataWriter(
-            domain, _topic(domain, topic, kind), qos=Qos(*(quality or ()), base=usual)
-        )
-        self.missed = 0
+        usual = _make_quality(kind, 1 if latched else _DEPTH, reliable=True, latched=latched)
+        qos = Qos(*(quality or ()), base=usual)
+        self._writer: Any = DataWriter(domain, _make_topic(domain, topic, kind), qos=qos)
 
     def write(self, message: Any) -> None:
-        """Publish a message; where DDS has no room for it, it is counted in `missed`."""
+        """Publish a message; drop it if DDS has no room for it."""
         try:
-            self._writer.write(Cdr(bytes(STORE.serialize_cdr(message, self._kind))))
+            self._writer.write(CdrSample(bytes(STORE.serialize_cdr(message, self._kind))))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise RunError(f"ROS 2: a message cannot be published: {error.msg or error}") from error
-            self.missed += 1
 
     @property
     def readers(self) -> int:
@@ -100,8 +158,8 @@ class Writer:
         return _count(self._writer.get_matched_subscriptions)
 
 
-class Reader:
-    """Receives messages of one type, without those published before it was made unless `latched`."""
+class TopicReader:
+    """Receives messages of one type; only with `latched` also the last one from before it was made."""
 
     def __init__(
         self,
@@ -112,20 +170,15 @@ class Reader:
         reliable: bool = True,
         latched: bool = False,
     ) -> None:
-        quality = Qos(
-            Policy.Reliability.Reliable(max_blocking_time=0) if reliable else Policy.Reliability.BestEffort,
-            Policy.History.KeepLast(_TAKEN),
-            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-            Policy.IgnoreLocal.Participant,
-            *_common(kind),
-        )
-        self._reader: Any = DataReader(domain, _topic(domain, topic, kind), qos=quality)
+        usual = _make_quality(kind, _TAKEN, reliable=reliable, latched=latched)
+        qos = Qos(Policy.IgnoreLocal.Participant, base=usual)
+        self._reader: Any = DataReader(domain, _make_topic(domain, topic, kind), qos=qos)
         self.condition = ReadCondition(self._reader, _ANY)
 
     def take(self) -> Iterator[tuple[bytes, tuple[int, int]]]:
-        """The data received since the last call, each with its publisher and its time there."""
+        """Yield the data received since the last call, each with its publisher and the publisher's time stamp."""
         for sample in self._reader.take(N=_TAKEN):
-            if isinstance(sample, Cdr):
+            if isinstance(sample, CdrSample):
                 info: Any = sample.sample_info
                 yield sample.data, (info.publication_handle, info.source_timestamp)
 
@@ -135,16 +188,16 @@ class Reader:
         return _count(self._reader.get_matched_publications)
 
 
-def waitset(domain: DomainParticipant, readers: list[Reader]) -> WaitSet:
-    """Something to wait on until one of the readers has data."""
-    found = WaitSet(domain)
+def make_waitset(domain: DomainParticipant, readers: list[TopicReader]) -> WaitSet:
+    """Return an object that waits until one of the readers has data."""
+    waitset = WaitSet(domain)
     for reader in readers:
-        found.attach(reader.condition)
-    return found
+        waitset.attach(reader.condition)
+    return waitset
 
 
-class Directory:
-    """The participants of a domain and their publishers, as far as they have been discovered."""
+class DomainDirectory:
+    """The discovered participants of a domain and their publishers."""
 
     def __init__(self, domain: DomainParticipant) -> None:
         readers: list[Any] = [
@@ -170,7 +223,7 @@ class Directory:
 
 
 def _count(matched: Callable[[], list[int]]) -> int:
-    """Number of what is matched. Cyclone DDS asks twice, and raises IndexError if there are more the second time."""
+    """Count matches. Cyclone DDS asks twice, and raises IndexError if the second answer is larger."""
     while True:
         try:
             return len(matched())
@@ -178,11 +231,17 @@ def _count(matched: Callable[[], list[int]]) -> int:
             continue
 
 
-def _common(kind: str) -> tuple[Any, ...]:
-    return Policy.DataRepresentation(use_cdrv0_representation=True), Policy.Userdata(user_data(kind))
+def _make_quality(kind: str, depth: int, *, reliable: bool, latched: bool) -> Qos:
+    return Qos(
+        Policy.Reliability.Reliable(max_blocking_time=0) if reliable else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(depth),
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(make_user_data(kind)),
+    )
 
 
-def _topic(domain: DomainParticipant, topic: str, kind: str) -> Any:
-    made: Any = Topic(domain, dds_topic(topic), idl_type(kind))
-    made.data_type = Cdr
+def _make_topic(domain: DomainParticipant, topic: str, kind: str) -> Any:
+    made: Any = Topic(domain, to_dds_topic(topic), make_idl_type(kind))
+    made.data_type = CdrSample
     return made

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flexneedle.errors import RigError
 from flexneedle.scenario.library import Library
-from flexneedle.scenario.problems import Problem, refuse
+from flexneedle.scenario.problems import Problem, refuse, to_line
 from flexneedle.scenario.sections.environment import Vector
 from flexneedle.scenario.sections.fields import Positive, Section, Title
 from flexneedle.types import Floats
@@ -26,7 +26,7 @@ _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST = 200
 
 
-def _a_topic(name: str) -> str:
+def _check_name(name: str) -> str:
     if len(name) > _LONGEST or not _TOPIC.fullmatch(name):
         raise ValueError(
             "must be a full topic name such as /needle/shape: letters, digits and _ after each /"
@@ -34,11 +34,13 @@ def _a_topic(name: str) -> str:
     return name
 
 
-TopicName = Annotated[str, AfterValidator(_a_topic)]
+TopicName = Annotated[str, AfterValidator(_check_name)]
+DeviceAge = Annotated[float, Field(gt=0, le=1000)]
+"""Age of data of a device (ms)."""
 
 
-class Axes(Section):
-    """Three axes, right-handed: which axis points along the insertion's x, y and z."""
+class AxisNames(Section):
+    """Axes, right-handed, that point along the insertion's x, y and z."""
 
     x: AxisName = "x"
     """Axis along the insertion axis, into the tissue."""
@@ -49,39 +51,39 @@ class Axes(Section):
 
     @property
     def rotation(self) -> Floats:
-        """Matrix (3, 3) from coordinates of the insertion to these."""
-        return np.array([_unit(self.x), _unit(self.y), _unit(self.z)]).T
+        """Matrix (3, 3) from coordinates of the insertion to coordinates along these axes."""
+        return np.array([_make_unit(self.x), _make_unit(self.y), _make_unit(self.z)]).T
 
     @model_validator(mode="after")
-    def _right_handed(self) -> Self:
+    def _check_handedness(self) -> Self:
         if abs(np.linalg.det(self.rotation) - 1.0) > 0.5:
             rule = "must be three different axes, right-handed, such as x = z, y = y, z = -x"
             refuse([Problem((), [self.x, self.y, self.z], rule)])
         return self
 
 
-def _unit(axis: AxisName) -> list[float]:
+def _make_unit(axis: AxisName) -> list[float]:
     sign = -1.0 if axis.startswith("-") else 1.0
     return [sign * (name == axis[-1]) for name in "xyz"]
 
 
-class FrameAxes(Axes):
-    """Section `frames.NAME`: a frame of the ROS system, and how the insertion is placed in it."""
+class FrameAxes(AxisNames):
+    """Section `frames.NAME`: a frame of the ROS system, with the place of the insertion in it."""
 
     id: Annotated[str, Field(min_length=1, max_length=_LONGEST)]
-    """`frame_id` of messages. A received message with another one is refused."""
+    """`frame_id` of messages. Received messages with another one are refused."""
     origin_mm: Vector = (0.0, 0.0, 0.0)
-    """Where the insertion axis enters the skin, in this frame."""
+    """Point where the insertion axis enters the skin, in this frame."""
 
 
-class Topic(Section):
+class ProfileTopic(Section):
     """A topic without positions."""
 
     topic: TopicName
     """Full name of the topic."""
 
 
-class PlacedTopic(Topic):
+class PlacedTopic(ProfileTopic):
     """A topic with positions."""
 
     frame: str
@@ -94,54 +96,54 @@ class ShapeTopic(PlacedTopic):
     """A topic of poses along the needle, the last one the tip."""
 
     spacing_mm: Positive | None = None
-    """Distance of the poses along the needle, counted from the tip. Not set: the nodes of the model."""
+    """Distance of the poses along the needle, counted from the tip (default: the nodes of the model)."""
 
 
-class Publish(Section):
-    """Section `publish`: what is published where."""
+class PublishedTopics(Section):
+    """Section `publish`: published topics."""
 
     shape: ShapeTopic | None = None
     """Estimated needle."""
     predicted_shape: ShapeTopic | None = None
-    """Needle at the target, as predicted."""
+    """Predicted needle at the target."""
     tip: PlacedTopic | None = None
     """Estimated tip."""
     measured_tip: PlacedTopic | None = None
-    """Tip as the tracker measured it, with its covariance; only where the tracker reports one."""
+    """Measured tip with its covariance, if the tracker reports a covariance."""
     plan: PlacedTopic | None = None
     """Planned path of the tip."""
     markers: PlacedTopic | None = None
     """Layers of tissue, and the target."""
     skin_entry: PlacedTopic | None = None
-    """Where the insertion axis enters the skin."""
+    """Point where the insertion axis enters the skin."""
     needle_pose: PlacedTopic | None = None
-    """Tip of the needle if it were straight: the inserted length along the insertion axis, and the roll."""
+    """Tip of a straight needle: the inserted length along the insertion axis, and the roll."""
     guide_pose: PlacedTopic | None = None
     """The inserted length along the insertion axis, and the guide across it."""
-    joint_states: Topic | None = None
+    joint_states: ProfileTopic | None = None
     """Positions of base and guide, and the roll (m, rad)."""
-    state: Topic | None = None
+    state: ProfileTopic | None = None
     """State of the rig in one word."""
-    diagnostics: Topic | None = None
+    diagnostics: ProfileTopic | None = None
     """State of the rig with its reason, and all scalars, readings and durations of each control period."""
-    joint_targets: Topic | None = None
-    """Positions that the joints of a rig of topics are to take."""
+    joint_targets: ProfileTopic | None = None
+    """Goals of the joints of a rig of topics."""
 
 
-class Subscribe(Section):
-    """Section `subscribe`: what is read where."""
+class ReadTopics(Section):
+    """Section `subscribe`: topics that are read."""
 
     tip: PlacedTopic | None = None
-    """Tip from a tracker."""
+    """Measured tip of a tracker."""
     shape: PlacedTopic | None = None
-    """Poses along the needle from a sensor of its shape, at any distances, the last one the tip."""
+    """Measured poses along the needle, at any distances, the last one the tip."""
     target: PlacedTopic | None = None
     """Target."""
-    stop: Topic | None = None
+    stop: ProfileTopic | None = None
     """true stops the rig."""
-    arm: Topic | None = None
+    arm: ProfileTopic | None = None
     """true arms the rig; false stops it."""
-    joint_states: Topic | None = None
+    joint_states: ProfileTopic | None = None
     """Positions of the joints of a rig of topics."""
 
 
@@ -175,58 +177,69 @@ SUBSCRIBED: dict[str, str] = {
 }
 """Message type of each key of `subscribe`."""
 
-OF_THE_LOOP = (tuple(key for key in PUBLISHED if key != "joint_targets"), ("stop", "arm", "target"))
-"""What the node of an insertion publishes and reads: a tracker and motors of topics have nodes of their own."""
+INSERTION_KEYS: dict[str, tuple[str, ...]] = {
+    "publish": tuple(key for key in PUBLISHED if key != "joint_targets"),
+    "subscribe": ("stop", "arm", "target"),
+}
+"""Keys of the node of an insertion; trackers and motors of topics have separate nodes."""
 
 
-class Profile(Section):
-    """A profile, as its file describes it."""
+class TopicProfile(Section):
+    """A profile, with the keys of its file."""
 
     name: Title
     """Title in messages."""
-    needle: Axes = Axes()
-    """Axes of a pose on the needle: which of its own axes points along the needle, and the two across."""
+    needle: AxisNames = AxisNames()
+    """Axes of a pose on the needle: the one along the needle, and the two across it."""
     frames: dict[str, FrameAxes] = Field(default_factory=dict)
     """Frames by name."""
-    publish: Publish = Publish()
-    subscribe: Subscribe = Subscribe()
+    publish: PublishedTopics = PublishedTopics()
+    subscribe: ReadTopics = ReadTopics()
 
-    def topics(self) -> Iterator[tuple[str, Topic]]:
+    def list_topics(self) -> Iterator[tuple[str, ProfileTopic]]:
         """Yield `publish.KEY` or `subscribe.KEY` and the topic of each that the profile lists."""
-        for section in ("publish", "subscribe"):
+        for section in INSERTION_KEYS:
             part = getattr(self, section)
             for key in type(part).model_fields:
                 if (topic := getattr(part, key)) is not None:
                     yield f"{section}.{key}", topic
 
-    def only(self, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> "Profile":
+    def select(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> "TopicProfile":
         """Return the profile with these keys alone."""
-        sections = {"publish": publish, "subscribe": subscribe}
-        kept = {
-            name: getattr(self, name).model_copy(
-                update={key: None for key in type(getattr(self, name)).model_fields if key not in keys}
-            )
-            for name, keys in sections.items()
-        }
-        return self.model_copy(update=kept)
+
+        def reduce(part: Section, keys: Collection[str]) -> Section:
+            return part.model_copy(update={key: None for key in type(part).model_fields if key not in keys})
+
+        parts = {"publish": reduce(self.publish, publish), "subscribe": reduce(self.subscribe, subscribe)}
+        return self.model_copy(update=parts)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse(_problems(self))
+        refuse(_find_problems(self))
         return self
 
 
-def _problems(profile: Profile) -> Iterator[Problem]:
+def _find_problems(profile: TopicProfile) -> Iterator[Problem]:
     known = ", ".join(profile.frames) or "none"
     owners: dict[str, str] = {}
-    for key, topic in profile.topics():
+    for key, topic in profile.list_topics():
         if (other := owners.setdefault(topic.topic, key)) != key:
-            rule = f"is that of {other}, too: what is published must not be read back as a measurement"
+            rule = f"is the topic of {other}, too: a published message must not be read back as a measurement"
             yield Problem(f"{key}.topic", topic.topic, rule)
         if isinstance(topic, PlacedTopic) and topic.frame not in profile.frames:
             yield Problem(f"{key}.frame", topic.frame, f"must be one of frames: {known}")
 
 
-def load_profile(source: str | Path) -> Profile:
+def load_profile(source: str | Path) -> TopicProfile:
     """Return the profile of a name or of a TOML file. Raises RigError with one line for each problem."""
-    return PROFILES.load(source, Profile)
+    return PROFILES.load(source, TopicProfile)
+
+
+def load_part(name: str, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> TopicProfile:
+    """Return a profile reduced to some keys. Raises RigError if it lacks one."""
+    profile = load_profile(name)
+    known = dict(profile.list_topics())
+    for key in (*(f"publish.{key}" for key in publish), *(f"subscribe.{key}" for key in subscribe)):
+        if key not in known:
+            raise RigError(to_line(Problem("profile", name, f"must list {key}; it lists {', '.join(known)}")))
+    return profile.select(publish=publish, subscribe=subscribe)

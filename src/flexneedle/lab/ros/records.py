@@ -1,21 +1,21 @@
-"""Records between a rig and its ROS node, besides `Plan` and `Period`.
+"""Records that a rig and its ROS node exchange, besides `Plan` and `Period`.
 
-Lengths are in mm, in the frame of the insertion: x along its axis into the tissue, y and z across. Times are in s: of
-what is published on the clock of the run, of what was received `time.monotonic()`.
+Lengths are in mm in the frame of the insertion: x along its axis into the tissue, y and z across. Times are in s: of
+published records on the clock of the run, of received records on `time.monotonic()`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from flexneedle.lab.ros.profile import Profile
+from flexneedle.lab.ros.profile import TopicProfile
 from flexneedle.types import VISIBLE, Point, Quaternion
 
-# What is published
+# Published
 
 
 @dataclass(frozen=True)
-class RigState:
-    """State of the rig by its name, such as "armed", a reason, whether it is as it should be, and more values."""
+class RosState:
+    """State of the rig by name, such as "armed", with its reason, whether it is good, and more values."""
 
     time: float
     state: str
@@ -25,8 +25,8 @@ class RigState:
 
 
 @dataclass(frozen=True)
-class Target:
-    """The target: as published, or as requested by a ROS node."""
+class RosTarget:
+    """A target that is published, or that another node requests."""
 
     time: float
     point: Point
@@ -34,18 +34,18 @@ class Target:
 
 @dataclass(frozen=True)
 class JointTargets:
-    """Positions that joints are to take, by name, in the units of the joint (m or rad). time: `time.monotonic()`."""
+    """Goals of joints by name, in the unit of the joint (m or rad). time: `time.monotonic()`."""
 
     time: float
     positions: Mapping[str, float]
 
 
-# What was received
+# Received
 
 
 @dataclass(frozen=True)
-class Stop:
-    """A node asks to stop, or sent on the topic of stops something that cannot be read."""
+class RosStop:
+    """A request to stop, or an unreadable message on the topic of stops."""
 
     time: float
     topic: str
@@ -53,8 +53,8 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class Arm:
-    """A node asks to arm the rig."""
+class RosArm:
+    """A request to arm the rig."""
 
     time: float
     topic: str
@@ -62,9 +62,9 @@ class Arm:
 
 @dataclass(frozen=True)
 class TipReading:
-    """A tip from a tracker of topics. time: when it was measured; orientation: z is the needle's axis, None if unknown.
+    """A tip at its time of measurement. orientation: its z is the needle's axis; None if unknown.
 
-    status: VISIBLE, or why there is no position.
+    status: VISIBLE, or the reason why there is no position.
     """
 
     time: float
@@ -76,10 +76,7 @@ class TipReading:
 
 @dataclass(frozen=True)
 class ShapeReading:
-    """Points along a needle from a sensor of its shape, from the base to the tip, at any distances.
-
-    tip: the last of them as a reading of the tip.
-    """
+    """Points along the needle from base to tip, at any distances. tip: the last one as a reading of the tip."""
 
     points: tuple[Point, ...]
     tip: TipReading
@@ -87,16 +84,15 @@ class ShapeReading:
 
 @dataclass(frozen=True)
 class JointReading:
-    """Positions and, where known, velocities of joints by name, in the units of the joint (m, rad, s)."""
+    """Positions of joints by name, in the unit of the joint (m or rad)."""
 
     time: float
     positions: Mapping[str, float]
-    velocities: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A message that was not taken, and why; count: messages of the topic refused so far."""
+class RosRefusal:
+    """A refused message. count: refused messages of the topic, this one included."""
 
     time: float
     topic: str
@@ -105,7 +101,7 @@ class Refused:
 
 
 @dataclass(frozen=True)
-class Lost:
+class NodeLoss:
     """The node has ended or does not answer: nothing is received any more, no stop either."""
 
     time: float
@@ -116,18 +112,18 @@ class Lost:
 
 
 @dataclass(frozen=True)
-class Setup:
-    """The first record to a node: what it is for. epoch: Unix time (s) of the records' time 0, 0: stamps are these."""
+class NodeSetup:
+    """The first record to a node. epoch: Unix time (s) of the records' time 0; 0: stamps are the records' times."""
 
-    profile: Profile
+    profile: TopicProfile
     epoch: float = 0.0
 
 
 @dataclass(frozen=True)
-class Beat:
-    """A sign of life; the first one is sent when the node is ready.
+class NodeHeartbeat:
+    """A sign of life of the node; the first one reports that it is ready.
 
-    subscribers: their number by key of `publish`; publishers: theirs by key of `subscribe`.
+    subscribers: number of subscribers by key of `publish`; publishers: number of publishers by key of `subscribe`.
     """
 
     time: float
@@ -135,5 +131,5 @@ class Beat:
     publishers: Mapping[str, int]
 
 
-Published = RigState | Target | JointTargets
-Request = Stop | Arm | Target | TipReading | ShapeReading | JointReading | Refused | Lost
+Published = RosState | RosTarget | JointTargets
+Received = RosStop | RosArm | RosTarget | TipReading | ShapeReading | JointReading | RosRefusal | NodeLoss

@@ -9,7 +9,7 @@ from shutil import which
 
 from rosbags.interfaces import Nodetype
 
-from flexneedle.lab.ros.idl import dds_name
+from flexneedle.lab.ros.dds import to_dds_name
 from flexneedle.record.messages import STORE
 
 _HERE = Path(__file__).parent
@@ -30,13 +30,13 @@ def missing():
     lacking = [name for name in ("fastddsgen", "g++") if which(name) is None]
     header = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
     lacking += [] if header.exists() else ["libfastrtps-dev"]
-    return f"needs Debian's {', '.join(lacking)} (tests/ros/fastdds/build.py)" if lacking else ""
+    return f"needs Debian's {', '.join(lacking)} (tests/lab/ros/fastdds/build.py)" if lacking else ""
 
 
 def build(folder, kinds):
     """Build the peer in an empty folder; return the path of the program."""
     (folder / "Types.idl").write_text(idl(kinds))
-    includes = "".join(f"KIND({label(kind)}, {dds_name(kind)})\n" for kind in kinds)
+    includes = "".join(f"KIND({label(kind)}, {to_dds_name(kind)})\n" for kind in kinds)
     (folder / "kinds.inc").write_text(includes)
     run(folder, "fastddsgen", "-replace", "-d", ".", "Types.idl")
     sources = ["Types.cxx", "TypesPubSubTypes.cxx", str(_HERE / "peer.cpp")]
@@ -70,7 +70,7 @@ def _add(kind, done):
         element = (how, detail) if how in (Nodetype.BASE, Nodetype.NAME) else detail[0]
         if element[0] is Nodetype.NAME:
             _add(element[1], done)
-        text = _BASIC[element[1][0]] if element[0] is Nodetype.BASE else dds_name(element[1])
+        text = _BASIC[element[1][0]] if element[0] is Nodetype.BASE else to_dds_name(element[1])
         text = f"sequence<{text}>" if how is Nodetype.SEQUENCE else text
         length = f"[{detail[1]}]" if how is Nodetype.ARRAY else ""
         lines.append(f"    {text} f_{name}{length};\n")

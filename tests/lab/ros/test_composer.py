@@ -11,9 +11,15 @@ from mcap.reader import make_reader
 
 import flexneedle
 from flexneedle.geometry.quaternion import to_matrix
-from flexneedle.lab.ros.messages import UNKNOWN_TURN, Composer, length_of, rolled, spaced
+from flexneedle.lab.ros.composer import (
+    UNKNOWN_TURN,
+    MessageComposer,
+    measure_length,
+    resample,
+    turn_about_axis,
+)
 from flexneedle.lab.ros.profile import PUBLISHED, load_profile
-from flexneedle.lab.ros.records import JointTargets, RigState, Target
+from flexneedle.lab.ros.records import JointTargets, RosState, RosTarget
 from flexneedle.record.messages import STORE, pose
 from flexneedle.record.writer import TraceWriter
 from flexneedle.types import Measurement, Pose, Shape
@@ -45,8 +51,8 @@ BENT = replace(PERIOD, shape=circle(np.linspace(0.0, 150.0, 61)))
 
 def composed(*records, profile="neutral", epoch=0.0):
     """Messages by key, the last of each, decoded from the bytes that are sent."""
-    composer = Composer(load_profile(profile), epoch)
-    found = [one for record in records for one in composer.messages(record)]
+    composer = MessageComposer(load_profile(profile), epoch)
+    found = [one for record in records for one in composer.compose(record)]
     return {
         one.key: STORE.deserialize_cdr(
             STORE.serialize_cdr(one.message, PUBLISHED[one.key]), PUBLISHED[one.key]
@@ -126,7 +132,7 @@ def test_poses_of_smartneedle_have_their_z_along_the_needle():
 def test_poses_are_on_the_needle_at_equal_distances_from_the_tip(spacing, curvature):
     """A circle: positions and slopes are known everywhere."""
     nodes = circle(np.linspace(0.0, 100.0, 41), curvature)
-    found, length = spaced(nodes, spacing), length_of(nodes)
+    found, length = resample(nodes, spacing), measure_length(nodes)
     expected = circle((length - spacing * np.arange(len(found))[::-1]) * 100.0 / length, curvature)
     np.testing.assert_allclose(found, expected, atol=2e-4)
     assert 0.0 <= length - spacing * (len(found) - 1) < spacing
@@ -149,7 +155,8 @@ def test_the_needle_pose_is_the_inserted_length_and_the_roll():
 def test_a_roll_turns_about_the_needles_own_axis():
     at = pose(0.0, Pose(1.0, 2.0, 3.0, 0.3, -0.2)).pose
     before, after = (
-        to_matrix(np.array([q.w, q.x, q.y, q.z])) for q in (at.orientation, rolled(at, 0.7).orientation)
+        to_matrix(np.array([q.w, q.x, q.y, q.z]))
+        for q in (at.orientation, turn_about_axis(at, 0.7).orientation)
     )
     np.testing.assert_allclose(after[:, 0], before[:, 0])
     np.testing.assert_allclose(after[:, 1] @ before[:, 1], math.cos(0.7))
@@ -204,7 +211,7 @@ def test_markers_are_the_layers_and_the_target():
 
 
 def test_a_new_target_keeps_the_layers():
-    sent = composed(PLAN, Target(3.0, (35.0, -4.0, 1.0)))["markers"].markers
+    sent = composed(PLAN, RosTarget(3.0, (35.0, -4.0, 1.0)))["markers"].markers
     assert [m.ns for m in sent] == ["tissue", "tissue", "target"]
     np.testing.assert_allclose(xyz(sent[-1].pose.position), (0.035, -0.004, 0.001))
 
@@ -214,7 +221,7 @@ def test_a_plan_without_a_scenario_has_no_layers():
 
 
 def test_the_state_is_a_word_and_a_diagnostic():
-    sent = composed(RigState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
+    sent = composed(RosState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
     assert sent["state"].data == "fault"
     (status,) = sent["diagnostics"].status
     assert (status.level, status.name, status.message) == (

@@ -10,7 +10,7 @@ from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl.types import array, sequence
 from rosbags.interfaces import Nodetype
 
-from flexneedle.lab.ros.idl import dds_name, dds_topic, idl_type, type_hash, user_data
+from flexneedle.lab.ros.dds import get_type_hash, make_idl_type, make_user_data, to_dds_name, to_dds_topic
 from flexneedle.lab.ros.profile import PUBLISHED, SUBSCRIBED
 from flexneedle.record.messages import STORE
 from ros_peers import cdr, joints, shape, target, tip
@@ -19,18 +19,19 @@ PUBLISHED_HASHES = json.loads((Path(__file__).parent / "type_hashes.json").read_
 KINDS = sorted({*PUBLISHED.values(), *SUBSCRIBED.values()})
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_hash_is_the_published_one(kind):
-    assert type_hash(kind) == PUBLISHED_HASHES[kind]
+def test_hashes_are_the_published_ones():
+    assert {kind: get_type_hash(kind) for kind in KINDS} == {kind: PUBLISHED_HASHES[kind] for kind in KINDS}
 
 
 def test_names_are_those_of_ros():
-    assert dds_name("geometry_msgs/msg/PoseStamped") == "geometry_msgs::msg::dds_::PoseStamped_"
-    assert idl_type("geometry_msgs/msg/PoseStamped").__idl__.idl_transformed_typename == dds_name(
+    assert to_dds_name("geometry_msgs/msg/PoseStamped") == "geometry_msgs::msg::dds_::PoseStamped_"
+    assert make_idl_type("geometry_msgs/msg/PoseStamped").__idl__.idl_transformed_typename == to_dds_name(
         "geometry_msgs/msg/PoseStamped"
     )
-    assert dds_topic("/needle/shape") == "rt/needle/shape"
-    assert user_data("std_msgs/msg/Bool") == f"typehash={PUBLISHED_HASHES['std_msgs/msg/Bool']};".encode()
+    assert to_dds_topic("/needle/shape") == "rt/needle/shape"
+    assert (
+        make_user_data("std_msgs/msg/Bool") == f"typehash={PUBLISHED_HASHES['std_msgs/msg/Bool']};".encode()
+    )
 
 
 def structure(message):
@@ -50,10 +51,10 @@ def structure(message):
 
 
 def fresh(name, made={}):  # noqa: B006  one type for one name
-    """A type that can be given values: `idl_type` makes types without a constructor."""
+    """A type that can be given values: `make_idl_type` makes types without a constructor."""
     if name not in made:
-        fields = {field: exchanged(hint) for field, hint in idl_type(name).__annotations__.items()}
-        made[name] = make_idl_struct(name.split("/")[-1] + "_", dds_name(name).replace("::", "."), fields)
+        fields = {field: exchanged(hint) for field, hint in make_idl_type(name).__annotations__.items()}
+        made[name] = make_idl_struct(name.split("/")[-1] + "_", to_dds_name(name).replace("::", "."), fields)
     return made[name]
 
 

@@ -1,0 +1,117 @@
+"""A participant that reads the topics of a rig and publishes nothing."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from flexneedle.errors import make_printable
+from flexneedle.lab.ros.dds import (
+    DomainDirectory,
+    TopicReader,
+    join_domain,
+    to_dds_name,
+    to_dds_topic,
+    to_ros_name,
+)
+from flexneedle.lab.ros.node import make_inputs
+from flexneedle.lab.ros.parsing import Subscription
+from flexneedle.lab.ros.profile import TopicProfile
+from flexneedle.lab.ros.records import RosRefusal, RosStop
+from flexneedle.ports import Clock
+
+_PAUSE_S = 0.01
+
+
+@dataclass(frozen=True)
+class TopicActivity:
+    """Activity on a topic of `subscribe`.
+
+    publishers, messages: their numbers; age: age (s) of the last message at the end, by the clocks of both computers,
+    None without a message; problem: "" if there is none.
+    """
+
+    key: str
+    topic: str
+    kind: str
+    publishers: int
+    messages: int
+    age: float | None = None
+    problem: str = ""
+
+
+class TopicListener:
+    """Reads all topics of `subscribe` that a profile lists. Raises InputError or RunError as `join_domain`.
+
+    identity: the domain.
+    """
+
+    def __init__(self, profile: TopicProfile) -> None:
+        domain = join_domain()
+        self.identity = f"domain {domain.domain_id}"
+        self._directory = DomainDirectory(domain)
+        self._topics = [_Topic(*each) for each in make_inputs(domain, profile)]
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._topics.clear()
+        del self._directory
+
+    @property
+    def others(self) -> int:
+        """Number of the other participants of the domain."""
+        return self._directory.participants - 1
+
+    def is_published(self, topic: str) -> bool:
+        """Return whether a node publishes a topic."""
+        return any(name == to_dds_topic(topic) for name, _ in self._directory.publishers)
+
+    def listen(self, clock: Clock, seconds: float) -> list[TopicActivity]:
+        """Listen for `seconds` and return the activity on each topic."""
+        begun = clock.now()
+        while clock.now() - begun < seconds:
+            for topic in self._topics:
+                topic.take(clock.now())
+            clock.wait(_PAUSE_S)
+        now, publishers = time.time(), self._directory.publishers
+        return [topic.summarize(now, publishers) for topic in self._topics]
+
+
+@dataclass
+class _Topic:
+    """One topic: its readers, the publisher and time of each message, and the last problem of a message."""
+
+    subscription: Subscription
+    readers: list[TopicReader]
+    sources: set[tuple[int, int]] = field(default_factory=set)
+    problem: str = ""
+
+    def take(self, now: float) -> None:
+        publishers = self.readers[0].writers
+        for data, source in self._take_all():
+            if source not in self.sources:  # a stop has several readers
+                self.sources.add(source)
+                match self.subscription.read(data, now, publishers):
+                    case RosStop(reason=reason):
+                        self.problem = f"{reason or 'true'}: an insertion would be stopped"
+                    case RosRefusal(reason=reason):
+                        self.problem = f"a message is refused: {reason}"
+
+    def _take_all(self) -> Iterator[tuple[bytes, tuple[int, int]]]:
+        for reader in self.readers:
+            yield from reader.take()
+
+    def summarize(self, now: float, publishers: list[tuple[str, str]]) -> TopicActivity:
+        """Return the activity; now: Unix time, s; publishers: of the domain."""
+        one, matched = self.subscription, self.readers[0].writers
+        kinds = [kind for topic, kind in publishers if topic == to_dds_topic(one.topic)]
+        wrong = [kind for kind in kinds if kind != to_dds_name(one.kind)]
+        problem = self.problem
+        if wrong:
+            problem = (
+                f"a publisher has the type {make_printable(to_ros_name(wrong[0]))}, which is not received"
+            )
+        elif len(kinds) > matched:
+            problem = "a publisher is not received: its quality of service must be reliable"
+        sent = max((time for _, time in self.sources), default=None)
+        age = None if sent is None else now - 1e-9 * sent
+        return TopicActivity(one.key, one.topic, one.kind, matched, len(self.sources), age, problem)
