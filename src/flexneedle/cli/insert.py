@@ -103,7 +103,7 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--controller",
         metavar="NAME",
-        help="controller: name from --list or module:CONTROLLER (default: adaptive-mpc)",
+        help="controller: name from --list or module:NAME (default: adaptive-mpc)",
     )
     parser.add_argument(
         "--phantom",

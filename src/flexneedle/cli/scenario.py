@@ -80,7 +80,7 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
         "--controller",
         action="append",
         default=[],
-        metavar="module:METHOD",
+        metavar="module:NAME",
         help="custom controller whose table the scenario may contain; repeatable",
     )
 

@@ -62,7 +62,7 @@ def unowned(scenario: Scenario, methods: Iterable[Controller], source: str = "")
     for table in sorted(set(scenario.control.tables) - set(known)):
         close = get_close_matches(table, known, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
-        own = "one of your own controllers needs --controller module:METHOD"
+        own = "one of your own controllers needs --controller module:NAME"
         rule = f"unknown table; {hint}tables: {', '.join(known)}; {own}"
         lines.append(f"{opening}{key_path(('control', table))}: {rule}")
     return lines
