@@ -3,13 +3,16 @@
 Records, progress bars, the page and ROS are listeners; a listener ignores the events that it does not need.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from flexneedle.control.interface import Decision
-from flexneedle.estimation.estimate import Estimate
-from flexneedle.types import Insertion, Period, Plan
+if TYPE_CHECKING:  # the command line imports this module for each help text
+    from flexneedle.control.interface import Decision
+    from flexneedle.estimation.estimate import Estimate
+    from flexneedle.types import Insertion, Period, Plan
 
 
 class Event:
