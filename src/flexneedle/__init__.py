@@ -1,4 +1,4 @@
-"""Simulate, plan and steer flexible bevel-tip needles in soft tissue.
+"""Simulation, planning and steering of flexible bevel-tip needles in soft tissue.
 
 Names are imported on first use, so that `import flexneedle` is fast and does not load the compiler.
 """
@@ -199,7 +199,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its home on first use (PEP 562)."""
+    """Import a public name from its module on first use (PEP 562)."""
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

@@ -1,4 +1,4 @@
-"""`python -m flexneedle` runs the command line."""
+"""The command line, for `python -m flexneedle`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Checks of arguments: one line with value, rule and remedy for an invalid one."""
+"""Checks of arguments. The error of an invalid argument is one line with value, rule and remedy."""
 
 import reprlib
 from collections.abc import Mapping
@@ -18,7 +18,17 @@ _ROUNDING = 1e-6  # of the largest entry: rounding of a product of matrices in s
 
 
 def check_whole(name: str, value: Any, least: int, remedy: str = "") -> int:
-    """Return an integer. Raises InputError for anything else, and for values below `least`."""
+    """Return an integer.
+
+    Args:
+        name: Name of the argument, for the message.
+        value: Any value.
+        least: Smallest valid value.
+        remedy: Further advice in the message (default: none).
+
+    Raises:
+        InputError: The value is no integer, or below `least`.
+    """
     try:
         number = least - 1 if isinstance(value, bool) else index(value)
     except TypeError:
@@ -29,7 +39,16 @@ def check_whole(name: str, value: Any, least: int, remedy: str = "") -> int:
 
 
 def check_point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
-    """Return three numbers, the last 0 if only two are given; `parts` describes them. Raises InputError for others."""
+    """Return a point of three numbers. The third is 0 if only two are given.
+
+    Args:
+        name: Name of the argument, for the message.
+        value: Any value.
+        parts: Description of the numbers, for the message.
+
+    Raises:
+        InputError: The value is not two or three numbers.
+    """
     try:
         given = [] if isinstance(value, str | Mapping) else list(value)
         numbers = [] if any(isinstance(part, bool | str) for part in given) else list(map(float, given))
@@ -42,7 +61,7 @@ def check_point(name: str, value: Any, parts: str) -> tuple[float, float, float]
 
 
 def read_numbers(value: Any, count: int) -> tuple[float, ...] | None:
-    """Return a row of `count` numbers, finite or not, as floats; None for anything else."""
+    """Return a row of `count` numbers as floats, finite or not; None for any other value."""
     try:
         row = tuple(value)
     except TypeError:
@@ -53,7 +72,7 @@ def read_numbers(value: Any, count: int) -> tuple[float, ...] | None:
 
 
 def read_rows(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
-    """Return any number of rows of `count` numbers, finite or not, as floats; None for anything else."""
+    """Return rows of `count` numbers as floats, finite or not; None for any other value."""
     try:
         rows = [read_numbers(row, count) for row in value]
     except TypeError:
@@ -63,8 +82,15 @@ def read_rows(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
 
 
 def check_covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...], ...]:
-    """Return a covariance by rows. Raises InputError unless it has `size` rows of `size` numbers, is symmetric up to
-    rounding and has no negative variance; entries that are not finite may be anything.
+    """Return a covariance by rows. Entries that are not finite are not checked.
+
+    Args:
+        name: Name of the argument, for the message.
+        value: Any value.
+        size: Number of rows and of columns.
+
+    Raises:
+        InputError: The value has another shape, is not symmetric up to rounding, or has a negative variance.
     """
     rows = read_rows(value, size)
     if rows is None or len(rows) != size:
@@ -81,7 +107,7 @@ def check_covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...
 
 
 def check_instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
-    """Return a value of the class `kind`. Raises InputError, with the remedy, for another."""
+    """Return a value of the class `kind`. Raises InputError with the remedy for any other value."""
     if not isinstance(value, kind):
         rule = f"must be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
         raise make_refusal(name, value, rule, remedy)
@@ -89,14 +115,14 @@ def check_instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Ki
 
 
 def check_path(name: str, value: Any) -> Path:
-    """Return the path of a file or folder. Raises InputError for anything but text and paths."""
+    """Return the path of a file or folder. Raises InputError unless the value is a text or a path."""
     if not isinstance(value, str | PathLike):
         raise make_refusal(name, value, "must be a path")
     return Path(value)
 
 
 def shorten(value: object) -> str:
-    """Return any value as short text in one line."""
+    """Return a value as short text in one line."""
     text = " ".join(reprlib.repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 

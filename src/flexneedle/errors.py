@@ -1,4 +1,4 @@
-"""The errors of the package. A message is one line: the value, the rule, the valid choices."""
+"""Errors of the package. A message is one line: value, rule, valid choices."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ class InputError(FlexneedleError):
 
 
 class FileError(InputError):
-    """A settings file cannot be read or violates a rule. Each argument is one problem in one line."""
+    """A settings file cannot be read or violates a rule. Each argument is the line of one problem."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -34,8 +34,11 @@ class RigError(FileError):
 class CommandError(InputError, ValueError):
     """A command to the simulator or a device is out of range.
 
-    `name` is the input (`db_x`), `value` the command, `limit` the bound that it exceeds (mm or rad, as the input) and
-    `rule` the rule as text, such as "must be at most 1 mm a step".
+    Attributes:
+        name: Input, such as `db_x`.
+        value: Commanded value (mm or rad).
+        limit: Bound that the value exceeds, in the same unit.
+        rule: Rule as text, such as "must be at most 1 mm a step".
     """
 
     def __init__(self, name: str, value: float, limit: float, rule: str) -> None:
@@ -59,28 +62,28 @@ class RecordError(RunError):
 
     @classmethod
     def of(cls, path: Path, error: OSError) -> "RecordError":
-        """The error for a file, with the reason of the operating system."""
+        """Return the error for a file, with the reason of the operating system."""
         return cls(f"{path.name} cannot be written: {error.strerror or error}")
 
 
 class DriverError(RunError):
-    """A motor controller cannot be reached, refuses a command, or does not do what it was commanded."""
+    """A device cannot be reached, refuses a command, or does not carry it out."""
 
 
 class StoppedError(RunError):
-    """A rig was stopped: from the keyboard, by a signal or service, or since its controller did not answer."""
+    """A rig was stopped: from the keyboard, by a signal or service, or because its controller did not reply."""
 
 
 class RefusedError(InputError):
-    """A rig refuses a command, and nothing moves: its state does not allow it, or it breaks a limit."""
+    """A rig refuses a command and does not move: its state does not allow the command, or a limit is exceeded."""
 
 
 class ScenarioWarning(UserWarning):
-    """A scenario has a deprecated or unused key that should be changed. The message is one line."""
+    """A scenario has a deprecated or unused key. The message is one line."""
 
 
 def one_line(error: FlexneedleError) -> str:
-    """Return the message of an error in one line, also if it has several problems."""
+    """Return the message of an error in one line; several problems are separated by semicolons."""
     return "; ".join(str(error).splitlines())
 
 

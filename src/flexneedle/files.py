@@ -1,4 +1,4 @@
-"""Files that are complete at any time, since Ctrl-C is delayed until a record is written; and new folders."""
+"""Files that are complete at any time, and new folders."""
 
 import os
 import re
@@ -14,9 +14,12 @@ _LONGEST_NAME = 60
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file in one step: readers get the old or the new one, never a part.
+    """Replace a file in one step, so that a reader finds the old or the new file, never a part of it.
 
-    Raises RecordError, and leaves the old one, if it cannot be written.
+    Ctrl-C is delayed until the file is complete.
+
+    Raises:
+        RecordError: The file cannot be written; the old file is kept.
     """
     draft = path.with_name(path.name + ".tmp")
     with uninterrupted():
@@ -27,14 +30,20 @@ def replace_file(path: Path, data: bytes) -> None:
                 os.fsync(file.fileno())
             draft.replace(path)
         except OSError as error:
-            draft.unlink(missing_ok=True)  # a part of it would take the last room of a full disk
+            draft.unlink(missing_ok=True)  # frees the space on a full disk
             raise RecordError.of(path, error) from error
 
 
 def create_folder(*parts: str, now: datetime | None = None, root: Path = RUNS) -> Path:
-    """Create and return a folder `<root>/<date>-<part>-<part>`; further ones in the same second get a number.
+    """Create and return a folder `<root>/<date>-<part>-<part>`, with a number if that exists.
 
-    now: time in the name (default: the present). Raises InputError if it cannot be created.
+    Args:
+        parts: Parts of the name; other characters than letters, digits, `_`, `.` and `-` are replaced.
+        now: Time in the name (default: the present).
+        root: Folder above it.
+
+    Raises:
+        InputError: The folder cannot be created.
     """
     plain = (re.sub(r"[^\w.-]+", "-", part).strip("-.")[:_LONGEST_NAME] or "unnamed" for part in parts)
     opening = "-".join((f"{now or datetime.now(UTC):%Y%m%dT%H%M%SZ}", *plain))

@@ -1,7 +1,7 @@
-"""Blocks that Ctrl-C does not interrupt: between a lock's taking and its release, or in the middle of a record.
+"""Blocks that Ctrl-C does not interrupt, such as a block that holds a lock or writes a record.
 
-Python raises KeyboardInterrupt between any two steps of the main thread, also of the standard library: in a condition
-of `threading`, its lock is then never released, and a thread that needs it waits without end.
+Python raises KeyboardInterrupt between any two steps of the main thread, also in the standard library. In a condition
+of `threading` the lock is then never released, and a thread that needs it waits forever.
 """
 
 import signal
@@ -12,7 +12,7 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""That may interrupt a command."""
+"""Signals that interrupt a command."""
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 class _Delayed:
-    """A handler that keeps the first signal until the block is over; from then on it acts as those before."""
+    """A handler that keeps the first signal of the block; after the block it calls the previous handler."""
 
     def __init__(self, before: Mapping[signal.Signals, Callable[[int, FrameType | None], Any]]) -> None:
         self._before = before

@@ -1,4 +1,4 @@
-"""Ports of the closed loop: a clock, a driver that moves the needle, a tracker of its tip; and the motors of a rig."""
+"""Ports of the closed loop and of a rig: clock, driver, trackers, motors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ class Clock(Protocol):
     """Time since the start of the run."""
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the time since the start (s)."""
         ...
 
     def wait(self, seconds: float) -> None:
-        """Wait for `seconds`."""
+        """Wait for a time (s)."""
         ...
 
 
@@ -23,21 +23,28 @@ class Driver(Protocol):
     """Moves base and guide and rolls the bevel."""
 
     def apply(self, command: Control, duration: float) -> Motion:
-        """Roll, then travel, the travel within `duration` seconds; return what was done, and when.
+        """Roll the needle, then travel; return the motion after all axes have come to rest.
 
-        The needle first rolls by `command.roll` (rad), with base and guide at rest, at the driver's own speed and in a
-        time of its own: the travel begins only once the roll has arrived. Base, guide and spin then move together, each
-        evenly over the `duration`, which is that of the slowest axis, never 0. Returns when all axes are at rest.
+        The needle first rolls by `command.roll` (rad) at the driver's own speed, with base and guide at rest. Base,
+        guide and spin then move together and evenly over the duration.
 
-        The `Motion` has the control as it was carried out, and times on the clock of the run: `begun`, before which,
-        and `ended`, after which nothing moved; `turned` (None without a roll), when the roll had arrived and the travel
-        began. So readings are compared with a needle that rests until `begun`, rolls until `turned`, and travels until
-        `ended`. Raises DriverError if the command is not carried out, CommandError if it exceeds a limit.
+        Args:
+            command: The control to carry out.
+            duration: Time of the travel (s), set by the slowest axis, never 0.
+
+        Returns:
+            The control that was carried out, with times on the clock of the run. Nothing moved before `begun` or after
+            `ended`; `turned` is the time at which the roll ended and the travel began, None without a roll. Readings
+            are compared with a needle that moves as these times state.
+
+        Raises:
+            DriverError: The command is not carried out.
+            CommandError: The command exceeds a limit.
         """
         ...
 
     def stop(self) -> None:
-        """Stop all axes at once, also a motion that is under way; without one, do nothing."""
+        """Stop all axes at once. At rest, do nothing."""
         ...
 
 
@@ -45,12 +52,12 @@ class Tracker(Protocol):
     """Measures sensors: a device, a recording or a simulation."""
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; may be empty. Does not wait for the next frame."""
+        """Return the frames since the last call, oldest first, without waiting; may be empty."""
         ...
 
     @property
     def status(self) -> str:
-        """VISIBLE while frames arrive, else the reason in a few words."""
+        """VISIBLE while frames arrive, otherwise the reason in a few words."""
         ...
 
 
@@ -58,23 +65,28 @@ class TipTracker(Protocol):
     """Measures the tip of the needle in the frame of the stage."""
 
     def read(self) -> tuple[Measurement, ...]:
-        """The readings since the last call, oldest first; may be empty."""
+        """Return the readings since the last call, oldest first, without waiting; may be empty."""
         ...
 
     @property
     def status(self) -> str:
-        """VISIBLE while readings arrive, else the reason in a few words."""
+        """VISIBLE while readings arrive, otherwise the reason in a few words."""
         ...
 
 
 @dataclass(frozen=True)
 class MotorState:
-    """One motor as its controller reports it. Positions in counts.
+    """State of one motor as its controller reports it. Positions are in counts.
 
-    position: measured by the encoder; commanded: where the controller's own profile is now; moving: whether the profile
-    is under way; on: whether the motor is powered; reverse_limit, forward_limit: whether the limit switch is active;
-    stopped: why the controller itself ended the motion or switched the motor off, "" while it did neither; repeated:
-    whether nothing newer is known than at the call before.
+    Attributes:
+        position: Position measured by the encoder.
+        commanded: Present position of the controller's own profile.
+        moving: Whether the profile is under way.
+        on: Whether the motor is powered.
+        reverse_limit: Whether the limit switch of the reverse side is active.
+        forward_limit: Whether the limit switch of the forward side is active.
+        stopped: Reason for which the controller itself ended the motion or switched the motor off, otherwise "".
+        repeated: Whether the state is the one of the previous call, without newer data.
     """
 
     position: float
@@ -89,11 +101,14 @@ class MotorState:
 
 @dataclass(frozen=True)
 class MotorSetup:
-    """How a controller is set up for one motor. Positions in counts.
+    """Setup of a controller for one motor. Positions are in counts.
 
-    lowest, highest: soft limits of the controller itself, infinite where it has none; most_error: difference of
-    commanded and measured position that it takes for an error; off_on_error: whether it then switches the motor off;
-    disabled: limit switches that it ignores, such as "forward", "" for none.
+    Attributes:
+        lowest: Lower soft limit of the controller, infinite without one.
+        highest: Upper soft limit of the controller, infinite without one.
+        most_error: Difference of commanded and measured position from which the controller reports an error.
+        off_on_error: Whether the controller then switches the motor off.
+        disabled: Limit switches that the controller ignores, such as "forward"; "" for none.
     """
 
     lowest: float
@@ -105,33 +120,35 @@ class MotorSetup:
 
 @dataclass(frozen=True)
 class MotorPaces:
-    """The smallest and largest speed (counts/s) and acceleration (counts/s²) that a controller takes."""
+    """Smallest and largest speed (counts/s) and acceleration (counts/s²) that a controller accepts."""
 
     speeds: tuple[float, float]
     accelerations: tuple[float, float]
 
 
 class Motors(Protocol):
-    """The motors of a rig by channel. It knows counts and channels, neither needles nor plans.
+    """The motors of a rig by channel, in counts.
 
-    No call takes longer than the reply timeout of the device. Each raises DriverError if the device cannot be reached
-    or refuses the command; the message has the device's reason. For `rig check` a driver may have `identity`, one line
-    that names the controller and its firmware, and `setup()`, which returns a `MotorSetup` by channel. It should have
-    `address`, one line that names the device on this machine, by which one program at a time moves it; without it the
-    driver's kind and settings in the rig file do. It may have `paces`, a `MotorPaces`: a rig file with another speed or
-    acceleration is refused when the motors are opened.
+    No call takes longer than the reply timeout of the device. A call raises DriverError with the device's reason if the
+    device cannot be reached or refuses the command.
+
+    A driver should have `address`, one line that names the device on this machine: one program at a time moves the
+    motors at an address. Without it, the address is the driver's kind with its settings in the rig file. Optional
+    attributes: `identity`, one line that names the controller and its firmware, and `setup()`, which returns a
+    `MotorSetup` by channel, both for `rig check`; and `paces`, a `MotorPaces`, so that a rig file with another speed
+    or acceleration is refused when the motors are opened.
     """
 
     def read(self) -> Mapping[str, MotorState]:
-        """State of every channel, as of now."""
+        """Return the present state of each channel."""
         ...
 
     def set_speed(self, channel: str, speed: float, acceleration: float) -> None:
-        """Limit speed (counts/s) and acceleration (counts/s²) of the motions to come, and of those under way."""
+        """Limit speed (counts/s) and acceleration (counts/s²) of present and later motions."""
         ...
 
     def follow(self, positions: Mapping[str, float]) -> None:
-        """Move channels to absolute positions (counts), from wherever they are; each call replaces the one before."""
+        """Move channels to absolute positions (counts); each call replaces the previous one."""
         ...
 
     def stop(self) -> None:
@@ -139,21 +156,21 @@ class Motors(Protocol):
         ...
 
     def define(self, channel: str, position: float) -> None:
-        """Call the present position of a channel at rest `position` (counts), as at the end of homing."""
+        """Set the present position of a channel at rest to `position` (counts), as at the end of homing."""
         ...
 
     def power(self, channel: str, on: bool) -> None:
-        """Switch a motor at rest on or off. Switched on from off, it is held where it is, its commanded position."""
+        """Switch a motor at rest on or off. A motor that is switched on is held at its measured position."""
         ...
 
     def reconnect(self) -> None:
-        """Drop the connection and open a new one. It moves nothing, and changes nothing in the device.
+        """Drop the connection and open a new one, without a motion or a change in the device.
 
-        One that takes longer than the reply timeout is opened in a thread: this call raises DriverError until it is
-        open, and is repeated.
+        If connecting takes longer than the reply timeout, connect in a thread: this call raises DriverError until the
+        connection is open, and is repeated.
         """
         ...
 
     def close(self) -> None:
-        """Close the connection; motors are left as they are."""
+        """Close the connection; the motors stay as they are."""
         ...
