@@ -90,16 +90,16 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tup
         ),
         (
             lambda: flexneedle.VirtualRig(tracker=3),
-            f"tracker = 3: must be one of scenario, {OWN}, or a function of (scenario, phantom, rng)",
+            f"tracker = 3: is an int, not a function of (scenario, phantom, rng); choices: scenario, or {OWN}",
         ),
         (
             lambda: flexneedle.VirtualRig(phantom={"exact": 1}),
-            f"phantom = {{'exact': 1}}: must be one of exact, model, {OWN}, or a function of (truth, roll)",
+            f"phantom = {{'exact': 1}}: is a dict, not a function of (truth, roll); choices: exact, model, or {OWN}",
         ),
         (
             lambda: flexneedle.insert("phantom", PLAN, controller=3),
-            f"controller = 3: must be one of {', '.join(CONTROLLERS)}, {OWN}, or a flexneedle.Controller, "
-            "missing: name, summary, decide",
+            "controller = 3: is an int, not a flexneedle.Controller, missing: name, summary, decide; "
+            f"choices: {', '.join(CONTROLLERS)}, or {OWN}",
         ),
         (lambda: flexneedle.Scenario(needle=3), MISSING),
         (lambda: flexneedle.Scenario(**{**VALUES, "needle": 3}), "needle = 3: must be a table"),

@@ -54,7 +54,7 @@ def find_part(
             problem = str(error)
     else:
         found, problem = given, rule(given)
-        problem += f"; or give one of {', '.join(included)}, or {OWN}" if problem else ""
+        problem += f"; choices: {', '.join(included)}, or {OWN}" if problem else ""
     if problem:
         label = repr(given) if isinstance(given, str) else getattr(given, "__name__", shorten(given))
         raise InputError(f"{key} = {make_printable(label)}: {problem}")
