@@ -119,7 +119,7 @@ def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], insertion.Outputs]:
     """The same rollout of planar controls (N, m, 9) from the start, by the kernels of space: complex arrays."""
     model, setup = simulator._model, SCENARIO.setup
-    base, tip = (nd.Pose(x, 0j, 0j) for x in (SCENARIO.start_base_x, setup.start_tip_x))
+    base, tip = (nd.NodePose(x, 0j, 0j) for x in (SCENARIO.start_base_x, setup.start_tip_x))
     rest = np.zeros(model.nodes.size, complex)
     work = rest.copy(), rest.copy(), nd.work_array(rest)
     needle = insertion.settle(

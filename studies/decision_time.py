@@ -56,14 +56,14 @@ def plan_to(target: tuple[float, float]) -> Plan:
 
 def taking(seconds: float, clock: Clock) -> Controller:
     """The default controller, whose decisions take time on a clock."""
-    method = CONTROLLERS[DEFAULT]
+    controller = CONTROLLERS[DEFAULT]
 
     def decide(task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Any]:
         if seconds > 0.0:
             clock.wait(seconds)
-        return method.decide(task, memory, estimate, rng)
+        return controller.decide(task, memory, estimate, rng)
 
-    return replace(method, name="slow-mpc", decide=decide)
+    return replace(controller, name="slow-mpc", decide=decide)
 
 
 def inserted(job: Job) -> Insertion:

@@ -132,7 +132,7 @@ def bent(simulator: Simulator, rng: np.random.Generator) -> Simulator:
     bend = float(rng.choice([0.0, 1.0])) * (y if axes == 1 else complex(y, z))
     clearance = float(rng.choice([0.0, rng.uniform(0.0, 0.2)]))
     fitted = Adaptation(np.zeros(layers - 1), np.ones(layers), bend=bend, clearance=clearance)
-    return simulator.adapted(fitted)
+    return simulator.with_adaptation(fitted)
 
 
 def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> np.ndarray:

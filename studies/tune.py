@@ -1,14 +1,14 @@
 """Tune a controller with 200 insertions, on phantoms that are not used for evaluation.
 
-    python studies/tune.py METHOD [--jobs N] [--seed N] [--out DIR]
+    python studies/tune.py CONTROLLER [--jobs N] [--seed N] [--out DIR]
 
-METHOD is a controller as in `flexneedle insert --controller`; its search space is in SPACES. Five settings, the middle
-of the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper, each case on
-its own phantom (exact plant, preset `phantom`). The best two after twenty cases continue to seventy: the standard
+CONTROLLER is a name as in `flexneedle insert --controller`; its search space is in SPACES. Five settings, the middle of
+the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper, each case on its own
+phantom (exact plant, preset `phantom`). The best two after twenty cases continue to seventy: the standard
 deviation of single errors is about their mean, so more settings with fewer cases each would be ranked by chance. The
 score is the mean true error plus a quarter of its 95 % quantile (mm); an unfinished insertion counts 5 mm. Planning
-is outside the budget. The table is printed on stdout; the record is written to DIR/METHOD.json (default: the shipped
-records, src/flexneedle/lab/study/tuning), with the same bytes for any number of processes.
+is outside the budget. The table is printed on stdout; the record is written to DIR/CONTROLLER.json (default: the
+shipped records, src/flexneedle/lab/study/tuning), with the same bytes for any number of processes.
 
 Each trial sets all settings of the space, independent of the shipped values, so that the result can be reproduced after
 the shipped settings have been changed to it. All other settings are the shipped ones. The weights of `adaptive-mpc` are
@@ -208,7 +208,9 @@ def counted(errors: Iterable[float], before: int) -> Iterator[float]:
 def main(arguments: list[str] | None = None) -> None:
     """Tune, print the table, write the record."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("method", choices=sorted(SPACES), metavar="METHOD", help=", ".join(sorted(SPACES)))
+    parser.add_argument(
+        "method", choices=sorted(SPACES), metavar="CONTROLLER", help=", ".join(sorted(SPACES))
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of the tried settings (default: 0)"

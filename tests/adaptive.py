@@ -6,7 +6,7 @@ import numpy as np
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.path import of_plan
+from flexneedle.control.path import path_of_plan
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
 from tasks import begun_with, task_of
@@ -31,7 +31,7 @@ def estimate_of(state, scenario=PHANTOM, **fields):
 def decided(plan, estimate, seed=0, path=None):
     """Decision and memory after it, with a current path that is the plan's unless another is given."""
     task = task_of(estimate.nominal, plan)
-    begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), estimate.state.tip[0])
+    begun, path = ADAPTIVE.begin(task), path or after(path_of_plan(plan), estimate.state.tip[0])
     memory = replace(begun, path=path, roll=estimate.state.roll)
     return ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(seed))
 

@@ -71,7 +71,7 @@ class Needle:
     def simulator(self, scenario):
         """The simulator with this needle's constants."""
         tissue = np.array(self.shift), np.array(self.modulus), 2.5, np.array(self.variation)
-        return Simulator(scenario, threads=1).adapted(
+        return Simulator(scenario, threads=1).with_adaptation(
             Adaptation(*tissue, self.bevel, self.bend, self.clearance)
         )
 
@@ -141,7 +141,7 @@ def off_the_prior(count=55, needle="all"):
     estimate, _ = followed(NEEDLES[needle], count)
     sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
     off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
-    off_prior = estimate._with(estimate.parameters + off)._differentiated(range(sd.size))
+    off_prior = estimate._simulate_with(estimate.parameters + off)._differentiate(range(sd.size))
     return off_prior, off_prior._readings[0]
 
 
@@ -154,7 +154,7 @@ def adaptation_of(parameters):
 def stepped(parameters, rows, axial=0.0):
     """States of a needle with these parameters, the start first, moved one step after another."""
     nominal = Simulator(QUIET, 1)
-    simulator = nominal.adapted(adaptation_of(parameters))
+    simulator = nominal.with_adaptation(adaptation_of(parameters))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
     state = start.with_estimate(base_x=base_x, base=(parameters[BASE],), slope=(parameters[SLOPE],))

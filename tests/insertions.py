@@ -16,7 +16,7 @@ from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.tracking.simulated import NoisyTracker
-from flexneedle.planning.origin import placed
+from flexneedle.planning.origin import with_planned_entry
 from flexneedle.types import STILL, VISIBLE, Measurement, Motion
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -94,7 +94,7 @@ def run(plan, rig, scenario=PHANTOM, seed=5, **options):
 def carry_out(scenario, plan, rig, seed, listeners=(), gate=None, **choices):
     """Carry out a plan with the randomness of `default_rng(seed)` for the controller."""
     stream = Stream(tuple(listeners), gate or Gate())
-    steering = prepare(placed(scenario, plan), plan, Choices.of(seed, rig=rig, **choices), stream)
+    steering = prepare(with_planned_entry(scenario, plan), plan, Choices.of(seed, rig=rig, **choices), stream)
     return closed_loop.run(replace(steering, rng=np.random.default_rng(seed)), rig)
 
 

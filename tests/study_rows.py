@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flexneedle.control.controllers import DEFAULT, checked
+from flexneedle.control.controllers import DEFAULT, check_tables
 from flexneedle.scenario.files import load_scenario
 
 TARGETS = tuple((depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0))
@@ -20,7 +20,7 @@ CONTROLLERS = {  # median error in mm
     "broyden-mpc": 0.28,
     "ce-mpc": 0.24,
 }
-BASE = checked(load_scenario("phantom")).flat()
+BASE = check_tables(load_scenario("phantom")).flat()
 VERSIONS = {"flexneedle": "0.3.0", "python": "3.11.9", "numpy": "2.4.0", "numba": "0.68.0"}
 
 

@@ -8,7 +8,7 @@ from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 
 def task_of(simulator, plan, controller=DEFAULT):
     """What a controller is to carry out, with its settings of the simulator's scenario."""
-    return tables.task(CONTROLLERS[controller], simulator, plan)
+    return tables.make_task(CONTROLLERS[controller], simulator, plan)
 
 
 def begun_with(simulator, roll=0.0, controller=DEFAULT):

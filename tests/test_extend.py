@@ -15,7 +15,7 @@ from kits import run_kits
 
 DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
 MODULES = dict(re.findall(r"^```python title=\"(\w+)\.py\"\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
-PARTS = {"controller": "follow_path:METHOD", "phantom": "unicycle:Unicycle", "tracker": "camera:Camera"}
+PARTS = {"controller": "follow_path:CONTROLLER", "phantom": "unicycle:Unicycle", "tracker": "camera:Camera"}
 QUICK = {
     "plan.samples": 16, "plan.iterations": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0,
     "target.lateral_mm": 0.5, "phantom.step_mm": 1.0, "phantom.contact_spacing_mm": 2.0, "phantom.element_mm": 2.0,
@@ -26,7 +26,7 @@ scenario = "quick.toml"
 
 [[axes]]
 key = "controller"
-values = ["open-loop", "follow_path:METHOD"]
+values = ["open-loop", "follow_path:CONTROLLER"]
 
 [[axes]]
 key = "control.follow_path.gain"

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import flexneedle
-from flexneedle.control.controllers import CONTROLLERS, checked
+from flexneedle.control.controllers import CONTROLLERS, check_tables
 from flexneedle.lab.study.findings.reading import read_tuning
 from flexneedle.record.plain import to_text
 
@@ -43,7 +43,7 @@ def record_of(method):
 
 @pytest.mark.parametrize("method", TUNED)
 def test_shipped_settings_are_those_chosen_by_tuning(method):
-    shipped, chosen = checked(flexneedle.load_scenario("phantom")).flat(), record_of(method)["chosen"]
+    shipped, chosen = check_tables(flexneedle.load_scenario("phantom")).flat(), record_of(method)["chosen"]
     assert chosen
     assert {key: shipped[key] for key in chosen} == chosen
 

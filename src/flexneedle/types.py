@@ -52,7 +52,7 @@ def across(rows: Floats, first: int) -> NDArray[np.complex128]:
     return lateral
 
 
-def wrapped(angle: Floats) -> Floats:
+def wrap_angles(angle: Floats) -> Floats:
     """Angles (rad) from −π, excluded, to π."""
     within: Floats = np.pi - (np.pi - angle) % (2.0 * np.pi)
     return within

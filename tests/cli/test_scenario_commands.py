@@ -11,7 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.cli import main as cli
-from flexneedle.control.controllers import CONTROLLERS, checked
+from flexneedle.control.controllers import CONTROLLERS, check_tables
 from flexneedle.errors import RunError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -44,7 +44,7 @@ def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenar
     status, out, err = run(capsys, "scenario", "show", path)
     assert (status, err) == (0, [])
     assert tomllib.loads(out)["plan"]["samples"] == 128
-    assert Scenario.from_values(tomllib.loads(out)) == checked(load_scenario(path))
+    assert Scenario.from_values(tomllib.loads(out)) == check_tables(load_scenario(path))
 
 
 def test_show_prints_the_settings_of_every_controller_and_round_trips(capsys, tmp_path):
@@ -54,7 +54,7 @@ def test_show_prints_the_settings_of_every_controller_and_round_trips(capsys, tm
     }
     path = tmp_path / "shown.toml"
     path.write_text(out)
-    assert load_scenario(path) == checked(load_scenario("phantom"))
+    assert load_scenario(path) == check_tables(load_scenario("phantom"))
     assert run(capsys, "scenario", "show", str(path)) == (0, out, [])
 
 

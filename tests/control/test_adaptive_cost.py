@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
 from flexneedle.control.controllers import adaptive_mpc
-from flexneedle.control.path import of_plan
+from flexneedle.control.path import path_of_plan
 from flexneedle.costs import terms
-from flexneedle.costs.table import charges
+from flexneedle.costs.table import evaluate_terms
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
@@ -67,7 +67,7 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    trajectories = adaptive_mpc.rollout_as_measured(estimate, ahead.controls(ahead.current[None])[0])
     (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
     past = float(terms.past_target(trajectories, quick_plan.target)[0].real)
     assert abs(past) > 1e-3
@@ -84,11 +84,11 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    trajectories = adaptive_mpc.rollout_as_measured(estimate, ahead.controls(ahead.current[None])[0])
     off = terms.past_target(trajectories, quick_plan.target)[0].real
     tips = np.repeat(trajectories.tips, 3, axis=0)
     tips[:, -1, Y] += np.array([0.01, 0.3, 30.0]) - off
-    charged = charges(
+    charged = evaluate_terms(
         adaptive_mpc.cost_terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
     )
     share = charged["large miss"] / charged["miss"] / (max(ahead.left, 5.0) / 40.0) ** -1.5
@@ -111,7 +111,7 @@ def test_what_is_expected_above_zero_is_the_integral(mean, sd):
     x = np.linspace(0.0, mean + 9.0 * sd, 20001)
     density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
     expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0
-    found = adaptive_mpc.above_zero(np.array([mean]), np.array([sd]))[0]
+    found = adaptive_mpc.mean_above_zero(np.array([mean]), np.array([sd]))[0]
     assert found == pytest.approx(expected, abs=1e-4 * sd)
 
 
@@ -125,9 +125,9 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     least, greatest = bevel_reach(BARE, 40.0, threads=1)
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least), 0.0), roll=roll)
     task = task_of(simulator, plan)
-    ahead = adaptive_mpc.Ahead.of(task, state, unrolled(of_plan(plan)))
+    ahead = adaptive_mpc.Ahead.of(task, state, unrolled(path_of_plan(plan)))
     expected, angle = adaptive_mpc.expected_out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task), 1.0)
-    rollout = adaptive_mpc.measured_rollout(estimate, ahead.constant)
+    rollout = adaptive_mpc.rollout_as_measured(estimate, ahead.constant)
     kept, _, rolled, _ = terms.out_of_reach(rollout, expected, angle)
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == state.bevel.real)

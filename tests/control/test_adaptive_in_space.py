@@ -61,7 +61,7 @@ def prepared(state, target, scenario=SPACE):
 @pytest.mark.parametrize("offset", [0.7 + 0.2j, -0.3 + 0.9j, -1.0j])
 def test_it_aims_from_where_the_current_path_ends_to_the_target(state, offset):
     task, estimate, _, ahead = prepared(state, ends(state) + offset)
-    assert adaptive_mpc._aim(task, estimate, ahead) == pytest.approx(offset, abs=0.02)
+    assert adaptive_mpc._aim_of_rolls(task, estimate, ahead) == pytest.approx(offset, abs=0.02)
 
 
 @pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -2.0])

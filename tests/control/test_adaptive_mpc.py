@@ -12,8 +12,8 @@ import flexneedle
 from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, rolls_at, unrolled
 from flexneedle.control.controllers import DEFAULT, adaptive_mpc
 from flexneedle.control.interface import travel_left
-from flexneedle.control.path import of_plan
-from flexneedle.costs.table import cost
+from flexneedle.control.path import path_of_plan
+from flexneedle.costs.table import evaluate_cost
 from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world
@@ -73,7 +73,7 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
     ends = [simulator.replay(state, rows)[0].tip for rows in way]
     goal, other = sorted(ends, key=lambda tip: -side * tip[Y])
     plan = replace(quick_plan, target=(float(goal[X]), float(goal[Y]), 0.0))
-    decision, memory = decided(plan, estimate_of(state, ROLLING), path=unrolled(of_plan(plan)))
+    decision, memory = decided(plan, estimate_of(state, ROLLING), path=unrolled(path_of_plan(plan)))
     rolled = (decision.command.roll > 0.0) + len(memory.path.rolls)
     assert abs(goal[Y] - other[Y]) > 1.0
     assert abs(decision.miss) < 0.25 * abs(goal[Y] - other[Y])
@@ -84,9 +84,12 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
 def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, along, offset):
     """With a base clamp that is off, where the plan's guide would miss."""
     estimate = estimate_of(along(quick_plan, 20, base=(offset,)), ACCURATE)
-    ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, of_plan(quick_plan))
+    ahead = adaptive_mpc.Ahead.of(
+        task_of(estimate.nominal, quick_plan), estimate.state, path_of_plan(quick_plan)
+    )
     kept = (
-        adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, Y] - 5.0
+        adaptive_mpc.rollout_as_measured(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, Y]
+        - 5.0
     )
     assert abs(kept) > 0.3
     assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
@@ -131,11 +134,11 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task = task_of(estimate.nominal, quick_plan)
     for rolls in ((), (20.0,), (15.0, 18.0)):
-        path = replace(of_plan(quick_plan), rolls=rolls_at(*rolls))
+        path = replace(path_of_plan(quick_plan), rolls=rolls_at(*rolls))
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.current[None])[0]
         listed = adaptive_mpc.cost_terms(task, estimate, ADAPTIVE.begin(task), ahead)
-        current = float(cost(listed, adaptive_mpc.measured_rollout(estimate, kept))[0])
+        current = float(evaluate_cost(listed, adaptive_mpc.rollout_as_measured(estimate, kept))[0])
         assert decided(quick_plan, estimate, path=path)[0].cost <= current + 1e-9
 
 
@@ -144,7 +147,7 @@ def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, car
     """A period that is held leaves the bevel where it is: the roll that was due in it is still planned."""
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task, x = task_of(estimate.nominal, quick_plan), float(estimate.state.tip[0])
-    path = replace(of_plan(quick_plan), rolls=rolls_at(x))
+    path = replace(path_of_plan(quick_plan), rolls=rolls_at(x))
     memory = replace(ADAPTIVE.begin(task), path=path, rolled=unrolled(path), roll=estimate.state.roll)
     if carried_out:
         estimate = replace(estimate, state=estimate.simulator.step(estimate.state, Control(flip=True)))
@@ -168,7 +171,7 @@ def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
     task, state, path = task_of(estimate.nominal, quick_plan), estimate.state, memory.path
     state = estimate.simulator.step(state, decision.command)
     while travel_left(PHANTOM, quick_plan, state) > 1e-9:
-        command, path = adaptive_mpc.Ahead.of(task, state, path).first(path)
+        command, path = adaptive_mpc.Ahead.of(task, state, path).first_command(path)
         state = estimate.simulator.step(state, command)
     assert state.tip[Y] - 5.0 == pytest.approx(decision.miss, abs=0.02)
     assert decision.miss_sd > 0.0
@@ -191,8 +194,8 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
     parameters = estimate.parameters.copy()
     parameters[estimate.slots.run_out] = 0.5
     controls = controls_of(1, 4, db_x=1.0, roll=[0.0, np.pi, 0.0, 0.0])
-    plain = adaptive_mpc.measured_rollout(estimate, controls).tips
-    tips = adaptive_mpc.measured_rollout(replace(estimate, parameters=parameters), controls).tips
+    plain = adaptive_mpc.rollout_as_measured(estimate, controls).tips
+    tips = adaptive_mpc.rollout_as_measured(replace(estimate, parameters=parameters), controls).tips
     side = estimate.state.bevel.real * np.array([1.0, -1.0, -1.0, -1.0])
     np.testing.assert_allclose(tips[0, :, Y] - plain[0, :, Y], 0.5 * side, atol=1e-12)
     np.testing.assert_array_equal(np.delete(tips, Y, axis=-1), np.delete(plain, Y, axis=-1))
@@ -201,7 +204,9 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
     """Tissue thrice as stiff asks for another guide step, from the same state."""
     estimate = estimate_of(along(quick_plan, 55, base=(0.3,)))
-    stiff = replace(estimate, simulator=estimate.nominal.adapted(Adaptation(np.zeros(1), np.full(2, 3.0))))
+    stiff = replace(
+        estimate, simulator=estimate.nominal.with_adaptation(Adaptation(np.zeros(1), np.full(2, 3.0)))
+    )
     assert decide(quick_plan, stiff).cost != decide(quick_plan, estimate).cost
     assert decide(quick_plan, stiff).command.dg_y != decide(quick_plan, estimate).command.dg_y
 
@@ -287,7 +292,7 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the mean of a few
     searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
     """
-    plant = Simulator(PHANTOM, threads=1).adapted(
+    plant = Simulator(PHANTOM, threads=1).with_adaptation(
         Adaptation(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
     )
     state = plant.start(quick_plan.roll)
@@ -369,7 +374,7 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
     """The current path is kept, and nothing is predicted."""
     estimate = estimate_of(along(quick_plan, 20), QUICK)
     task = task_of(estimate.nominal, quick_plan)
-    memory, rollout = ADAPTIVE.begin(task), adaptive_mpc.measured_rollout
+    memory, rollout = ADAPTIVE.begin(task), adaptive_mpc.rollout_as_measured
 
     def lost(fitted, controls):
         trajectories = rollout(fitted, controls)

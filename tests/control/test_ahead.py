@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.ahead import along_plan, rest_of_plan
+from flexneedle.control.ahead import predict_planned_shape, remaining_controls
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, Motion, X
@@ -36,7 +36,7 @@ def estimates(plan, controller, steps):
 def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
     """All of guide, base and rolls; the shape at its end is the plan's, to the length of a step at each roll."""
     task, estimate = estimates(plan, "open-loop", steps)
-    rows = rest_of_plan(task, estimate)
+    rows = remaining_controls(task, estimate)
     left = plan.controls[steps:]
     assert rows[:, DB_X].max() <= task.scenario.setup.max_advance_mm + 1e-9
     assert estimate.state.tip[X] + rows[:, DB_X].sum() == pytest.approx(plan.target[0], abs=1e-6)
@@ -44,7 +44,7 @@ def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
         rows[:, [DG_Y, DG_Z]].sum(axis=0), left[:, [DG_Y, DG_Z]].sum(axis=0), atol=0.02
     )
     assert rows[:, ROLL].sum() == pytest.approx(left[:, ROLL].sum(), abs=1e-9)
-    nodes, sd = along_plan(task, estimate)
+    nodes, sd = predict_planned_shape(task, estimate)
     np.testing.assert_allclose(nodes[:, 1:3], plan.shapes[-1][:, 1:3], atol=0.15)
     assert np.isfinite(sd).all()
     assert (sd[:, 1] == 0.0).all() == (plan.scenario.setup.axes == 1)
@@ -56,7 +56,7 @@ def test_the_base_goes_to_its_planned_pose(plan):
     rows = plan.controls.copy()
     rows[:, columns] = 1e-3 * np.arange(1, 1 + len(columns))
     task, estimate = estimates(replace(plan, controls=rows), "open-loop", 20)
-    moved = rest_of_plan(task, estimate)[:, columns].sum(axis=0)
+    moved = remaining_controls(task, estimate)[:, columns].sum(axis=0)
     np.testing.assert_allclose(moved, rows[20:, columns].sum(axis=0), atol=1e-2)
     assert moved.min() > 0.03
 
@@ -84,7 +84,7 @@ def test_each_period_of_each_controller_has_a_predicted_shape(plan, controller):
 
 def test_at_the_target_the_predicted_shape_is_the_present_one(plan):
     task, estimate = estimates(plan, "open-loop", len(plan.controls))
-    rows = rest_of_plan(task, estimate)
+    rows = remaining_controls(task, estimate)
     assert rows.shape == (1, 9)
     assert np.abs(rows[0, DG_Y:]).max() < 1e-3
-    np.testing.assert_allclose(along_plan(task, estimate).nodes, estimate.state.nodes, atol=2e-4)
+    np.testing.assert_allclose(predict_planned_shape(task, estimate).nodes, estimate.state.nodes, atol=2e-4)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from flexneedle.control.bang_bang import closest_approach, wanted_roll
+from flexneedle.control.bang_bang import choose_roll, closest_approach
 
 POSES = {
     "straight ahead": ((0.0, 0.0, 0.0), (40.0, 0.0)),
@@ -33,7 +33,7 @@ def nearest(pose, curvature, target):
 
 def wants_flip(pose, bevel, curvature, target, band, noise):
     """Whether the bevel is to be rolled, and the reason."""
-    roll, why = wanted_roll(pose, bevel, curvature, (*target, 0.0), band, noise)
+    roll, why = choose_roll(pose, bevel, curvature, (*target, 0.0), band, noise)
     assert roll in (0.0, math.pi)
     return roll > 0.0, why
 

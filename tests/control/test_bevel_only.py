@@ -67,7 +67,7 @@ def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
 
 
 def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
-    calls, rule = [], bang_bang.wanted_roll
+    calls, rule = [], bang_bang.choose_roll
 
     def spied(*args, **options):
         calls.append((*args[2:], options))

@@ -32,12 +32,12 @@ MOVE = VECTOR.filter(lambda move: np.abs(move).max() > 0.05)
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR)
 def test_the_full_update_meets_the_secant_equation(jacobian, moved, measured):
-    np.testing.assert_allclose(bm.broyden(jacobian, moved, measured, 1.0) @ moved, measured, atol=1e-9)
+    np.testing.assert_allclose(bm.broyden_update(jacobian, moved, measured, 1.0) @ moved, measured, atol=1e-9)
 
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, gain=st.floats(0, 1))
 def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian, moved, measured, gain):
-    updated = bm.broyden(jacobian, moved, measured, gain)
+    updated = bm.broyden_update(jacobian, moved, measured, gain)
     across = np.array([-moved[1], moved[0]])
     np.testing.assert_allclose(updated @ across, jacobian @ across, atol=1e-9)
     assert np.linalg.matrix_rank(updated - jacobian, tol=1e-9) <= 1
@@ -45,13 +45,13 @@ def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian,
 
 @given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, other=MATRIX)
 def test_no_other_matrix_that_meets_the_equation_is_nearer(jacobian, moved, measured, other):
-    nearest = bm.broyden(jacobian, moved, measured, 1.0)
+    nearest = bm.broyden_update(jacobian, moved, measured, 1.0)
     meets = other + np.outer(measured - other @ moved, moved) / (moved @ moved)
     assert np.linalg.norm(nearest - jacobian) <= np.linalg.norm(meets - jacobian) + 1e-9
 
 
 def test_the_gain_is_the_share_of_the_update_that_is_made():
-    by_hand = bm.broyden(np.diag([1.0, 1.0]), np.array([1.0, 0.0]), np.array([1.0, 0.2]), 0.65)
+    by_hand = bm.broyden_update(np.diag([1.0, 1.0]), np.array([1.0, 0.0]), np.array([1.0, 0.2]), 0.65)
     np.testing.assert_allclose(by_hand, [[1.0, 0.0], [0.13, 1.0]], atol=1e-15)
     assert SETTINGS.update_gain == 0.65
 
@@ -105,7 +105,9 @@ def test_a_guide_without_effect_or_room_stays():
 def moves(plan, jacobian, tip, guide=0.0, steps=4, **settings):
     ahead = np.arange(1.0, steps + 1)
     chosen = SETTINGS.model_copy(update=settings)
-    found, cost = bm.guide_moves(chosen, PHANTOM, plan, jacobian, np.array(tip), ahead, np.array([guide]))
+    found, cost = bm.solve_guide_moves(
+        chosen, PHANTOM, plan, jacobian, np.array(tip), ahead, np.array([guide])
+    )
     return found[:, 0], cost
 
 
@@ -214,17 +216,17 @@ def test_an_old_reading_is_not_learnt_from_again():
     memory = bm.JacobianEstimate(
         np.eye(2), ((0.0, 28.5, 0.0),), (np.array([0.0, 0.0]), np.array([28.5, 0.0]))
     )
-    assert bm.updated(memory, np.array([0.02, 0.05]), np.array([28.52, 0.0]), 0.65) is memory
-    further = bm.updated(memory, np.array([1.0, 0.05]), np.array([29.5, 0.0]), 0.65)
+    assert bm.update_jacobian(memory, np.array([0.02, 0.05]), np.array([28.52, 0.0]), 0.65) is memory
+    further = bm.update_jacobian(memory, np.array([1.0, 0.05]), np.array([29.5, 0.0]), 0.65)
     assert further.jacobian[1, 0] == pytest.approx(0.65 * 0.05)
 
 
 def test_inputs_are_those_of_when_the_tip_was_there():
     memory = bm.JacobianEstimate(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
-    np.testing.assert_allclose(bm.inputs_at(memory, 1.25), [10.25, 0.3])
-    np.testing.assert_allclose(bm.inputs_at(memory, 9.0), [11.5, 0.6])
+    np.testing.assert_allclose(bm.interpolate_inputs(memory, 1.25), [10.25, 0.3])
+    np.testing.assert_allclose(bm.interpolate_inputs(memory, 9.0), [11.5, 0.6])
     for k in range(20):
-        memory = bm.remember(memory, 3.0 + k, np.zeros(2))
+        memory = bm.record_inputs(memory, 3.0 + k, np.zeros(2))
     assert len(memory.history) == 8
 
 

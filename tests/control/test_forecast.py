@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 import flexneedle
-from flexneedle.control.forecast import hopeless, likely_misses, missed, probability_beyond, warning
+from flexneedle.control.forecast import (
+    count_likely_misses,
+    describe_miss,
+    probability_beyond,
+    reason_to_hold,
+    warn_of_miss,
+)
 from flexneedle.control.interface import Decision
 from flexneedle.types import STILL
 
@@ -36,17 +42,17 @@ def test_a_miss_that_is_certain_is_beyond_the_limit_or_not(miss, beyond):
 @pytest.mark.parametrize(("miss", "sd"), [(math.nan, math.nan), (math.nan, 1.0), (9.0, math.nan)])
 def test_what_is_not_predicted_holds_and_warns_of_nothing(miss, sd):
     assert probability_beyond(LIMIT, miss, sd) == 0.0
-    assert hopeless(predicting(miss, sd), CONTROL) == ""
-    assert likely_misses(predicting(miss, sd), 5) == 0
+    assert reason_to_hold(predicting(miss, sd), CONTROL) == ""
+    assert count_likely_misses(predicting(miss, sd), 5) == 0
 
 
 def test_where_nothing_was_found_the_needle_is_held_for_that():
-    assert hopeless(Decision(STILL, "no path converges", math.inf), CONTROL) == "no path converges"
+    assert reason_to_hold(Decision(STILL, "no path converges", math.inf), CONTROL) == "no path converges"
 
 
 def test_a_decision_predicts_nothing_by_default():
-    assert hopeless(Decision(STILL, ""), CONTROL) == ""
-    assert likely_misses(Decision(STILL, ""), 5) == 0
+    assert reason_to_hold(Decision(STILL, ""), CONTROL) == ""
+    assert count_likely_misses(Decision(STILL, ""), 5) == 0
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -54,8 +60,8 @@ def test_a_decision_predicts_nothing_by_default():
 def test_the_needle_is_held_from_the_confidence_on(side, sd):
     """Where the limit is as many standard deviations away as the confidence asks for."""
     bound = LIMIT + SURE * sd
-    assert hopeless(predicting(side * (bound - 1e-6), sd), CONTROL) == ""
-    held = hopeless(predicting(side * (bound + 1e-6), sd), CONTROL)
+    assert reason_to_hold(predicting(side * (bound - 1e-6), sd), CONTROL) == ""
+    held = reason_to_hold(predicting(side * (bound + 1e-6), sd), CONTROL)
     assert held.startswith(f"no path to the target found: predicted miss {side * bound:+.2f} ± {sd:.2f} mm")
     assert "control.miss_limit_mm = 2 " in held
     assert "(limit 0.95)" in held
@@ -66,16 +72,16 @@ def test_limit_and_confidence_are_the_scenarios():
     strict = flexneedle.load_scenario("phantom").with_values(
         {"control.miss_limit_mm": 0.5, "control.miss_confidence": 0.5}
     )
-    assert hopeless(predicting(0.51, 0.3), CONTROL) == ""
-    assert "control.miss_limit_mm = 0.5 " in hopeless(predicting(0.51, 0.3), strict.control)
+    assert reason_to_hold(predicting(0.51, 0.3), CONTROL) == ""
+    assert "control.miss_limit_mm = 0.5 " in reason_to_hold(predicting(0.51, 0.3), strict.control)
 
 
 def warned(decisions):
     """Warnings of decisions one after another."""
     in_a_row, lines = 0, []
     for decision in decisions:
-        in_a_row = likely_misses(decision, in_a_row)
-        lines.append(warning(decision, in_a_row))
+        in_a_row = count_likely_misses(decision, in_a_row)
+        lines.append(warn_of_miss(decision, in_a_row))
     return lines
 
 
@@ -92,20 +98,20 @@ def test_several_likely_misses_in_a_row_make_a_warning():
 def test_it_is_likely_from_a_probability_of_one_half_on():
     """With a small standard deviation: where the predicted miss itself is beyond 1 mm, on either side."""
     for miss, likely in ((0.999, 0), (1.001, 1), (-0.999, 0), (-1.001, 1)):
-        assert likely_misses(predicting(miss, 0.05), 0) == likely
-    assert likely_misses(predicting(1.5, 0.05), 4) == 5
-    assert likely_misses(predicting(0.0, 0.05), 4) == 0
+        assert count_likely_misses(predicting(miss, 0.05), 0) == likely
+    assert count_likely_misses(predicting(1.5, 0.05), 4) == 5
+    assert count_likely_misses(predicting(0.0, 0.05), 4) == 0
 
 
 def test_without_a_prediction_nothing_is_warned_of():
     """At rest, after decisions that were: there is no figure to warn with."""
-    assert warning(predicting(math.nan, math.nan), 9) == ""
+    assert warn_of_miss(predicting(math.nan, math.nan), 9) == ""
 
 
 @given(st.floats(-5.0, 5.0), st.floats(1e-3, 3.0))
 def test_whoever_is_held_is_warned_too(miss, sd):
     decision = predicting(miss, sd)
-    assert likely_misses(decision, 0) == 1 or not hopeless(decision, CONTROL)
+    assert count_likely_misses(decision, 0) == 1 or not reason_to_hold(decision, CONTROL)
 
 
 @pytest.mark.parametrize(
@@ -120,4 +126,4 @@ def test_whoever_is_held_is_warned_too(miss, sd):
 def test_an_end_beyond_a_millimetre_of_the_target_is_missed_by_the_truth_where_it_is_known(
     true, estimated, line
 ):
-    assert missed(true, estimated) == line
+    assert describe_miss(true, estimated) == line

@@ -6,7 +6,7 @@ import pytest
 import flexneedle
 from flexneedle.control import mpc
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.guide import check_guide, guide_may_move, most_guide_step
+from flexneedle.control.guide import check_guide, guide_may_move, largest_guide_step
 from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
 from flexneedle.loop.choices import Choices
@@ -34,7 +34,7 @@ def steered():
 )
 def test_the_guide_may_move_where_there_is_one_and_the_plan_does_not_leave_it_still(scenario, strategy, free):
     assert guide_may_move(scenario.setup, strategy) is free
-    assert most_guide_step(scenario.setup, strategy) == (0.5 if free else 0.0)
+    assert largest_guide_step(scenario.setup, strategy) == (0.5 if free else 0.0)
 
 
 @pytest.mark.parametrize("name", list(CONTROLLERS))
@@ -70,7 +70,7 @@ def test_the_refusal_comes_before_the_plan(tmp_path):
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
     """With a base clamp that is off, which it would move the guide for otherwise."""
     state = along(steered, 40, base=(1.0,))
-    choice = mpc.choose(
+    choice = mpc.choose_step(
         Simulator(PHANTOM, 1), steered, state, CeMpc(), roll=0.0, rng=np.random.default_rng(0)
     )
     assert choice.command.dg_y == 0.0

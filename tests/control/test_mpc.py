@@ -8,8 +8,8 @@ import pytest
 import flexneedle
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.interface import at_depth
-from flexneedle.costs.table import Trajectories, cost
+from flexneedle.control.interface import is_at_depth
+from flexneedle.costs.table import Trajectories, evaluate_cost
 from flexneedle.costs.terms import CE_MPC
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.simulator import Simulator
@@ -26,7 +26,9 @@ def plan(quick_plan):
 
 def choose(plan, state, scenario=PHANTOM, seed=0, *, roll=0.0):
     task = task_of(Simulator(scenario, 1), plan, "ce-mpc")
-    return mpc.choose(task.simulator, plan, state, task.settings, roll=roll, rng=np.random.default_rng(seed))
+    return mpc.choose_step(
+        task.simulator, plan, state, task.settings, roll=roll, rng=np.random.default_rng(seed)
+    )
 
 
 def decide(plan, estimate, seed=0):
@@ -69,7 +71,7 @@ def test_the_deviation_shrinks_over_the_next_periods(plan, along):
 
     first = deviation()
     for _ in range(12):
-        choice = mpc.choose(simulator, plan, state, mpc.CeMpc(), roll=0.0, rng=rng)
+        choice = mpc.choose_step(simulator, plan, state, mpc.CeMpc(), roll=0.0, rng=rng)
         state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
     assert first > 0.1
     assert deviation() < 0.2 * first
@@ -81,7 +83,7 @@ def test_guide_stays_within_its_reach(plan):
     away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0, 0.0, 0.0]))
     simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
     for _ in range(4):
-        choice = mpc.choose(simulator, away, state, mpc.CeMpc(), roll=0.0, rng=rng)
+        choice = mpc.choose_step(simulator, away, state, mpc.CeMpc(), roll=0.0, rng=rng)
         state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
         assert abs(state.guide[0]) <= 0.3 + 1e-9
     assert state.guide == (pytest.approx(0.3), 0.0)
@@ -163,7 +165,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     simulator, choice = Simulator(scenario), choose(plan, state, scenario)
     reference, nominal = mpc.plan_window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
-    controls = mpc.controls_of(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
+    controls = mpc.make_controls(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
     trajectories = Trajectories(controls, *simulator.rollout(state, controls)[:3])
     settings = mpc.CeMpc(horizon=1)
     charged = CE_MPC.terms(
@@ -172,7 +174,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
         orientation=settings.orientation_weight_mm,
         nominal=nominal[:, [DG_Y, DG_Z]],
     )
-    best = cost(charged, trajectories).min()
+    best = evaluate_cost(charged, trajectories).min()
     assert choice.cost <= best + 0.002
 
 
@@ -183,7 +185,7 @@ def test_the_guide_stays_within_its_travel_from_the_entry_on_each_axis():
     state = Simulator(scenario, 1).start()
     for sign in (-1.0, 1.0):
         z = np.repeat([[0.9, sign, sign]], 30, axis=1)
-        rows = mpc.controls_of(scenario, state, z, np.zeros((30, 4)), 40.0, roll=0.0)
+        rows = mpc.make_controls(scenario, state, z, np.zeros((30, 4)), 40.0, roll=0.0)
         end = np.array(state.guide) + rows[0, :, DG_Y : DG_Z + 1].sum(axis=0)
         np.testing.assert_allclose(end, [-2.0 + 8.0 * sign, 5.0 + 8.0 * sign])
 
@@ -191,7 +193,9 @@ def test_the_guide_stays_within_its_travel_from_the_entry_on_each_axis():
 @pytest.mark.parametrize("roll", [np.pi, 0.0])
 def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, roll, along):
     state = along(plan, 40)
-    controls = mpc.controls_of(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 4)), 30.0, roll=roll)
+    controls = mpc.make_controls(
+        PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 4)), 30.0, roll=roll
+    )
     assert (controls[:, 0, ROLL] == roll).all()
     assert (controls[:, 1:, ROLL] == 0.0).all()
 
@@ -234,7 +238,7 @@ def test_command_has_the_inputs_of_the_plane_and_leaves_the_base_alone(plan, alo
 def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there, along, estimated):
     state = along(plan, 60)
     goal = replace(plan, target=(float(state.tip[0]) + short, 5.0, 0.0))
-    assert at_depth(Task(Simulator(PHANTOM), goal), None, estimated(state)) is there
+    assert is_at_depth(Task(Simulator(PHANTOM), goal), None, estimated(state)) is there
 
 
 @pytest.mark.parametrize(("more", "there"), [(0.02, False), (0.009, True)])
@@ -243,7 +247,7 @@ def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, estimated
     advanced = float(plan.controls[:60, DB_X].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
     state = along(plan, 60, short)
-    assert at_depth(Task(Simulator(short), plan), None, estimated(state)) is there
+    assert is_at_depth(Task(Simulator(short), plan), None, estimated(state)) is there
     assert choose(plan, state, short).command.db_x <= more + 1e-9
 
 
@@ -253,34 +257,34 @@ def test_planned_base_steps_are_followed_and_caught_up_with():
     scenario = PHANTOM.with_values({"setup.max_base_step_mm": 0.2})
     moved = np.cumsum(plan.controls[:, DB_Y])
     state = Simulator(scenario).start()
-    steps = mpc.planned_base(scenario.setup, plan, state, plan.tips[1:9, 0])
+    steps = mpc.steps_to_planned_base(scenario.setup, plan, state, plan.tips[1:9, 0])
     assert abs(moved[:8]).max() > 0.01
     np.testing.assert_allclose(np.cumsum(steps[:, 0]), moved[:8], atol=1e-12)
     away = moved[20] + np.sign(moved[20]) * 0.5
     ahead = replace(plan, controls=stretched(plan.controls, away / moved[20], DB_Y))
-    caught_up = mpc.planned_base(scenario.setup, ahead, state, np.full(9, plan.tips[21, 0]))
+    caught_up = mpc.steps_to_planned_base(scenario.setup, ahead, state, np.full(9, plan.tips[21, 0]))
     assert abs(caught_up).max() == pytest.approx(0.2)
     assert caught_up[:, 0].sum() == pytest.approx(away)
     far = replace(plan, controls=stretched(plan.controls, 1e4, DB_Y))
-    to_the_end = mpc.planned_base(scenario.setup, far, state, np.repeat(plan.tips[-1:, 0], 400))
+    to_the_end = mpc.steps_to_planned_base(scenario.setup, far, state, np.repeat(plan.tips[-1:, 0], 400))
     assert abs(np.cumsum(to_the_end[:, 0])).max() == pytest.approx(15.0)
 
 
 def test_without_planned_base_steps_none_is_made(plan, along):
-    steps = mpc.planned_base(PHANTOM.setup, plan, along(plan, 30), plan.tips[31:35, 0])
+    steps = mpc.steps_to_planned_base(PHANTOM.setup, plan, along(plan, 30), plan.tips[31:35, 0])
     np.testing.assert_array_equal(steps, np.zeros((4, 4)))
 
 
 def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
     base = np.array([[0.1, 0.0, 1e-3, 0.0]] * 8)
     z = np.tile(np.repeat([0.9, 0.0], 8), (2, 1))
-    controls = mpc.controls_of(PHANTOM, along(plan, 10), z, base, 2.0, roll=0.0)
+    controls = mpc.make_controls(PHANTOM, along(plan, 10), z, base, 2.0, roll=0.0)
     np.testing.assert_allclose(controls[:, :3, DB_Y:DG_Y], np.broadcast_to(base[:3], (2, 3, 4)))
     assert (controls[:, 3:] == STILL).all()
 
 
 def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, estimated):
-    noises, rule = [], bang_bang.wanted_roll
+    noises, rule = [], bang_bang.choose_roll
 
     def spied(*args, **options):
         noises.append(args[-1])

@@ -133,7 +133,7 @@ def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
     estimate, _ = followed(NEEDLES["all"], 40)
     controls, tips, shape = ahead_of(estimate)
     old = Outlook.of(estimate)
-    new = old.renewed(estimate, controls, tips, shape)
+    new = old.renew(estimate, controls, tips, shape)
     passed = (new.grid > tips[0, X]) & (new.grid < tips[-1, X])
     renewed = {one.parameter for one in estimate.perturbed} | {RUN_OUT}
     for one in estimate.perturbed:
@@ -153,7 +153,7 @@ def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
 def test_the_run_out_is_on_the_bevels_side():
     estimate, _ = followed(NEEDLES["run-out"], 30)
     controls, tips, shape = ahead_of(estimate)
-    curve = Outlook.of(estimate).renewed(estimate, controls, tips, shape).curves[RUN_OUT]
+    curve = Outlook.of(estimate).renew(estimate, controls, tips, shape).curves[RUN_OUT]
     side = estimate.state.bevel.real
     assert np.interp(tips[3, X], estimate.grid, curve) == side
     assert np.interp(tips[9, X], estimate.grid, curve) == -side

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import flexneedle
 from adaptive import rolls_at
-from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, of_plan, proposals
+from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, DG_Z, ROLL, X, Y
@@ -24,7 +24,7 @@ STEP, REACH = PHANTOM.setup.max_guide_step_mm, PHANTOM.setup.max_guide_travel_mm
 def ahead_of(plan, state, path=None, scenario=PHANTOM):
     """The way ahead of a state, by default on the plan's path."""
     simulator = Simulator(scenario, threads=1)
-    return Ahead.of(task_of(simulator, plan), replace(state, scenario=scenario), path or of_plan(plan))
+    return Ahead.of(task_of(simulator, plan), replace(state, scenario=scenario), path or path_of_plan(plan))
 
 
 def level(*rolls, guide=0.0):
@@ -55,7 +55,7 @@ def test_it_begins_as_the_plans(quick_plan):
     controls = quick_plan.controls.copy()
     controls[:, ROLL] = 0.0
     controls[[12, 40, 60], ROLL] = np.pi
-    path = of_plan(replace(quick_plan, controls=controls))
+    path = path_of_plan(replace(quick_plan, controls=controls))
     for axis in range(2):
         there = np.interp(quick_plan.tips[:, X], path.depth, path.guide[:, axis])
         np.testing.assert_array_equal(there, quick_plan.guide[:, axis])
@@ -69,12 +69,12 @@ def test_no_roll_of_the_plan_is_lost(quick_plan):
     controls[:, ROLL] = 0.0
     controls[35:70:5, ROLL] = np.pi
     plan = replace(quick_plan, controls=controls)
-    path = of_plan(plan)
+    path = path_of_plan(plan)
     assert depths(path) == quick_plan.tips[35:70:5, X].tolist()
     ahead = ahead_of(plan, started(0.0), path)
     controls, depth = ahead.controls(ahead.current[None])
     assert depth[0, :-1][controls[0, :, ROLL] > 0.0].tolist() == depths(path)
-    z = proposals(ahead, 24, np.random.default_rng(0))
+    z = propose_samples(ahead, 24, np.random.default_rng(0))
     np.testing.assert_array_equal(z[0], ahead.current)
 
 
@@ -82,7 +82,7 @@ def test_depths_ascend_where_a_plan_stands_still(quick_plan):
     """Steps without an advance, as where only the guide is moved."""
     tips, guide = quick_plan.tips.copy(), quick_plan.guide
     tips[5:8, 0] = tips[4, 0]
-    path = of_plan(replace(quick_plan, tips=tips))
+    path = path_of_plan(replace(quick_plan, tips=tips))
     assert (np.diff(path.depth) > 0.0).all()
     assert len(path.guide) == len(guide) - 3
 
@@ -95,12 +95,12 @@ def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along,
     """The same guide at the ends of the steps, the same rolls."""
     state = along(quick_plan, steps)
     x = float(state.tip[0])
-    path = replace(of_plan(quick_plan), rolls=rolls_at(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
+    path = replace(path_of_plan(quick_plan), rolls=rolls_at(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
     ahead = ahead_of(quick_plan, state, path)
     controls, depth = ahead.controls(ahead.current[None])
     guide = state.guide[0] + np.cumsum(controls[0, :, DG_Y])
     np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide[:, 0]), atol=2e-3)
-    kept = ahead.corrected(ahead.current)
+    kept = ahead.correct(ahead.current)
     assert depths(kept) == pytest.approx(depths(path))
     again = ahead_of(quick_plan, state, kept)
     np.testing.assert_allclose(again.controls(again.current[None])[0], controls, atol=1e-12)
@@ -122,8 +122,8 @@ def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along)
     """Any sample, made the current path, is the sample that corrects nothing."""
     state = along(quick_plan, 30)
     ahead = ahead_of(quick_plan, state)
-    for z in proposals(ahead, 48, np.random.default_rng(2)):
-        after = ahead_of(quick_plan, state, ahead.corrected(z))
+    for z in propose_samples(ahead, 48, np.random.default_rng(2)):
+        after = ahead_of(quick_plan, state, ahead.correct(z))
         np.testing.assert_allclose(
             after.controls(after.current[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1),
             ahead.controls(z[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1), atol=1e-9,
@@ -194,7 +194,7 @@ def test_two_rolls_at_one_place_cancel(quick_plan):
     """Those before and after them do not."""
     for rolls, left in [((20.0, 20.0), []), ((10.0, 20.0, 20.0, 30.0), [10.0, 30.0]), ((20.0,) * 3, [20.0])]:
         ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
-        assert depths(ahead.corrected(ahead.current)) == left
+        assert depths(ahead.correct(ahead.current)) == left
 
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
@@ -207,8 +207,8 @@ def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
     depth = ahead.controls(ahead.current[None])[1]
     assert (np.diff(depth) >= 0.0).all()
     assert depth[0, -1] == ahead.depth[-1]
-    assert depths(ahead.corrected(ahead.current)) == pytest.approx(rolls, abs=0.5)
-    assert depths(ahead.corrected(ahead.current))[1:] == rolls[1:]
+    assert depths(ahead.correct(ahead.current)) == pytest.approx(rolls, abs=0.5)
+    assert depths(ahead.correct(ahead.current))[1:] == rolls[1:]
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
@@ -216,9 +216,9 @@ def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
     for plan, scenario in ((quick_plan, BARE), (replace(quick_plan, strategy="steering"), PHANTOM)):
         state = started(10.0, simulator=Simulator(scenario, threads=1))
         ahead = ahead_of(plan, state, scenario=scenario)
-        controls, _ = ahead.controls(proposals(ahead, 60, np.random.default_rng(0)))
+        controls, _ = ahead.controls(propose_samples(ahead, 60, np.random.default_rng(0)))
         np.testing.assert_array_equal(controls[:, :, [DG_Y, DG_Z]], 0.0)
-        assert ahead.first(ahead.path)[0].dg_y == 0.0
+        assert ahead.first_command(ahead.path)[0].dg_y == 0.0
 
 
 def test_base_motion_of_the_plan_is_followed(quick_plan):
@@ -229,7 +229,7 @@ def test_base_motion_of_the_plan_is_followed(quick_plan):
     simulator = Simulator(PHANTOM, threads=1)
     state = simulator.replay(state, controls_of(1, db_y=0.6, db_theta=30e-4))[0]
     ahead = ahead_of(plan, state)
-    first, planned = ahead.first(ahead.path)[0], np.diff(quick_plan.tips[30:32, 0])[0]
+    first, planned = ahead.first_command(ahead.path)[0], np.diff(quick_plan.tips[30:32, 0])[0]
     assert np.divide([first.db_y, first.db_theta], first.db_x) == pytest.approx(
         np.array([0.02, 1e-4]) / planned, rel=0.02
     )
@@ -246,7 +246,7 @@ def test_base_motion_of_the_plan_is_followed(quick_plan):
 def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, rolls, scenario):
     state = started(10.0, simulator=Simulator(scenario, threads=1))
     ahead = ahead_of(quick_plan, state, level(*rolls), scenario)
-    z = proposals(ahead, 96, np.random.default_rng(1))
+    z = propose_samples(ahead, 96, np.random.default_rng(1))
     lower, upper = ahead.bounds
     assert z.shape == (96, KNOTS.size + ahead.slots)
     np.testing.assert_array_equal(z[0], ahead.current)
@@ -259,7 +259,7 @@ def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, ro
     assert bevel.any()
     new_pair = (z[:, KNOTS.size :] < 40.0).sum(axis=1) >= len(rolls) + 2
     assert new_pair.any() is (np.True_ if len(rolls) + 2 <= LEAST_SLOTS else np.False_)
-    np.testing.assert_array_equal(z, proposals(ahead, 96, np.random.default_rng(1)))
+    np.testing.assert_array_equal(z, propose_samples(ahead, 96, np.random.default_rng(1)))
 
 
 # ---- the first step
@@ -272,7 +272,7 @@ def carried_out(plan, path, state, simulator):
         ahead = Ahead.of(task, state, path)
         if ahead.left <= 1e-9:
             return rolls, advances, state, path
-        command, path = ahead.first(path)
+        command, path = ahead.first_command(path)
         if command.roll > 0.0:
             rolls.append(float(state.tip[0]))
         advances.append(command.db_x)
@@ -295,7 +295,7 @@ def test_rolls_are_executed_once_at_their_depth(quick_plan, rolls):
 def test_two_rolls_that_are_due_are_none(quick_plan):
     """They would bring the bevel back to its side; both are over."""
     ahead = ahead_of(quick_plan, started(10.0), level(9.0, 10.01, 25.0))
-    command, after = ahead.first(ahead.path)
+    command, after = ahead.first_command(ahead.path)
     assert command.roll == 0.0
     assert depths(after) == [25.0]
 
@@ -303,7 +303,7 @@ def test_two_rolls_that_are_due_are_none(quick_plan):
 def test_the_advance_ends_where_the_next_roll_is_due(quick_plan):
     for roll, advance in ((10.6, 0.6), (10.3, 0.3), (11.0, 1.0), (11.4, 1.0), (39.0, 1.0)):
         ahead = ahead_of(quick_plan, started(10.0), level(roll))
-        command, after = ahead.first(ahead.path)
+        command, after = ahead.first_command(ahead.path)
         assert command.db_x == pytest.approx(advance, abs=1e-6)
         assert (command.roll, depths(after)) == (0.0, [roll])
 
@@ -322,28 +322,28 @@ def test_the_last_advance_ends_at_the_target_depth(quick_plan, left):
     state = started(20.0)
     near = replace(quick_plan, target=(float(state.tip[0]) + left, 5.0, 0.0))
     ahead = ahead_of(near, state, level())
-    assert ahead.first(ahead.path)[0].db_x == pytest.approx(left, rel=1e-6)
+    assert ahead.first_command(ahead.path)[0].db_x == pytest.approx(left, rel=1e-6)
 
 
 def test_at_the_depth_nothing_moves(quick_plan):
     state = started(20.0)
     past = replace(quick_plan, target=(float(state.tip[0]) - 0.1, 9.0, 0.0))
     ahead = ahead_of(past, state, level())
-    controls, _ = ahead.controls(proposals(ahead, 24, np.random.default_rng(0)))
+    controls, _ = ahead.controls(propose_samples(ahead, 24, np.random.default_rng(0)))
     np.testing.assert_allclose(controls[:, :, :ROLL], 0.0, atol=1e-12)
-    assert ahead.first(ahead.path)[0][:ROLL] == pytest.approx((0.0,) * ROLL, abs=1e-12)
+    assert ahead.first_command(ahead.path)[0][:ROLL] == pytest.approx((0.0,) * ROLL, abs=1e-12)
 
 
 def test_the_stroke_ends_the_advance(quick_plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 48.9, "target.depth_mm": 10.0})
     state = started(20.0)
     ahead = ahead_of(quick_plan, state, level(), short)
-    assert ahead.first(ahead.path)[0].db_x == pytest.approx(48.9 - float(state.travel[0]), abs=1e-9)
+    assert ahead.first_command(ahead.path)[0].db_x == pytest.approx(48.9 - float(state.travel[0]), abs=1e-9)
 
 
 @pytest.mark.parametrize("wanted", [4.0, -4.0])
 def test_a_guide_far_from_its_path_comes_back_as_fast_as_it_may(quick_plan, wanted):
     ahead = ahead_of(quick_plan, started(10.0), level(guide=wanted))
-    assert ahead.first(ahead.path)[0].dg_y == pytest.approx(np.sign(wanted) * STEP)
+    assert ahead.first_command(ahead.path)[0].dg_y == pytest.approx(np.sign(wanted) * STEP)
     controls, _ = ahead.controls(ahead.current[None])
     assert np.abs(np.cumsum(controls[0, :, DG_Y])).max() == pytest.approx(min(abs(wanted), REACH))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from flexneedle.control.path import KNOTS, Ahead, GuidePath, proposals
+from flexneedle.control.path import KNOTS, Ahead, GuidePath, propose_samples
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.simulator.simulator import Simulator
@@ -61,7 +61,7 @@ def angles_of(ahead, rows):
 def test_every_sample_is_within_the_limits_of_the_rig(rig, seed):
     """Guide, on its axes alone, and rotation; the depths grow to the target."""
     ahead, scenario = ahead_of(rig)
-    rows, depth = ahead.controls(proposals(ahead, 24, np.random.default_rng(seed), 0.3 - 1.0j))
+    rows, depth = ahead.controls(propose_samples(ahead, 24, np.random.default_rng(seed), 0.3 - 1.0j))
     limits = Limits.of(scenario)
     assert (np.diff(depth, axis=1) >= -1e-12).all()
     np.testing.assert_allclose(depth[:, -1], ahead.depth[-1])
@@ -82,9 +82,9 @@ def test_every_sample_is_within_the_limits_of_the_rig(rig, seed):
 def test_the_first_sample_is_the_current_path(rig):
     """Its guide, its rolls at their depths, and their angles."""
     ahead, scenario = ahead_of(rig)
-    first = proposals(ahead, 24, np.random.default_rng(0))[0]
+    first = propose_samples(ahead, 24, np.random.default_rng(0))[0]
     np.testing.assert_array_equal(first, ahead.current)
-    path = ahead.corrected(first)
+    path = ahead.correct(first)
     for axis in range(2):
         planned = np.interp(path.depth, ahead.path.depth, ahead.path.guide[:, axis])
         np.testing.assert_allclose(path.guide[:, axis], planned, atol=1e-12)
@@ -98,7 +98,7 @@ def test_a_knot_moves_the_guide_on_its_own_axis():
     ahead, _ = ahead_of("two axes")
     z = ahead.current
     z[2 * KNOTS.size - 1] += 0.1
-    before, after = ahead.corrected(ahead.current), ahead.corrected(z)
+    before, after = ahead.correct(ahead.current), ahead.correct(z)
     np.testing.assert_allclose(after.guide[:, 0], before.guide[:, 0], atol=1e-12)
     share = (after.depth - after.depth[0]) / ahead.left
     wanted = 0.1 * np.interp(share, [KNOTS[-2], KNOTS[-1]], [0.0, 1.0])
@@ -109,7 +109,7 @@ def test_a_roll_due_now_is_made_at_once_and_the_next_step_ends_at_the_following_
     ahead, _ = ahead_of("two axes")
     x = float(ahead.depth[0])
     path = replace(ahead.path, rolls=np.array([[x - 1.0, 2.0], [x + 0.01, 0.7], [x + 0.4, -1.0]]))
-    command, rest = ahead.first(path)
+    command, rest = ahead.first_command(path)
     assert command.roll == pytest.approx(0.7 - ahead.state.roll)
     assert command.db_x == pytest.approx(0.4)
     np.testing.assert_array_equal(rest.rolls, [[x + 0.4, -1.0]])
@@ -119,8 +119,8 @@ def test_two_half_turns_that_are_due_cancel():
     ahead, _ = ahead_of("half turns")
     x = float(ahead.depth[0])
     two = np.array([[x - 1.0, math.pi], [x, 2.0 * math.pi]])
-    assert ahead.first(replace(ahead.path, rolls=two))[0].roll == 0.0
-    assert ahead.first(replace(ahead.path, rolls=two[:1]))[0].roll == math.pi
+    assert ahead.first_command(replace(ahead.path, rolls=two))[0].roll == 0.0
+    assert ahead.first_command(replace(ahead.path, rolls=two[:1]))[0].roll == math.pi
 
 
 @given(seed=SAMPLES)
@@ -135,7 +135,7 @@ def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
     order = rng.permutation(4)
     z[ahead.depths], z[ahead.angles] = depths[order], angles[order]
     rows, depth = ahead.controls(z[None])
-    np.testing.assert_allclose(ahead.corrected(z).rolls, np.stack([depths, angles], axis=1), atol=1e-9)
+    np.testing.assert_allclose(ahead.correct(z).rolls, np.stack([depths, angles], axis=1), atol=1e-9)
     middle, angle = 0.5 * (depth[0, 1:] + depth[0, :-1]), angles_of(ahead, rows)[0]
     behind = np.searchsorted(depths, middle)
     np.testing.assert_allclose(angle, np.append(ahead.state.roll, angles)[behind], atol=1e-9)
@@ -148,13 +148,13 @@ def test_no_roll_goes_the_long_way_round(seed):
     """Whatever angles a sample has, if the driver turns without limit; also of several rolls that are due at once."""
     ahead, _ = ahead_of("two axes", roll=2.0)
     rng = np.random.default_rng(seed)
-    samples = proposals(ahead, 24, rng)
+    samples = propose_samples(ahead, 24, rng)
     samples[:, ahead.angles] += rng.uniform(-12.0, 12.0, samples[:, ahead.angles].shape)
     rows, _ = ahead.controls(samples)
     assert (np.abs(rows[..., ROLL]) <= math.pi + 1e-9).all()
     x = float(ahead.depth[0])
     now = GuidePath(ahead.path.depth, ahead.path.guide, np.array([[x, 5.0], [x, 7.9]]))
-    command, _ = ahead.first(now)
+    command, _ = ahead.first_command(now)
     assert command.roll == pytest.approx(math.remainder(7.9 - 2.0, 2.0 * math.pi))
 
 
@@ -165,14 +165,14 @@ def test_of_two_rolls_at_one_depth_the_second_counts():
     at = float(ahead.depth[5]) + 0.2
     z[ahead.depths.start : ahead.depths.start + 2] = at, at + 1e-3
     z[ahead.angles.start : ahead.angles.start + 2] = 1.0, -2.0
-    np.testing.assert_allclose(ahead.corrected(z).rolls, [[at + 1e-3, -2.0]])
+    np.testing.assert_allclose(ahead.correct(z).rolls, [[at + 1e-3, -2.0]])
 
 
 @pytest.mark.parametrize("rig", ["two axes", "no guide"])
 def test_pairs_of_rolls_point_to_either_side_of_the_aim(rig):
     """Half of them roll now."""
     ahead, _ = ahead_of(rig, rolls=())
-    z = proposals(ahead, 240, np.random.default_rng(3), 1.0j)
+    z = propose_samples(ahead, 240, np.random.default_rng(3), 1.0j)
     pair = np.flatnonzero(z[:, ahead.depths.stop - 1] < ahead.depth[-1])
     assert pair.size >= 30
     one, two = z[pair, ahead.angles.stop - 2], z[pair, ahead.angles.stop - 1]

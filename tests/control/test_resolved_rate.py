@@ -47,8 +47,8 @@ def disturbed(rows, by):
 @pytest.mark.parametrize("ahead", [1.0, 7.3])
 def test_jacobian_is_the_finite_difference_of_steps(quick_plan, along, steps, ahead):
     state = along(quick_plan, steps)
-    rows = resolved_rate.nominal(PHANTOM, quick_plan, state, ahead, 0.05, 0.0)
-    end, jacobian = resolved_rate.sensitivity(Simulator(PHANTOM, threads=1), state, rows, 0.05)
+    rows = resolved_rate.nominal_controls(PHANTOM, quick_plan, state, ahead, 0.05, 0.0)
+    end, jacobian = resolved_rate.guide_jacobian(Simulator(PHANTOM, threads=1), state, rows, 0.05)
     np.testing.assert_array_equal(end, stepped(state, rows).tip)
     right, left = (stepped(state, disturbed(rows, by)).tip[Y] for by in (0.01, -0.01))
     assert jacobian.shape == (2, 1)
@@ -60,7 +60,7 @@ def test_jacobian_is_the_finite_difference_of_steps(quick_plan, along, steps, ah
 
 def damped_inverse(jacobian, damping):
     """Motion of the guide that moves the tip by 1 mm, in the plane."""
-    (step,) = resolved_rate.damped_solution(np.array([[jacobian], [0.0]]), np.array([1.0, 0.0]), damping)
+    (step,) = resolved_rate.solve_damped(np.array([[jacobian], [0.0]]), np.array([1.0, 0.0]), damping)
     return step
 
 
@@ -77,7 +77,7 @@ def test_damped_inverse_is_the_least_squares_solution(jacobian, damping):
 )  # fmt: skip
 def test_with_two_axes_too(jacobian, off, damping):
     """It solves (JᵀJ + λ²) u = Jᵀ off."""
-    step = resolved_rate.damped_solution(jacobian, off, damping)
+    step = resolved_rate.solve_damped(jacobian, off, damping)
     normal = jacobian.T @ jacobian + damping**2 * np.eye(2)
     np.testing.assert_allclose(normal @ step, jacobian.T @ off, atol=1e-12)
 
@@ -121,8 +121,8 @@ def test_what_the_newest_reading_was_off_is_taken_to_stay(quick_plan, along, est
     state, settings = along(quick_plan, 45), {"gain": 0.5, "damping": 0.1, "lookahead_mm": 3.0}
     plain = decide(quick_plan, estimated(state), **settings).command.dg_y
     shifted = decide(quick_plan, estimated(state, innovation=(0.4, 0.01, 0.0)), **settings).command.dg_y
-    rows = resolved_rate.nominal(PHANTOM, quick_plan, state, 3.0, 0.05, 0.0)
-    _, jacobian = resolved_rate.sensitivity(Simulator(PHANTOM, threads=1), state, rows, 0.05)
+    rows = resolved_rate.nominal_controls(PHANTOM, quick_plan, state, 3.0, 0.05, 0.0)
+    _, jacobian = resolved_rate.guide_jacobian(Simulator(PHANTOM, threads=1), state, rows, 0.05)
     assert plain - shifted == pytest.approx(0.5 * damped_inverse(jacobian[0, 0], 0.1) * 0.01, rel=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_nominal_controls_insert_by_the_way_and_leave_room_for_the_disturbance(
     )  # fmt: skip
     centred = state.needle._replace(boundary=state.needle.boundary._replace(guide=0.0))
     start = replace(state, needle=centred)
-    rows = resolved_rate.nominal(scenario, quick_plan, start, way, low, roll)
+    rows = resolved_rate.nominal_controls(scenario, quick_plan, start, way, low, roll)
     assert rows[:, DB_X].sum() == pytest.approx(way)
     assert rows[:, DB_X].min() > 0.0
     assert rows[:, DB_X].max() <= advance + 1e-12
@@ -163,10 +163,10 @@ def test_nominal_controls_insert_by_the_way_and_leave_room_for_the_disturbance(
 
 def test_the_path_is_led_to_the_target_at_its_end(quick_plan):
     goal = replace(quick_plan, target=(40.0, 6.0, 0.0))
-    assert resolved_rate.planned_lateral(goal, 40.0).tolist() == [6.0, 0.0]
-    assert resolved_rate.planned_lateral(goal, 50.0).tolist() == [6.0, 0.0]
+    assert resolved_rate.planned_offset(goal, 40.0).tolist() == [6.0, 0.0]
+    assert resolved_rate.planned_offset(goal, 50.0).tolist() == [6.0, 0.0]
     x, y = quick_plan.tips[-5, :2]
-    assert resolved_rate.planned_lateral(goal, float(x)).tolist() == [pytest.approx(y), 0.0]
+    assert resolved_rate.planned_offset(goal, float(x)).tolist() == [pytest.approx(y), 0.0]
 
 
 def test_at_the_target_depth_nothing_moves_any_more(quick_plan, along, estimated):

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexneedle.control.bang_bang import closest_approach, seen, wanted_roll
-from flexneedle.control.rotation import roll_within
+from flexneedle.control.bang_bang import choose_roll, closest_approach, target_from_tip
+from flexneedle.control.rotation import limit_roll
 from flexneedle.scenario.files import load_scenario
 
 SLOPES = st.floats(-0.4, 0.4)
@@ -52,8 +52,8 @@ def test_the_closest_approach_is_that_of_the_circle_in_space(theta, psi, roll, x
 def test_what_the_tip_sees_turns_with_everything(theta, psi, turn, x, y, z):
     by = cmath.exp(1j * turn)
     slope, place = complex(theta, psi) * by, complex(y, z) * by
-    along, across = seen(np.array([0.0, 0.0, 0.0, theta, psi]), (x, y, z))
-    turned = seen(np.array([0.0, 0.0, 0.0, slope.real, slope.imag]), (x, place.real, place.imag))
+    along, across = target_from_tip(np.array([0.0, 0.0, 0.0, theta, psi]), (x, y, z))
+    turned = target_from_tip(np.array([0.0, 0.0, 0.0, slope.real, slope.imag]), (x, place.real, place.imag))
     assert turned[0] == pytest.approx(along, abs=1e-12)
     assert turned[1] == pytest.approx(across * by, abs=1e-12)
 
@@ -62,7 +62,7 @@ def test_what_the_tip_sees_turns_with_everything(theta, psi, turn, x, y, z):
 def test_a_needle_that_rolls_freely_aims_at_the_target_or_away_from_it(roll, y, z):
     """Straight ahead, without dead band: rolled, its path passes no farther from the target than any other."""
     pose, bevel, target = np.zeros(5), cmath.exp(1j * roll), (30.0, y, z)
-    angle, why = wanted_roll(pose, bevel, 0.004, target, 0.0, 0.0, within=float)
+    angle, why = choose_roll(pose, bevel, 0.004, target, 0.0, 0.0, within=float)
     chosen = closest_approach(pose, 0.004, bevel * cmath.exp(1j * angle), target)
     others = [
         closest_approach(pose, 0.004, cmath.exp(1j * other), target) for other in np.linspace(0.0, 6.3, 64)
@@ -76,8 +76,8 @@ def test_a_needle_that_rolls_freely_aims_at_the_target_or_away_from_it(roll, y, 
 def test_within_the_dead_band_the_bevel_is_kept(roll, y, z, band, noise):
     """Of the target's distance from the tip's line, as in the plane; a roll gains at least a quarter of its share."""
     bevel, target = cmath.exp(1j * roll), (30.0, y, z)
-    angle, _ = wanted_roll(np.zeros(5), bevel, 0.004, target, band, noise, within=float)
-    best, _ = wanted_roll(np.zeros(5), bevel, 0.004, target, 0.0, 0.0, within=float)
+    angle, _ = choose_roll(np.zeros(5), bevel, 0.004, target, band, noise, within=float)
+    best, _ = choose_roll(np.zeros(5), bevel, 0.004, target, 0.0, 0.0, within=float)
     keep, rolled = (
         closest_approach(np.zeros(5), 0.004, bevel * cmath.exp(1j * one), target) for one in (0.0, best)
     )
@@ -90,11 +90,11 @@ def test_within_the_dead_band_the_bevel_is_kept(roll, y, z, band, noise):
 def test_where_the_driver_cannot_aim_the_best_possible_roll_is_made_or_none():
     """The target is behind the bevel, and the driver turns it by at most 60°."""
     pose, target = np.zeros(5), (30.0, -3.0, 0.5)
-    angle, _ = wanted_roll(
+    angle, _ = choose_roll(
         pose, 1.0 + 0.0j, 0.004, target, 0.0, 0.0, within=lambda roll: max(-1.0, min(1.0, roll))
     )
     assert abs(angle) == 1.0
-    still, why = wanted_roll(pose, 1.0 + 0.0j, 0.004, target, 0.0, 0.0, within=lambda _: 0.0)
+    still, why = choose_roll(pose, 1.0 + 0.0j, 0.004, target, 0.0, 0.0, within=lambda _: 0.0)
     assert still == 0.0
     assert "kept" in why
 
@@ -102,9 +102,9 @@ def test_where_the_driver_cannot_aim_the_best_possible_roll_is_made_or_none():
 def test_half_turns_are_all_that_the_papers_driver_is_asked_for():
     """Whatever the direction of the target."""
     for y, z in ((5.0, 0.0), (-5.0, 1.0), (0.5, 5.0)):
-        angle, _ = wanted_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, y, z), 0.0, 0.0)
+        angle, _ = choose_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, y, z), 0.0, 0.0)
         assert angle in (0.0, math.pi)
-    assert wanted_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, -5.0, 1.0), 0.0, 0.0)[0] == math.pi
+    assert choose_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, -5.0, 1.0), 0.0, 0.0)[0] == math.pi
 
 
 @given(most=st.floats(10.0, 360.0), angle=st.floats(-1.0, 1.0), roll=ANGLES)
@@ -112,7 +112,7 @@ def test_a_roll_stays_within_the_range_of_the_driver(most, angle, roll):
     """And has the wanted direction wherever the range has it."""
     setup = SPACE.with_values({"setup.max_rotation_deg": most}).setup
     before = angle * setup.max_rotation
-    after = before + roll_within(setup, before, roll)
+    after = before + limit_roll(setup, before, roll)
     assert abs(after) <= setup.max_rotation + 1e-12
     wanted = math.remainder(before + roll, 2.0 * math.pi)
     if abs(wanted) <= setup.max_rotation:
@@ -127,7 +127,7 @@ def test_a_roll_stays_within_the_range_of_the_driver(most, angle, roll):
 def test_no_angle_in_the_range_is_nearer_in_direction(most, angle, roll, other):
     setup = SPACE.with_values({"setup.max_rotation_deg": most}).setup
     before = angle * setup.max_rotation
-    wanted, after = before + roll, before + roll_within(setup, before, roll)
+    wanted, after = before + roll, before + limit_roll(setup, before, roll)
     ends = (other * setup.max_rotation, -setup.max_rotation, setup.max_rotation)
     off, *others = (abs(math.remainder(one - wanted, 2.0 * math.pi)) for one in (after, *ends))
     assert abs(after) <= setup.max_rotation + 1e-12
@@ -139,7 +139,7 @@ def test_a_roll_goes_the_short_way_round_where_it_can(most, angle, roll):
     """The long way only where the short one ends beyond the range."""
     setup = SPACE.with_values({} if most is None else {"setup.max_rotation_deg": most}).setup
     before = angle * min(setup.max_rotation, 10.0)
-    turn = roll_within(setup, before, roll)
+    turn = limit_roll(setup, before, roll)
     assert abs(math.remainder(turn - roll, 2.0 * math.pi)) < 1e-8
     short = math.remainder(roll, 2.0 * math.pi)
     if abs(turn) > math.pi + 1e-9:

@@ -7,7 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control import tables
-from flexneedle.control.controllers import CONTROLLERS, DEFAULT, checked, used
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, check_tables, with_controller_defaults
 from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario
@@ -47,25 +47,25 @@ def test_a_scenario_keeps_a_table_as_it_is_given():
 
 
 def test_all_defaults_are_filled_in_and_nothing_else_changes():
-    full = checked(PHANTOM.with_values({"control.bevel_only.curvature_per_m": 0.3}), OWN)
-    for name, method in CONTROLLERS.items():
-        if method.settings is not None:
-            own = full.control.tables[method.table]
-            assert set(own) == set(method.settings.model_fields), name
+    full = check_tables(PHANTOM.with_values({"control.bevel_only.curvature_per_m": 0.3}), OWN)
+    for name, controller in CONTROLLERS.items():
+        if controller.settings is not None:
+            own = full.control.tables[controller.table]
+            assert set(own) == set(controller.settings.model_fields) - {"own_terms"}, name
     assert full.control.tables["my_pid"] == {"gain": 0.5}
     assert full.control.tables["bevel_only"] == {
         **CONTROLLERS["bevel-only"].settings().model_dump(),
         "curvature_per_m": 0.3,
     }
     assert full.values() | {"control": 0} == PHANTOM.values() | {"control": 0}
-    assert checked(full, OWN) == full
+    assert check_tables(full, OWN) == full
 
 
 def test_a_task_has_the_settings_of_its_controller():
     scenario = PHANTOM.with_values({"control.my_pid.gain": 0.25})
-    task = tables.task(OWN, Simulator(scenario, 1), None)
+    task = tables.make_task(OWN, Simulator(scenario, 1), None)
     assert task.settings == Gains(gain=0.25)
-    assert tables.task(CONTROLLERS["open-loop"], Simulator(scenario, 1), None).settings is None
+    assert tables.make_task(CONTROLLERS["open-loop"], Simulator(scenario, 1), None).settings is None
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_task_has_the_settings_of_its_controller():
 )
 def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, message):
     scenario = PHANTOM.with_values({f"control.{key}": value})
-    for check in (checked, used):
+    for check in (check_tables, with_controller_defaults):
         with pytest.raises(ScenarioError) as caught:
             check(scenario, OWN, source="x.toml")
         (line,) = caught.value.problems
@@ -94,14 +94,16 @@ def test_a_table_of_nobody_is_refused_by_a_check_and_warned_of_in_use():
     scenario = PHANTOM.with_values({"control.my_pdi.gain": 1})
     message = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; one of your own"
     with pytest.raises(ScenarioError, match="^x.toml: " + message):
-        checked(scenario, OWN, source="x.toml")
+        check_tables(scenario, OWN, source="x.toml")
     with pytest.warns(ScenarioWarning, match=f"^{message}.*; it is not used$"):
-        assert used(scenario, OWN, source="x.toml").control.tables["my_pdi"] == {"gain": 1}
+        assert with_controller_defaults(scenario, OWN, source="x.toml").control.tables["my_pdi"] == {
+            "gain": 1
+        }
 
 
 def test_two_controllers_do_not_share_a_table():
     with pytest.raises(InputError, match="two controllers are called ce-mpc: give one of them another name"):
-        checked(PHANTOM, replace(OWN, name="ce-mpc"))
+        check_tables(PHANTOM, replace(OWN, name="ce-mpc"))
 
 
 class NoDefault(Section):
@@ -148,4 +150,4 @@ def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, message):
 def test_an_observer_may_be_of_any_kind():
     """Also one that cannot be hashed."""
     own = replace(OWN, observer=ByName())
-    assert checked(PHANTOM.with_values({"control.my_pid.gain": 0.5}), own) is not None
+    assert check_tables(PHANTOM.with_values({"control.my_pid.gain": 0.5}), own) is not None

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.controllers import checked
-from flexneedle.costs.table import Trajectories, cost
+from flexneedle.control.controllers import check_tables
+from flexneedle.costs.table import Trajectories, evaluate_cost
 from flexneedle.costs.terms import CE_MPC, PLAN
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.types import DG_Y
@@ -61,7 +61,7 @@ def test_a_function_is_recorded_by_its_name(module):
 @pytest.mark.usefixtures("module")
 def test_controllers_charge_it_too():
     scenario = with_terms(("own_costs:guide_speed", 3.0), section="control.ce_mpc")
-    settings = checked(scenario).control.tables["ce_mpc"]
+    settings = check_tables(scenario).control.tables["ce_mpc"]
     assert settings["own_terms"][0]["weight"] == 3.0
     names = [weight.name for _, weight in CE_MPC.rows()]
     assert names == ["deviation", "guide", "energy"]
@@ -93,4 +93,4 @@ def test_values_of_another_shape_and_errors_name_the_term(module, wrong):
     settings = with_terms(("own_costs:wrong", 1.0)).plan
     arrays = np.zeros((2, 4, 9)), np.zeros((2, 4, 5)), np.zeros((2, 4)), np.ones((2, 4), dtype=bool)
     with pytest.raises(InputError, match="own_costs:wrong"):
-        cost(PLAN.terms(settings, target=(1.0, 0.0, 0.0))[-1:], Trajectories(*arrays))
+        evaluate_cost(PLAN.terms(settings, target=(1.0, 0.0, 0.0))[-1:], Trajectories(*arrays))

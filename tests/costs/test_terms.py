@@ -8,7 +8,7 @@ import pytest
 
 from flexneedle import controls as controls_of
 from flexneedle.costs import terms
-from flexneedle.costs.table import Term, Trajectories, charges, cost
+from flexneedle.costs.table import Term, Trajectories, evaluate_cost, evaluate_terms
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, SPIN, THETA, X, Y
 
 # Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.
@@ -147,12 +147,12 @@ def test_a_slope_does_not_depend_on_the_length_of_the_steps():
 
 def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
     listed = (Term("energy", 2.0, terms.energy_at_end), Term("flips", 0.5, terms.flips))
-    charged = charges(listed, TRAJECTORIES)
+    charged = evaluate_terms(listed, TRAJECTORIES)
     np.testing.assert_allclose(charged["energy"], [8.0, 6.0])
     np.testing.assert_allclose(charged["flips"], [1.0, 0.5])
-    np.testing.assert_allclose(cost(listed, TRAJECTORIES), [9.0, 6.5])
+    np.testing.assert_allclose(evaluate_cost(listed, TRAJECTORIES), [9.0, 6.5])
     failed = replace(TRAJECTORIES, converged=np.array([[True, True, True], [True, False, True]]))
-    assert cost(listed, failed).tolist() == [9.0, np.inf]
+    assert evaluate_cost(listed, failed).tolist() == [9.0, np.inf]
 
 
 def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():

@@ -40,7 +40,7 @@ def finely(estimate):
     """The same with all its derivatives simulated now, on a grid so fine that nothing is lost between its points."""
     grid = np.arange(estimate.grid[0], estimate.grid[-1], 0.05)
     size = estimate.parameters.size
-    return replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size)))._differentiated(range(size))
+    return replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size)))._differentiate(range(size))
 
 
 def test_derivatives_agree_with_central_differences():
@@ -144,7 +144,7 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     right = np.concatenate([missing / sd, prior @ (estimate.prior.mean - estimate.parameters)])
     step = np.linalg.lstsq(matrix, right, rcond=None)[0]
     assert (np.abs(step) > 1e-4).sum() > 10
-    found = idn.improved(estimate).parameters
+    found = idn.improve_fit(estimate).parameters
     np.testing.assert_allclose(found, estimate.parameters + step, rtol=1e-6, atol=1e-8)
 
 
@@ -169,7 +169,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], idn.improved, idn.Identified._with
+    costs, tried, improved, with_ = [], [], idn.improve_fit, idn.Identified._with
 
     def spied(estimate):
         tried.append(0)
@@ -205,7 +205,7 @@ def test_a_wrong_step_is_not_taken(monkeypatch, factor):
     estimate, readings = off_the_prior(45)
     jacobian = idn.jacobian_of
     monkeypatch.setattr(idn, "jacobian_of", lambda *args: factor * jacobian(*args))
-    fitted = idn.improved(estimate)
+    fitted = idn.improve_fit(estimate)
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate) * (1.0 + 1e-12)
 
 
@@ -223,7 +223,7 @@ def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
         return spoilt(other) if len(tried) <= 2 else other
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn.improved(estimate)
+    fitted = idn.improve_fit(estimate)
     assert len(tried) >= 3
     assert np.isfinite(fitted.tips).all()
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate)
@@ -238,7 +238,7 @@ def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
         return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn.improved(estimate)
+    fitted = idn.improve_fit(estimate)
     np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
     np.testing.assert_array_equal(fitted.tips, estimate.tips)
 
@@ -257,7 +257,7 @@ def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
         )
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    assert idn.improved(estimate).state.converged
+    assert idn.improve_fit(estimate).state.converged
 
 
 def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
@@ -265,7 +265,7 @@ def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
     monkeypatch.setattr(
         idn, "jacobian_of", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
     )
-    np.testing.assert_array_equal(idn.improved(estimate).parameters, estimate.parameters)
+    np.testing.assert_array_equal(idn.improve_fit(estimate).parameters, estimate.parameters)
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
@@ -292,10 +292,10 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(roll
 
 def test_the_low_pass_follows_the_newest_and_forgets():
     gain = OWN.residual_gain
-    assert idn.low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
-    assert idn.low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
-    assert idn.low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
-    assert idn.low_passed(OWN, np.zeros(0)) == 0.0
+    assert idn.low_pass(OWN, np.array([1.0])) == pytest.approx(gain)
+    assert idn.low_pass(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
+    assert idn.low_pass(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
+    assert idn.low_pass(OWN, np.zeros(0)) == 0.0
 
 
 # ---- what is left uncertain

@@ -9,11 +9,11 @@ import pytest
 import flexneedle
 from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.lateral import facing
+from flexneedle.estimation.lateral import bevel_directions
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.prior import Slots
-from flexneedle.estimation.sensors import SENSORS, used
+from flexneedle.estimation.sensors import SENSORS, sensors_of
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA, Control, Measurement, Motion, Y, Z
@@ -56,7 +56,7 @@ def followed(count, scenario=QUIET, turn=0.0, truth=True, given=lambda one: one,
     own = Adaptation(
         np.zeros(1), np.ones(2), cell=cells, variation=np.ones(1), bevel=1.0, bend=BEND if truth else 0.0
     )
-    needle = model.adapted(own)
+    needle = model.adapt(own)
     state = needle.start(turn)
     base, slope = BASE * by, SLOPE * by
     state = needle.step(
@@ -120,7 +120,7 @@ def test_the_bevel_turns_with_rolls_and_spins():
     """After each control, from its direction before them."""
     rows = flexneedle.controls(2, roll=[0.0, 1.0], spin=[0.25, 0.5])
     expected = np.exp(1j * (0.4 + np.array([0.25, 1.75])))
-    np.testing.assert_allclose(facing(np.exp(0.4j), rows, 2), expected, rtol=1e-12)
+    np.testing.assert_allclose(bevel_directions(np.exp(0.4j), rows, 2), expected, rtol=1e-12)
 
 
 def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted):
@@ -143,8 +143,8 @@ def test_a_scenario_without_directions_has_no_place_for_their_tilt():
     without, with_ = Slots.of(QUIET), Slots.of(DIRECTED)
     assert with_.bevel == without.bevel + 2
     assert without.tilt.start == without.tilt.stop
-    assert [sensor.name for sensor in used(QUIET)] == ["tip position"]
-    assert [sensor.name for sensor in used(DIRECTED)] == ["tip position", "tip direction"]
+    assert [sensor.name for sensor in sensors_of(QUIET)] == ["tip position"]
+    assert [sensor.name for sensor in sensors_of(DIRECTED)] == ["tip position", "tip direction"]
     one, _ = followed(8)
     other, _ = followed(8, given=lambda reading: replace(reading, direction=(0.3, -0.3)))
     np.testing.assert_array_equal(one.parameters, other.parameters)

@@ -82,7 +82,7 @@ def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
     estimate = Identification().begin(begun_with(simulator))
     parameters = estimate.parameters.copy()
     parameters[[BEND, RUN_OUT]] = 0.6, 0.1
-    adapted = simulator.adapted(Adaptation(np.zeros(1), np.ones(2), bend=0.6))
+    adapted = simulator.with_adaptation(Adaptation(np.zeros(1), np.ones(2), bend=0.6))
     state = adapted.step(simulator.start(), Control())
     bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
     assert bent.tip[Y] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
@@ -137,7 +137,7 @@ def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
     states = stepped(estimate.parameters, commands(45), estimate.axial)
     assert states[-1] == estimate.state
     np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
-    now = Simulator(QUIET, 1).adapted(adaptation_of(estimate.parameters))
+    now = Simulator(QUIET, 1).with_adaptation(adaptation_of(estimate.parameters))
     forward = Control(db_x=1.0)
     assert estimate.simulator.step(states[-1], forward) == now.step(states[-1], forward)
 

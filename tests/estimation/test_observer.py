@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.estimation.moves import Move, along, place
+from flexneedle.estimation.moves import Move, position_along, tip_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA, Control, Measurement, Motion, X, Y, Z
 from observed import AHEAD, PHANTOM, QUIET, begun, follow, in_tissue, readings_between, start_with
@@ -209,7 +209,7 @@ def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
 @pytest.mark.parametrize(("time", "part"), [(7.0, 0.0), (7.5, 0.25), (9.0, 1.0), (6.0, 0.0), (11.0, 1.0)])
 def test_the_tip_moves_evenly_within_a_move_and_rests_outside(time, part):
     tips = np.array([[10.0, 1.0, -2.0, 0.3, 0.1], [12.0, 0.0, 2.0, 0.2, 0.1]])
-    point = along((Move(7.0, 9.0, AHEAD),), tips, time)
+    point = position_along((Move(7.0, 9.0, AHEAD),), tips, time)
     assert point == pytest.approx((10.0 + 2.0 * part, 1.0 - part, -2.0 + 4.0 * part))
     assert Move(7.0, 9.0, AHEAD).part(time) == pytest.approx(part)
 
@@ -218,9 +218,9 @@ def test_the_tip_goes_from_move_to_move():
     moves = Move(0.0, 1.0, AHEAD), Move(1.0, 3.0, AHEAD)
     tips = np.zeros((3, 5))
     tips[:, X], tips[:, Y], tips[:, Z] = (0.0, 1.0, 2.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4)
-    assert along(moves, tips, 0.5) == pytest.approx((0.5, 0.1, 0.0))
-    assert along(moves, tips, 2.5) == pytest.approx((1.75, 0.05, 0.3))
-    assert along((), tips[2:], 99.0) == (2.0, 0.0, 0.4)
+    assert position_along(moves, tips, 0.5) == pytest.approx((0.5, 0.1, 0.0))
+    assert position_along(moves, tips, 2.5) == pytest.approx((1.75, 0.05, 0.3))
+    assert position_along((), tips[2:], 99.0) == (2.0, 0.0, 0.4)
     estimate = begun(Simulator(PHANTOM))
     assert estimate.tip_at(3.0) == (-28.5, 0.0, 0.0)
     two = estimate.move(Motion(AHEAD, 0.0, 1.0)).move(Motion(AHEAD, 1.0, 3.0))
@@ -245,7 +245,7 @@ def test_an_empty_reading_is_refused():
     with pytest.raises(ValueError, match="not removed"):
         moved.observe([Measurement(1.0, None, None)])
     with pytest.raises(ValueError, match="not removed"):
-        place(Measurement(1.0, 3.0, None))
+        tip_of(Measurement(1.0, 3.0, None))
 
 
 def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():

@@ -51,7 +51,7 @@ def test_the_prior_is_that_of_the_scenario():
 def test_precision_of_a_chain_is_the_inverse_of_its_correlation(size, distance):
     correlation = np.exp(-distance * np.abs(np.subtract.outer(np.arange(size), np.arange(size))))
     np.testing.assert_allclose(
-        prior_of.uncorrelating(size, distance), np.linalg.inv(correlation), rtol=1e-9, atol=1e-9
+        prior_of.inverse_correlation(size, distance), np.linalg.inv(correlation), rtol=1e-9, atol=1e-9
     )
 
 
@@ -86,7 +86,7 @@ def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
     assert low == 0.0
     assert high > 1.0
     assert high * offset <= 0.7 * min(heights)
-    widest = Simulator(scenario, 1).adapted(
+    widest = Simulator(scenario, 1).with_adaptation(
         Adaptation(np.zeros(len(heights) - 1), np.ones(len(heights)), bevel=high)
     )
     assert widest._model.bevel_offset <= 0.7 * min(heights)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.moves import Move, along, assigned, outside_rolls
+from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along
 from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Measurement, Motion
@@ -30,7 +30,7 @@ def at(*times):
 
 def owners(moves, *times):
     """The number of the move to which each reading is assigned."""
-    given = assigned(moves, at(*times))
+    given = assign_readings(moves, at(*times))
     found = {one.time: k for k, move in enumerate(given) for one in move.measurements}
     return [found[time] for time in times]
 
@@ -38,7 +38,7 @@ def owners(moves, *times):
 def test_the_tip_rests_in_a_roll_and_travels_after_it():
     tips = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.2, 0.0, 0.0, 0.0]])
     move = Move.of(ROLLED)
-    found = [along((move,), tips, time)[0] for time in (0.5, 1.0, 1.6, 1.8, 2.0, 3.0)]
+    found = [position_along((move,), tips, time)[0] for time in (0.5, 1.0, 1.6, 1.8, 2.0, 3.0)]
     np.testing.assert_allclose(found, [0.0, 0.0, 0.0, 0.5, 1.0, 1.0])
     assert move.part(1.8) == pytest.approx(0.5)
 
@@ -51,10 +51,10 @@ def test_a_reading_between_two_moves_is_one_of_the_end_of_the_first():
 
 def test_readings_of_a_roll_are_left_out():
     moves = Move.of(Motion(AHEAD, 0.0, 0.5)), Move.of(ROLLED)
-    kept = outside_rolls(moves, at(0.4, 0.9, 1.0, 1.1, 1.5, 1.6, 1.7, 2.5))
+    kept = drop_roll_readings(moves, at(0.4, 0.9, 1.0, 1.1, 1.5, 1.6, 1.7, 2.5))
     assert [one.time for one in kept] == [0.4, 0.9, 1.0, 1.6, 1.7, 2.5]
-    assert outside_rolls(moves[1:], at(0.9, 1.1)) == []  # the bevel was on the other side
-    assert outside_rolls((), at(0.9)) == at(0.9)
+    assert drop_roll_readings(moves[1:], at(0.9, 1.1)) == []  # the bevel was on the other side
+    assert drop_roll_readings((), at(0.9)) == at(0.9)
 
 
 def test_without_a_run_out_readings_of_a_roll_correct_nothing():

@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.control.interface import Controller, Decision, travel_left
 from flexneedle.errors import CommandError, StoppedError
-from flexneedle.estimation.moves import Move, along
+from flexneedle.estimation.moves import Move, position_along
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion, Outcome
 from insertions import PHANTOM, Stage, Tank, run
@@ -56,7 +56,7 @@ def test_the_time_of_a_decision_is_no_motion(plan, thinking):
 def test_between_two_moves_the_tip_rests():
     tips = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.2, 0.0, 0.0, 0.0], [2.0, 0.2, 0.4, 0.0, 0.0]])
     moves = Move.of(Motion(STILL, 0.0, 1.0)), Move.of(Motion(STILL, 2.0, 3.0))
-    found = [along(moves, tips, time) for time in (0.5, 1.0, 1.5, 2.0, 2.5, 9.0)]
+    found = [position_along(moves, tips, time) for time in (0.5, 1.0, 1.5, 2.0, 2.5, 9.0)]
     expected = [(0.5, 0.1, 0.0), *[(1.0, 0.2, 0.0)] * 3, (1.5, 0.2, 0.2), (2.0, 0.2, 0.4)]
     np.testing.assert_allclose(found, expected)
 

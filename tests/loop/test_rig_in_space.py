@@ -13,7 +13,7 @@ from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
-from flexneedle.simulator.control import half_turned
+from flexneedle.simulator.control import limit_half_turn
 from flexneedle.types import Measurement, VerdictKind
 from rooms import STILL
 
@@ -154,7 +154,7 @@ def test_a_sensor_that_moves_along_z_alone_is_not_frozen():
     ],
 )  # fmt: skip
 def test_a_driver_of_half_turns_turns_to_and_fro(angle, roll, expected):
-    assert half_turned(angle, roll) == expected
+    assert limit_half_turn(angle, roll) == expected
 
 
 @pytest.mark.parametrize("kind", PLANTS)

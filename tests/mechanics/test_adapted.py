@@ -10,7 +10,7 @@ from flexneedle.mechanics.model import (
     GUIDE,
     Adaptation,
     Model,
-    adapted,
+    adapt,
     contact_nodes,
     tissue_layers,
 )
@@ -78,7 +78,7 @@ ESTIMATES = {
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_a_contact_has_the_tissue_along_its_interval(estimate):
     """Stiffness ∫3μw/h dx, whatever divides the interval."""
-    nodes = adapted(MODEL, estimate).nodes
+    nodes = adapt(MODEL, estimate).nodes
     for node, stiffness in zip(NODES[CONTACTS], nodes["stiffness"][CONTACTS], strict=True):
         expected = along(node["x"] - node["reach"], node["x"] + node["reach"], estimate, 1000)
         assert stiffness == pytest.approx(3.0 / HEIGHT * expected, rel=4e-3)
@@ -88,7 +88,7 @@ def test_a_contact_has_the_tissue_along_its_interval(estimate):
 def test_all_contacts_together_have_all_of_the_tissue(estimate):
     end = NODES["x"][-1] + NODES["reach"][-1]
     expected = 3.0 / HEIGHT * along(0.0, end, estimate, 38_000)
-    assert adapted(MODEL, estimate).nodes["stiffness"][CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
+    assert adapt(MODEL, estimate).nodes["stiffness"][CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
 
 
 def tip_spring(model, depth, u=0.7):
@@ -99,7 +99,7 @@ def tip_spring(model, depth, u=0.7):
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(estimate):
     """It is linear in ∫μw dx over the bevel's length, in which any number of boundaries may lie."""
-    model = adapted(MODEL, estimate)
+    model = adapt(MODEL, estimate)
     one = tip_spring(MODEL._replace(layers=tissue((30.0, 1.0, np.inf))), 10.0)
     per_tissue = np.array(one[:3]) / (3.0 * MU[0] * WIDTH[0])
     for depth in (0.4, 2.0, 5.7, 6.2, 7.9, 10.1, 14.0):
@@ -109,7 +109,7 @@ def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(estimate):
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_no_layer_begins_above_the_skin_or_ends_before_it_begins(estimate):
-    end = adapted(MODEL, estimate).layers["end"]
+    end = adapt(MODEL, estimate).layers["end"]
     assert end[0] >= 0.0
     assert (end[1:] >= end[:-1]).all()
     assert end[-1] == np.inf
@@ -121,7 +121,7 @@ def test_no_shift_and_factors_of_one_are_the_model(cell):
     layers = tissue(law=(0, 1, 2), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, np.array([1.0, 0.5, 0.7]), 1.0, 18.0, -41.0)
     model = MODEL._replace(nodes=nodes, layers=layers)
-    same = adapted(model, adaptation(cell=cell, variation=np.ones(9)))
+    same = adapt(model, adaptation(cell=cell, variation=np.ones(9)))
     for name in nodes.dtype.names:
         np.testing.assert_allclose(same.nodes[name], nodes[name], rtol=1e-12, atol=1e-18, err_msg=name)
     assert (same.bevel_offset, same.curvature) == (model.bevel_offset, 0.0)
@@ -131,7 +131,7 @@ def test_no_shift_and_factors_of_one_are_the_model(cell):
 
 def test_modulus_factors_are_those_of_the_points_layers():
     factors = np.array([2.0, 0.5, 3.0])
-    changed = adapted(MODEL, adaptation(stiffness=factors))
+    changed = adapt(MODEL, adaptation(stiffness=factors))
     factor = factors[np.searchsorted([6.0, 9.5], NODES["x"])]
     np.testing.assert_allclose(changed.nodes["stiffness"], factor * NODES["stiffness"], rtol=1e-12)
     np.testing.assert_array_equal(changed.layers["end"], LAYERS["end"])
@@ -139,7 +139,7 @@ def test_modulus_factors_are_those_of_the_points_layers():
 
 
 def test_the_last_cell_goes_on():
-    changed = adapted(MODEL, adaptation(cell=2.0, variation=(1.0, 0.25)))
+    changed = adapt(MODEL, adaptation(cell=2.0, variation=(1.0, 0.25)))
     deep = CONTACTS & (NODES["x"] > 2.0)
     np.testing.assert_allclose(changed.nodes["stiffness"][deep], 0.25 * NODES["stiffness"][deep], rtol=1e-12)
     assert changed.layers["end"][-1] == np.inf
@@ -149,7 +149,7 @@ def test_the_last_cell_goes_on():
 def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
     layers = tissue(law=(0, 1, 2), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
-    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(1.7, -1.0))).nodes
+    changed = adapt(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(1.7, -1.0))).nodes
     layer = np.searchsorted([7.7, 8.5], changed["x"], side="right")
     np.testing.assert_array_equal(changed["law"], layer)
     np.testing.assert_array_equal(changed["height"], np.array([20.0, 10.0, 15.0])[layer])
@@ -158,13 +158,13 @@ def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
 def test_the_guide_is_no_tissue():
     guide = NODES["kind"] == GUIDE
     assert guide.sum() == 1
-    changed = adapted(MODEL, adaptation(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
+    changed = adapt(MODEL, adaptation(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
     np.testing.assert_array_equal(changed[guide], NODES[guide])
 
 
 def test_bevel_offset_is_multiplied_and_the_bend_becomes_a_curvature():
     """A free needle of curvature κ = 2w/L² is w off the straight at its tip."""
-    changed = adapted(MODEL, adaptation(bevel=1.5, bend=0.45))
+    changed = adapt(MODEL, adaptation(bevel=1.5, bend=0.45))
     assert changed.bevel_offset == 6.0
     assert changed.curvature == pytest.approx(2.0 * 0.45 / 150.0**2, rel=1e-15)
     assert MODEL.curvature == 0.0
@@ -174,7 +174,7 @@ def test_nothing_else_changes_and_the_old_constants_stay():
     before = NODES.copy(), LAYERS.copy()
     estimate = adaptation((1.0, 1.0), (3.0, 0.1, 1.0), 2.0, CELLS, bevel=0.2, bend=-1.0)
     known = [array.copy() for array in (estimate.shift, estimate.stiffness, estimate.variation)]
-    changed = adapted(MODEL, estimate)
+    changed = adapt(MODEL, estimate)
     for kept, now in zip(before, (NODES, LAYERS), strict=True):
         np.testing.assert_array_equal(kept, now)
     for kept, now in zip(known, (estimate.shift, estimate.stiffness, estimate.variation), strict=True):
@@ -189,7 +189,7 @@ def test_a_single_layer_has_no_boundary():
     layers = tissue_layers(*(np.array([value]) for value in (np.inf, 3.0 * MU[0], HEIGHT, WIDTH[0], 0)))
     nodes = contact_nodes(layers, np.ones(1), 1.0, 8.0, None)
     model = MODEL._replace(nodes=nodes, layers=layers)
-    changed = adapted(model, Adaptation(np.zeros(0), np.array([2.0]), 4.0, np.array([1.0, 3.0])))
+    changed = adapt(model, Adaptation(np.zeros(0), np.array([2.0]), 4.0, np.array([1.0, 3.0])))
     factor = np.where(nodes["x"] < 4.0, 2.0, 6.0)
     np.testing.assert_allclose(changed.nodes["stiffness"], factor * nodes["stiffness"], rtol=1e-12)
     np.testing.assert_array_equal(changed.layers["end"], [4.0, np.inf])
@@ -200,7 +200,7 @@ def test_a_contact_between_unlike_layers_has_the_stiffness_of_both(unlike):
     """∫3μw/h dx in the interval that a displaced boundary divides."""
     layers = tissue(**unlike)
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
-    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(0.4, 0.0))).nodes
+    changed = adapt(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(0.4, 0.0))).nodes
     i = int(np.flatnonzero(np.isclose(changed["x"], 6.5))[0])
     height = unlike.get("height", (HEIGHT,) * 3)
     expected = 3.0 * (0.4 * MU[0] * WIDTH[0] / height[0] + 0.6 * MU[1] * WIDTH[1] / height[1])

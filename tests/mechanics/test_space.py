@@ -89,7 +89,7 @@ def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
     model = start(PHANTOM).model
     length, offset, step = model.bevel_length, model.bevel_offset, 2.3
     bevel, q0 = cmath.exp(0.7j), 0.3 - 1.1j
-    tip, channel = nd.Pose(10.0, 0j, 0j), nd.Channel(10.0, q0)
+    tip, channel = nd.NodePose(10.0, 0j, 0j), nd.CutChannel(10.0, q0)
     cut = nd.Cut(tip, channel, spin)
     found, slope = nd.spring_rest(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
 

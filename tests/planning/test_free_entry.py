@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import flexneedle
 from flexneedle.errors import ScenarioError
 from flexneedle.planning import planner
-from flexneedle.planning.insertion import entry_bounds, entry_of
+from flexneedle.planning.insertion import entry_bounds, read_entry
 from flexneedle.scenario.sections.apparatus import Entry
 from flexneedle.simulator.control import Limits
 
@@ -54,10 +54,10 @@ def test_the_entry_of_a_plan_is_legal(scenario, entry, off, strategy):
 def test_every_sample_of_the_entry_is_legal(which, seed):
     """And one that is legal by itself, as most are, is not changed by the limits."""
     free = aimed(*CASES[which])
-    problem = planner._problem(free, free.target.position, "steering")
+    problem = planner._make_problem(free, free.target.position, "steering")
     bounds = entry_bounds(problem)
     z = np.random.default_rng(seed).uniform(-1.0, 1.0, (64, bounds.size)) * bounds
-    point, slope = entry_of(problem, z)
+    point, slope = read_entry(problem, z)
     assert (np.abs(point) <= problem.entry[0] + 1e-9).all()
     assert (np.abs(slope) <= problem.entry[1] + 1e-9).all()
     steep, left = free.entry.slope + slope, problem.across - point - slope * DEPTH

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flexneedle import controls as controls_of
 from flexneedle.costs import terms
-from flexneedle.costs.table import Term, Trajectories, cost
+from flexneedle.costs.table import Term, Trajectories, evaluate_cost
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning import horizon
 from flexneedle.types import DB_X, DG_Y, X, Y
@@ -53,7 +53,7 @@ class Taped:
 
 
 def search(rollout=rigid, variables=VARIABLES, settings=SEARCH, seed=0, **options):
-    return horizon.best(variables, rollout, TERMS, settings, np.random.default_rng(seed), **options)
+    return horizon.find_best(variables, rollout, TERMS, settings, np.random.default_rng(seed), **options)
 
 
 def test_what_is_found_is_told_with_its_terms_and_rollout():
@@ -68,7 +68,7 @@ def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
     """The same samples, the same bytes as the method called by hand."""
     settings = ce.Settings(**vars(SEARCH), lower=VARIABLES.lower, upper=VARIABLES.upper)
     by_hand = ce.minimize(
-        lambda z: cost(TERMS, rigid(controls(z))),
+        lambda z: evaluate_cost(TERMS, rigid(controls(z))),
         ce.start(VARIABLES.mean, VARIABLES.sigma),
         settings,
         np.random.default_rng(0),
@@ -91,7 +91,7 @@ def test_a_correlation_is_that_of_the_first_samples():
 @hypothesis_settings(max_examples=40)
 def test_it_is_never_worse_than_the_incumbent(seed, z):
     incumbent = np.array([z])
-    before = cost(TERMS, rigid(controls(incumbent)))[0]
+    before = evaluate_cost(TERMS, rigid(controls(incumbent)))[0]
     others = np.random.default_rng(seed).uniform(-1.0, 1.0, (16, 4))
     found = search(
         seed=seed, settings=replace(SEARCH, iterations=2), first=np.concatenate([incumbent, others])

@@ -7,8 +7,8 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError
-from flexneedle.planning.insertion import PlanProblem, entry_bounds, mounted
-from flexneedle.planning.origin import placed
+from flexneedle.planning.insertion import PlanProblem, entry_bounds, mount_needle
+from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
@@ -110,7 +110,7 @@ def test_an_insertion_begins_where_the_plan_enters():
     """With the scenario of a free entry, and with that of the plan; another entry is refused."""
     free = PHANTOM.with_values({"entry.free_radius_mm": 4.0, "target.lateral_z_mm": 4.0})
     plan = flexneedle.plan(free, threads=1)
-    assert placed(free, plan) == plan.scenario
+    assert with_planned_entry(free, plan) == plan.scenario
     one, other = (flexneedle.insert(each, plan, 3, threads=1) for each in (free, plan.scenario))
     assert one.true_error_mm == other.true_error_mm
     assert one.scenario.entry == plan.scenario.entry
@@ -135,7 +135,7 @@ def test_a_sample_of_the_entry_is_a_line_within_its_disc(axes):
     z = np.stack([0.0 * bounds, 0.5 * bounds, bounds])
     rows = controls(3, 4, db_x=1.0)
     rows[:, 0, ROLL] = 0.7
-    all_rows = mounted(problem, rows, z)
+    all_rows = mount_needle(problem, rows, z)
     first = all_rows[:, 0]
     np.testing.assert_array_equal(all_rows[:, 1:, 0], 1.0)
     assert (first[:, 0] == 0.0).all()

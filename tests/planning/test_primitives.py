@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flexneedle import controls as controls_of
-from flexneedle.costs.table import Trajectories, charges
+from flexneedle.costs.table import Trajectories, evaluate_terms
 from flexneedle.costs.terms import PLAN
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import PlanProblem, optimise, schedule, widened
+from flexneedle.planning.insertion import PlanProblem, make_controls, search_primitives, widen_search
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, X, Y
 
@@ -51,7 +51,7 @@ def sampled():
 def test_equal_shares_and_full_steps():
     """12 mm in three primitives of four steps; the bevel rolls at the second and again at the third."""
     z = primitives((1, 0, 0, 0.1, 2.0, 0), (1, 0.02, 0, 0, -0.1, 0), (1, 0, 0.001, -0.2, 0.1, 0))
-    controls, wanted = schedule(PROBLEM, z)
+    controls, wanted = make_controls(PROBLEM, z)
     expected = controls_of(12, db_x=1.0)
     expected[:4, DG_Y], expected[4:8, DB_Y], expected[8:, DB_THETA], expected[8:, DG_Y] = (
         0.1,
@@ -67,7 +67,7 @@ def test_equal_shares_and_full_steps():
 def test_shares_are_the_exponentials_and_steps_no_longer_than_asked():
     """Shares 2 : 1 : 1 of 12 mm with longest steps of 1, 0.7 and 0.5: 6, 5 and 6 steps."""
     z = primitives((1, 0, 0, 0, 1, np.log(2)), (0.7, 0, 0, 0, 1, 0), (0.5, 0, 0, 0, 1, 0))
-    controls, _ = schedule(PROBLEM, z)
+    controls, _ = make_controls(PROBLEM, z)
     np.testing.assert_allclose(controls[0, :, DB_X], [*[1.0] * 6, *[0.6] * 5, *[0.5] * 6])
 
 
@@ -75,18 +75,18 @@ def test_rounding_makes_no_further_step():
     """2.1 / 0.7 is a little more than 3 in double precision."""
     assert 2.1 / 0.7 > 3.0
     one = replace(PROBLEM, travel=2.1, primitives=1)
-    controls, _ = schedule(one, primitives((0.7, 0, 0, 0, 1, 0)))
+    controls, _ = make_controls(one, primitives((0.7, 0, 0, 0, 1, 0)))
     assert controls.shape == (1, 3, 9)
 
 
 def test_wanting_minus_from_the_start_turns_in_the_first_step():
-    controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, -1, 0)] * 3))
+    controls, wanted = make_controls(PROBLEM, primitives(*[(1, 0, 0, 0, -1, 0)] * 3))
     assert controls[0, :, ROLL].tolist() == [np.pi, *[0.0] * 11]
     assert wanted.tolist() == [[np.pi] * 3]
 
 
 def test_no_direction_at_all_counts_as_plus():
-    controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, 0.0, 0)] * 3))
+    controls, wanted = make_controls(PROBLEM, primitives(*[(1, 0, 0, 0, 0.0, 0)] * 3))
     assert (controls[0, :, ROLL] == 0.0).all()
     assert (wanted == 0.0).all()
 
@@ -94,15 +94,15 @@ def test_no_direction_at_all_counts_as_plus():
 def test_guide_stops_at_its_reach_and_comes_back_from_there():
     """Four steps of 0.5 reach 2.0, the limit; four more stay; four back end at 0."""
     up = (1, 0, 0, 0.5, 1, 0)
-    controls, _ = schedule(PROBLEM, primitives(up, up, (1, 0, 0, -0.5, 1, 0)))
+    controls, _ = make_controls(PROBLEM, primitives(up, up, (1, 0, 0, -0.5, 1, 0)))
     np.testing.assert_allclose(controls[0, :, DG_Y], [*[0.5] * 4, *[0.0] * 4, *[-0.5] * 4], atol=1e-14)
-    halfway, _ = schedule(PROBLEM, primitives((1, 0, 0, 0.4, 1, 0), up, up))
+    halfway, _ = make_controls(PROBLEM, primitives((1, 0, 0, 0.4, 1, 0), up, up))
     np.testing.assert_allclose(halfway[0, :, DG_Y], [*[0.4] * 4, *[0.1] * 4, *[0.0] * 4], atol=1e-14)
 
 
 def test_short_samples_are_padded_with_steps_that_do_nothing():
     quick, slow = (1, 0, 0, 0.1, -1, 0), (0.5, 0, 0, 0.1, -1, 0)
-    controls, _ = schedule(PROBLEM, np.concatenate([primitives(*[quick] * 3), primitives(*[slow] * 3)]))
+    controls, _ = make_controls(PROBLEM, np.concatenate([primitives(*[quick] * 3), primitives(*[slow] * 3)]))
     assert controls.shape == (2, 24, 9)
     assert not controls[0, 12:].any()
     assert (controls[1, :, DB_X] > 0.0).all()
@@ -111,7 +111,7 @@ def test_short_samples_are_padded_with_steps_that_do_nothing():
 @given(z=sampled())
 @hypothesis_settings(max_examples=100)
 def test_any_sample_keeps_travel_limits_and_turns(z):
-    controls, wanted = schedule(PROBLEM, z)
+    controls, wanted = make_controls(PROBLEM, z)
     np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), PROBLEM.travel, rtol=1e-12)
     assert (np.abs(controls[:, :, :ROLL]) <= PROBLEM.step + 1e-12).all()
     travel = np.abs(np.cumsum(controls[:, :, :ROLL], axis=1))
@@ -143,9 +143,9 @@ def made_up(n):
 
 
 def terms(z, change=lambda *arrays: arrays, problem=PROBLEM):
-    controls, _ = schedule(problem, z)
+    controls, _ = make_controls(problem, z)
     trajectories = Trajectories(controls, *change(*made_up(len(controls))))
-    return {name: float(value[0]) for name, value in charges(problem.terms, trajectories).items()}
+    return {name: float(value[0]) for name, value in evaluate_terms(problem.terms, trajectories).items()}
 
 
 GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05, 1, 0))
@@ -187,12 +187,12 @@ def test_padding_of_a_shorter_sample_is_not_charged():
     """Two samples, 12 and 24 steps: the first one's last twelve steps lie in tissue and count nothing."""
     z = np.concatenate([primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), primitives(*[(0.5, 0, 0, 0.1, 1, 0)] * 3)])
 
-    controls, _ = schedule(PROBLEM, z)
+    controls, _ = make_controls(PROBLEM, z)
     n, m = controls.shape[:2]
     trajectories = Trajectories(
         controls, np.ones((n, m, 5)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
     )
-    found = charges(PROBLEM.terms, trajectories)
+    found = evaluate_terms(PROBLEM.terms, trajectories)
     np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
 
 
@@ -208,7 +208,7 @@ def rigid(controls, bevel=1.0):
 
 
 def test_search_meets_the_target_of_a_rigid_needle():
-    found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
+    found = search_primitives(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
     end = rigid(found.controls[None], math.cos(found.roll)).tips[0, -1]
     np.testing.assert_allclose(end[:2], [8.0, 2.0], atol=0.01)
     assert sum(found.terms.values()) == pytest.approx(found.search_state.best_cost)
@@ -222,7 +222,7 @@ def bevel_only(sign):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_bevel_at_the_start_is_told_and_no_turn_is_left_in_the_first_step(sign):
     """Straight away to one side: 8 mm at 0.1 a mm, without a roll while inserting."""
-    found = optimise(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
+    found = search_primitives(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
     assert math.cos(found.roll) == sign
     assert (found.controls[:, ROLL] == 0.0).all()
     assert found.terms["flips"] == 0.0
@@ -231,7 +231,7 @@ def test_bevel_at_the_start_is_told_and_no_turn_is_left_in_the_first_step(sign):
 
 
 def test_inputs_that_are_not_free_stay_still():
-    found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
+    found = search_primitives(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
     assert (found.controls[:, DB_Y:DG_Y] == 0.0).all()
     assert found.controls[:, DG_Y].any()
 
@@ -245,7 +245,7 @@ def test_bounds_of_the_search_keep_the_steps():
         evaluated.append(controls)
         return rigid(controls)
 
-    optimise(rollout, wild, replace(SEARCH, iterations=4), np.random.default_rng(0))
+    search_primitives(rollout, wild, replace(SEARCH, iterations=4), np.random.default_rng(0))
     for controls in evaluated:
         assert (np.abs(controls[:, :, :ROLL]) <= PROBLEM.step + 1e-12).all()
         assert controls.shape[1] <= 2 * 12 + 3
@@ -262,7 +262,7 @@ def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
         return rigid(controls)
 
     many = replace(SEARCH, samples=4000, iterations=1, elite=100)
-    optimise(rollout, replace(PROBLEM, primitives=6), many, np.random.default_rng(0))
+    search_primitives(rollout, replace(PROBLEM, primitives=6), many, np.random.default_rng(0))
     expected = 5 * np.arccos(0.8) / np.pi
     assert rolls[0].mean() == pytest.approx(expected, abs=0.06)
 
@@ -270,8 +270,8 @@ def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
 def test_progress_and_same_seed_same_bytes():
     calls = []
     short = replace(SEARCH, iterations=5)
-    one = optimise(rigid, PROBLEM, short, np.random.default_rng(3), calls.append)
-    again = optimise(rigid, PROBLEM, short, np.random.default_rng(3))
+    one = search_primitives(rigid, PROBLEM, short, np.random.default_rng(3), calls.append)
+    again = search_primitives(rigid, PROBLEM, short, np.random.default_rng(3))
     assert [call["iteration"] for call in calls] == [1, 2, 3, 4, 5]
     assert one.controls.tobytes() == again.controls.tobytes()
     assert one.search_state.history == again.search_state.history
@@ -279,9 +279,9 @@ def test_progress_and_same_seed_same_bytes():
 
 def test_wider_samples_span_the_largest_steps_of_what_is_free():
     """The base is fixed; longest step, ε and share stay as they are; a deviation beyond the largest step does, too."""
-    np.testing.assert_array_equal(widened(PROBLEM).sigma, [0.1, 0.0, 0.0, 0.5, 1.0, 0.3])
+    np.testing.assert_array_equal(widen_search(PROBLEM).sigma, [0.1, 0.0, 0.0, 0.5, 1.0, 0.3])
     wide = replace(PROBLEM, sigma=np.array([0.1, 0.9, 0.001, 0.25, 1.0, 0.3]))
-    np.testing.assert_array_equal(widened(wide).sigma, [0.1, 0.9, 0.005, 0.5, 1.0, 0.3])
+    np.testing.assert_array_equal(widen_search(wide).sigma, [0.1, 0.9, 0.005, 0.5, 1.0, 0.3])
 
 
 def test_wider_samples_in_space_keep_the_ratio_across_the_frame():
@@ -289,5 +289,5 @@ def test_wider_samples_in_space_keep_the_ratio_across_the_frame():
     step = np.array([1.0, 0.5, 0.5, 0.005, 0.005, 0.5, 0.5])
     for across, expected in ((0.006, 0.05), (0.0, 0.0)):
         sigma = np.array([0.03, 0, 0, 0, 0, 0.06, across, 1.0, 0.1, 0.1])
-        made = widened(replace(PROBLEM, axes=2, step=step, sigma=sigma)).sigma
+        made = widen_search(replace(PROBLEM, axes=2, step=step, sigma=sigma)).sigma
         np.testing.assert_allclose(made, [0.03, 0, 0, 0, 0, 0.5, expected, 1.0, 0.1, 0.1])

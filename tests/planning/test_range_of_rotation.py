@@ -8,7 +8,7 @@ import pytest
 
 import flexneedle
 from flexneedle.planning import planner, steering
-from flexneedle.planning.insertion import PlanProblem, schedule
+from flexneedle.planning.insertion import PlanProblem, make_controls
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.simulator import Simulator
@@ -101,8 +101,8 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
         {"setup.max_rotation_deg": most, "entry.lateral_mm": 3.0, "entry.slope_z_mrad": 50.0}
     )
     goal = scenario.entry.lateral(DEPTH) + cmath.rect(1.0, math.radians(angle))
-    problem = planner._problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
-    rollout = planner._rollout(Simulator(scenario, threads=1))
+    problem = planner._make_problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
+    rollout = planner._make_rollout(Simulator(scenario, threads=1))
     expected = [REACH * least, REACH * greatest]
     np.testing.assert_allclose(steering.reach(rollout, problem), expected, rtol=0.02, atol=1e-6)
     assert problem.lateral == pytest.approx(1.0)
@@ -130,7 +130,7 @@ def test_rolls_take_the_shortest_way_that_the_range_has(most, wanted, expected):
     z = np.zeros((1, 3, problem.coordinates))
     z[0, :, 0] = 1.0
     z[0, :, problem.bevel] = np.stack([np.cos(np.radians(wanted)), np.sin(np.radians(wanted))], axis=1)
-    rows, _ = schedule(problem, z.reshape(1, -1))
+    rows, _ = make_controls(problem, z.reshape(1, -1))
     angles = np.degrees(np.cumsum(rows[0, :, ROLL]))[rows[0, :, ROLL] != 0.0]
     np.testing.assert_allclose(angles, expected)
 

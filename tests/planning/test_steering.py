@@ -55,7 +55,9 @@ def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
 
 def end(z, side, p=None):
     """Where the tip ends for rolls at shares z of the depth."""
-    return float(kinematic(steering.rolled(p or problem(0.0), np.array([z]), side)).tips[0, -1, Y])
+    return float(
+        kinematic(steering.controls_with_flips(p or problem(0.0), np.array([z]), side)).tips[0, -1, Y]
+    )
 
 
 @pytest.mark.parametrize(("z", "side"), [((), 1.0), ((0.3,), -1.0), ((0.25, 0.9), 1.0)])
@@ -68,7 +70,7 @@ def test_rolls_are_where_they_are_asked_for(z, side):
 @given(z=arrays(float, (3, 4), elements=st.floats(0.0, 1.0)), side=st.sampled_from([-1.0, 1.0]))
 @hypothesis_settings(max_examples=100)
 def test_any_sample_keeps_travel_and_steps_and_has_its_rolls(z, side):
-    controls = steering.rolled(problem(0.0), z, side)
+    controls = steering.controls_with_flips(problem(0.0), z, side)
     np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), 28.0, rtol=1e-12)
     assert (controls[:, :, DB_X] >= 0.0).all()
     assert (controls[:, :, DB_X] <= 3.0 + 1e-12).all()
@@ -88,14 +90,17 @@ def test_where_a_roll_crosses_a_step_the_end_is_continuous(at):
 
 
 def test_a_roll_leaves_the_other_steps_where_they_are():
-    edges = [np.cumsum(steering.rolled(problem(0.0), np.array([[z]]), 1.0)[0, :, DB_X]) for z in (0.31, 0.32)]
+    edges = [
+        np.cumsum(steering.controls_with_flips(problem(0.0), np.array([[z]]), 1.0)[0, :, DB_X])
+        for z in (0.31, 0.32)
+    ]
     assert len(np.setdiff1d(np.round(edges[0], 9), np.round(edges[1], 9))) == 1
 
 
 @given(share=st.floats(-0.95, 0.95), seed=st.integers(0, 2**32))
 @hypothesis_settings(max_examples=20)
 def test_every_target_within_reach_is_reached(share, seed):
-    found = steering.steer(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
+    found = steering.search_rolls(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
     tip = kinematic(found.controls[None], math.cos(found.roll)).tips[0, -1]
     assert abs(tip[1] - share * 2.0) < 1e-3
     assert (found.controls[:, DB_X] > 0.0).all()
@@ -108,7 +113,7 @@ def test_reach_is_between_the_ends_without_a_roll():
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_beyond_reach_the_bevel_stays_on_the_targets_side(side):
-    found = steering.steer(kinematic, problem(side * 3.0), SEARCH, np.random.default_rng(0))
+    found = steering.search_rolls(kinematic, problem(side * 3.0), SEARCH, np.random.default_rng(0))
     assert math.cos(found.roll) == side
     assert (found.controls[:, ROLL] == 0.0).all()
     assert found.terms["accuracy"] == pytest.approx(20.0)
@@ -124,7 +129,9 @@ def test_more_rolls_are_made_where_they_pay():
         int((found.controls[:, ROLL] > 0.0).sum())
         for weight in (0.0, 100.0)
         for found in [
-            steering.steer(swinging, problem(0.0, energy_weight=weight), SEARCH, np.random.default_rng(0))
+            steering.search_rolls(
+                swinging, problem(0.0, energy_weight=weight), SEARCH, np.random.default_rng(0)
+            )
         ]
     ]
     assert rolls[0] == 1
@@ -133,7 +140,7 @@ def test_more_rolls_are_made_where_they_pay():
 
 def test_progress_counts_through_all_searches_and_the_best_never_rises():
     calls = []
-    steering.steer(kinematic, problem(0.5), SEARCH, np.random.default_rng(0), calls.append)
+    steering.search_rolls(kinematic, problem(0.5), SEARCH, np.random.default_rng(0), calls.append)
     assert [call["iteration"] for call in calls] == list(range(1, len(calls) + 1))
     assert (np.diff([call["best"] for call in calls]) <= 0.0).all()
     assert all(call["iteration"] <= call["iterations"] for call in calls)
@@ -141,5 +148,7 @@ def test_progress_counts_through_all_searches_and_the_best_never_rises():
 
 
 def test_same_seed_same_bytes():
-    one, again = (steering.steer(kinematic, problem(0.5), SEARCH, np.random.default_rng(3)) for _ in range(2))
+    one, again = (
+        steering.search_rolls(kinematic, problem(0.5), SEARCH, np.random.default_rng(3)) for _ in range(2)
+    )
     assert one.controls.tobytes() == again.controls.tobytes()

@@ -14,7 +14,7 @@ from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Model
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.state import State, solved
+from flexneedle.simulator.state import State, freeze_solve
 
 ADVANCE, GUIDE_Y, GUIDE_Z, ROLL, SPIN = (
     insertion.DB_X, insertion.DG_Y, insertion.DG_Z, insertion.ROLL, insertion.SPIN,
@@ -53,15 +53,15 @@ def start(scenario: Scenario, imposed: Imposed = UNLOADED, across: type = comple
     """The needle in air, solved; `across` is complex, or float for the kernels of the plane."""
     model, none = model_of(scenario, **constants), across(0.0)
     bevel, base, slope, guide, load = (across(part) for part in imposed)
-    tip = nd.Pose(scenario.setup.start_tip_x, none, none)
-    needle = nd.start(nd.Pose(scenario.start_base_x, base, slope), tip, bevel, guide)
+    tip = nd.NodePose(scenario.setup.start_tip_x, none, none)
+    needle = nd.start(nd.NodePose(scenario.start_base_x, base, slope), tip, bevel, guide)
     needle = needle._replace(boundary=needle.boundary._replace(load=load))
     rest = np.zeros(model.nodes.size, across)
     u, work = rest.copy(), nd.work_array(rest)
-    state = State(scenario, model, needle, nd.Pose(0.0, none, none), rest, u, np.zeros(0), 0.0, 0.0)
+    state = State(scenario, model, needle, nd.NodePose(0.0, none, none), rest, u, np.zeros(0), 0.0, 0.0)
     rest, u = rest.copy(), u.copy()
     needle = insertion.settle(model, needle, rest, u, work, across(math.nan))
-    return solved(state, model, needle, rest, u, work)
+    return freeze_solve(state, model, needle, rest, u, work)
 
 
 def carried_out(state: State, commands: np.ndarray) -> tuple[State, np.ndarray]:
@@ -72,7 +72,7 @@ def carried_out(state: State, commands: np.ndarray) -> tuple[State, np.ndarray]:
     needle = insertion.rollout(
         state.model, *start, *work, rows, np.zeros((1, 2), state.rest.dtype), 0, 1, out
     )
-    return solved(state, state.model, needle, *work), out.tips[0]
+    return freeze_solve(state, state.model, needle, *work), out.tips[0]
 
 
 def commands(count: int, advance=0.0, *, base=0.0, slope=0.0, guide=0.0, roll=0.0, spin=0.0) -> np.ndarray:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from flexneedle.control.bang_bang import BevelRule
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario, check_target
@@ -36,13 +36,13 @@ def test_the_phantom_in_space_is_the_same_with_two_axes_and_a_target_off_both():
         "target.lateral_mm": 4.0,
         "target.lateral_z_mm": 3.0,
     }
-    assert checked(load_scenario("phantom3d")) == checked(PHANTOM).with_values(changes)
+    assert check_tables(load_scenario("phantom3d")) == check_tables(PHANTOM).with_values(changes)
 
 
 def test_a_minimal_file_takes_its_settings_from_the_phantom(minimal_text, scenario_file):
     scenario = load_scenario(scenario_file(minimal_text))
     for section in ("contact", "target", "plan", "control", "tracker", "phantom"):
-        assert getattr(checked(scenario), section) == getattr(checked(PHANTOM), section)
+        assert getattr(check_tables(scenario), section) == getattr(check_tables(PHANTOM), section)
     assert scenario.needle.bevel == PHANTOM.needle.bevel
     assert scenario.needle.length_mm == 150.0
     assert not scenario.setup.has_guide

@@ -4,7 +4,7 @@ import pytest
 
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.plausible import USUAL, doubts
+from flexneedle.scenario.plausible import USUAL, find_doubts
 from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.scenario.worlds import PERFECT, STRUCTURE, world
@@ -99,20 +99,20 @@ WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_
     ],
 )
 def test_an_implausible_value_is_one_line(values, line):
-    (found,) = doubts(PHANTOM.with_values(values))
+    (found,) = find_doubts(PHANTOM.with_values(values))
     assert found.startswith(line)
     assert found.isprintable()
 
 
 def test_every_value_that_is_off_has_its_line():
     off = {"target.depth_mm": 0.07, "needle.youngs_modulus_gpa": 2e5, "tissue.1.thickness_mm": 3.0}
-    assert len(doubts(PHANTOM.with_values(off))) == 3
+    assert len(find_doubts(PHANTOM.with_values(off))) == 3
 
 
 @pytest.mark.parametrize(("value", "ratio"), [(210.0, ""), (600.0, ""), (700.0, "3.33"), (7000.0, "33.3")])
 def test_a_warning_begins_half_an_order_of_magnitude_beyond_the_range(value, ratio):
     """√10 times 210 GPa is 664 GPa."""
-    lines = doubts(PHANTOM.with_values({"needle.youngs_modulus_gpa": value}))
+    lines = find_doubts(PHANTOM.with_values({"needle.youngs_modulus_gpa": value}))
     assert [f" {ratio} times the largest" in line for line in lines] == [True] * bool(ratio)
 
 
@@ -121,10 +121,10 @@ def test_what_comes_with_the_package_is_beyond_doubt():
     guided = [number for number, each in enumerate(worlds) if each.setup.has_guide]
     cases = (*(world(n, PERFECT) for n in range(0, 201, 20)), *(world(n, STRUCTURE) for n in guided))
     for scenario in (*map(load_scenario, PRESETS.names()), *worlds, *cases):
-        assert doubts(scenario) == []
+        assert find_doubts(scenario) == []
     for gauge in GAUGES:
         named = {"needle.outer_diameter_mm": None, "needle.inner_diameter_mm": None, "needle.gauge": gauge}
-        assert doubts(PHANTOM.with_values(named)) == []
+        assert find_doubts(PHANTOM.with_values(named)) == []
 
 
 def test_every_range_names_its_source_and_a_key_of_scenarios():

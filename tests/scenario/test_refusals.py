@@ -8,18 +8,18 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from scenario_rules import ABOVE_ZERO, COUNTS, NOT_NEGATIVE, POSITIVE, RULES
 
-PHANTOM = checked(load_scenario("phantom"))
+PHANTOM = check_tables(load_scenario("phantom"))
 
 
 def problems(values, source="case.toml"):
     with pytest.raises(ScenarioError) as caught:
-        checked(Scenario.from_values(values, source), source=source)
+        check_tables(Scenario.from_values(values, source), source=source)
     lines = caught.value.problems
     assert all(line.startswith(f"{source}: ") and line.isprintable() for line in lines)
     return [line.removeprefix(f"{source}: ") for line in lines]
@@ -181,7 +181,7 @@ json_like = st.recursive(
 @given(key=st.sampled_from(sorted(PHANTOM.flat())), value=json_like)
 def test_any_value_gives_a_scenario_or_one_line_each(key, value):
     try:
-        checked(PHANTOM.with_values({key: value}))
+        check_tables(PHANTOM.with_values({key: value}))
         message = ["fine"]
     except ScenarioError as error:
         message = list(error.problems)

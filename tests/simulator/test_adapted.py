@@ -27,7 +27,7 @@ def adaptation(stiffness=(1.0, 1.0), shift=None, **others):
 
 def bent(scenario, bend, roll=0.0):
     """The needle at the start, with its natural bend."""
-    simulator = tight(scenario, slide=1e-10).adapted(adaptation(bend=bend))
+    simulator = tight(scenario, slide=1e-10).with_adaptation(adaptation(bend=bend))
     return simulator, simulator.step(simulator.start(roll), Control())
 
 
@@ -96,7 +96,9 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
         simulator = Simulator(scenario, threads=1)
         state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
         length = scenario.needle.length_mm
-        state = simulator.adapted(adaptation((1.0,), bend=0.5 * kappa * length**2)).step(state, Control())
+        state = simulator.with_adaptation(adaptation((1.0,), bend=0.5 * kappa * length**2)).step(
+            state, Control()
+        )
         errors.append(
             [
                 state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
@@ -110,7 +112,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
 
 def test_bevel_and_bend_mirror_together():
     """Through the skin and into tissue, with guide motion and a roll."""
-    here = Simulator(PHANTOM, threads=1).adapted(adaptation((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
+    here = Simulator(PHANTOM, threads=1).with_adaptation(adaptation((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
     states = {}
     for side, roll in ((1, 0.0), (-1, math.pi)):
         state = here.start(roll)
@@ -132,7 +134,7 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
             "needle.bevel.offset_mm": 4.0 * 0.4,
         }
     )  # fmt: skip
-    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation((1.7, 0.6), bevel=0.4))
+    adapted = Simulator(PHANTOM, threads=1).with_adaptation(adaptation((1.7, 0.6), bevel=0.4))
     expected = Simulator(other, threads=1)
     one, two = insert_to(adapted, 27.0), insert_to(expected, 27.0)
     for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2)):
@@ -163,7 +165,7 @@ def rolled(state, simulator):
 def test_a_displaced_boundary_is_that_of_another_scenario(shift):
     """By whole intervals, so that the contact points of both are at the same depths."""
     other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 20.0 + shift}), threads=1)
-    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation(shift=(shift,)))
+    adapted = Simulator(PHANTOM, threads=1).with_adaptation(adaptation(shift=(shift,)))
     agree(rolled(insert_to(adapted, 27.0), adapted), rolled(insert_to(other, 27.0), other))
 
 
@@ -171,14 +173,14 @@ def test_a_boundary_displaced_by_part_of_an_interval_is_nearly_that_of_another_s
     """There the interval is divided: a hundredth of what the shift does."""
     other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 21.4}), threads=1)
     simulator = Simulator(PHANTOM, threads=1)
-    adapted = simulator.adapted(adaptation(shift=(1.4,)))
+    adapted = simulator.with_adaptation(adaptation(shift=(1.4,)))
     ends = [rolled(insert_to(one, 35.0), one).tip[1] for one in (adapted, other, simulator)]
     assert abs(ends[2] - ends[1]) > 5e-3
     assert abs(ends[0] - ends[1]) < 0.02 * abs(ends[2] - ends[1])
 
 
 def test_a_boundary_past_the_skin_leaves_the_layer_below_alone():
-    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation((5.0, 1.0), (-30.0,)))
+    adapted = Simulator(PHANTOM, threads=1).with_adaptation(adaptation((5.0, 1.0), (-30.0,)))
     other = Simulator(PHANTOM.with_values({"tissue.0.shear_modulus_kpa": 3.63}), threads=1)
     agree(rolled(insert_to(adapted, 27.0), adapted), rolled(insert_to(other, 27.0), other))
 
@@ -192,7 +194,7 @@ def test_cells_along_the_depth_are_the_layers_of_another_scenario():
         for k, factor in enumerate(factors)
     ]  # fmt: skip
     other = Simulator(PHANTOM.with_values({"tissue": cells}), threads=1)
-    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation(cell=4.0, variation=np.array(factors)))
+    adapted = Simulator(PHANTOM, threads=1).with_adaptation(adaptation(cell=4.0, variation=np.array(factors)))
     agree(rolled(insert_to(adapted, 37.0), adapted), rolled(insert_to(other, 37.0), other))
 
 
@@ -200,7 +202,7 @@ def test_cells_along_the_depth_are_the_layers_of_another_scenario():
 def test_factors_of_one_and_no_bend_are_the_simulator_itself(cell):
     """Through the boundary, to 1e-12."""
     simulator = Simulator(PHANTOM, threads=1)
-    same = simulator.adapted(adaptation(cell=cell, variation=np.ones(30)))
+    same = simulator.with_adaptation(adaptation(cell=cell, variation=np.ones(30)))
     one, two = (rolled(insert_to(by, 22.0), by) for by in (simulator, same))
     np.testing.assert_allclose(one.nodes, two.nodes, atol=1e-12, rtol=1e-12)
     np.testing.assert_allclose(numbers(one), numbers(two), atol=1e-11, rtol=1e-12)
@@ -210,7 +212,7 @@ def test_factors_of_one_and_no_bend_are_the_simulator_itself(cell):
 def test_adapting_leaves_the_simulator_as_it_was():
     simulator = Simulator(PHANTOM, threads=2)
     before = insert_to(simulator, 12.0)
-    assert simulator.adapted(adaptation((3.0, 3.0), (1.0,), bevel=0.0, bend=2.0)).threads == 2
+    assert simulator.with_adaptation(adaptation((3.0, 3.0), (1.0,), bevel=0.0, bend=2.0)).threads == 2
     assert insert_to(simulator, 12.0) == before
 
 
@@ -231,7 +233,7 @@ def test_a_replay_is_repeated_steps_bit_for_bit(bend):
     estimated = adaptation(
         (1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend
     )
-    adapted = simulator.adapted(estimated)
+    adapted = simulator.with_adaptation(estimated)
     state = simulator.start().with_estimate(base=(0.3, 0.0), slope=(-1e-3, 0.0))
     for first, last in ((0, 50), (50, 80)):
         after, tips = adapted.replay(state, rows[first:last])
@@ -265,7 +267,9 @@ def test_a_replay_takes_steps_longer_than_a_command():
 
 def test_a_pickled_simulator_keeps_what_it_learnt():
     """And its threads, after they were used."""
-    simulator = Simulator(PHANTOM, threads=2).adapted(adaptation((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
+    simulator = Simulator(PHANTOM, threads=2).with_adaptation(
+        adaptation((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4)
+    )
     state = insert_to(simulator, 10.0)
     rows = np.tile(rows_of(30), (16, 1, 1))
     tips = simulator.rollout(state, rows).tips

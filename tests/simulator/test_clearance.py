@@ -23,7 +23,7 @@ TOLERANCE = 1e-9  # mm
 
 def loose(clearance, **others):
     """The simulator of the phantom with a clearance (mm)."""
-    return EXACT.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=clearance, **others))
+    return EXACT.with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=clearance, **others))
 
 
 def off_centre(state):
@@ -165,8 +165,8 @@ def test_without_clearance_nothing_of_it_is_left():
 
 def test_a_needle_without_a_guide_has_no_clearance():
     bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
-    wide = bare.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
-    none = bare.adapted(Adaptation(np.zeros(1), np.ones(2)))
+    wide = bare.with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
+    none = bare.with_adaptation(Adaptation(np.zeros(1), np.ones(2)))
     rows = controls(60, db_x=1.0)
     np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
 
@@ -212,7 +212,7 @@ def test_rollouts_converge_and_equal_steps():
 def test_a_clearance_however_small_is_solved(preset, clearance):
     """A needle that nothing bends touches its guide without force, on no side in particular."""
     scenario = load_scenario(preset).with_values({"needle.bevel.offset_mm": 0.0})
-    simulator = Simulator(scenario).adapted(Adaptation(np.zeros(1), np.ones(2), clearance=clearance))
+    simulator = Simulator(scenario).with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=clearance))
     states = repeat(simulator, simulator.start(), Control(db_x=1.0), 40)
     moved = simulator.step(states[-1], Control(dg_y=clearance))
     assert all(state.converged for state in (*states, moved))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.tables import typed_scenario
+from flexneedle.control.tables import scenario_class
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "reference" / "scenario.md"
@@ -44,7 +44,7 @@ class Table(NamedTuple):
 
 def schema() -> dict[str, Any]:
     """Return the JSON schema of a scenario with the tables of all controllers, as `flexneedle scenario schema` does."""
-    return typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
+    return scenario_class(tuple(CONTROLLERS.values())).model_json_schema()
 
 
 def tables(root: dict[str, Any]) -> Iterator[Table]:

@@ -92,10 +92,10 @@ def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> N
 
 def choose_scenario(args: argparse.Namespace, *own: Controller) -> Scenario:
     """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
-    from flexneedle.control.controllers import used
+    from flexneedle.control.controllers import with_controller_defaults
     from flexneedle.scenario.files import load_scenario
 
-    scenario = used(load_scenario(args.scenario), *own, source=args.scenario)
+    scenario = with_controller_defaults(load_scenario(args.scenario), *own, source=args.scenario)
     return scenario if args.target is None else with_target(scenario, args.target)
 
 

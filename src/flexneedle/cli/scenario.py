@@ -55,7 +55,7 @@ def _add_check(commands: Commands) -> None:
         "check a scenario: one line for each problem, exit status 2",
         _check,
         "flexneedle scenario check mine.toml --strict",
-        "flexneedle scenario check mine.toml --controller follow_path:METHOD",
+        "flexneedle scenario check mine.toml --controller follow_path:CONTROLLER",
         about="Check a scenario. Prints one line per problem (exit status 2) and a warning for each unused "
         "or implausible value (exit status 0).",
     )
@@ -103,12 +103,12 @@ def _show(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.errors import ScenarioWarning
-    from flexneedle.scenario.plausible import doubts
+    from flexneedle.scenario.plausible import find_doubts
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ScenarioWarning)
         scenario = _checked(args)
-        for line in doubts(scenario):
+        for line in find_doubts(scenario):
             warnings.warn(f"{args.scenario}: {line}", ScenarioWarning, stacklevel=1)
     for warning in caught:
         warnings.warn(warning.message, warning.category, stacklevel=1)
@@ -120,19 +120,19 @@ def _check(args: argparse.Namespace) -> int:
 
 def _checked(args: argparse.Namespace) -> Scenario:
     """Return the scenario with all defaults, including the settings of the controllers."""
-    from flexneedle.control.controllers import checked, find_controller
+    from flexneedle.control.controllers import check_tables, find_controller
     from flexneedle.scenario.files import load_scenario
 
     own = [find_controller(name)[1] for name in args.controller]
-    return checked(load_scenario(args.scenario), *own, source=args.scenario)
+    return check_tables(load_scenario(args.scenario), *own, source=args.scenario)
 
 
 def _schema(_args: argparse.Namespace) -> int:
     import json
 
     from flexneedle.control.controllers import CONTROLLERS
-    from flexneedle.control.tables import typed_scenario
+    from flexneedle.control.tables import scenario_class
 
-    schema = typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
+    schema = scenario_class(tuple(CONTROLLERS.values())).model_json_schema()
     print(json.dumps(schema, indent=2, ensure_ascii=False))
     return 0

@@ -1,1 +1,1 @@
-"""Closed-loop control of an insertion (paper section III-B): one file in `methods` for each controller."""
+"""Closed-loop control of an insertion (paper section III-B): one file in `controllers` for each controller."""

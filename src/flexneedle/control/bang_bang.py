@@ -1,4 +1,4 @@
-"""The bang-bang rule for the bevel: of two kinematic paths the one nearer to the target (paper eq. 14 and 15).
+"""Bang-bang rule for the bevel: of two kinematic paths, the one nearer to the target (paper eq. 14 and 15).
 
 In space a needle that rolls to any angle aims its bevel at the target or away from it.
 """
@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from flexneedle.control.rotation import roll_within
+from flexneedle.control.rotation import limit_roll
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.planning.insertion import LEAST_ROLL
@@ -23,10 +23,10 @@ _LEAST_GAIN = 0.25  # of the dead band without noise: a bevel that is nearly aim
 _LEAST_ANGLE = sys.float_info.min  # rad: the direction of a smaller slope is rounding
 
 
-def seen(pose: Floats, target: Point) -> tuple[float, complex]:
-    """Distance (mm) of a target ahead of a tip along its axis, and across it, y + iz, as `pose` (5,) sees it.
+def target_from_tip(pose: Floats, target: Point) -> tuple[float, complex]:
+    """Return the distance (mm) of a target ahead of a tip at `pose` (5,) along its axis, and across it, y + iz.
 
-    The axes across are those of y and z, turned by the smallest rotation that turns x into the needle's axis.
+    The axes across are y and z, turned by the smallest rotation that turns x into the needle's axis.
     """
     x, y, z, theta, psi = pose.tolist()
     ahead, across = target[0] - x, complex(target[1] - y, target[2] - z)
@@ -40,11 +40,11 @@ def seen(pose: Floats, target: Point) -> tuple[float, complex]:
 
 
 def closest_approach(pose: Floats, curvature: float, bevel: complex, target: Point) -> float:
-    """Least distance (mm) to `target` of the path from `pose` (5,) that bends by `curvature` (1/mm), ahead only.
+    """Return the least distance (mm) to `target` of the path ahead from `pose` (5,) that bends by `curvature` (1/mm).
 
     bevel: its direction. The path of paper eq. 14 with steps u → 0: a line for curvature 0, else a circle.
     """
-    along, across = seen(pose, target)
+    along, across = target_from_tip(pose, target)
     lateral, across_bevel = (across * bevel.conjugate()).real, (across * bevel.conjugate()).imag
     if along <= 0.0:
         return math.dist(target, pose[:3].tolist())
@@ -53,7 +53,7 @@ def closest_approach(pose: Floats, curvature: float, bevel: complex, target: Poi
     return math.hypot(bend / (1.0 + math.sqrt(max(0.0, 1.0 + curvature * bend))), across_bevel)
 
 
-def wanted_roll(
+def choose_roll(
     pose: Floats,
     bevel: complex,
     curvature: float,
@@ -63,12 +63,12 @@ def wanted_roll(
     *,
     within: Callable[[float], float] | None = None,
 ) -> tuple[float, str]:
-    """Angle (rad) by which to roll the bevel, and the reason.
+    """Return the angle (rad) by which to roll the bevel, and the reason.
 
     The bevel is rolled if the other path passes nearer and the target is off the tip's line by more than a dead band:
     the share `dead_band` of half of the paths' separation at the target, ½κs², plus `noise` (mm). It shrinks towards
     the target, where the two paths are close together, but not below the resolution of the tracker. With rolls to any
-    angle, which `within` maps to those that the driver can make, the bevel is aimed at the target or away from it, if
+    angle, which `within` maps to rolls that the driver can make, the bevel is aimed at the target or away from it, if
     that lowers the miss by at least a quarter of that share.
     """
     half = 0.5 * curvature * float(np.sum(np.square(np.subtract(target, pose[:3]))))
@@ -78,10 +78,10 @@ def wanted_roll(
         angle, roll = math.pi, closest_approach(pose, curvature, -bevel, target)
         rolled = roll < keep and keep > half + band
     else:
-        across = seen(pose, target)[1]
+        across = target_from_tip(pose, target)[1]
         towards = across if across != 0.0 else bevel
         angles = [within(float(np.angle(one * bevel.conjugate()))) for one in (towards, -towards)]
-        ends = ((closest_approach(pose, curvature, _turned(bevel, one), target), one) for one in angles)
+        ends = ((closest_approach(pose, curvature, _turn_bevel(bevel, one), target), one) for one in angles)
         (roll, angle), off = min(ends), closest_approach(pose, 0.0, bevel, target)
         gain = keep - roll
         rolled = (
@@ -91,7 +91,7 @@ def wanted_roll(
     return (angle, f"bevel rolled: {why}") if rolled else (0.0, f"bevel kept: {why}")
 
 
-def _turned(bevel: complex, angle: float) -> complex:
+def _turn_bevel(bevel: complex, angle: float) -> complex:
     return bevel * cmath.rect(1.0, angle)
 
 
@@ -110,17 +110,17 @@ class BevelRule(Section):
         return 1e-3 * self.curvature_per_m
 
 
-def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[float, str]:
-    """`wanted_roll` to the plan's target, from the estimated tip. In air the bevel has no effect and is kept."""
+def decide_roll(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[float, str]:
+    """Return the roll (rad) towards the plan's target from the estimated tip, and the reason; no roll in air."""
     if estimate.tip[X] <= 0.0:
         return 0.0, "in air"
     setup, state = task.scenario.setup, estimate.state
-    return wanted_roll(
+    return choose_roll(
         estimate.tip,
         state.bevel,
         rule.curvature,
         task.plan.target,
         rule.flip_dead_band,
         _NOISE_SDS * task.scenario.tracker.jitter_per_axis,
-        within=None if setup.half_turns else partial(roll_within, setup, state.roll),
+        within=None if setup.half_turns else partial(limit_roll, setup, state.roll),
     )

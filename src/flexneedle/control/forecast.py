@@ -1,4 +1,4 @@
-"""Consequences of the miss that a decision predicts at the target: a warning, or a hold."""
+"""Reactions to the miss that a decision predicts at the target: a warning, or a hold."""
 
 import cmath
 import math
@@ -14,9 +14,9 @@ _IN_A_ROW = 3  # such decisions make one: a single prediction, right after the s
 
 
 def probability_beyond(limit: float, miss: float | complex, sd: float) -> float:
-    """Probability that a normal miss (mean `miss`, standard deviation `sd` on each axis, mm) is larger than `limit`.
+    """Return the probability that a normal miss is larger than `limit` (mm); 0 where nothing is predicted (NaN).
 
-    0 where nothing is predicted (NaN).
+    miss: its mean; sd: its standard deviation on each axis (mm).
     """
     if cmath.isnan(miss) or math.isnan(sd):
         return 0.0
@@ -28,13 +28,13 @@ def probability_beyond(limit: float, miss: float | complex, sd: float) -> float:
     return 0.5 * (math.erfc((limit - miss) / scale) + math.erfc((limit + miss) / scale))
 
 
-def size_text(miss: float | complex) -> str:
-    """A miss (mm) as text: with its sign in the plane, its size in space."""
+def format_miss(miss: float | complex) -> str:
+    """Return a miss (mm) as text: with its sign in the plane, its size in space."""
     return f"{abs(miss):.3f}" if isinstance(miss, complex) else f"{miss:+.3f}"
 
 
-def hopeless(decision: Decision, control: ControlSettings) -> str:
-    """Reason to hold the needle: no path was found, or none that ends within the limit; empty if one may."""
+def reason_to_hold(decision: Decision, control: ControlSettings) -> str:
+    """Return the reason to hold the needle: no path was found, or none that ends within the limit; else ""."""
     if decision.cost == math.inf:
         return decision.why
     limit = control.miss_limit_mm
@@ -42,33 +42,39 @@ def hopeless(decision: Decision, control: ControlSettings) -> str:
     if probability < control.miss_confidence:
         return ""
     return (
-        f"no path to the target found: predicted miss {_predicted(decision)} is beyond "
+        f"no path to the target found: predicted miss {_format_prediction(decision)} is beyond "
         f"control.miss_limit_mm = {limit:g} with a probability of {probability:.3f} "
         f"(limit {control.miss_confidence:g}); to insert anyway: flexneedle insert --force"
     )
 
 
-def likely_misses(decision: Decision, before: int) -> int:
-    """Number of successive decisions that predict a miss of more than 1 mm, this one included; `before`: without it."""
+def count_likely_misses(decision: Decision, before: int) -> int:
+    """Return the number of successive decisions that predict a miss of more than 1 mm, including this one.
+
+    before: the number before this decision.
+    """
     probability = probability_beyond(_RADIUS_MM, decision.miss, decision.miss_sd)
     return before + 1 if probability >= _LIKELY else 0
 
 
-def warning(decision: Decision, in_a_row: int) -> str:
-    """A warning once `in_a_row` successive decisions that predict a miss of more than 1 mm are enough; else empty."""
+def warn_of_miss(decision: Decision, in_a_row: int) -> str:
+    """Return a warning after enough successive decisions that predict a miss of more than 1 mm, else ""."""
     if in_a_row < _IN_A_ROW or cmath.isnan(decision.miss):
         return ""
-    return f"predicted miss {_predicted(decision)}: likely beyond {_RADIUS_MM:g} mm"
+    return f"predicted miss {_format_prediction(decision)}: likely beyond {_RADIUS_MM:g} mm"
 
 
-def _predicted(decision: Decision) -> str:
+def _format_prediction(decision: Decision) -> str:
     miss = decision.miss
     size = f"{abs(miss):.2f}" if isinstance(miss, complex) else f"{miss:+.2f}"
     return f"{size} ± {decision.miss_sd:.2f} mm"
 
 
-def missed(true: float, estimated: float) -> str:
-    """A line if an insertion ended more than 1 mm from its target, else empty; distances in mm, true NaN if unknown."""
+def describe_miss(true: float, estimated: float) -> str:
+    """Return a line if an insertion ended more than 1 mm from its target, else "".
+
+    true, estimated: distances of the true and the estimated tip (mm), true NaN if unknown.
+    """
     if not math.isnan(true):
         return f"missed the target by {true:.2f} mm" if true > _RADIUS_MM else ""
     return f"the estimated tip ended {estimated:.2f} mm from the target" if estimated > _RADIUS_MM else ""

@@ -1,4 +1,4 @@
-"""Interface of all controllers: a method is a `begin` and a `decide`, in one file of `methods`."""
+"""Interface of all controllers: a controller is a `begin` and a `decide`, in one file of `controllers`."""
 
 import math
 import re
@@ -26,16 +26,24 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 @dataclass(frozen=True)
 class Decision:
-    """A command, its reason, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
+    """A command and its reason.
 
     An infinite cost means that no feasible command was found: the loop holds the needle, with `why` as the reason.
 
-    miss, miss_sd: lateral miss predicted at the target, y or, in space, y + iz, and its standard deviation on an axis
-    with the corrections to come (mm; NaN: not predicted). The loop warns and holds by them. rest: time (s) for which
-    the needle rests, in place of the command, so that late readings arrive. predicted: shape of the needle at the
-    target, None if it is not predicted; samples: of the search behind it, None without one; neither is compared.
-    command: a `Control`, or its nine columns. Raises InputError for another command, or one that is not finite, a
-    negative miss_sd, or a rest that is negative or not finite.
+    Attributes:
+        command: A `Control`, or its nine columns.
+        why: Reason, one line.
+        cost: Predicted cost (default: NaN).
+        spread: Standard deviation left in the guide step (mm; NaN: none).
+        miss: Lateral miss predicted at the target (mm): y or, in space, y + iz (NaN: not predicted). The loop warns and
+            holds by it.
+        miss_sd: Standard deviation of the miss on an axis, with the corrections to come (mm).
+        rest: Time (s) for which the needle rests, in place of the command, so that late readings arrive.
+        predicted: Shape of the needle at the target, None if it is not predicted; not compared.
+        samples: Samples of the search, None without one; not compared.
+
+    Raises:
+        InputError: Another command, or a number that is negative or not finite where it may not be.
     """
 
     command: Control
@@ -59,7 +67,7 @@ class Decision:
 
 
 def _plain_command(command: Any) -> Control:
-    """The command as plain numbers, whatever their types."""
+    """Return the command with plain floats, whatever the types of its numbers."""
     try:
         row = Control.of(map(float, command))
     except (TypeError, ValueError, InputError):
@@ -79,8 +87,8 @@ def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
     return max(0.0, min(plan.target[0] - float(state.tip[X]), stroke_left))
 
 
-def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
-    """Whether the estimated tip is at the target depth, within the tolerance, or past it, or the stroke is used up."""
+def is_at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
+    """Return whether the tip is at or past the target depth, within the tolerance, or the stroke is used up."""
     return travel_left(task.scenario, task.plan, estimate.state) <= task.scenario.control.depth_tolerance_mm
 
 
@@ -88,27 +96,36 @@ class Observer(Protocol):
     """Provides the estimate on which a controller decides."""
 
     def begin(self, task: Task) -> Estimate:
-        """The estimate before the first reading."""
+        """Return the estimate before the first reading."""
         ...
 
 
-def _nothing(_task: Task) -> None:
-    """No memory."""
+def _no_memory(_task: Task) -> None:
+    """Return None."""
 
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A controller. Memory is a frozen value of the controller's own type, carried from one period to the next.
+    """Definition of a controller.
 
-    name: as in `--controller`, lower-case letters, digits and hyphens; summary: one line for lists; observer: provides
-    the estimate from the readings (default: the model, corrected by them);
-    decide: returns the next command and the memory after it; begin: returns the memory at the start (default: None);
-    arrived: whether the insertion is done (default: at the target depth);
-    settings: class of its settings, with a default for each, in the scenario's table `control.<table>`;
-    needs_guide: whether it is refused where the guide may not move;
-    predicts: whether its decisions predict the miss, by which the loop then holds: a plan that misses is accepted.
+    Its memory is a frozen value of any type, carried from one period to the next. Without a given function the
+    estimate is the scenario's model corrected by the readings, the memory is None, and the insertion ends at the target
+    depth.
 
-    Raises InputError for a name or settings that cannot be used.
+    Attributes:
+        name: Name as in `--controller`: lower-case letters, digits and hyphens.
+        summary: One line for lists.
+        observer: Provides the estimate from the readings.
+        decide: Returns the next command and the memory after it.
+        begin: Returns the memory at the start.
+        arrived: Returns whether the insertion is complete.
+        settings: Class of its settings, with a default for each, in the scenario's table `control.<table>`.
+        needs_guide: Whether it is refused where the guide may not move.
+        predicts: Whether its decisions predict the miss. The loop then holds by the prediction, and accepts a plan
+            that misses.
+
+    Raises:
+        InputError: A name or settings that cannot be used.
     """
 
     name: str
@@ -116,8 +133,8 @@ class Controller:
     observer: Observer = _CORRECTED_MODEL
     _: KW_ONLY
     decide: Callable[[Task, Any, Estimate, np.random.Generator], tuple[Decision, Any]]
-    begin: Callable[[Task], Any] = _nothing
-    arrived: Callable[[Task, Any, Estimate], bool] = at_depth
+    begin: Callable[[Task], Any] = _no_memory
+    arrived: Callable[[Task, Any, Estimate], bool] = is_at_depth
     settings: type[Section] | None = None
     needs_guide: bool = False
     predicts: bool = False

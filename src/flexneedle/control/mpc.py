@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.control.bang_bang import BevelRule
-from flexneedle.control.guide import guide_reach, most_guide_step
+from flexneedle.control.guide import guide_reach, largest_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.costs.table import Trajectories
 from flexneedle.costs.terms import CE_MPC
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.horizon import Samples, Variables, best
+from flexneedle.planning.horizon import Samples, Variables, find_best
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
@@ -44,7 +44,7 @@ class CeMpc(BevelRule):
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The command of a period, its cost, the sd left in dg_y (mm), and the samples of the last iteration."""
+    """The command of a period, its cost, the standard deviation left in dg_y (mm), and the last samples."""
 
     command: Control
     cost: float
@@ -52,7 +52,7 @@ class Choice:
     samples: Samples
 
 
-def choose(
+def choose_step(
     simulator: Simulator,
     plan: Plan,
     state: State,
@@ -63,13 +63,13 @@ def choose(
 ) -> Choice:
     """Search the next steps of advance and guide for the least deviation from the planned tip poses.
 
-    roll: that of the first step (rad).
+    roll: roll in the first step (rad).
     """
     scenario = simulator.scenario
     steps, travel = control.horizon, travel_left(scenario, plan, state)
     reference, nominal = plan_window(plan, float(state.tip[X]), steps)
-    base = planned_base(scenario.setup, plan, state, reference[:, X])
-    guide = most_guide_step(scenario.setup, plan.strategy)
+    base = steps_to_planned_base(scenario.setup, plan, state, reference[:, X])
+    guide = largest_guide_step(scenario.setup, plan.strategy)
     variables = _variables(scenario, state, base, travel, nominal, guide, roll)
     search = Search(
         samples=control.samples,
@@ -87,13 +87,13 @@ def choose(
     charged = CE_MPC.terms(
         control, target=plan.target, reference=reference, orientation=weight, nominal=steps_of_guide
     )
-    found = best(variables, rollout, charged, search, rng)
+    found = find_best(variables, rollout, charged, search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
     return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread, found.samples)
 
 
 def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
-    """Planned tip poses (steps, 5) after each step from the plan's tip at depth x, and its controls (steps, 9)."""
+    """Return planned tip poses (steps, 5) after each step from the tip's depth x (mm), and the controls (steps, 9)."""
     last = len(plan.tips) - 1
     at = float(np.interp(x, plan.tips[:, X], np.arange(last + 1)))
     index = np.minimum(at + np.arange(1, steps + 1), last)
@@ -102,8 +102,8 @@ def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
     return poses, np.concatenate([plan.controls, [STILL]])[rows]
 
 
-def planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:
-    """Steps (n, 4) of base y, z (mm), θ, ψ (rad) to the planned base poses with the tip at `depth` (n,), mm.
+def steps_to_planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:
+    """Return steps (n, 4) of base y, z (mm), θ, ψ (rad) to the planned base poses with the tip at `depth` (n,), mm.
 
     A base that lags behind the plan moves as fast as its limits allow.
     """
@@ -128,7 +128,7 @@ def _variables(
     guide: float,
     roll: float,
 ) -> Variables:
-    """z = (advances, guide steps on each axis), each (steps,), about those of the plan (steps, 9).
+    """Return the variables z of the search: advances, and guide steps on each axis, (steps,) each, about the plan's.
 
     guide: the longest step (mm).
     """
@@ -144,14 +144,17 @@ def _variables(
         upper=upper,
         mean=np.clip(np.concatenate(planned), lower, upper),
         sigma=np.repeat([scenario.plan.advance_sigma_mm, *[sigma] * axes], steps),
-        controls=lambda z: controls_of(scenario, state, z, base, travel, roll),
+        controls=lambda z: make_controls(scenario, state, z, base, travel, roll),
     )
 
 
-def controls_of(
+def make_controls(
     scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, roll: float
 ) -> Floats:
-    """Controls (N, steps, 9) of z and the base's steps: advance limited to the travel, the guide to its reach."""
+    """Return controls (N, steps, 9) of z and the base's steps.
+
+    The advance is limited to the travel, the guide to its reach.
+    """
     n, steps = len(z), len(base)
     moved = np.minimum(np.cumsum(z[:, :steps], axis=1), travel)
     rows = controls(n, steps, db_x=np.diff(moved, axis=1, prepend=0.0))

@@ -1,14 +1,14 @@
 """Uncertainty of the miss at the target that a controller's model predicts.
 
-The estimate's parameters are normal, with the posterior covariance P. Readings to come reduce it to P',
-and the path is corrected by them, until the tip is so near the target that a correction takes no effect. With c, the
-derivative of the tip's lateral position at the target with respect to the parameters, the variance of the miss is
+The estimate's parameters are normal, with the posterior covariance P. Readings to come reduce it to P', and the path is
+corrected by them, until the tip is so near the target that a correction takes no effect. With c, the derivative of the
+tip's lateral position at the target with respect to the parameters, the variance of the miss is
 
     f² (c P' c + σ² + (κ l)²) + min(m², c P c)
 
-σ is the model error of a reading, κ l that of the remaining path of length l. The last term is for a miss m that
-is predicted although the search minimises it: at the limits of the needle, errors that later
-readings reveal cannot be corrected either.
+σ is the model error of a reading, κ l the model error of the remaining path of length l. The last term is for a miss m
+that is predicted although the search minimises it: at the limits of the needle, errors that later readings reveal
+cannot be corrected either.
 
 Tissue is rarely as far from the prior as this allows for, and the fit takes the errors of its model for noise of the
 readings. So the normal distribution is too wide about a tip that the guide corrects, and too narrow along the needle.
@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexneedle.estimation.identification import Identified
-from flexneedle.estimation.lateral import directions, facing
+from flexneedle.estimation.lateral import bevel_directions, directions
 from flexneedle.types import Floats, Laterals, X, Y, laterals
 
 UNCORRECTED = 5.0
@@ -34,10 +34,14 @@ _SHAPE_FACTOR = 1.4  # f_s
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """Derivatives (K, g) of the tip's lateral position ahead with respect to the parameters, over the depth grid
-    (g,), and those of the needle's shape at the target (K, n).
+    """Derivatives of the tip's lateral position ahead, and of the needle's shape, with respect to the parameters.
 
     A few of them are simulated again each period, along the current path (`Identified.perturbed`).
+
+    Attributes:
+        grid: Depths (g,), mm.
+        curves: Derivatives (K, g) of the lateral position over the depths.
+        bent: Derivatives (K, n) of the shape at the target.
     """
 
     grid: Floats
@@ -46,18 +50,18 @@ class Outlook:
 
     @staticmethod
     def of(estimate: Identified) -> "Outlook":
-        """The derivatives before the first path: those of the estimate itself, a few steps ahead; none of the shape."""
+        """Return the derivatives before the first path: from the estimate, a few steps ahead; zeros for the shape."""
         nodes = estimate.nominal.scenario.needle.nodes
         curves = estimate.curves[0]
         return Outlook(estimate.grid, curves, np.zeros((len(curves), nodes), curves.dtype))
 
-    def renewed(self, estimate: Identified, controls: Floats, tips: Floats, shape: Floats) -> "Outlook":
-        """Derivatives renewed for the parameters that the estimate has just perturbed, along controls (m, 9).
+    def renew(self, estimate: Identified, controls: Floats, tips: Floats, shape: Floats) -> "Outlook":
+        """Return the derivatives, new for the parameters that the estimate has just perturbed, along controls (m, 9).
 
         tips (m, 5), shape (n, 5): measured tips, and the shape at the end, predicted for these controls.
         """
         curves, bent = self.curves.copy(), self.bent.copy()
-        bevel = facing(estimate.state.bevel, controls, estimate.axes)
+        bevel = bevel_directions(estimate.state.bevel, controls, estimate.axes)
         lateral = (
             laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
         )  # of the axis
@@ -76,16 +80,16 @@ class Outlook:
         return replace(self, curves=curves, bent=bent)
 
     def sd(self, estimate: Identified, target: float, miss: complex, *, guided: bool) -> float:
-        """Standard deviation (mm), on an axis, of the miss at the depth `target` (mm), if `miss` (mm) is predicted.
+        """Return the standard deviation (mm), on an axis, of the miss at the depth `target` (mm).
 
-        guided: whether the guide may move.
+        miss: the predicted miss (mm); guided: whether the guide may move.
         """
         factor = _MISS_FACTOR if guided else 1.0
         stays = min(abs(miss) ** 2 / estimate.axes, self.sd_now(estimate, target) ** 2)
         return float(np.sqrt((factor * self.sd_to_come(estimate, target)) ** 2 + stays))
 
     def sd_to_come(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm), on an axis, of a miss that is corrected while it can be, by the linear model."""
+        """Return the standard deviation (mm), on an axis, of the miss after all corrections, by the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end, axes = np.array([np.interp(target, self.grid, curve) for curve in self.curves]), estimate.axes
         to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= target - UNCORRECTED * step)
@@ -97,7 +101,7 @@ class Outlook:
         return float(np.sqrt(known))
 
     def shape_sd(self, estimate: Identified, target: float, lever: Laterals, miss_sd: float) -> Floats:
-        """Standard deviations (n, 2) of y and z of the nodes at the target (mm).
+        """Return the standard deviations (n, 2) of y and z of the nodes at the target (mm).
 
         Corrections of the path to come undo the miss at the depth `target` (mm) but for `miss_sd` (mm); by this they
         move the nodes by `lever` (n,), relative to the tip.
@@ -110,8 +114,6 @@ class Outlook:
         return sd
 
     def sd_now(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm), on an axis, of the tip's lateral position at the depth `target` (mm) without
-        corrections.
-        """
+        """Return the standard deviation (mm), on an axis, of the tip's lateral position at a depth if uncorrected."""
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
         return float(np.sqrt((end.conj() @ np.linalg.solve(estimate.precision, end)).real / estimate.axes))

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.guide import guide_axes, guide_reach, most_guide_step
+from flexneedle.control.guide import guide_axes, guide_reach, largest_guide_step
 from flexneedle.control.interface import travel_left
-from flexneedle.control.mpc import planned_base
-from flexneedle.control.rotation import roll_within, shortest
+from flexneedle.control.mpc import steps_to_planned_base
+from flexneedle.control.rotation import limit_roll, shorten_roll
 from flexneedle.estimation.task import Task
 from flexneedle.planning.insertion import LEAST_ROLL
 from flexneedle.scenario.sections.apparatus import Setup
@@ -24,7 +24,7 @@ from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, Plan, X
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
 LEAST_SLOTS = 4
-"""Number of rolls in a search, or that of the current path if it is larger."""
+"""Least number of rolls in a search, which has as many as the current path."""
 _FINE, _COARSE = (
     2,
     2.0,
@@ -41,8 +41,12 @@ _TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an ang
 
 @dataclass(frozen=True, eq=False)
 class GuidePath:
-    """The guide's position y, z (r, 2) over the depth (r,) of the tip, mm; and the rolls (k, 2): their depths (mm),
-    ascending, and the needle's angle (rad) after each.
+    """A path of the guide, with the rolls of the needle.
+
+    Attributes:
+        depth: Depths (r,) of the tip, mm.
+        guide: Position y, z (r, 2) of the guide at these depths, mm.
+        rolls: Depths (mm), ascending, of the rolls, and the needle's angle (rad) after each, (k, 2).
     """
 
     depth: Floats
@@ -50,8 +54,8 @@ class GuidePath:
     rolls: Floats
 
 
-def of_plan(plan: Plan) -> GuidePath:
-    """The plan's path."""
+def path_of_plan(plan: Plan) -> GuidePath:
+    """Return the path of a plan."""
     rolled = plan.controls[:, ROLL] != 0.0
     angle = plan.roll + np.cumsum(plan.controls[:, ROLL])
     keep = np.concatenate([[True], np.diff(plan.tips[:, X]) > 1e-9])
@@ -61,10 +65,16 @@ def of_plan(plan: Plan) -> GuidePath:
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """The path from the tip to the target in m steps: depth (m + 1,) of their ends, base (m, 4) of each; mm, rad.
+    """The path from the tip to the target in m steps.
 
-    state: the estimated needle; path: the current one; setup: its limits; step: largest one of the guide (mm), which
-    moves on `axes` axes.
+    Attributes:
+        depth: Depths (m + 1,) of the ends of the steps, mm.
+        base: Motion of the base (m, 4) in each step, mm and rad.
+        state: The estimated needle.
+        path: The current path.
+        setup: Limits of the needle.
+        step: Largest step of the guide (mm).
+        axes: Number of axes on which the guide moves.
     """
 
     depth: Floats
@@ -77,7 +87,7 @@ class Ahead:
 
     @staticmethod
     def of(task: Task, state: State, path: GuidePath) -> "Ahead":
-        """Two control steps, then longer ones."""
+        """Return the path ahead of a state: two control steps, then longer steps."""
         setup, left = task.scenario.setup, travel_left(task.scenario, task.plan, state)
         longest = setup.max_advance_mm
         fine = min(_FINE * longest, left)
@@ -88,11 +98,11 @@ class Ahead:
         strategy = task.plan.strategy
         return Ahead(
             depth,
-            planned_base(setup, task.plan, state, depth[1:]),
+            steps_to_planned_base(setup, task.plan, state, depth[1:]),
             state,
             path,
             setup,
-            most_guide_step(setup, strategy),
+            largest_guide_step(setup, strategy),
             guide_axes(setup, strategy) or 1,
         )
 
@@ -153,17 +163,15 @@ class Ahead:
         angles = rolls[:0, 1] if self.setup.half_turns else rolls[:, 1]
         return np.concatenate([np.zeros(self.knots), rolls[:, 0], angles])
 
-    def leaning(self, z: Floats) -> Floats:
-        """A sample (d,) with the guide a tenth of a millimetre further in +y at the target, where it may move."""
+    def lean_guide(self, z: Floats) -> Floats:
+        """Return a sample (d,) with the guide 0.1 mm further in +y at the target, where it may move."""
         other = z.copy()
         other[: KNOTS.size] += _LEAN * KNOTS if self.step > 0.0 else 0.0
         return other
 
     @property
     def constant(self) -> Floats:
-        """Controls (4, m, 9) that roll by half a turn before the first step or not, and after it or not (last index),
-        and never again.
-        """
+        """Controls (4, m, 9) of all combinations of half a turn before the first step and after it (last index)."""
         rows, _ = self._unrolled(self.current[None, : self.knots], np.tile(self.depth, (4, 1)))
         rows[2:, 0, ROLL] = np.pi
         if rows.shape[1] > 1:
@@ -171,14 +179,14 @@ class Ahead:
         return rows
 
     def controls(self, z: Floats) -> tuple[Floats, Floats]:
-        """Controls (N, m, 9) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
+        """Return controls (N, m, 9) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
         depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
         rows, depth = self._unrolled(z[:, : self.knots], depth)
         rows[:, :, ROLL] = roll
         return rows, depth
 
     def _unrolled(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
-        """Controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
+        """Return controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
         rows = controls(len(depth), depth.shape[1] - 1, db_x=np.diff(depth, axis=1))
         for axis, ones in enumerate(np.split(corrections, self.axes, axis=1)):
             rows[:, :, DG_Y + axis] = np.diff(self._guide(ones, depth, axis), axis=1)
@@ -186,7 +194,7 @@ class Ahead:
         return rows, depth
 
     def _grid(self, rolls: Floats, angles: Floats) -> tuple[Floats, Floats]:
-        """Depths (N, m + 1) with a boundary at each roll (N, s), and the roll (rad) before each step (N, m).
+        """Return depths (N, m + 1) with a boundary at each roll (N, s), and the roll (rad) before each step (N, m).
 
         So the cost is continuous in the depth of a roll. Each roll has its own boundary, the nearest or the next one
         that is free, if there is one before the last step; of two rolls at one depth the second counts, and two half
@@ -203,7 +211,7 @@ class Ahead:
             _without_twins(ascending, _DUE * self.advance, both=half).T, goals.T, strict=True
         ):
             nearest = np.searchsorted(middle, roll)
-            turn = goal - angle if half else shortest(self.setup, angle, goal - angle)
+            turn = goal - angle if half else shorten_roll(self.setup, angle, goal - angle)
             made = (roll < self.depth[-1]) & (nearest < m) & (np.abs(turn) >= LEAST_ROLL)
             at = np.minimum(np.maximum(nearest, last + 1), m - 1)
             inner = made & (at > 0)
@@ -215,11 +223,11 @@ class Ahead:
         if half:
             return depth, np.pi * (np.rint(roll / np.pi) % 2.0)
         # Rolls that share the last boundary are one, the short way.
-        roll[:, -1] = shortest(self.setup, self.state.roll + roll[:, :-1].sum(axis=1), roll[:, -1])
+        roll[:, -1] = shorten_roll(self.setup, self.state.roll + roll[:, :-1].sum(axis=1), roll[:, -1])
         return depth, roll
 
     def _guide(self, corrections: Floats, depth: Floats, axis: int) -> Floats:
-        """Guide positions (N, m + 1) on an axis within the limits, for corrections (N, k) at the knots."""
+        """Return guide positions (N, m + 1) on an axis within the limits, for corrections (N, k) at the knots."""
         least, greatest = guide_reach(self.state.scenario, axis)
         share = (depth - self.depth[0]) / max(self.left, 1e-9)
         knots = np.append(0.0, KNOTS)
@@ -237,8 +245,8 @@ class Ahead:
             guide[:, k + 1] = np.clip(wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k])
         return guide
 
-    def corrected(self, z: Floats) -> GuidePath:
-        """The path with the corrections of a sample (d,)."""
+    def correct(self, z: Floats) -> GuidePath:
+        """Return the path with the corrections of a sample (d,)."""
         rows, depth = self.controls(z[None])
         moved = np.cumsum(rows[0, :, DG_Y : DG_Y + 2], axis=0)
         guide = np.array(self.state.guide) + np.concatenate([np.zeros((1, 2)), moved])
@@ -246,8 +254,8 @@ class Ahead:
         rolls = np.stack([depth[0, :-1], angle], axis=1)[rows[0, :, ROLL] != 0.0]
         return GuidePath(depth[0], guide, rolls)
 
-    def first(self, path: GuidePath) -> tuple[Control, GuidePath]:
-        """The command of this period, and the rest of a path after it.
+    def first_command(self, path: GuidePath) -> tuple[Control, GuidePath]:
+        """Return the command of this period, and the rest of a path after it.
 
         A roll that is due is made at once; the advance ends at the depth of the next one.
         """
@@ -266,15 +274,18 @@ class Ahead:
         return Control.of(row.tolist()), replace(path, rolls=later)
 
     def _due_roll(self, angles: Floats) -> float:
-        """The roll (rad) to the last of these angles, the short way."""
+        """Return the shortest roll (rad) to the last of these angles."""
         if self.setup.half_turns:
             return np.pi * (len(angles) % 2)
         present = self.state.roll
-        return roll_within(self.setup, present, float(angles[-1]) - present) if len(angles) else 0.0
+        return limit_roll(self.setup, present, float(angles[-1]) - present) if len(angles) else 0.0
 
 
 def _without_twins(rolls: Floats, near: float, *, both: bool) -> Floats:
-    """Ascending rolls (N, s); of pairs within `near` (mm) the first is infinite, or both, if they cancel."""
+    """Return ascending rolls (N, s), in which the first of a pair within `near` (mm) is infinite.
+
+    both: whether both rolls of a pair are, since half turns cancel.
+    """
     left = rolls.copy()
     for k in range(left.shape[1] - 1):
         twins = np.isfinite(left[:, k]) & (left[:, k + 1] - left[:, k] <= near)
@@ -282,8 +293,8 @@ def _without_twins(rolls: Floats, near: float, *, both: bool) -> Floats:
     return left
 
 
-def proposals(ahead: Ahead, count: int, rng: np.random.Generator, aim: complex = 1.0) -> Floats:
-    """Samples (count, d) around the current path, which is the first, with scales over two decades.
+def propose_samples(ahead: Ahead, count: int, rng: np.random.Generator, aim: complex = 1.0) -> Floats:
+    """Return samples (count, d) around the current path, which is the first, with scales over two decades.
 
     With a guide a quarter changes it alone, a quarter the rolls alone, a sixth adds a pair of rolls, the rest changes
     all; without one three quarters change the rolls, a half adds a pair. Where the needle rolls to any angle, a pair
@@ -320,12 +331,10 @@ def _propose_angles(
     aim: complex,
     rng: np.random.Generator,
 ) -> None:
-    """Change the angles of the rolls `changed` (N, s), and those of samples `pair`, of which every second one rolls
-    now.
-    """
+    """Change the angles of the rolls `changed` (N, s) and of the samples `pair`, half of which roll now."""
     z[:, ahead.angles] += np.where(changed, _WIDEST * scale * rng.standard_normal(changed.shape), 0.0)
     present = ahead.state.roll
-    towards = present + roll_within(ahead.setup, present, float(np.angle(aim * np.exp(-1j * present))))
+    towards = present + limit_roll(ahead.setup, present, float(np.angle(aim * np.exp(-1j * present))))
     angle = rng.choice([-1.0, 1.0], pair.size) * rng.uniform(0.0, np.pi, pair.size)
     last = ahead.angles.stop
     z[pair, last - 2], z[pair, last - 1] = towards + angle, towards - angle

@@ -1,4 +1,4 @@
-"""Rolls within the range of the driver's rotation, the short way round."""
+"""The shortest rolls within the range of the driver's rotation."""
 
 import math
 
@@ -11,9 +11,10 @@ _TURN = 2.0 * math.pi
 _NEAR = 1e-9  # rad: beyond the range by rounding
 
 
-def shortest(setup: Setup, angle: Floats, roll: Floats) -> Floats:
-    """The shortest rolls (rad) of needles at `angle` (rad) that turn their bevels as `roll` does and end in the range
-    of the driver: the same as `roll`, or by whole turns less; `roll` itself where none ends in the range.
+def shorten_roll(setup: Setup, angle: Floats, roll: Floats) -> Floats:
+    """Return the shortest rolls (rad) that turn bevels of needles at `angle` (rad) as `roll` does, within the range.
+
+    They differ from `roll` by whole turns; where none of them ends in the range, `roll` is returned.
     """
     most = setup.max_rotation + _NEAR
     short = roll - _TURN * np.rint(roll / _TURN)
@@ -24,14 +25,14 @@ def shortest(setup: Setup, angle: Floats, roll: Floats) -> Floats:
     return fits
 
 
-def roll_within(setup: Setup, angle: float, roll: float) -> float:
-    """The shortest roll (rad) of a needle at `angle` (rad) that turns its bevel as `roll` does, in the driver's range.
+def limit_roll(setup: Setup, angle: float, roll: float) -> float:
+    """Return the shortest roll (rad) of a needle at `angle` (rad) that turns its bevel as `roll` does.
 
-    The nearest possible one where no angle in the range has that direction; with half turns, `roll` itself.
+    Where no angle in the driver's range has that direction, the nearest possible roll; with half turns, `roll`.
     """
     if roll == 0.0 or setup.half_turns:
         return roll
-    most, found = setup.max_rotation, float(shortest(setup, np.asarray(angle), np.asarray(roll)))
+    most, found = setup.max_rotation, float(shorten_roll(setup, np.asarray(angle), np.asarray(roll)))
     after = angle + found
     if abs(after) > most + _NEAR:
         after -= _TURN * round(after / _TURN)

@@ -21,15 +21,16 @@ from flexneedle.types import Plan
 
 
 @cache
-def typed_scenario(methods: tuple[Controller, ...]) -> type[Scenario]:
-    """Return the class of scenarios in which the tables of these controllers have the controllers' settings classes.
+def scenario_class(controllers: tuple[Controller, ...]) -> type[Scenario]:
+    """Return the class of scenarios whose controllers' tables have the controllers' settings classes.
 
-    Raises InputError if two of them would share a table.
+    Raises:
+        InputError: Two of the controllers share a table.
     """
-    owners = {method.table: method for method in methods}
-    for method in methods:
-        if owners[method.table] != method:
-            raise InputError(f"two controllers are called {method.name}: give one of them another name")
+    owners = {controller.table: controller for controller in controllers}
+    for controller in controllers:
+        if owners[controller.table] != controller:
+            raise InputError(f"two controllers are called {controller.name}: give one of them another name")
     tables: dict[str, Any] = {
         table: (owner.settings, owner.settings()) for table, owner in owners.items() if owner.settings
     }
@@ -40,23 +41,23 @@ def typed_scenario(methods: tuple[Controller, ...]) -> type[Scenario]:
     return create_model("Scenario", __base__=Scenario, __doc__=Scenario.__doc__, **fields)
 
 
-def completed(scenario: Scenario, methods: Iterable[Controller], source: str = "") -> Scenario:
+def complete_tables(scenario: Scenario, controllers: Iterable[Controller], source: str = "") -> Scenario:
     """Return the scenario with all settings of these controllers, other tables unchanged.
 
     Raises ScenarioError with one line for each problem, which opens with `source`.
     """
-    return Scenario.from_values(_typed(scenario, tuple(methods), source).values())
+    return Scenario.from_values(_with_classes(scenario, tuple(controllers), source).values())
 
 
-def task(method: Controller, simulator: Simulator, plan: Plan) -> Task:
-    """Return the task of `method`, with its settings from the simulator's scenario. Raises ScenarioError."""
-    control = _typed(simulator.scenario, (method,), "").control
-    return Task(simulator, plan, getattr(control, method.table) if method.settings else None)
+def make_task(controller: Controller, simulator: Simulator, plan: Plan) -> Task:
+    """Return the task of `controller`, with its settings from the simulator's scenario. Raises ScenarioError."""
+    control = _with_classes(simulator.scenario, (controller,), "").control
+    return Task(simulator, plan, getattr(control, controller.table) if controller.settings else None)
 
 
-def unowned(scenario: Scenario, methods: Iterable[Controller], source: str = "") -> list[str]:
+def find_unowned_tables(scenario: Scenario, controllers: Iterable[Controller], source: str = "") -> list[str]:
     """Return a line for each table below `control` that belongs to none of these controllers."""
-    known = [method.table for method in methods if method.settings]
+    known = [controller.table for controller in controllers if controller.settings]
     opening = f"{source}: " if source else ""
     lines = []
     for table in sorted(set(scenario.control.tables) - set(known)):
@@ -68,5 +69,5 @@ def unowned(scenario: Scenario, methods: Iterable[Controller], source: str = "")
     return lines
 
 
-def _typed(scenario: Scenario, methods: tuple[Controller, ...], source: str) -> Scenario:
-    return typed_scenario(methods).from_values(scenario.model_dump(exclude_none=True), source)
+def _with_classes(scenario: Scenario, controllers: tuple[Controller, ...], source: str) -> Scenario:
+    return scenario_class(controllers).from_values(scenario.model_dump(exclude_none=True), source)

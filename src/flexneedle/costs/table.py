@@ -55,14 +55,14 @@ class Term:
     value: Callable[[Trajectories], Floats]
 
 
-def charges(terms: Sequence[Term], trajectories: Trajectories) -> dict[str, Floats]:
+def evaluate_terms(terms: Sequence[Term], trajectories: Trajectories) -> dict[str, Floats]:
     """Return the weighted terms (N,) by name."""
     return {term.name: term.weight * term.value(trajectories) for term in terms}
 
 
-def cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
+def evaluate_cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
     """Return the sum (N,) of the weighted terms; infinite where the model did not converge."""
-    total: Floats = np.sum(list(charges(terms, trajectories).values()), axis=0)
+    total: Floats = np.sum(list(evaluate_terms(terms, trajectories).values()), axis=0)
     return np.where(trajectories.converged.all(axis=1), total, np.inf)
 
 
@@ -109,7 +109,7 @@ def cost_term(unit: str, **weights: Weight) -> Callable[[TermFunction], TermFunc
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of one user."""
+    """The cost of one user of the table: planner or controller."""
 
     user: str
 
@@ -141,26 +141,26 @@ class Cost:
     def terms(
         self, settings: Any, weights: Mapping[str, float] | None = None, **values: Any
     ) -> tuple[Term, ...]:
-        """Return the terms of this cost, those of the user's own in `settings.own_terms` last.
+        """Return the terms of this cost, with the user's terms (`settings.own_terms`) last.
 
         weights: by the names of the terms (default: as in the settings); values: arguments of the functions by name,
         each passed to every function that takes it.
         """
         weights = self.weights(settings) if weights is None else weights
-        found = [Term(w.name, weights[w.name], _with_values(term.value, values)) for term, w in self.rows()]
+        found = [Term(w.name, weights[w.name], _bind_values(term.value, values)) for term, w in self.rows()]
         own = [
-            Term(each.term, each.weight, _checked(each.term, _with_values(each.function, values)))
+            Term(each.term, each.weight, _check_values(each.term, _bind_values(each.function, values)))
             for each in settings.own_terms or ()
         ]
         return *found, *own
 
 
-def _with_values(value: TermFunction, values: Mapping[str, Any]) -> Callable[[Trajectories], Floats]:
-    """Return the function with those of the values bound that it takes."""
+def _bind_values(value: TermFunction, values: Mapping[str, Any]) -> Callable[[Trajectories], Floats]:
+    """Return the function with its arguments bound, as far as the values have them."""
     return partial(value, **{name: values[name] for name in signature(value).parameters if name in values})
 
 
-def _checked(name: str, value: Callable[[Trajectories], Floats]) -> Callable[[Trajectories], Floats]:
+def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callable[[Trajectories], Floats]:
     """Return the function of a user, which then raises InputError unless it returns an array (N,)."""
 
     def checked(trajectories: Trajectories) -> Floats:

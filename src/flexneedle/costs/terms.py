@@ -31,7 +31,7 @@ Complexes = NDArray[np.complex128]
 
 
 def past_target(trajectories: Trajectories, target: Point) -> Complexes:
-    """Lateral miss y + iz (N,), mm, at the target's depth, to which the tip's line is extended from the end."""
+    """Return the lateral miss y + iz (N,), mm, of the line from the tip at the end, at the target's depth."""
     end = trajectories.tips[:, -1]
     slope = np.tan(end[:, THETA]) + 1j * np.tan(end[:, PSI])
     vector: Complexes = across(end, Y) + slope * (target[0] - end[:, X]) - complex(*target[1:])
@@ -48,7 +48,7 @@ def past_target(trajectories: Trajectories, target: Point) -> Complexes:
     adaptive_mpc=Weight("miss"),
 )  # fmt: skip
 def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
-    """Lateral distance (mm) from the target at its depth, the size of `past_target`.
+    """Return the lateral distance (mm) from the target at its depth, the size of `past_target`.
 
     blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
     """
@@ -58,8 +58,9 @@ def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats
 
 @cost_term("mm", adaptive_mpc=Weight("large miss"))
 def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float) -> Floats:
-    """The share d² / (d² + sd²) of the `miss` (mm): near 0 for a distance d far below its standard deviation sd (mm),
-    near 1 far above it.
+    """Return the share d² / (d² + sd²) of the `miss` (mm), d its distance and sd its standard deviation (mm).
+
+    The share is near 0 far below the standard deviation, and near 1 far above it.
     """
     square = np.abs(past_target(trajectories, target)) ** 2
     least = np.finfo(float).tiny
@@ -85,7 +86,7 @@ def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float
     ),
 )  # fmt: skip
 def energy_at_end(trajectories: Trajectories) -> Floats:
-    """Strain energy of the tissue after the last step (mJ)."""
+    """Return the strain energy of the tissue after the last step (mJ)."""
     return trajectories.energy[:, -1]
 
 
@@ -97,7 +98,7 @@ def energy_at_end(trajectories: Trajectories) -> Floats:
     ),
 )  # fmt: skip
 def deflection(trajectories: Trajectories) -> Floats:
-    """Mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    """Return the mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
     total: Floats = (trajectories.deflection * trajectories.inside).sum(axis=1)
     return total
 
@@ -110,7 +111,7 @@ def deflection(trajectories: Trajectories) -> Floats:
     ),
 )  # fmt: skip
 def guide_motion(trajectories: Trajectories) -> Floats:
-    """Squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    """Return the squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
     total: Floats = (_guide_squares(trajectories) * trajectories.inside).sum(axis=1)
     return total
 
@@ -128,7 +129,7 @@ def guide_motion(trajectories: Trajectories) -> Floats:
     ),
 )  # fmt: skip
 def distance_from_line(trajectories: Trajectories, start: Point, target: Point) -> Floats:
-    """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
+    """Return the mean lateral distance (mm) of the tip from the line between two points, over the advance in tissue."""
     x, y = trajectories.tips[:, :, X], across(trajectories.tips, Y)
     length, begin = target[0] - start[0], complex(*start[1:])
     slope = (complex(*target[1:]) - begin) / length if length != 0.0 else 0.0
@@ -147,7 +148,7 @@ def distance_from_line(trajectories: Trajectories, start: Point, target: Point) 
     ),
 )  # fmt: skip
 def guide_slope(trajectories: Trajectories) -> Floats:
-    """Mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
+    """Return the mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
     advance = trajectories.controls[:, :, DB_X]
     squares = np.divide(
         _guide_squares(trajectories), advance, out=np.zeros_like(advance), where=advance > 0.0
@@ -168,7 +169,7 @@ def guide_slope(trajectories: Trajectories) -> Floats:
     ),
 )  # fmt: skip
 def flips(trajectories: Trajectories, first: int = 0) -> Floats:
-    """Flips of the bevel from step `first` on, by their angle: each half turn counts as one."""
+    """Return the number of flips of the bevel from step `first` on, by their angle: each half turn counts as one."""
     count: Floats = _half_turns(trajectories)[:, first:].sum(axis=1)
     return count
 
@@ -182,7 +183,7 @@ def flips(trajectories: Trajectories, first: int = 0) -> Floats:
     ),
 )  # fmt: skip
 def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Floats:
-    """Sum over the rolls of the bevel of e^(−d/length), d the distance (mm) of the tip from the depth (mm) then."""
+    """Return the sum of e^(−d/length) over the rolls, d the distance (mm) of the tip from the depth (mm)."""
     before = trajectories.tips[:, :, X] - trajectories.controls[:, :, DB_X]
     near = np.exp(np.minimum(0.0, before - depth) / length)
     sum_: Floats = (near * _half_turns(trajectories)).sum(axis=1)
@@ -203,7 +204,7 @@ def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Float
     ),
 )  # fmt: skip
 def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.0) -> Floats:
-    """Expected distance (mm) of the target from the bevel's reach after the first step.
+    """Return the expected distance (mm) of the target from the bevel's reach after the first step.
 
     expected (2,): if the roll before that step turns the bevel by `angle` (rad), and if it turns it the other way.
     """
@@ -214,7 +215,7 @@ def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.
 
 @cost_term("mm²", ce_mpc=Weight("deviation"))
 def deviation(trajectories: Trajectories, reference: Floats, orientation: float) -> Floats:
-    """Squared deviation (mm²) from poses (m, 5), summed over the steps (paper eq. 13).
+    """Return the squared deviation (mm²) from poses (m, 5), summed over the steps (paper eq. 13).
 
     orientation: weight of the slopes, as the distance (mm) that is equivalent to 1 rad.
     """
@@ -232,7 +233,7 @@ def deviation(trajectories: Trajectories, reference: Floats, orientation: float)
     ),
 )  # fmt: skip
 def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
-    """Squared differences (mm²) of the guide steps from `nominal` (m, 2), summed over the steps."""
+    """Return the squared differences (mm²) of the guide steps from `nominal` (m, 2), summed over the steps."""
     off = trajectories.controls[:, :, DG_Y : DG_Y + 2] - nominal
     total: Floats = (off**2).sum(axis=(1, 2))
     return total
@@ -247,7 +248,7 @@ def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
     ),
 )  # fmt: skip
 def energy_of_steps(trajectories: Trajectories) -> Floats:
-    """Strain energy of the tissue, summed over the steps (mJ)."""
+    """Return the strain energy of the tissue, summed over the steps (mJ)."""
     total: Floats = trajectories.energy.sum(axis=1)
     return total
 

@@ -1,8 +1,8 @@
-"""What the parameters of the fit mean: the model with them, and its start."""
+"""The model with the parameters of the fit, and its start."""
 
 import numpy as np
 
-from flexneedle.estimation.lateral import components, of_components
+from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.prior import Priors, Slots
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
@@ -12,28 +12,30 @@ from flexneedle.types import STILL, THETA, Floats, Y, Z
 _REST = np.array([STILL])
 
 
-def adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
-    """The model with these parameters (K,); nominal: the scenario's, to which they refer."""
+def adapt_model(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
+    """Return the model with these parameters (K,); nominal: the scenario's model, to which they refer."""
     layers, slots = len(nominal.scenario.tissue), Slots.of(nominal.scenario)
     shift = slots.modulus + layers
     variation = shift + layers - 1
-    return nominal.adapted(
+    return nominal.with_adaptation(
         Adaptation(
             shift=parameters[shift:variation],
             stiffness=np.exp(parameters[slots.modulus : shift]),
             cell=settings.cell_mm,
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[slots.bevel]),
-            bend=of_components(parameters[slots.bend]),
+            bend=from_components(parameters[slots.bend]),
             clearance=float(parameters[slots.clearance]),
         )
     )
 
 
-def started(nominal: Simulator, model: Simulator, parameters: Floats, roll: float, axial: float) -> State:
-    """The state of the start, settled with these parameters (K,); axial: start error along the axis (mm).
+def settle_start(
+    nominal: Simulator, model: Simulator, parameters: Floats, roll: float, axial: float
+) -> State:
+    """Return the state of the start, settled with these parameters (K,); axial: start error along the axis (mm).
 
-    model: that with the parameters; roll: of the needle before the first step (rad).
+    model: the model with the parameters; roll: of the needle before the first step (rad).
     """
     slots, start = Slots.of(nominal.scenario), nominal.start(roll)
     moved = start.with_estimate(

@@ -44,27 +44,27 @@ class Estimate(Protocol):
         ...
 
     def shape_sd(self, nodes: Floats) -> Floats:
-        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5) of the needle at the target."""
+        """Return standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5) of the needle at the target."""
         ...
 
     def tip_at(self, time: float) -> Point:
-        """Estimated position of the tip (mm) at `time`, with constant velocity in each move."""
+        """Return the estimated position of the tip (mm) at `time`, with constant velocity in each move."""
         ...
 
     def move(self, motion: Motion) -> "Estimate":
-        """The estimate after a motion, as the driver carried it out: without limits, which are those of commands."""
+        """Return the estimate after a motion as the driver carried it out, which limits of commands do not apply to."""
         ...
 
     def observe(self, measurements: Sequence[Measurement]) -> "Estimate":
-        """The estimate corrected by good readings, the newest last."""
+        """Return the estimate corrected by good readings, the newest last."""
         ...
 
     def without_reading(self) -> "Estimate":
-        """The estimate of a period without a good reading: innovation 0."""
+        """Return the estimate of a period without a good reading: innovation 0."""
         ...
 
 
-def described(estimate: Estimate) -> str:
+def describe_estimate(estimate: Estimate) -> str:
     """Return one line about an estimate, for its `repr`."""
     axes, tip = estimate.simulator.scenario.setup.axes, estimate.tip
     position = ", ".join(f"{value:.3f}" for value in tip[: 1 + axes])
@@ -73,6 +73,6 @@ def described(estimate: Estimate) -> str:
     return f"<{type(estimate).__name__} {where}>"
 
 
-def after(simulator: Simulator, state: State, applied: Control) -> State:
-    """The state after a motion as the driver carried it out, which may exceed a limit of commands a little."""
+def carry_out(simulator: Simulator, state: State, applied: Control) -> State:
+    """Return the state after a motion as the driver carried it out, which may exceed a limit of commands a little."""
     return simulator.replay(state, np.array([applied]))[0]

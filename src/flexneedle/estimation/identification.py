@@ -1,4 +1,4 @@
-"""An observer that corrects the model: parameters of start, needle and tissue are fitted to all readings.
+"""Observer that corrects the model: parameters of start, needle and tissue are fitted to all readings.
 
 Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simulated again with other parameters, which
 takes a millisecond, and compared with the lateral readings. Parameters, with normal priors from the scenario:
@@ -8,12 +8,11 @@ takes a millisecond, and compared with the lateral readings. Parameters, with no
     ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
     ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
-So tissue ahead of the tip is estimated as far as it is correlated with that behind it. The start along the axis is a
-shift of all axial readings, fitted separately. The residuals of the fit are low-passed and added as a constant.
+So tissue ahead of the tip is estimated as far as it is correlated with the tissue behind it. The start along the axis
+is a shift of all axial readings, fitted separately. The residuals of the fit are low-passed and added as a constant.
 
 The derivative of the lateral position with respect to a parameter is kept as a curve over the depth of the tip, a few
-steps ahead of it too. A few of the curves are simulated again each period, so that none is older than `_ROUND`
-periods.
+steps ahead of it too. A few of the curves are simulated again each period, so that none is older than `_ROUND` periods.
 """
 
 import cmath
@@ -23,14 +22,14 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.adapted import adapted, started
-from flexneedle.estimation.estimate import described
-from flexneedle.estimation.lateral import directions, of_components, variance_of
-from flexneedle.estimation.moves import Move, along, assigned
+from flexneedle.estimation.adapted import adapt_model, settle_start
+from flexneedle.estimation.estimate import describe_estimate
+from flexneedle.estimation.lateral import directions, from_components, variance_of
+from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
-from flexneedle.estimation.readings import MoveMeans, shared
+from flexneedle.estimation.readings import MoveMeans, fit_constant
 from flexneedle.estimation.sensor import Sensor
-from flexneedle.estimation.sensors import used
+from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
@@ -52,7 +51,7 @@ class Identification:
     """The observer of `adaptive-mpc`, whose settings it uses."""
 
     def begin(self, task: Task) -> "Identified":
-        """The estimate before the first reading: the prior's means. Raises ScenarioError for too short cells."""
+        """Return the estimate before the first reading, the prior's means. Raises ScenarioError for too short cells."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         check_cells(scenario, settings)
         state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
@@ -71,13 +70,13 @@ class Identification:
             ((0, state),),
             grid,
             np.zeros(
-                (len(used(scenario)), prior.mean.size, grid.size),
+                (len(sensors_of(scenario)), prior.mean.size, grid.size),
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
             axial_variance=scenario.control.start_axial_sd_mm**2,
         )
-        return start._differentiated(range(prior.mean.size))
+        return start._differentiate(range(prior.mean.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +91,28 @@ class Perturbed:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The estimate. nominal: the scenario's model, to which the prior refers; simulator: that with the parameters (K,);
-    state: its present state; tips (m + 1, 5): at the ends of the m moves, the start first; stops: its state before some
-    of the moves; grid (g,), curves (S, K, g): derivatives of the sensors' quantities over the tip's depth (mm), its
-    lateral position first;
-    precision (K, K): inverse covariance of the parameters; axial: start error along the axis (mm); period: its number.
+    """An `Estimate` with fitted parameters.
+
+    Attributes:
+        nominal: The scenario's model, to which the prior refers.
+        settings: Settings of the observer.
+        prior: Prior of the parameters.
+        simulator: The model with the parameters.
+        parameters: Posterior means (K,).
+        state: Present state of the model.
+        tips: Tip poses (m + 1, 5) at the ends of the m moves, the start first.
+        stops: State before some of the moves.
+        grid: Depths of the tip (g,), mm.
+        curves: Derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first.
+        precision: Inverse covariance (K, K) of the parameters.
+        axial: Start error along the axis (mm).
+        axial_variance: Its variance (mm²).
+        period: Number of the period.
+        perturbed: The present needle with one parameter changed, for some parameters.
+        moves: All moves.
+        residual: Low-passed residual (mm).
+        innovation: The last reading minus its prediction (mm).
+        measured: Tip measured at the end of the last move with a reading (mm), None before the first.
     """
 
     nominal: Simulator
@@ -120,11 +136,11 @@ class Identified:
     measured: Point | None = None
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe_estimate(self)
 
     @property
     def tip(self) -> Floats:
-        """Tip pose (5,) as measured: that of the model plus the tip's offset from the needle's axis."""
+        """Tip pose (5,) as measured: the model's, plus the tip's offset from the needle's axis."""
         tip, off = self.state.tip, self.off_axis(self.state.bevel)
         tip[Y] += off.real
         tip[Z] += off.imag
@@ -143,21 +159,21 @@ class Identified:
     @property
     def run_out(self) -> complex:
         """Lateral offset (mm) of the measured tip from the needle's axis, relative to the bevel's direction."""
-        return of_components(self.parameters[self.slots.run_out])
+        return from_components(self.parameters[self.slots.run_out])
 
     def off_axis(self, bevel: complex) -> complex:
-        """Lateral offset (mm) of the measured tip from the model's, with the bevel in this direction."""
+        """Return the lateral offset (mm) of the measured tip from the model's, with the bevel in this direction."""
         return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> Point:
-        """Estimated position of the tip (mm) at `time`."""
-        x, y, z = along(self.moves, self.tips, time)
+        """Return the estimated position of the tip (mm) at `time`."""
+        x, y, z = position_along(self.moves, self.tips, time)
         left = sum(done.left_to_turn(time) for done in self.moves if time < done.ended)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
         return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
     def without_reading(self) -> "Identified":
-        """The estimate of a period without a good reading: innovation 0."""
+        """Return the estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0, 0.0))
 
     def move(self, motion: Motion) -> "Identified":
@@ -175,13 +191,13 @@ class Identified:
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
         if not measurements or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assigned(self.moves, measurements))
+        extended = replace(self, moves=assign_readings(self.moves, measurements))
         readings = extended._readings[0]
         without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
-        axial, axial_variance = shared(without, extended.axial_variances(), prior_sd)
+        axial, axial_variance = fit_constant(without, extended.axial_variances(), prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
-        fitted = improved(extended)._differentiated()
+        fitted = improve_fit(extended)._differentiate()
         left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
@@ -190,7 +206,7 @@ class Identified:
         inside = fitted.tips[-1, X] > 0.0
         return replace(
             fitted,
-            residual=low_passed(self.settings, left) if inside else 0.0,
+            residual=low_pass(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
             measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
         )
@@ -203,14 +219,14 @@ class Identified:
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The sensors in use, the tip's position first."""
-        return used(self.nominal.scenario)
+        return sensors_of(self.nominal.scenario)
 
     @cached_property
     def _readings(self) -> tuple[MoveMeans, ...]:
         return tuple(MoveMeans.of(self.moves, one.name, self.state.bevel, self.axes) for one in self.sensors)
 
     def variances(self) -> list[Floats]:
-        """Variances (r,) of the means of each sensor's readings: jitter, model error, error of the angle in a roll."""
+        """Return variances (r,) of the means of each sensor's readings: jitter, model error, angle error in a roll."""
         scenario, sd = self.nominal.scenario, 1.0 / np.sqrt(np.diag(self.prior.precision))
         return [
             readings.variance(sensor.sd(scenario) or 0.0, sensor.unexplained(scenario, self.settings))
@@ -219,7 +235,7 @@ class Identified:
         ]
 
     def axial_variances(self) -> Floats:
-        """Variances (r,) of the means of the tip's x: jitter and model error."""
+        """Return variances (r,) of the means of the tip's x: jitter and model error."""
         scenario, position = self.nominal.scenario, self.sensors[0]
         unexplained = position.unexplained(scenario, self.settings)
         return self._readings[0].axial_variance(position.sd(scenario) or 0.0, unexplained)
@@ -231,16 +247,16 @@ class Identified:
 
     @property
     def left(self) -> list[Laterals]:
-        """Lateral residuals (r,) of each sensor: readings minus those of the model."""
+        """Lateral residuals (r,) of each sensor: readings minus the model's quantities."""
         return [
-            readings.left(tips, of_components(self.parameters[getattr(self.slots, sensor.offset)]))
+            readings.left(tips, from_components(self.parameters[getattr(self.slots, sensor.offset)]))
             for sensor, readings, tips in zip(self.sensors, self._readings, self.laterals, strict=True)
         ]
 
-    def _with(self, parameters: Floats) -> "Identified":
-        """The estimate with these parameters: the insertion simulated again, in segments."""
-        simulator = adapted(self.nominal, self.settings, parameters)
-        state = self._started(simulator, parameters)
+    def _simulate_with(self, parameters: Floats) -> "Identified":
+        """Return the estimate with these parameters: the insertion is simulated again, in segments."""
+        simulator = adapt_model(self.nominal, self.settings, parameters)
+        state = self._settle_start(simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, X], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
         stops, parts, first = [], [state.tip[None]], 0
@@ -259,9 +275,9 @@ class Identified:
             stops=tuple(stops),
         )
 
-    def _started(self, simulator: Simulator, parameters: Floats) -> State:
-        """The state of the start with these parameters."""
-        return started(self.nominal, simulator, parameters, self.stops[0][1].roll, self.axial)
+    def _settle_start(self, simulator: Simulator, parameters: Floats) -> State:
+        """Return the state of the start with these parameters."""
+        return settle_start(self.nominal, simulator, parameters, self.stops[0][1].roll, self.axial)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -277,7 +293,7 @@ class Identified:
         return float(np.sqrt(variance_of(slope, self.covariance) + self.axial_variance))
 
     def shape_sd(self, nodes: Floats) -> Floats:
-        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5): those of a tip that passes there."""
+        """Return standard deviations (n, 2), mm, of y and z at nodes (n, 5), as of a tip that passes there."""
         slopes = self._slopes(nodes[:, 0])
         parts = np.stack([slopes.real, slopes.imag])
         sd: Floats = np.sqrt(np.einsum("ank,kl,anl->na", parts, self.covariance, parts))
@@ -305,7 +321,7 @@ class Identified:
         return float(np.sqrt(variance_of(slope, self.covariance)))
 
     def _slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
-        """Derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
+        """Return derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
         step = self.grid[1] - self.grid[0]
         place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
         left = place.astype(int)
@@ -314,22 +330,22 @@ class Identified:
         slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes
 
-    def _differentiated(self, which: Sequence[int] | None = None) -> "Identified":
+    def _differentiate(self, which: Sequence[int] | None = None) -> "Identified":
         """Simulate the curves that are due again, with a few steps ahead."""
         ahead = controls(_ROUND, db_x=self.nominal.scenario.setup.max_advance_mm)
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
         depth = np.maximum.accumulate(base[:, X])
         curves, members = self.curves.copy(), []
-        for k in self._due() if which is None else which:
+        for k in self._due_parameters() if which is None else which:
             if self.slots.is_offset(k):
                 continue
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
             if depth[-1] < self.prior.begins[k]:
-                simulator = adapted(self.nominal, self.settings, parameters)
+                simulator = adapt_model(self.nominal, self.settings, parameters)
                 members.append(Perturbed(k, float(self.prior.steps[k]), simulator, self.state))
                 continue
-            member, tips = _perturbed(self, parameters, k, ahead)
+            member, tips = _perturb(self, parameters, k, ahead)
             members.append(member)
             for curve, sensor in zip(curves[:, k], self.sensors, strict=True):
                 moved = laterals(tips, sensor.column, self.axes) - laterals(base, sensor.column, self.axes)
@@ -345,8 +361,8 @@ class Identified:
         unexplained = self.sensors[0].unexplained(scenario, self.settings)
         return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
 
-    def _due(self) -> Iterator[int]:
-        """The parameters whose curves are simulated this period."""
+    def _due_parameters(self) -> Iterator[int]:
+        """Yield the parameters whose curves are simulated this period."""
         leading = (*range(self.slots.run_out.start), self.slots.bevel, self.slots.clearance)
         for place, k in enumerate(leading):
             if place % _LEADING_ROUND == self.period % _LEADING_ROUND:
@@ -356,8 +372,11 @@ class Identified:
                 yield k
 
 
-def improved(estimate: Identified) -> Identified:
-    """One Gauss–Newton step to the maximum a posteriori within the bounds, shortened until the cost does not rise."""
+def improve_fit(estimate: Identified) -> Identified:
+    """Return the estimate after a Gauss–Newton step to the maximum a posteriori within the bounds.
+
+    The step is shortened until the cost does not rise.
+    """
     prior = estimate.prior
     jacobian = jacobian_of(estimate)
     both = zip(estimate.variances(), estimate._readings, estimate.laterals, strict=True)
@@ -369,7 +388,7 @@ def improved(estimate: Identified) -> Identified:
     estimate = replace(estimate, precision=precision)
     step = np.linalg.solve(precision, gradient)
     if not np.isfinite(step).all():
-        return estimate._with(estimate.parameters)
+        return estimate._simulate_with(estimate.parameters)
     goal = np.clip(estimate.parameters + step, *prior.bounds)
 
     def cost(other: Identified) -> float:
@@ -378,14 +397,14 @@ def improved(estimate: Identified) -> Identified:
 
     most, fitted = cost(estimate), estimate
     for share in _SHARES:
-        fitted = estimate._with(estimate.parameters + share * (goal - estimate.parameters))
+        fitted = estimate._simulate_with(estimate.parameters + share * (goal - estimate.parameters))
         if fitted.state.converged and cost(fitted) <= most:
             break
     return fitted
 
 
 def jacobian_of(estimate: Identified) -> Laterals:
-    """Derivative (r, K) of the predicted readings of all sensors, from the curves."""
+    """Return the derivative (r, K) of the predicted readings of all sensors, from the curves."""
     parts = []
     for k, (sensor, readings) in enumerate(zip(estimate.sensors, estimate._readings, strict=True)):
         part = estimate._slopes(readings.between(estimate.tips[:, X]), k)
@@ -395,13 +414,13 @@ def jacobian_of(estimate: Identified) -> Laterals:
     return np.concatenate(parts)
 
 
-def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
-    """The needle with another value of parameter k, and its tips (m + 1 + a, 5), the a steps `ahead` included.
+def _perturb(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
+    """Return the needle with another value of parameter k, and its tips (m + 1 + a, 5), including a steps `ahead`.
 
     Moves before the parameter has an effect are not simulated again.
     """
     simulator, begins = (
-        adapted(estimate.nominal, estimate.settings, parameters),
+        adapt_model(estimate.nominal, estimate.settings, parameters),
         float(estimate.prior.begins[k]),
     )
     reached = int(np.argmax(np.append(estimate.tips[:, X], np.inf) > begins))  # by the move before this one
@@ -409,7 +428,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
         (stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0]
     )
     if first == 0:
-        state = estimate._started(simulator, parameters)
+        state = estimate._settle_start(simulator, parameters)
     before = np.concatenate([estimate.tips[:first], state.tip[None]])
     now, tips = simulator.replay(state, estimate.rows[first:])
     later = simulator.replay(now, ahead)[1]
@@ -417,8 +436,8 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     return member, np.concatenate([before, tips, later])
 
 
-def low_passed(settings: Priors, left: Laterals) -> complex:
-    """Low-pass of the residuals (r,) of the last moves, later ones with more weight."""
+def low_pass(settings: Priors, left: Laterals) -> complex:
+    """Return the low-pass of the residuals (r,) of the last moves, later ones with more weight."""
     level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():
         level += gain * (value - level)

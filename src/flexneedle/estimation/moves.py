@@ -1,4 +1,4 @@
-"""The moves of an insertion, and the readings that were taken during each."""
+"""The moves of an insertion, and the readings taken during each."""
 
 import cmath
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,18 @@ _ROUNDING_S = 1e-9
 
 
 class Means(NamedTuple):
-    """Means over the readings of a move: share of the move done, x (mm), y and z of the measured quantity, and those of
-    the bevel's direction, relative to that after the move; the number of readings, and the variances of the means of y
-    or z and of x where all readings report them, else NaN.
+    """Means over the readings of a move.
+
+    Attributes:
+        part: Share of the move that is done.
+        x: x of the tip (mm).
+        y: y of the measured quantity.
+        z: z of the measured quantity.
+        facing_y: y of the bevel's direction, relative to its direction after the move.
+        facing_z: z of the bevel's direction.
+        number: Number of readings.
+        across: Variance of the mean of y or z where all readings report it, else NaN.
+        ahead: Variance of the mean of x where all readings report it, else NaN.
     """
 
     part: float
@@ -35,8 +44,8 @@ class Means(NamedTuple):
     across: float
     ahead: float
 
-    def joined(self, other: "Means") -> "Means":
-        """The means over the readings of both."""
+    def join(self, other: "Means") -> "Means":
+        """Return the means over the readings of both."""
         number = self.number + other.number
         mine, theirs = self.number / number, other.number / number
         last = Means._fields.index("number")
@@ -51,8 +60,9 @@ class Means(NamedTuple):
 class Move:
     """A motion from `begun` to `ended` (s) as applied by the driver, and the good readings taken during it.
 
-    turned: end of the roll before the travel (s); None: it took no time, or there was none. earlier: means over
-    readings of a needle at rest that are no longer kept one by one.
+    Attributes:
+        turned: End of the roll before the travel (s); None: it took no time, or there was none.
+        earlier: Means over readings of a needle at rest that are no longer kept one by one.
     """
 
     begun: float
@@ -67,7 +77,7 @@ class Move:
         """Means over its readings by sensor; sensors without readings are left out."""
         means = ((sensor.name, self._mean(sensor)) for sensor in SENSORS.values())
         newer = {name: mean for name, mean in means if mean is not None}
-        both = {name: self.earlier[name].joined(newer[name]) for name in self.earlier.keys() & newer.keys()}
+        both = {name: self.earlier[name].join(newer[name]) for name in self.earlier.keys() & newer.keys()}
         return {**self.earlier, **newer, **both}
 
     def _mean(self, sensor: Sensor) -> Means | None:
@@ -79,7 +89,7 @@ class Move:
         facing = sum(cmath.exp(-1j * self.left_to_turn(time)) for time in times) / len(times)
         across = _variance_of_mean([sensor.variance(one) for one, _ in known])
         ahead = _variance_of_mean([one.covariance[0][0] if one.covariance else None for one, _ in known])
-        part, x = fmean(map(self.part, times)), fmean(place(one)[0] for one, _ in known)
+        part, x = fmean(map(self.part, times)), fmean(tip_of(one)[0] for one, _ in known)
         y, z = (fmean(column) for column in zip(*(value for _, value in known), strict=True))
         return Means(part, x, y, z, facing.real, facing.imag, float(len(known)), across, ahead)
 
@@ -89,14 +99,14 @@ class Move:
         return self.applied.roll != 0.0 and self.applied._replace(roll=0.0) == STILL
 
     def left_to_turn(self, time: float) -> float:
-        """Angle (rad) by which the needle has yet to turn at `time`; a roll before a travel is done at its start."""
+        """Return the angle (rad) left to turn at `time`; a roll before a travel is done at its start."""
         if self.is_roll:
             return self.applied.roll * (1.0 - self.part(time))
         before = self.applied.roll if time <= self.travel_begun else 0.0
         return before + self.applied.spin * (1.0 - self.part(time))
 
     def part(self, time: float) -> float:
-        """Share of the travel that is done at `time`."""
+        """Return the share of the travel that is done at `time`."""
         if self.ended <= self.travel_begun:
             return 1.0
         return min(1.0, max(0.0, (time - self.travel_begun) / (self.ended - self.travel_begun)))
@@ -107,7 +117,7 @@ class Move:
         return self.begun if self.turned is None else self.turned
 
     def with_readings(self, new: tuple[Measurement, ...]) -> "Move":
-        """The move with further readings, of which a needle at rest keeps the newest, and the mean of the others."""
+        """Return the move with further readings; at rest the newest are kept, and the means of the others."""
         every = self.measurements + new
         count = len(every) - _KEPT if self.applied == STILL else 0
         if count <= 0:
@@ -117,21 +127,24 @@ class Move:
 
     @staticmethod
     def of(motion: Motion) -> "Move":
-        """A motion before its readings."""
+        """Return a motion without readings."""
         turned = motion.turned if motion.control.roll != 0.0 else None
         return Move(motion.begun, motion.ended, motion.control, turned=turned)
 
     @staticmethod
     def parts_of(motion: Motion) -> "tuple[Move, ...]":
-        """The roll and the travel of a motion, if the roll took time, as moves of their own."""
+        """Return the roll and the travel of a motion as separate moves, if the roll took time."""
         if motion.turned is None or motion.control.roll == 0.0:
             return (Move.of(motion),)
         roll, travel = Control(roll=motion.control.roll), motion.control._replace(roll=0.0)
         return Move(motion.begun, motion.turned, roll), Move(motion.turned, motion.ended, travel)
 
 
-def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
-    """Assign each measurement to the last move that had begun, earlier ones to the first: between moves it rests."""
+def assign_readings(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
+    """Assign each measurement to the last move that had begun, and earlier ones to the first.
+
+    Between moves the tip rests.
+    """
     owner = _owners(moves, measurements)
     return tuple(
         done.with_readings(new)
@@ -141,8 +154,8 @@ def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tu
     )
 
 
-def outside_rolls(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> list[Measurement]:
-    """The measurements without those of a roll, whose tip is between two sides of the needle's axis."""
+def drop_roll_readings(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> list[Measurement]:
+    """Return the measurements without those during a roll, when the tip is between two sides of the needle's axis."""
     if not moves:
         return list(measurements)
     owned = zip(measurements, _owners(moves, measurements), strict=True)
@@ -152,14 +165,17 @@ def outside_rolls(moves: tuple[Move, ...], measurements: Sequence[Measurement]) 
 
 
 def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> NDArray[np.intp]:
-    """The number of the last move that had begun before each measurement, 0 for earlier ones."""
+    """Return the number of the last move that had begun before each measurement, 0 for earlier ones."""
     starts = np.array([done.begun for done in moves[1:]])
     owners: NDArray[np.intp] = np.searchsorted(starts, [one.time - _ROUNDING_S for one in measurements])
     return owners
 
 
-def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
-    """Position (mm) at `time` on the path through tips (k + 1, 5), at the ends of k moves, at rest between them."""
+def position_along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
+    """Return the position (mm) at `time` on the path through tips (k + 1, 5), at the ends of k moves.
+
+    Between moves the tip rests.
+    """
     if not moves:
         return Pose.of(tips[-1]).point
     times = [limit for done in moves for limit in (done.travel_begun, done.ended)]
@@ -169,13 +185,13 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
 
 
 def _variance_of_mean(variances: Sequence[float | None]) -> float:
-    """Variance of the mean of readings with these variances; NaN unless all are known."""
+    """Return the variance of the mean of readings with these variances; NaN unless all are known."""
     known = [value for value in variances if value is not None]
     return sum(known) / len(known) ** 2 if len(known) == len(variances) else nan
 
 
-def place(measurement: Measurement) -> Point:
-    """Measured tip (mm) of a good measurement, z = 0 if it is not measured. Raises ValueError for an empty one."""
+def tip_of(measurement: Measurement) -> Point:
+    """Return the tip (mm) of a good measurement, z = 0 if it is not measured. Raises ValueError for an empty one."""
     if measurement.x is None or measurement.y is None:
         raise ValueError("an empty measurement was not removed")
     return measurement.x, measurement.y, measurement.z or 0.0

@@ -1,12 +1,12 @@
-"""An observer that corrects the state of the model to the readings, so that its prediction has no offset.
+"""Observer that corrects the state of the model by the readings, so that its prediction has no offset.
 
-Readings come late. Each belongs to the move in which it was taken; the estimate is corrected there, and the moves
-since are predicted again (a fixed-lag filter).
+Readings are late. Each belongs to the move in which it was taken; the estimate is corrected there, and the moves since
+are predicted again (a fixed-lag filter).
 
-The start error along the axis is estimated from all readings (a scalar Kalman filter): axial motion is rigid.
-In air the free end is short and stiff, so that noise would act as a force: there the start offset and angle of the base
-are fitted (recursive least squares with a prior). In tissue the measured tip is an essential condition, and the
-force that it needs, low-passed, stays as a tip load in the prediction.
+The start error along the axis is estimated from all readings (a scalar Kalman filter): axial motion is rigid. In air
+the free end is short and stiff, so that noise would act as a force: there the start offset and angle of the base are
+fitted (recursive least squares with a prior). In tissue the measured tip is an essential condition, and the force that
+it needs, low-passed, remains as a tip load in the prediction.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import after, described
-from flexneedle.estimation.moves import Move, along, assigned, outside_rolls, place
+from flexneedle.estimation.estimate import carry_out, describe_estimate
+from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along, tip_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
@@ -27,7 +27,7 @@ _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model'
 
 @dataclass(frozen=True)
 class StateCorrection:
-    """Quantities that this observer estimates: in air the pose of the base clamp, in tissue a tip load.
+    """Observer that estimates the pose of the base clamp in air, and a tip load in tissue.
 
     Without the load the prediction releases the measured tip, as in the paper. It uses the position of the tip with the
     scenario's noise, not the direction, points and covariances that a measurement may have.
@@ -37,7 +37,7 @@ class StateCorrection:
     estimates_load: bool = True
 
     def begin(self, task: Task) -> "Corrected":
-        """The estimate before the first reading: a straight needle, and the scenario's prior."""
+        """Return the estimate before the first reading: a straight needle, and the scenario's prior."""
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
         state = simulator.start(task.plan.roll)
@@ -48,11 +48,20 @@ class StateCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """An `Estimate`; `state` is the present one.
+    """An `Estimate`.
 
-    past: the state before the first of `moves`, those whose readings may still arrive; tips (k + 1, 5): estimated
-    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and θ (rad), and axial, the variance of
-    the start along the axis (mm²), before `moves`; drift: standard deviation of the path's curvature (1/mm).
+    Attributes:
+        simulator: The model.
+        correction: Quantities that are estimated.
+        state: Present state.
+        past: State before the first of `moves`.
+        covariance: Covariance (2, 2) of base y (mm) and θ (rad) before `moves`.
+        axial: Variance of the start along the axis (mm²) before `moves`.
+        tips: Estimated tip poses (k + 1, 5) at the ends of the moves, the start first.
+        drift: Standard deviation of the path's curvature (1/mm).
+        moves: Moves whose readings may still arrive.
+        innovation: The last reading minus its prediction (mm).
+        measured: Tip measured at the end of the last move with a reading (mm), None before the first.
     """
 
     simulator: Simulator
@@ -68,7 +77,7 @@ class Corrected:
     measured: Point | None = None
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe_estimate(self)
 
     @property
     def tip(self) -> Floats:
@@ -86,7 +95,7 @@ class Corrected:
         return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + self.axial))
 
     def _across(self, x: Floats, arms: Floats) -> Floats:
-        """Variance (n,), mm², of positions on a lateral axis at x (n,), mm, with these distances (n,) from the base."""
+        """Return the variance (n,), mm², of positions on a lateral axis at x (n,), mm, `arms` (n,) from the base."""
         arm = np.stack([np.ones_like(arms), arms])
         measured = max(0.0, self.measured[0] if self.measured else 0.0)
         off_path = self.drift * np.maximum(0.0, np.maximum(x, 0.0) ** 2 - measured**2)
@@ -94,16 +103,16 @@ class Corrected:
         return variance
 
     def shape_sd(self, nodes: Floats) -> Floats:
-        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5), the same on each axis of the setup."""
+        """Return standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5), the same on each axis."""
         sd = np.sqrt(self._across(nodes[:, 0], nodes[:, 0] - nodes[0, 0]))[:, None]
         return sd * ([1.0, 0.0] if self.simulator.scenario.setup.axes == 1 else [1.0, 1.0])
 
     def tip_at(self, time: float) -> Point:
-        """Estimated position of the tip (mm) at `time`."""
-        return along(self.moves, self.tips, time)
+        """Return the estimated position of the tip (mm) at `time`."""
+        return position_along(self.moves, self.tips, time)
 
     def without_reading(self) -> "Corrected":
-        """The estimate of a period without a good reading: innovation 0."""
+        """Return the estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0, 0.0))
 
     def move(self, motion: Motion) -> "Corrected":
@@ -111,7 +120,7 @@ class Corrected:
         if motion.control == STILL and self._rests_unread:  # one move, however long
             last = replace(self.moves[-1], ended=motion.ended)
             return replace(self, moves=(*self.moves[:-1], last))
-        state = after(self.simulator, self.state, motion.control)
+        state = carry_out(self.simulator, self.state, motion.control)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)))
 
@@ -122,13 +131,13 @@ class Corrected:
 
     def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
         """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
-        used = outside_rolls(self.moves, measurements)
-        moves = assigned(self.moves, used)
+        used = drop_roll_readings(self.moves, measurements)
+        moves = assign_readings(self.moves, used)
         newest = max((one.time for one in used), default=-np.inf)
         at = replace(self, state=self.past, moves=moves)
         past, closed, tips = at, 0, [at.tip]
         for k, done in enumerate(moves):
-            at = _followed(at, done)
+            at = _follow(at, done)
             tips.append(at.tip)
             if closed == k and newest >= done.ended - 1e-9:
                 past, closed = at, k + 1
@@ -142,57 +151,57 @@ class Corrected:
         )
 
 
-def _followed(at: Corrected, done: Move) -> Corrected:
-    """The estimate after a move: predicted, and corrected by the mean innovation of its readings."""
-    before, predicted = at.tip, after(at.simulator, at.state, done.applied)
+def _follow(at: Corrected, done: Move) -> Corrected:
+    """Return the estimate after a move: predicted, and corrected by the mean innovation of its readings."""
+    before, predicted = at.tip, carry_out(at.simulator, at.state, done.applied)
     if not done.measurements:
         return replace(at, state=predicted)
     innovation = np.mean([_innovation(before, predicted.tip, done, one) for one in done.measurements], axis=0)
     measured = predicted.tip[: Z + 1] + innovation
     noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.measurements)))
-    at, predicted = _moved_along(at, done, float(innovation[0]), noise)
+    at, predicted = _correct_axially(at, done, float(innovation[0]), noise)
     at = replace(
         at,
-        innovation=_point(innovation),
-        measured=_point(measured),
+        innovation=_as_point(innovation),
+        measured=_as_point(measured),
     )
     if predicted.tip[0] > 0.0:
-        return replace(at, state=_held(at, predicted, measured))
+        return replace(at, state=_hold_tip(at, predicted, measured))
     if not at.correction.fits_start:
-        return replace(at, state=_assimilated(at, predicted, measured))
+        return replace(at, state=_assimilate(at, predicted, measured))
     return _fit_start(at, predicted, measured[Y:] - predicted.tip[Y : Z + 1], noise)
 
 
-def _innovation(before: Floats, after: Floats, done: Move, measurement: Measurement) -> Floats:
-    """Reading (mm) less prediction at its time, the move taken as even, shape (3,)."""
-    here, there = before[: Z + 1], after[: Z + 1]
+def _innovation(before: Floats, carry_out: Floats, done: Move, measurement: Measurement) -> Floats:
+    """Return reading less prediction at its time (mm), the move being even, shape (3,)."""
+    here, there = before[: Z + 1], carry_out[: Z + 1]
     expected: Floats = here + done.part(measurement.time) * (there - here)
-    return np.asarray(place(measurement)) - expected
+    return np.asarray(tip_of(measurement)) - expected
 
 
-def _point(values: Floats) -> Point:
+def _as_point(values: Floats) -> Point:
     x, y, z = values.tolist()
     return x, y, z
 
 
-def _assimilated(at: Corrected, predicted: State, measured: Floats) -> State:
+def _assimilate(at: Corrected, predicted: State, measured: Floats) -> State:
     axes = at.simulator.scenario.setup.axes
     return at.simulator.assimilate(predicted, measured[: 1 + axes].tolist()).state
 
 
-def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
-    """One step of a Kalman filter on the start along the axis, and the move predicted again with it.
+def _correct_axially(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
+    """Return the start along the axis corrected by a Kalman filter's step, and the move predicted again with it.
 
-    In one step with the correction: its cut can still follow the measured tip.
+    Prediction and correction are one step, so that the cut of the move still follows the measured tip.
     """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
     moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
-    predicted = after(at.simulator, moved, done.applied)
+    predicted = carry_out(at.simulator, moved, done.applied)
     return replace(at, axial=(1.0 - gain) * at.axial), predicted
 
 
 def _bevel_reach(simulator: Simulator, depth: float) -> float:
-    """Lateral distance (mm) of the tip from the entry's axis at `depth` (mm), with the bevel never rolled."""
+    """Return the lateral distance (mm) of the tip from the entry's axis at `depth` (mm), without rolls."""
     setup = simulator.scenario.setup
     travel = min(depth + setup.tip_to_skin_mm, setup.stroke_mm)
     steps = int(np.ceil(travel / setup.max_advance_mm - 1e-9))
@@ -202,8 +211,10 @@ def _bevel_reach(simulator: Simulator, depth: float) -> float:
 
 
 def _fit_start(at: Corrected, predicted: State, innovation: Floats, noise: float) -> Corrected:
-    """One step of recursive least squares on base position and slope, with the same gain on both axes; linear, since
-    only the guide touches the needle. innovation (2,): y, z.
+    """Return the estimate after a step of recursive least squares on base position and slope.
+
+    The gain is the same on both axes. The problem is linear, since only the guide touches the needle. innovation (2,):
+    y, z.
     """
     simulator = at.simulator
     sensitivity = np.array(
@@ -221,15 +232,15 @@ def _fit_start(at: Corrected, predicted: State, innovation: Floats, noise: float
 
 
 def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: float) -> float:
-    """Shift of the tip (mm) along y for a shift of the base along it (mm, rad)."""
+    """Return the shift of the tip (mm) along y for a shift of the base along it (mm, rad)."""
     _, y, z, theta, psi = state.base.tolist()
     moved = state.with_estimate(base=(y + base_y, z), slope=(theta + base_turn, psi))
     return float(simulator.step(moved, STILL).tip[Y] - state.tip[Y])
 
 
-def _held(at: Corrected, predicted: State, measured: Floats) -> State:
-    """The state with the tip held at its measured position and, if it is estimated, the low-passed load of that."""
-    held = _assimilated(at, predicted, measured)
+def _hold_tip(at: Corrected, predicted: State, measured: Floats) -> State:
+    """Return the state with the tip held at its measured position and, if estimated, the low-passed load."""
+    held = _assimilate(at, predicted, measured)
     if not at.correction.estimates_load:
         return held
     gain = at.simulator.scenario.control.load_gain

@@ -18,8 +18,10 @@ from flexneedle.types import Floats
 
 
 class Slots(NamedTuple):
-    """Places of the parameters: on each axis base, slope, bend, run-out and the tilt of a measured direction (the
-    latter three relative to the bevel's direction), bevel factor, clearance, and the first of the moduli.
+    """Places of the parameters.
+
+    On each axis: base, slope, bend, run-out, and the tilt of a measured direction (the latter three relative to the
+    bevel's direction). Then the bevel factor, the clearance, and the first of the moduli.
     """
 
     base: slice
@@ -33,7 +35,7 @@ class Slots(NamedTuple):
 
     @staticmethod
     def of(scenario: Scenario) -> "Slots":
-        """The places for the axes of a scenario."""
+        """Return the places for the axes of a scenario."""
         axes, kinds = scenario.setup.axes, 4 if scenario.tracker.direction_jitter is None else 5
         base, slope, bend, run_out, tilt = (
             slice(min(k, kinds) * axes, min(k + 1, kinds) * axes) for k in range(5)
@@ -42,12 +44,12 @@ class Slots(NamedTuple):
         return Slots(base, slope, bend, run_out, tilt, bevel, bevel + 1, bevel + 2)
 
     def is_offset(self, parameter: int) -> bool:
-        """Whether a parameter is an offset of a measurement, without effect on the needle."""
+        """Return whether a parameter is an offset of a measurement, without effect on the needle."""
         return bool(self.run_out.start <= parameter < self.tilt.stop)
 
 
 LEAST_SD = 1e-6
-"""Standard deviation of a parameter that is known (given as 0)."""
+"""Standard deviation of a known parameter (given as 0)."""
 _LATERAL_STEPS = (0.05, 3e-4, 0.05, 0.05, 1e-3)  # for differences, on each axis: mm, rad, mm, mm, rad
 _STEPS = (0.05, 0.02)  # of bevel factor and clearance: 1, mm
 _LOG_STEP = 0.05
@@ -93,8 +95,14 @@ class Priors(Section):
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Normal prior of the parameters: mean (K,), precision (K, K), bounds (2, K); steps for differences (K,); the depth
-    of the tip (mm) from which each has an effect on it (K,).
+    """Normal prior of the parameters.
+
+    Attributes:
+        mean: Means (K,).
+        precision: Inverse covariance (K, K).
+        bounds: Lower and upper bounds (2, K).
+        steps: Steps for differences (K,).
+        begins: Depth of the tip (mm) from which each parameter affects it (K,).
     """
 
     mean: Floats
@@ -105,9 +113,9 @@ class Prior:
 
     @staticmethod
     def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":
-        """The prior of a scenario."""
+        """Return the prior of a scenario."""
         control, slots, axes = scenario.control, Slots.of(scenario), scenario.setup.axes
-        layers, cells = len(scenario.tissue), _cells(depth, settings)
+        layers, cells = len(scenario.tissue), _count_cells(depth, settings)
         lateral = (
             control.start_offset_sd_mm,
             control.start_angle_sd,
@@ -125,7 +133,9 @@ class Prior:
         mean = np.where(np.arange(sd.size) == slots.bevel, 1.0, 0.0)
         mean[slots.clearance] = settings.clearance_mm if scenario.setup.has_guide else 0.0
         precision = np.diag(sd**-2.0)
-        precision[-cells:, -cells:] = uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
+        precision[-cells:, -cells:] = inverse_correlation(
+            cells, settings.cell_mm / settings.variation_length_mm
+        )
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
         bounds[0, slots.clearance] = 0.0
@@ -141,13 +151,13 @@ class Prior:
         return Prior(mean, precision, bounds, steps, begins)
 
     def cost(self, parameters: Floats) -> float:
-        """Negative logarithm of the density, up to a constant."""
+        """Return the negative logarithm of the density, up to a constant."""
         off = parameters - self.mean
         return float(0.5 * off @ self.precision @ off)
 
 
-def uncorrelating(size: int, distance: float) -> Floats:
-    """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
+def inverse_correlation(size: int, distance: float) -> Floats:
+    """Return the inverse of the correlation exp(−distance |i − j|) of a Markov chain, which is tridiagonal."""
     share = np.exp(-distance)
     inner = np.full(size, 1.0 + share**2)
     inner[[0, -1]] = 1.0
@@ -156,8 +166,8 @@ def uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(depth: float, settings: Priors) -> int:
-    """Number of cells from the skin to the target's depth (mm); the last one has no lower end."""
+def _count_cells(depth: float, settings: Priors) -> int:
+    """Return the number of cells from the skin to the target's depth (mm); the last one has no lower end."""
     return max(2, int(np.ceil(depth / settings.cell_mm)))
 
 
@@ -170,6 +180,6 @@ def check_cells(scenario: Scenario, settings: Priors) -> None:
 
 
 def _largest_bevel(scenario: Scenario) -> float:
-    """Largest factor on the bevel offset with which the law stays above its floor stretch."""
+    """Return the largest factor on the bevel offset with which the law stays above its floor stretch."""
     most, offset = min(layer.most_bevel_mm for layer in scenario.tissue), scenario.needle.bevel.offset_mm
     return most / offset if offset > 0.0 else 1.0

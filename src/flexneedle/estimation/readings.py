@@ -1,4 +1,4 @@
-"""The readings of an insertion, a mean for each move, compared with a model's tip."""
+"""Means of the readings of each move, compared with a model's tip."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +12,21 @@ from flexneedle.types import Floats, Laterals
 
 @dataclass(frozen=True, eq=False)
 class MoveMeans:
-    """Means of a sensor's readings of each move that has any: the move, the share of it done, x (mm) and the measured
-    quantity y, their number, variances of y on an axis and of x (NaN: not reported), and the mean of the bevel's
-    direction; each (r,). turns: whether the move is a roll. Lateral quantities are complex in space.
+    """Means of a sensor's readings, for each of r moves that has any; (r,) each.
 
-    Quantities of a model are given at the ends of all m moves, the start first: (m + 1,).
+    Lateral quantities are complex in space. Quantities of a model are given at the ends of all m moves, the start
+    first: (m + 1,).
+
+    Attributes:
+        index: Index of the move.
+        part: Share of the move that is done.
+        x: x of the tip (mm).
+        y: Measured quantity.
+        count: Number of readings.
+        reported: Reported variance of y on an axis (NaN: not reported).
+        reported_x: Reported variance of x (NaN: not reported).
+        bevel: Mean of the bevel's direction.
+        turns: Whether the move is a roll.
     """
 
     index: NDArray[np.intp]
@@ -31,7 +41,7 @@ class MoveMeans:
 
     @staticmethod
     def of(moves: Sequence[Move], sensor: str, bevel: complex, axes: int) -> "MoveMeans":
-        """The means of a sensor's readings; bevel: its direction after the last move."""
+        """Return the means of a sensor's readings; bevel: its direction after the last move."""
         found = {k: done.means[sensor] for k, done in enumerate(moves) if sensor in done.means}
         kept = np.array([*found], dtype=int)
         part, x, y, z, facing_y, facing_z, count, reported, ahead = (
@@ -47,28 +57,29 @@ class MoveMeans:
         return MoveMeans(kept, part, x, y + 1j * z, count, reported, ahead, facing, turns)
 
     def between(self, ends: Laterals) -> Laterals:
-        """A quantity interpolated to the readings (r,)."""
+        """Return a quantity interpolated to the readings (r,)."""
         between: Laterals = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
         return between
 
     def left(self, y: Laterals, offset: complex) -> Laterals:
-        """Lateral residuals (r,): readings minus those of a model, with an offset that turns with the bevel."""
+        """Return lateral residuals (r,): readings minus a model's, with an offset that turns with the bevel."""
         left: Laterals = self.y - self.between(y) - offset * self.bevel
         return left
 
     def ahead(self, x: Floats) -> Floats:
-        """Axial residuals (r,), mm: readings minus those of a model."""
+        """Return axial residuals (r,), mm: readings minus a model's x."""
         ahead: Floats = self.x - self.between(x)
         return ahead
 
     def variance(self, jitter: float, unexplained: float) -> Floats:
-        """Variances (r,) of the means of y on an axis; jitter of a reading and model error of a mean: standard
-        deviations.
+        """Return the variances (r,) of the means of y on an axis.
+
+        jitter, unexplained: standard deviations of a reading and of the model error of a mean.
         """
         return self._variance(self.reported, jitter, unexplained)
 
     def axial_variance(self, jitter: float, unexplained: float) -> Floats:
-        """As `variance`, of the means of x."""
+        """Return the variances (r,) of the means of x, with arguments as for `variance`."""
         return self._variance(self.reported_x, jitter, unexplained)
 
     def _variance(self, reported: Floats, jitter: float, unexplained: float) -> Floats:
@@ -77,16 +88,17 @@ class MoveMeans:
         return variance
 
     def bent(self, y: Laterals) -> Floats:
-        """Possible deviation (r,) of a reading from the chord of its move: the tip's path bends below the skin."""
+        """Return the possible deviation (r,) of a reading from the chord of its move: in tissue the path bends."""
         change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
         sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])
         return sag
 
 
-def shared(ahead: Floats, variance: Floats, prior_sd: float) -> tuple[float, float]:
-    """A constant that all readings share (mm) and its variance, maximum a posteriori.
+def fit_constant(ahead: Floats, variance: Floats, prior_sd: float) -> tuple[float, float]:
+    """Return the maximum a posteriori of a constant that all readings share (mm), and its variance.
 
-    ahead (r,): readings minus those predicted without it, mm, of `variance` (r,); prior: mean 0, sd (mm).
+    ahead (r,): readings minus predictions without it, mm, of `variance` (r,); prior: mean 0, standard deviation
+    `prior_sd` (mm).
     """
     weight = 1.0 / variance
     left = 1.0 / (weight.sum() + prior_sd**-2.0)

@@ -1,4 +1,4 @@
-"""A kind of measurement that corrects the model: a lateral quantity of the tip."""
+"""Kind of measurement that corrects the model: a lateral quantity of the tip."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,10 +12,14 @@ from flexneedle.types import Lateral, Measurement
 class Sensor:
     """A lateral quantity of the tip that a tracker measures.
 
-    column: of y in the tip's pose, of which the quantity is a column and the next; read: y and z of a measurement, None
-    if it has none; variance: of one of them in a measurement that reports it, else None; sd: standard deviation of one
-    of them by the scenario, None if it is not measured; unexplained: that of the mean of a move's readings which no
-    parameter explains; offset: name of the slot of its constant offset, which turns with the bevel.
+    Attributes:
+        name: Name.
+        column: Column of y in the tip's pose; z is the next.
+        read: Returns y and z of a measurement, None if it has none.
+        variance: Returns the variance of y or z that a measurement reports, else None.
+        sd: Returns the standard deviation of y or z by the scenario, None if the quantity is not measured.
+        unexplained: Returns the standard deviation of the mean of a move's readings which no parameter explains.
+        offset: Name of the slot of its constant offset, which turns with the bevel.
     """
 
     name: str

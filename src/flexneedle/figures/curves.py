@@ -74,8 +74,9 @@ def applied_rolls(insertion: Insertion) -> list[Roll]:
 
 
 def planned_angles(plan: Plan) -> Floats:
-    """Return depth of the tip (mm) and angle of the needle (rad) (2m + 1, 2): the start, then begin and end of each
-    step.
+    """Return depth of the tip (mm) and angle of the needle (rad), (2m + 1, 2).
+
+    The rows are the start, then begin and end of each step.
     """
     rolls, spins = plan.controls[:, ROLL], plan.controls[:, SPIN]
     ends = plan.roll + np.cumsum(rolls + spins)

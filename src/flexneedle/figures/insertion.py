@@ -53,7 +53,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
 
 
 def _panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
-    """Panels over depth by name, from above."""
+    """Return panels over depth by name, from above."""
     roll = {"roll": _roll(insertion)} if scenario.setup.axes == 2 else {}
     deviation, motion = _deviation(scenario, insertion), _motion(scenario, insertion)
     return {"deviation": deviation, "motion": motion} | roll | {"energy": _energy(insertion)}
@@ -119,7 +119,7 @@ def _prediction(ax: Axes, insertion: Insertion, view: View) -> None:
 
 
 def _guide_travel(insertion: Insertion) -> Floats:
-    """Columns x (0), y, z of the guide, from the start."""
+    """Return columns x (0), y, z of the guide, from the start."""
     places = [tuple(insertion.plan.guide[0]), *(period.guide for period in insertion.periods)]
     return np.array([(0.0, *place) for place in places])
 
@@ -171,7 +171,7 @@ def _deviation(scenario: Scenario, insertion: Insertion) -> DepthPanel:
 
 
 def _motion(scenario: Scenario, insertion: Insertion) -> DepthPanel:
-    """Lateral position of the guide over depth, or of the base where there is no guide."""
+    """Return the lateral position of the guide over depth, or of the base where there is no guide."""
     plan, guided = insertion.plan, scenario.setup.has_guide
     depth = curves.estimated_path(insertion)[:, X]
     lines: list[Line] = []
@@ -184,7 +184,7 @@ def _motion(scenario: Scenario, insertion: Insertion) -> DepthPanel:
 
 
 def _roll(insertion: Insertion) -> DepthPanel:
-    """Angle of the needle over depth."""
+    """Return the angle of the needle over depth."""
     planned, applied = curves.planned_angles(insertion.plan), curves.applied_angles(insertion)
     lines = [
         Line("planned", planned[:, 0], np.degrees(planned[:, 1]), PLAN, "--"),
@@ -219,7 +219,7 @@ def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) ->
 
 
 def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
-    """Magnify the end: around the target, or around the tip where that is far from the target."""
+    """Magnify the end: around the target, or around the tip where it is far from the target."""
     tip: Any = tuple(map(float, _known_path(insertion)[-1]))
     target = insertion.target
     distance = dist(tip, target)
@@ -246,13 +246,13 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
 
 
 def _known_path(insertion: Insertion) -> Floats:
-    """The true path of the tip, or where it is unknown the estimated one."""
+    """Return the true path of the tip or, where it is unknown, the estimated path."""
     truth = curves.true_path(insertion)
     return truth if len(truth) else curves.estimated_path(insertion)
 
 
 def _facts(scenario: Scenario, insertion: Insertion) -> list[str]:
-    """Errors, bevel flips or rolls, controller and phantom, as far as they are known."""
+    """Return errors, bevel flips or rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
     flips = f"{scenario.setup.turns}: {insertion.flips} (planned {insertion.plan.flips})"

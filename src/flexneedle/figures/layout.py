@@ -1,4 +1,4 @@
-"""What figures share: titles and legends, one look for each controller, panels side by side, axes over decades."""
+"""Parts that figures share: titles, legends, a style for each controller, panels side by side, axes over decades."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Panel(Generic[Content]):
-    """What one panel of a figure shows. Above it are title and note, at the right what must not be overlooked."""
+    """Content of one panel of a figure. Title and note are above it, the alarm at the right."""
 
     title: str
     note: str
@@ -61,18 +61,18 @@ class Panel(Generic[Content]):
 
 
 def look(number: int) -> Look:
-    """Return the look of controller `number`; colours come again after seven, markers after eleven more."""
+    """Return colour and marker of controller `number`; colours repeat after seven, markers after eleven more."""
     again = number // len(_COLORS)
     return Look(_COLORS[number % len(_COLORS)], _MARKERS[(number + again) % len(_MARKERS)])
 
 
 def columns_of(count: int) -> int:
-    """Return in how many columns `count` panels are laid out."""
+    """Return the number of columns for `count` panels."""
     return {1: 1, 2: 2, 4: 2}.get(count, 3)
 
 
 def ticks_of(count: int) -> int:
-    """Return how many ticks there is room for along each of `count` panels."""
+    """Return the number of ticks that fit along each of `count` panels."""
     return {1: 9, 2: 7}.get(columns_of(count), 5)
 
 
@@ -161,7 +161,7 @@ _MARKS: dict[str | None, HandlerBase] = {UPRIGHT: _Upright(), ARROW: _Arrow()}
 
 
 def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
-    """Name at the foot of the figure all that is drawn in some of its axes, each label once."""
+    """Name at the foot of the figure all artists of some of its axes, each label once."""
     named: dict[str, Artist] = {}
     for ax in shown:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -170,7 +170,7 @@ def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
 
 
 def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = ()) -> None:
-    """Name the marks at the foot of the figure: of `handles` those whose label an artist has."""
+    """Name marks at the foot of the figure: the given ones, and `handles` whose label an artist has."""
     drawn = {artist.get_label() for ax in figure.axes for artist in ax.get_children()}
     shown = [*named, *(handle for handle in handles if handle.get_label() in drawn)]
     rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / _ROW)
@@ -224,7 +224,7 @@ def _ticks(low: float, high: float, most: int) -> list[float]:
 
 
 def scattered(count: int, alpha: float = 0.75) -> dict[str, Any]:
-    """Return how dots are drawn so that `count` of them can be distinguished."""
+    """Return the style of dots with which `count` of them can be distinguished."""
     if count > MANY:
         return {"s": 2.0, "alpha": 0.25, "linewidths": 0.0, "rasterized": True}
     return {"s": 9.0 if count <= 300 else 5.0, "alpha": alpha if count <= 300 else 0.55, "linewidths": 0.0}

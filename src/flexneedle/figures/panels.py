@@ -100,7 +100,7 @@ def _is_visible(line: Line, width: float) -> bool:
 
 
 def _why_empty(lines: Sequence[Line]) -> str:
-    """Reason why a panel shows no line: the tip hardly moved, or there is no data."""
+    """Return the reason why a panel shows no line: the tip hardly moved, or there is no data."""
     unknown = [line.name for line in lines if not len(line.x)]
     still = ["the tip hardly moved"] if len(unknown) < len(lines) else []
     return "; ".join(still + ([f"no data: {', '.join(unknown)}"] if unknown else []))

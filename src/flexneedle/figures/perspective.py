@@ -84,7 +84,7 @@ def perspective_figure(scenario: Scenario, insertion: Insertion) -> Figure:
 
 
 def _box(scenario: Scenario, insertion: Insertion) -> tuple[Floats, Floats]:
-    """Corners (3,) of the box that is drawn: as wide as it is high."""
+    """Return corners (3,) of the box that is drawn: as wide as it is high."""
     paths = [insertion.plan.tips, curves.true_path(insertion), curves.estimated_path(insertion)]
     points = np.concatenate([*(path[:, :3] for path in paths), [insertion.target]])
     guide = np.array([[0.0, *period.guide] for period in insertion.periods])
@@ -97,7 +97,7 @@ def _box(scenario: Scenario, insertion: Insertion) -> tuple[Floats, Floats]:
 
 
 def _turned(points: Any) -> Floats:
-    """Columns of points (…, 3) as Matplotlib draws them (3, …): z towards the viewer, y upwards."""
+    """Return columns of points (…, 3) as Matplotlib draws them (3, …): z towards the viewer, y upwards."""
     x, y, z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
     return np.stack([x, -z, y])
 
@@ -169,7 +169,7 @@ def _name_depths(ax: Any, low: Floats, high: Floats) -> None:
 
 
 def _name_axes(ax: Any, low: Floats, high: Floats) -> None:
-    """Show the directions of y and z at the front of the floor, by arrows as long as those of the bevel."""
+    """Show the directions of y and z at the front of the floor, by arrows as long as the arrows of the bevel."""
     corner = np.array([low[X], low[Y], high[Z]])
     _, up, out = _ARROW * np.eye(3)
     top, behind = corner + up, corner - out
@@ -289,7 +289,7 @@ def _draw_target(ax: Any, insertion: Insertion) -> None:
 
 
 def _marks(insertion: Insertion) -> list[Artist]:
-    """The marks of the legend."""
+    """Return the marks of the legend."""
     marks: list[Artist] = [
         Patch(color=NEEDLE, label="estimated needle"),
         Line2D([], [], color=PLAN, linestyle="--", linewidth=1.2, label="planned path"),

@@ -1,4 +1,4 @@
-"""The figure of plans: each to scale, below them guide, energy and cost (as in the paper's Fig. 2)."""
+"""The figure of plans: each to scale, with guide, energy and cost below (as in the paper's Fig. 2)."""
 
 from collections.abc import Sequence
 from math import cos, degrees, isnan, sin
@@ -49,7 +49,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
 
 
 def _panels(scenario: Scenario, plans: Sequence[Plan]) -> dict[str, DepthPanel]:
-    """Panels over depth by name, from above."""
+    """Return panels over depth by name, from above."""
     roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
     return {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}
 
@@ -106,7 +106,7 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
 
 
 def _result(scenario: Scenario, plan: Plan) -> str:
-    """The plan in a line: result, cost, and angles of the tip at the skin, if they are known."""
+    """Return the plan in a line: result, cost, and angles of the tip at the skin, if they are known."""
     angles = [
         f"{signed(round(degrees(angle), 1) + 0.0, '+.1f')}°"
         for angle in plan.entry_angles[: scenario.setup.axes]
@@ -131,7 +131,7 @@ def _draw_entry(ax: Axes, plan: Plan, view: View) -> None:
 
 
 def _motion(scenario: Scenario, plans: Sequence[Plan]) -> DepthPanel:
-    """Lateral position of the guide over depth, or of the base where there is no guide."""
+    """Return the lateral position of the guide over depth, or of the base where there is no guide."""
     guided = scenario.setup.has_guide
     title = "Guide, lateral (mm)" if guided else "Base, lateral (mm)"
     lines = [
@@ -145,7 +145,7 @@ def _motion(scenario: Scenario, plans: Sequence[Plan]) -> DepthPanel:
 
 
 def _roll(plans: Sequence[Plan]) -> DepthPanel:
-    """Angle of the needle over depth."""
+    """Return the angle of the needle over depth."""
     angles = [curves.planned_angles(plan) for plan in plans]
     lines = [
         Line(plan.strategy, depth, np.degrees(angle), color)

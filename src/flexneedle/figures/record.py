@@ -1,4 +1,4 @@
-"""The figure of a plan or an insertion, whichever it is given."""
+"""The figure of a plan or an insertion."""
 
 from matplotlib.figure import Figure
 
@@ -8,9 +8,12 @@ from flexneedle.types import Insertion, Plan, scenario_of
 
 
 def plot(record: Plan | Insertion) -> Figure:
-    """Return the figure of a plan or of an insertion, as `flexneedle view` draws it; without a period it is the plan's.
+    """Return the figure of a plan or of an insertion, as `flexneedle view` draws it.
 
-    Raises InputError for anything else, and for a record that does not carry its scenario.
+    An insertion without a period is drawn as its plan.
+
+    Raises:
+        InputError: Another object, or a record without a scenario.
     """
     scenario = scenario_of(record)
     if isinstance(record, Insertion) and record.periods:

@@ -1,6 +1,4 @@
-"""What figures of a needle in space add to the scene: directions of the bevel, the predicted shape, the view along
-the axis.
-"""
+"""Figures of a needle in space: directions of the bevel, the predicted shape, the view along the axis."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -59,12 +57,12 @@ def draw_start(ax: Axes, plan: Plan, view: View, length: float) -> None:
 
 
 def prediction_label(period: Period) -> str:
-    """Return the name of the shape that was predicted in a period."""
+    """Return the name of a period's predicted shape."""
     return f"final shape ± {SDS:g} sd, predicted at {signed(period.estimate.x, '.0f')} mm"
 
 
 def draw_prediction(ax: Axes, predicted: Shape, view: View, label: str) -> None:
-    """Draw the band about a predicted shape, seen from the side."""
+    """Draw the band about a predicted shape, in the view from the side."""
     x, y = predicted.nodes[:, view].T
     half = SDS * predicted.sd[:, view[1] - Y]
     ax.fill_between(x, y - half, y + half, color=ESTIMATE, alpha=0.2, linewidth=0.0, zorder=2.2, label=label)
@@ -114,7 +112,7 @@ def _draw_depths(ax: Axes, path: Floats) -> None:
 
 
 def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
-    """Draw the guide's path y, z (k, 2) along the axis, and the guide at its end, named on the side off the target."""
+    """Draw the guide's path y, z (k, 2) along the axis, and the guide at its end, named away from the target."""
     y, z = travel.T
     ax.plot(z, y, color=GUIDE, linewidth=1.0, zorder=3)
     ring = Annulus((z[-1], y[-1]), _RING, 0.25, facecolor=GUIDE, alpha=0.6, edgecolor="none", zorder=2)

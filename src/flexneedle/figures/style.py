@@ -66,7 +66,7 @@ _SETTINGS: Any = {
 
 
 def tone(color: str, axis: int) -> str:
-    """Return the colour of a line along y, or the lighter one along z."""
+    """Return the colour of a line along y, or its lighter variant for a line along z."""
     return _SECOND[color] if axis == Z else color
 
 
@@ -86,14 +86,14 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of this height (inches), which arranges its parts itself."""
+    """Return an empty figure of this height (inches), with automatic layout."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def settle(figure: Figure) -> None:
-    """Arrange the parts of a figure and keep them there, rounded: the solver's last digits differ between runs."""
+    """Arrange the parts of a figure and fix them, rounded: the solver's last digits differ between runs."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for part in figure.subfigs:

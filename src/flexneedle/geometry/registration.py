@@ -1,7 +1,7 @@
 """Rigid registration of a tracker's frame to the stage's from pairs of points, and its expected errors.
 
-The least-squares fit without scale is that of Kabsch (Acta Cryst. A32, 1976); the expected errors are those of
-Fitzpatrick, West and Maurer (IEEE Trans. Med. Imaging 17, 1998), for isotropic localisation errors.
+The least-squares fit without scale is by Kabsch (Acta Cryst. A32, 1976); the expected errors are by Fitzpatrick, West
+and Maurer (IEEE Trans. Med. Imaging 17, 1998), for isotropic localisation errors.
 """
 
 import math
@@ -34,16 +34,16 @@ class Rigid:
         return mapped
 
     def inverse(self) -> "Rigid":
-        """The inverse map."""
+        """Return the inverse map."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
 
     def after(self, first: "Rigid") -> "Rigid":
-        """The composition: `first`, then this map."""
+        """Return the composition: `first`, then this map."""
         return Rigid(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
 
 def identity() -> Rigid:
-    """The identity map."""
+    """Return the identity map."""
     return Rigid(np.eye(3), np.zeros(3))
 
 
@@ -137,7 +137,7 @@ def expected_error(registration: Registration, target: Point) -> float:
 
 
 def _off_axes(points: Floats, axes: Floats) -> Floats:
-    """Squared distances of points (n, 3) from the three axes (rows), shape (n, 3)."""
+    """Return the squared distances of points (n, 3) from the three axes (rows), shape (n, 3)."""
     along = (points @ axes.T) ** 2
     off: Floats = along.sum(axis=1, keepdims=True) - along
     return off

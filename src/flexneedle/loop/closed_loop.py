@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from flexneedle.arguments import check_instance
-from flexneedle.control.forecast import missed, warning
-from flexneedle.control.interface import Decision, at_depth
+from flexneedle.control.forecast import describe_miss, warn_of_miss
+from flexneedle.control.interface import Decision, is_at_depth
 from flexneedle.errors import CommandError, DriverError, RefusedError, StoppedError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
@@ -48,7 +48,7 @@ def run(steering: Steering, rig: Rig) -> Insertion:
         task.plan, choices.seed, tuple(periods), *ending, choices.name, scenario=task.scenario
     )
     if insertion.outcome is Outcome.DONE:
-        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, task.plan.target))
+        line = describe_miss(insertion.true_error_mm, math.dist(periods[-1].estimate.point, task.plan.target))
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
 
@@ -123,7 +123,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         state = _advance(decided, step, observation, steering, begun, now)
         ending = _ending(task, state)
         period = make_period(index, now, task.plan, rig, step, motion.control, observation, clocks)
-        yield replace(period, warning=warning(step.decision, state.in_a_row)), ending
+        yield replace(period, warning=warn_of_miss(step.decision, state.in_a_row)), ending
         if ending is not None:
             return
 
@@ -206,7 +206,7 @@ def _ending(task: Task, state: LoopState) -> _Ending | None:
     if not state.measured_at_rest:
         return _hold_ending(task.scenario, state)
     short = task.plan.target[0] - float(estimate.tip[X])
-    if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
+    if short > task.scenario.control.depth_tolerance_mm and is_at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
     return Outcome.DONE, ""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Estimate, after
+from flexneedle.estimation.estimate import Estimate, carry_out
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.state import State
@@ -58,7 +58,7 @@ class Guard:
         Beyond a limit, which a reading may reveal, a command may lead back but not further.
         """
         now = estimate.state
-        then = after(estimate.simulator, now, command)
+        then = carry_out(estimate.simulator, now, command)
         if not then.converged:
             return f"guard: the model does not converge: residual {then.residual:.3g} mm"
         both = zip(self._excesses(now), self._excesses(then), strict=True)

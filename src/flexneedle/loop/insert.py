@@ -6,7 +6,7 @@ from pathlib import Path
 
 from flexneedle.arguments import check_instance
 from flexneedle.control import tables
-from flexneedle.control.controllers import DEFAULT, used
+from flexneedle.control.controllers import DEFAULT, with_controller_defaults
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
 from flexneedle.errors import RunError
@@ -17,7 +17,7 @@ from flexneedle.loop.guard import Guard
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.step import Steering
 from flexneedle.loop.virtual import Seeds
-from flexneedle.planning.origin import check_origin, placed
+from flexneedle.planning.origin import check_origin, with_planned_entry
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
@@ -71,7 +71,9 @@ def insert(
         check_instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)"),
     )
     choices = Choices.of(seed, controller, rig, force=force, threads=threads)
-    return carry_out(placed(scenario, plan), plan, choices, Stream(tuple(listeners), gate or Gate()))
+    return carry_out(
+        with_planned_entry(scenario, plan), plan, choices, Stream(tuple(listeners), gate or Gate())
+    )
 
 
 def check_choices(scenario: Scenario, strategy: str, choices: Choices) -> None:
@@ -100,5 +102,7 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
             "to insert anyway: flexneedle insert --force (force=True)"
         )
-    task = tables.task(chosen, Simulator(used(scenario, chosen), choices.threads), plan)
+    task = tables.make_task(
+        chosen, Simulator(with_controller_defaults(scenario, chosen), choices.threads), plan
+    )
     return Steering(task, choices, Guard.of(task.scenario, plan), Seeds.controller(choices.seed), stream)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.control.ahead import along_plan
-from flexneedle.control.forecast import hopeless, likely_misses
+from flexneedle.control.ahead import predict_planned_shape
+from flexneedle.control.forecast import count_likely_misses, reason_to_hold
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import InputError
 from flexneedle.estimation.estimate import Estimate
@@ -101,7 +101,7 @@ class Steering:
             memory=memory,
             refused=state.refused.after(reason),
             moves=state.moves - bool(reason),
-            in_a_row=likely_misses(decision, state.in_a_row),
+            in_a_row=count_likely_misses(decision, state.in_a_row),
             predicted=decision.predicted,
         )
         resting = replace(decision, command=STILL)
@@ -114,7 +114,7 @@ class Steering:
 
     def _refusal(self, estimate: Estimate, decision: Decision) -> str:
         """Return the reason to refuse a decision, "" for none."""
-        reason = "" if self.choices.force else hopeless(decision, self.task.scenario.control)
+        reason = "" if self.choices.force else reason_to_hold(decision, self.task.scenario.control)
         if reason or decision.rest > 0.0:
             return reason
         return self.guard.refusal(estimate, decision.command)
@@ -135,5 +135,5 @@ def _with_predicted_shape(decision: Decision, task: Task, estimate: Estimate) ->
     return (
         decision
         if decision.predicted is not None
-        else replace(decision, predicted=along_plan(task, estimate))
+        else replace(decision, predicted=predict_planned_shape(task, estimate))
     )

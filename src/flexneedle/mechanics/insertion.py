@@ -12,13 +12,13 @@ from flexneedle.mechanics.law import stored_energy
 from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
 from flexneedle.mechanics.needle import (
     Boundary,
-    Channel,
     Cut,
+    CutChannel,
+    Equilibrium,
     Laterals,
-    Needle,
+    NeedleState,
+    NodePose,
     Plain,
-    Pose,
-    Solution,
     Work,
     from_plain,
     solve,
@@ -71,7 +71,7 @@ def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Bo
     base, like = boundary.base, boundary.guide
     bevel = boundary.bevel if roll == 0.0 else turned(roll, boundary.bevel)
     return Boundary(
-        Pose(
+        NodePose(
             base.x + share * command[DB_X],
             base.y + times(share, lateral(like, command[DB_Y], command[DB_Z])),
             base.slope + times(share, lateral(like, command[DB_THETA], command[DB_PSI])),
@@ -83,7 +83,9 @@ def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Bo
 
 
 @inner
-def settled(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Needle:
+def settled(
+    model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
+) -> NeedleState:
     """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
 
     Arrays in place, as in `needle.solve`. Out of the skin the channel is closed.
@@ -98,21 +100,23 @@ def settled(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, 
             rest[i] = w[i].fixed + times(w[i].share, y)
     fixed, slope = spring_rest(model, boundary.bevel, cut, path, x)
     front = max(cut.channel.front, x) if x > 0.0 else 0.0
-    return Needle(boundary, cut, Channel(front, fixed + times(1.0 - slope, y)), solution)
+    return NeedleState(boundary, cut, CutChannel(front, fixed + times(1.0 - slope, y)), solution)
 
 
 @kernel
-def _settle(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
+def _settle(model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
     return to_plain(settled(model, needle, rest, u, w, held))
 
 
-def settle(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Needle:
+def settle(
+    model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
+) -> NeedleState:
     """`settled`, for callers outside of kernels."""
     return from_plain(_settle(model, needle, rest, u, w, held))
 
 
 @inner
-def _end_of_part(model: Model, needle: Needle, advance: float, done: float) -> float:
+def _end_of_part(model: Model, needle: NeedleState, advance: float, done: float) -> float:
     """Share of a step at which its next part ends, `done` being the share so far.
 
     Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state
@@ -127,7 +131,9 @@ def _end_of_part(model: Model, needle: Needle, advance: float, done: float) -> f
 
 
 @inner
-def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, command: Floats) -> Needle:
+def _advanced(
+    model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, command: Floats
+) -> NeedleState:
     """The needle after one step, in its parts."""
     done, residual, converged, roll = 0.0, 0.0, True, command[ROLL]
     while done < 1.0:
@@ -137,7 +143,7 @@ def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work
         cut = Cut(needle.solution.tip, needle.channel, spin)
         needle = settled(
             model,
-            Needle(boundary, cut, needle.channel, needle.solution),
+            NeedleState(boundary, cut, needle.channel, needle.solution),
             rest,
             u,
             w,
@@ -146,8 +152,8 @@ def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work
         residual, converged = max(residual, needle.solution.residual), converged and needle.solution.converged
         roll, done = 0.0, end
     last = needle.solution
-    solution = Solution(last.tip, last.last, last.loads, last.iterations, residual, converged)
-    return Needle(needle.boundary, needle.cut, needle.channel, solution)
+    solution = Equilibrium(last.tip, last.last, last.loads, last.iterations, residual, converged)
+    return NeedleState(needle.boundary, needle.cut, needle.channel, solution)
 
 
 @inner
@@ -161,7 +167,7 @@ def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
 
 
 @inner
-def _strain_energy(model: Model, needle: Needle, u: Laterals) -> float:
+def _strain_energy(model: Model, needle: NeedleState, u: Laterals) -> float:
     """Tissue strain energy Σ w_c W (mJ) of the contacts (paper eq. 12)."""
     total = 0.0
     for i in range(needle.solution.last.behind):
@@ -171,7 +177,7 @@ def _strain_energy(model: Model, needle: Needle, u: Laterals) -> float:
 
 
 @kernel
-def energies(model: Model, needle: Needle, u: Laterals, stored: Floats) -> float:
+def energies(model: Model, needle: NeedleState, u: Laterals, stored: Floats) -> float:
     """Fill the energy (mJ) of each node behind the tip, (behind,), without its weight; return the tip spring's."""
     tip_x = needle.solution.tip.x
     for i in range(stored.size):
@@ -180,7 +186,7 @@ def energies(model: Model, needle: Needle, u: Laterals, stored: Floats) -> float
 
 
 @inner
-def _mean_square_deflection(model: Model, needle: Needle, w: Work, axis: Laterals) -> float:
+def _mean_square_deflection(model: Model, needle: NeedleState, w: Work, axis: Laterals) -> float:
     """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam).
 
     axis: y at x = 0 and slope of the line from which y counts.
@@ -205,7 +211,7 @@ def _mean_square_deflection(model: Model, needle: Needle, w: Work, axis: Lateral
 
 @inner
 def _shape(
-    model: Model, needle: Needle, w: Work, x: Floats, y: Laterals, slope: Laterals, out: Floats
+    model: Model, needle: NeedleState, w: Work, x: Floats, y: Laterals, slope: Laterals, out: Floats
 ) -> None:
     """Fill poses (n, 5) along the needle, after a solve; x, y, slope (k + 2,) are scratch."""
     base, tip, count = needle.boundary.base, needle.solution.tip, needle.solution.last.behind
@@ -219,7 +225,7 @@ def _shape(
 @kernel
 def _rollout(
     model: Model,
-    start: Needle,
+    start: NeedleState,
     rest0: Laterals,
     u0: Laterals,
     rest: Laterals,
@@ -255,7 +261,7 @@ def _rollout(
 
 def rollout(
     model: Model,
-    start: Needle,
+    start: NeedleState,
     rest0: Laterals,
     u0: Laterals,
     rest: Laterals,
@@ -266,7 +272,7 @@ def rollout(
     first: int,
     last: int,
     out: Outputs,
-) -> Needle:
+) -> NeedleState:
     """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1).
 
     axes (N, 2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.

@@ -140,7 +140,7 @@ class Adaptation(NamedTuple):
     clearance: float = 0.0
 
 
-def adapted(model: Model, adaptation: Adaptation) -> Model:
+def adapt(model: Model, adaptation: Adaptation) -> Model:
     """The model with other constants, its contact points where they were.
 
     A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.

@@ -48,7 +48,7 @@ BEARING_LOOKS = 15  # at the needle in its guide, in an iteration without coupli
 MAX_ITERATIONS = 100
 
 
-class Pose(NamedTuple):
+class NodePose(NamedTuple):
     """Position x along the axis and y across it (mm), and slope dy/dx."""
 
     x: float
@@ -62,13 +62,13 @@ class Boundary(NamedTuple):
     The bevel is ±1 in the plane and a unit number in space.
     """
 
-    base: Pose
+    base: NodePose
     guide: Lateral
     bevel: Lateral
     load: Lateral
 
 
-class Channel(NamedTuple):
+class CutChannel(NamedTuple):
     """The end of the cut: its deepest point `front` and the rest position of the tip spring (mm)."""
 
     front: float
@@ -78,8 +78,8 @@ class Channel(NamedTuple):
 class Cut(NamedTuple):
     """Where the running step began to cut: tip, channel, and by how much the bevel turns in the step (rad)."""
 
-    tip: Pose
-    channel: Channel
+    tip: NodePose
+    channel: CutChannel
     spin: float
 
 
@@ -116,10 +116,10 @@ class Loads(NamedTuple):
     moment: Lateral
 
 
-class Solution(NamedTuple):
+class Equilibrium(NamedTuple):
     """Equilibrium, and how it was found; residual: estimated distance from it (mm)."""
 
-    tip: Pose
+    tip: NodePose
     last: Iterate
     loads: Loads
     iterations: int
@@ -127,17 +127,17 @@ class Solution(NamedTuple):
     converged: bool
 
 
-class Needle(NamedTuple):
+class NeedleState(NamedTuple):
     """State of a needle besides the rest positions and compressions of its contacts; the input of the next step."""
 
     boundary: Boundary
     cut: Cut
-    channel: Channel
-    solution: Solution
+    channel: CutChannel
+    solution: Equilibrium
 
 
 @inner
-def to_plain(needle: Needle) -> Plain:
+def to_plain(needle: NeedleState) -> Plain:
     """A needle as tuples without names; `from_plain` makes it again.
 
     Kernels return these. Compiled code that makes a named tuple for Python calls Python: if a signal's handler raises
@@ -160,23 +160,25 @@ def to_plain(needle: Needle) -> Plain:
     )
 
 
-def from_plain(plain: Plain) -> Needle:
+def from_plain(plain: Plain) -> NeedleState:
     """The needle of `to_plain`."""
     base, imposed, begun, cut, channel, tip, last, guide, loads, found = plain
     (front, rest, spin), (spring, shortening, behind) = cut, last
-    return Needle(
-        Boundary(Pose(*base), *imposed),
-        Cut(Pose(*begun), Channel(front, rest), spin),
-        Channel(*channel),
-        Solution(Pose(*tip), Iterate(spring, shortening, Bearing(*guide), behind), Loads(*loads), *found),
+    return NeedleState(
+        Boundary(NodePose(*base), *imposed),
+        Cut(NodePose(*begun), CutChannel(front, rest), spin),
+        CutChannel(*channel),
+        Equilibrium(
+            NodePose(*tip), Iterate(spring, shortening, Bearing(*guide), behind), Loads(*loads), *found
+        ),
     )
 
 
-def start(base: Pose, tip: Pose, bevel: Lateral, guide: Lateral) -> Needle:
+def start(base: NodePose, tip: NodePose, bevel: Lateral, guide: Lateral) -> NeedleState:
     """The straight needle in air, before a solve, with the guide on it."""
     none = 0.0 * bevel
-    channel = Channel(0.0, none)
-    solution = Solution(
+    channel = CutChannel(0.0, none)
+    solution = Equilibrium(
         tip,
         Iterate(none, 0.0, Bearing(none, 0.0, none, none), 0),
         Loads(none, none, none, none),
@@ -184,7 +186,7 @@ def start(base: Pose, tip: Pose, bevel: Lateral, guide: Lateral) -> Needle:
         0.0,
         True,
     )
-    return Needle(Boundary(base, guide, bevel, none), Cut(tip, channel, 0.0), channel, solution)
+    return NeedleState(Boundary(base, guide, bevel, none), Cut(tip, channel, 0.0), channel, solution)
 
 
 class Path(NamedTuple):
@@ -614,7 +616,7 @@ def _iterate(
     w: Work,
     held: Lateral,
     radial_weight: float,
-) -> tuple[Pose, Iterate, Loads, int, float, bool]:
+) -> tuple[NodePose, Iterate, Loads, int, float, bool]:
     """One iteration, in place; returns tip, where the next begins, loads, first node being cut, what is left (mm), and
     whether the needle bears on its guide as it began.
 
@@ -649,7 +651,7 @@ def _iterate(
             u[i] = w[i].new_u if fraction == 1.0 else u[i] + times(fraction, w[i].new_u - u[i])
     spring = tip.spring if fraction == 1.0 else at.spring + times(fraction, tip.spring - at.spring)
     return (
-        Pose(tip_x, tip.y, tip.slope),
+        NodePose(tip_x, tip.y, tip.slope),
         Iterate(spring, shortening, guide, count),
         Loads(tip.force, tip.reaction, shear, moment),
         fresh,
@@ -668,7 +670,7 @@ def solve(
     u: Laterals,
     w: Work,
     held: Lateral,
-) -> tuple[Solution, Path, int]:
+) -> tuple[Equilibrium, Path, int]:
     """Find the equilibrium; a `held` tip (mm, NaN if free) is an essential condition.
 
     The shortening and the end of the path being cut are found with it. Where that does not converge, both are
@@ -707,10 +709,10 @@ def solve(
             guide = at.guide
         at = Iterate(new.spring, shortening, guide, new.behind)
     on = times(slide, tip.slope) if math.isnan(held.real) else times(0.0, tip.slope)
-    tip = Pose(tip.x + slide, tip.y + on, tip.slope)
+    tip = NodePose(tip.x + slide, tip.y + on, tip.slope)
     finite = math.isfinite(size(tip.y)) and math.isfinite(tip.x)
     return (
-        Solution(tip, at, loads, iteration, max(left, abs(slide)), finite and found and agrees),
+        Equilibrium(tip, at, loads, iteration, max(left, abs(slide)), finite and found and agrees),
         path,
         fresh,
     )

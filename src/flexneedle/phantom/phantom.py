@@ -9,7 +9,7 @@ import numpy as np
 
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
-from flexneedle.simulator.control import MOVES, Limits, half_turned
+from flexneedle.simulator.control import MOVES, Limits, limit_half_turn
 from flexneedle.simulator.pace import roll_time
 from flexneedle.types import (
     COLUMNS,
@@ -90,7 +90,7 @@ class Phantom:
         self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)
         if self._limits.half_turns:
-            row[ROLL] = half_turned(self._rolled, row[ROLL])
+            row[ROLL] = limit_half_turn(self._rolled, row[ROLL])
         begun, turned = self._time, self._roll(float(row[ROLL]))
         parts = max(1, math.ceil(abs(row[DB_X]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):

@@ -15,7 +15,7 @@ from flexneedle.phantom.space import roll_about_x, tilt_of, turn, vector
 from flexneedle.plugins import find_part, function_rule, missing_parts, parts_of
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
-from flexneedle.simulator.control import along_entry
+from flexneedle.simulator.control import drive_along_entry
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL, Control, Floats, Z
 
@@ -143,7 +143,7 @@ class ExactPlant:
 
     def step(self, row: Floats) -> None:
         """Move the needle and cut the tissue."""
-        driven = along_entry(self.scenario, row)
+        driven = drive_along_entry(self.scenario, row)
         self.count = step(self.rod, self.state, self.segments, self.channel, self.count, driven)
         self._converged &= bool(self.state["converged"] > 0.0)
 

@@ -1,1 +1,1 @@
-"""The cross-entropy method, the terms of a cost, and insertion plans found with both."""
+"""Insertion plans, found with the cross-entropy method."""

@@ -22,7 +22,7 @@ _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the i
 
 
 def elite_count(samples: int, fraction: float) -> int:
-    """Number of elite samples of N: ⌈ρN⌉ (paper section III), at least two, for a covariance."""
+    """Return the number of elite samples of N: ⌈ρN⌉ (paper section III), at least two, for a covariance."""
     return max(2, ceil(samples * fraction - 1e-9))  # the slack is for rounding of the product
 
 
@@ -72,12 +72,12 @@ class SearchState:
         return len(self.history)
 
     def done(self, settings: Settings) -> bool:
-        """Whether the search has ended."""
+        """Return whether the search has ended."""
         return self.converged or self.iterations >= settings.iterations
 
 
 def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> SearchState:
-    """Initial Gaussian with standard deviations `sigma` (d,) and a `correlation` (d, d) (default: none)."""
+    """Return the initial Gaussian with standard deviations `sigma` (d,) and a `correlation` (d, d) (default: none)."""
     mean, sigma = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     correlation = np.eye(mean.size) if correlation is None else correlation
     return SearchState(mean, correlation * np.outer(sigma, sigma), sigma, mean)
@@ -105,7 +105,7 @@ def update(search_state: SearchState, settings: Settings, samples: Floats, costs
     order = np.argsort(costs, kind="stable")
     elite = order[: settings.elite][np.isfinite(costs[order[: settings.elite]])]
     if elite.size == 0:
-        return _with(
+        return _append(
             search_state, search_state.mean, search_state.covariance, samples[order[0]], costs, settings
         )
     keep = settings.smoothing
@@ -113,7 +113,7 @@ def update(search_state: SearchState, settings: Settings, samples: Floats, costs
     centred = samples[elite] - samples[elite].mean(axis=0)
     covariance = (1.0 - keep) * centred.T @ centred / elite.size + keep * search_state.covariance
     covariance += np.diag((_FLOOR * search_state.initial_sigma) ** 2)
-    return _with(search_state, mean, covariance, samples[order[0]], costs, settings)
+    return _append(search_state, mean, covariance, samples[order[0]], costs, settings)
 
 
 def minimize(
@@ -124,7 +124,10 @@ def minimize(
     progress: Callable[[dict[str, Any]], None] | None = None,
     first: Floats | None = None,
 ) -> SearchState:
-    """Sample and update until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): those of iteration 1."""
+    """Sample and update until done.
+
+    cost: maps samples (N, d) to costs (N,); first (n, d): samples of the first iteration (default: drawn).
+    """
     while not search_state.done(settings):
         samples = (
             sample(search_state, settings, rng) if first is None or search_state.iterations > 0 else first
@@ -138,13 +141,13 @@ def minimize(
 
 
 def _elite_spread(entry: dict[str, Any]) -> float:
-    """Spread of an iteration's elite costs; infinite where one of them failed."""
+    """Return the spread of an iteration's elite costs; infinite where one of them failed."""
     least, worst, _, _ = entry["cost_quantiles"]
     return float(worst - least) if np.isfinite(worst) else np.inf
 
 
-def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
-    """Whether the spread of the elite's costs is within tolerance, or the best cost fell by less in ten iterations."""
+def _has_converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
+    """Return whether the elite's costs are within tolerance, or the best cost fell by less in ten iterations."""
     spreads = [_elite_spread(entry) for entry in history]
     little = settings.tolerance * next((spread for spread in spreads if np.isfinite(spread)), np.inf)
     if not np.isfinite(little):
@@ -156,7 +159,7 @@ def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
     return bool(history[-1 - _PATIENCE]["best"] - history[-1]["best"] <= little)
 
 
-def _with(
+def _append(
     search_state: SearchState,
     mean: Floats,
     covariance: Floats,
@@ -177,5 +180,11 @@ def _with(
     }
     best, history = winner if better else search_state.best, (*search_state.history, entry)
     return SearchState(
-        mean, covariance, search_state.initial_sigma, best, best_cost, _converged(history, settings), history
+        mean,
+        covariance,
+        search_state.initial_sigma,
+        best,
+        best_cost,
+        _has_converged(history, settings),
+        history,
     )

@@ -1,9 +1,9 @@
-"""The search behind every plan and every predictive controller: the best of the sequences that some variables describe.
+"""Search behind every plan and every predictive controller: the best of the sequences that some variables describe.
 
-    found = best(variables, rollout, terms, search, rng)
+    found = find_best(variables, rollout, terms, search, rng)
 
-Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` maps them to
-controls, `rollout` simulates these, and the terms are evaluated on the trajectories.
+Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` maps them to controls,
+`rollout` simulates these, and the terms are evaluated on the trajectories.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexneedle.costs.table import RolloutFunction, Term, Trajectories, charges, cost
+from flexneedle.costs.table import RolloutFunction, Term, Trajectories, evaluate_cost, evaluate_terms
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.types import Floats
 
@@ -44,8 +44,15 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The best sample z (d,), its cost, the cost's weighted terms by name, its rollout (N = 1), the search, and the
-    samples of its last iteration.
+    """Result of a search.
+
+    Attributes:
+        z: The best sample (d,).
+        cost: Its cost.
+        terms: The cost's weighted terms by name.
+        trajectories: Its rollout (N = 1).
+        search_state: State of the search.
+        samples: Samples of the last iteration.
     """
 
     z: Floats
@@ -56,7 +63,7 @@ class Found:
     samples: Samples
 
 
-def best(
+def find_best(
     variables: Variables,
     rollout: RolloutFunction,
     terms: Sequence[Term],
@@ -68,9 +75,16 @@ def best(
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
-    first (n, d): samples of the first iteration in place of the Gaussian's, at least as many as the elite. The best
-    sample is kept: the result is never worse than an incumbent among them. progress: called after each iteration with a
-    dict: the entry of its history, `iteration`, `iterations`, and its `Samples` as `samples`.
+    Args:
+        variables: Variables of the search.
+        rollout: Simulates controls.
+        terms: Terms of the cost.
+        search: Numbers of samples and iterations.
+        rng: Random numbers.
+        first: Samples (n, d) of the first iteration in place of the Gaussian's, at least as many as the elite. The best
+            sample is kept: the result is never worse than an incumbent among them.
+        progress: Called after each iteration with a dict: the entry of its history, `iteration`, `iterations`, and its
+            `Samples` as `samples`.
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
     search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
@@ -79,7 +93,7 @@ def best(
 
     def evaluate(z: Floats) -> Floats:
         drawn = rollout(variables.controls(z))
-        latest[:] = [Samples(drawn.tips, cost(terms, drawn))]
+        latest[:] = [Samples(drawn.tips, evaluate_cost(terms, drawn))]
         return latest[0].costs
 
     def show(info: dict[str, Any]) -> None:
@@ -90,12 +104,14 @@ def best(
     opening = np.clip(opening, settings.lower, settings.upper)
     search_state = ce.minimize(evaluate, search_state, settings, rng, show, opening)
     trajectories = rollout(variables.controls(search_state.best[None]))
-    charged = {name: float(value[0]) for name, value in charges(terms, trajectories).items()}
+    charged = {name: float(value[0]) for name, value in evaluate_terms(terms, trajectories).items()}
     return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state, latest[0])
 
 
-def counted(progress: OnIteration | None, before: int, usual: int, least: float) -> OnIteration | None:
-    """`progress` of a search after `before` iterations of others, which found a cost of `least`.
+def count_iterations(
+    progress: OnIteration | None, before: int, usual: int, least: float
+) -> OnIteration | None:
+    """Return `progress` of a search after `before` iterations of others, which found a cost of `least`.
 
     usual: number of iterations of all searches together.
     """

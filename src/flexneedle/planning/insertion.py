@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexneedle.costs.table import RolloutFunction, Term
 from flexneedle.costs.terms import PLAN
 from flexneedle.planning.cross_entropy import Search, SearchState
-from flexneedle.planning.horizon import Found, Variables, best
+from flexneedle.planning.horizon import Found, Variables, find_best
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import (
     COLUMNS,
@@ -31,13 +31,13 @@ from flexneedle.types import (
     Floats,
     Laterals,
     Point,
-    wrapped,
+    wrap_angles,
 )
 
 ADVANCE, LATERAL = range(2)
-"""Coordinates of a primitive: the longest step, then those of `MOVES`, of ε on each axis, and of the share."""
+"""Coordinates of a primitive: the longest step, then `MOVES`, ε on each axis, and the share."""
 MOVES = {1: (DB_Y, DB_THETA, DG_Y), 2: (DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z)}
-"""Columns of a control that lateral coordinates are, by the number of axes."""
+"""Columns of a control of the lateral coordinates, by the number of axes."""
 _LEAST_ADVANCE = 0.5  # of the longest step
 _BEVEL_BOUND = 3.0  # ε has standard deviation 1 at first
 _ENTRY_SIGMA = 0.25  # of the bounds
@@ -113,8 +113,7 @@ class PlanProblem:
 
     @property
     def direction(self) -> complex:
-        """Direction in which the bevel alone steers: from the needle's axis to the target, or y where it rolls by half
-        turns.
+        """Direction in which the bevel alone steers: from the needle's axis to the target; y with half turns.
 
         Where a limit keeps a free entry from moving straight to the target: from the nearest axis that is free.
         """
@@ -146,8 +145,15 @@ class PlanProblem:
 
 @dataclass(frozen=True)
 class Solution:
-    """The best controls (m, 9), entry as changes of y + iz (mm) and slope, roll at the start (rad), its cost by term,
-    and the search behind it.
+    """The best controls of a plan, and the search behind them.
+
+    Attributes:
+        controls: Controls (m, 9).
+        entry: Entry as changes of y + iz (mm) and slope.
+        roll: Roll at the start (rad).
+        cost: Cost.
+        terms: Cost by term.
+        search_state: State of the search.
     """
 
     controls: Floats
@@ -158,7 +164,7 @@ class Solution:
     search_state: SearchState
 
 
-def optimise(
+def search_primitives(
     rollout: RolloutFunction,
     problem: PlanProblem,
     search: Search,
@@ -167,16 +173,17 @@ def optimise(
 ) -> Solution:
     """Search the primitives.
 
-    `rollout` starts without roll in air; a sample that wants another direction rolls in its first step, which is not
-    charged.
+    `rollout` starts without roll in air; a sample with another direction rolls in its first step, which is not charged.
     """
-    found = best(_variables(problem), rollout, problem.terms, search, rng, progress=progress)
-    return solution(problem, found)
+    found = find_best(_variables(problem), rollout, problem.terms, search, rng, progress=progress)
+    return make_solution(problem, found)
 
 
-def widened(problem: PlanProblem) -> PlanProblem:
-    """The problem with wider first samples: the standard deviation of each lateral step along the frame is at least the
-    largest step, and that across it is in the same ratio to it. What is not free stays so.
+def widen_search(problem: PlanProblem) -> PlanProblem:
+    """Return the problem with wider first samples.
+
+    The standard deviation of each lateral step along the frame is at least the largest step; across it, the ratio is
+    the same. Fixed coordinates remain fixed.
     """
     lateral, sigma = slice(LATERAL, problem.bevel.start), problem.sigma.copy()
     along = sigma[lateral][:: problem.axes]
@@ -186,10 +193,10 @@ def widened(problem: PlanProblem) -> PlanProblem:
     return replace(problem, sigma=sigma)
 
 
-def solution(problem: PlanProblem, found: Found) -> Solution:
-    """The solution: without steps that do not advance, rolled before the first."""
+def make_solution(problem: PlanProblem, found: Found) -> Solution:
+    """Return the solution: without steps that do not advance, rolled before the first."""
     controls = found.trajectories.controls[0]
-    entry = entry_of(problem, found.z[None, found.z.size - problem.entry_coordinates :])
+    entry = read_entry(problem, found.z[None, found.z.size - problem.entry_coordinates :])
     facing = np.cumsum(controls[:, ROLL])
     moving = controls[:, DB_X] > 0.0
     controls, facing = controls[moving], facing[moving]
@@ -206,27 +213,27 @@ def _variables(problem: PlanProblem) -> Variables:
         lower=np.append(np.tile([_LEAST_ADVANCE * problem.step[0], *np.negative(most)], n), -entry),
         upper=np.append(np.tile([problem.step[0], *most], n), entry),
         mean=np.append(np.tile([problem.step[0], *np.zeros(len(most))], n), 0.0 * entry),
-        sigma=np.append(np.tile(problem.sigma, n), _ENTRY_SIGMA * entry * _aside(problem)),
-        controls=lambda z: schedule(problem, z)[0],
+        sigma=np.append(np.tile(problem.sigma, n), _ENTRY_SIGMA * entry * _entry_ratios(problem)),
+        controls=lambda z: make_controls(problem, z)[0],
         correlation=_correlation(problem),
     )
 
 
-def _aside(problem: PlanProblem) -> Floats:
-    """Standard deviations of the coordinates of the entry, relative to those along the frame: as those of ε."""
+def _entry_ratios(problem: PlanProblem) -> Floats:
+    """Return the standard deviations of the coordinates of the entry, relative to those along the frame, as for ε."""
     return np.tile(problem.sigma[problem.bevel], 2)[: problem.entry_coordinates]
 
 
 def entry_bounds(problem: PlanProblem) -> Floats:
-    """Bounds to either side of the coordinates of the entry: those of the point, then those of the slope."""
+    """Return the bounds to either side of the coordinates of the entry: of the point, then of the slope."""
     return np.repeat(problem.entry, problem.axes)[: problem.entry_coordinates]
 
 
-def entry_of(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
-    """Changes (N,) of point (mm) and slope (rad) of the entry, for its coordinates (N, 2 axes) or none (N, 0).
+def read_entry(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
+    """Return changes (N,) of point (mm) and slope (rad) of the entry, for its coordinates (N, 2 axes) or none (N, 0).
 
-    The slope stays within its limit, and the target within the lateral travel: an entry that is too far from it is
-    moved towards `home` as far as necessary.
+    The slope keeps its limit, and the target the lateral travel: an entry that is too far from it is moved towards
+    `home` as far as necessary.
     """
     if not z.size:
         none = np.zeros(len(z), dtype=complex)
@@ -268,14 +275,14 @@ def _add_along(rows: Floats, slope: Laterals) -> None:
     rows[:, :, DB_Z] += slope.imag[:, None] * rows[:, :, DB_X]
 
 
-def mounted(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
-    """Controls (N, m, 9) after one more that moves base and guide to the entry (N, 2 axes), and rolls, in air.
+def mount_needle(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
+    """Return controls (N, m, 9) after one more that moves base and guide to the entry (N, 2 axes), and rolls, in air.
 
     The advance is along the axis of the entry.
     """
     if not z.size:
         return rows
-    point, slope = entry_of(problem, z)
+    point, slope = read_entry(problem, z)
     base, guide = (point + slope * x for x in problem.mounts)
     first = np.zeros_like(rows[:, :1])
     for column, value in ((DB_Y, base), (DB_THETA, slope), (DG_Y, guide)):
@@ -288,7 +295,7 @@ def mounted(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
 
 
 def _correlation(problem: PlanProblem) -> Floats:
-    """Correlation of the coordinates at first: only that of ε between primitives."""
+    """Return the initial correlation of the coordinates: only ε is correlated, between primitives."""
     correlation = np.eye(problem.primitives * problem.coordinates + problem.entry_coordinates)
     index = np.arange(problem.primitives)
     apart = np.abs(index[:, None] - index)
@@ -298,9 +305,8 @@ def _correlation(problem: PlanProblem) -> Floats:
     return correlation
 
 
-def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
-    """Primitives and entry z (N, c P + e) to controls (N, m, 9), padded with zero steps, and bevel directions (N, P),
-    rad.
+def make_controls(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
+    """Return controls (N, m, 9), padded with zero steps, and bevel directions (N, P), rad, of samples z (N, c P + e).
 
     The sum of lateral steps is limited to the reach here, before any rollout.
     """
@@ -309,7 +315,7 @@ def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     share = np.exp(primitives[:, :, -1])
     share *= problem.travel / share.sum(axis=1, keepdims=True)
     count = np.ceil(share / primitives[:, :, ADVANCE] - 1e-9).astype(int)  # steps of each primitive
-    steps = np.concatenate([(share / count)[:, :, None], _within_reach(problem, primitives, count)], axis=2)
+    steps = np.concatenate([(share / count)[:, :, None], _limit_reach(problem, primitives, count)], axis=2)
     wanted = _directions(problem, primitives[:, :, problem.bevel])
     ends = np.cumsum(count, axis=1)
     index = np.arange(ends[:, -1].max())
@@ -321,45 +327,43 @@ def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     controls = np.zeros((len(z), index.size, len(COLUMNS)))
     controls[:, :, [DB_X, *MOVES[problem.axes]]] = steps[rows, owner]
     first = np.concatenate([np.zeros((len(z), 1), dtype=int), ends[:, :-1]], axis=1)
-    wanted = without_small_rolls(wanted)
-    rolls = np.diff(_in_range(wanted, problem.rotation), axis=1, prepend=0.0)
-    controls[rows, first, ROLL] = rolls if np.isfinite(problem.rotation) else wrapped(rolls)
-    return mounted(problem, controls, entry), wanted
+    wanted = drop_small_rolls(wanted)
+    rolls = np.diff(_unwrap_in_range(wanted, problem.rotation), axis=1, prepend=0.0)
+    controls[rows, first, ROLL] = rolls if np.isfinite(problem.rotation) else wrap_angles(rolls)
+    return mount_needle(problem, controls, entry), wanted
 
 
-def without_small_rolls(wanted: Floats) -> Floats:
-    """Directions (N, P), rad, of which one that hardly differs from the direction before it is the same."""
+def drop_small_rolls(wanted: Floats) -> Floats:
+    """Return directions (N, P), rad, in which one that hardly differs from the direction before it is the same."""
     kept = wanted.copy()
     for p in range(1, wanted.shape[1]):
-        small = np.abs(wrapped(kept[:, p] - kept[:, p - 1])) < LEAST_ROLL
+        small = np.abs(wrap_angles(kept[:, p] - kept[:, p - 1])) < LEAST_ROLL
         kept[small, p] = kept[small, p - 1]
     return kept
 
 
-def _in_range(wanted: Floats, rotation: float) -> Floats:
-    """Angles (N, P), rad, of the directions `wanted` (N, P), −π to π: of those within the range the nearest to the one
-    before, so that no roll is longer than need be.
-    """
+def _unwrap_in_range(wanted: Floats, rotation: float) -> Floats:
+    """Return the angles (N, P), rad, of directions (N, P), −π to π: each the nearest in range to the one before."""
     if not np.pi < rotation < np.inf:
         return wanted
     angles = wanted.copy()
     for p in range(1, wanted.shape[1]):
-        near = angles[:, p - 1] + wrapped(wanted[:, p] - angles[:, p - 1])
+        near = angles[:, p - 1] + wrap_angles(wanted[:, p] - angles[:, p - 1])
         back = near - 2.0 * np.pi * np.sign(near)
         angles[:, p] = np.where(np.abs(near) <= rotation, near, back)
     return angles
 
 
 def _directions(problem: PlanProblem, bevel: Floats) -> Floats:
-    """Angles (N, P) of wanted directions (N, P, axes)."""
+    """Return angles (N, P) of wanted directions (N, P, axes)."""
     if problem.half_turns:
         return np.where(bevel[:, :, 0] >= 0.0, 0.0, np.pi)
-    angles = wrapped(np.arctan2(bevel[:, :, 1], bevel[:, :, 0]) + np.angle(problem.frame))
+    angles = wrap_angles(np.arctan2(bevel[:, :, 1], bevel[:, :, 0]) + np.angle(problem.frame))
     return np.clip(angles, -problem.rotation, problem.rotation)
 
 
-def _within_reach(problem: PlanProblem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
-    """Lateral steps (N, P, k) whose running sums stay within reach."""
+def _limit_reach(problem: PlanProblem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
+    """Return the lateral steps (N, P, k) whose running sums stay within reach."""
     columns = list(MOVES[problem.axes])
     lateral, reach = primitives[:, :, LATERAL : problem.bevel.start].copy(), problem.reach[columns]
     if problem.frame != 1.0:

@@ -1,4 +1,4 @@
-"""The scenario that a plan was made for, and whether a plan may be carried out in another."""
+"""The scenario of a plan, and the check that a plan may be carried out in another."""
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.dotted import split_key
@@ -10,8 +10,8 @@ PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "pl
 phantom."""
 
 
-def placed(scenario: Scenario, plan: Plan) -> Scenario:
-    """The scenario with the entry that a plan has chosen, where it is free."""
+def with_planned_entry(scenario: Scenario, plan: Plan) -> Scenario:
+    """Return the scenario with the entry that a plan has chosen, where it is free."""
     made = plan.scenario
     if made is None or not scenario.entry.free:
         return scenario
@@ -22,7 +22,7 @@ def check_origin(plan: Plan, scenario: Scenario) -> None:
     """Raise InputError, with the first key that differs, if a plan was made for another scenario.
 
     Its target may have been given to the planner in place of the scenario's: it only has to be the plan's or the same
-    in both. A plan that does not carry its scenario, as those of earlier versions, is taken as it is.
+    in both. A plan without a scenario is accepted.
     """
     made = plan.scenario
     if made is None:

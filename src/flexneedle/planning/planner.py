@@ -13,9 +13,9 @@ from flexneedle.costs.table import Trajectories
 from flexneedle.costs.terms import PLAN
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.horizon import OnIteration, counted
-from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise, widened
-from flexneedle.planning.steering import MOST_ROLLS, radius, reach, steer
+from flexneedle.planning.horizon import OnIteration, count_iterations
+from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, search_primitives, widen_search
+from flexneedle.planning.steering import MOST_ROLLS, radius, reach, search_rolls
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -62,15 +62,24 @@ def plan(
     *,
     threads: int | None = None,
 ) -> Plan:
-    """Plan an insertion to `target` (x, y) or (x, y, z) in mm (default: the scenario's), best found by cross-entropy.
+    """Plan an insertion to a target, the best found by cross-entropy. Same seed, same plan.
 
-    scenario: also by its name or path, as for `load_scenario`;
-    strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
-    needle itself, not on a softer one). A plan that misses its target although guide or base are free is searched again
-    with wider samples, and the better of the two is returned. `progress` gets a dict after each iteration, with the
-    samples of the search as `planning.horizon.Samples`. `threads` is for rollouts (default: all cores) and changes no
-    result. Same seed, same plan.
-    Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
+    A plan that misses its target although guide or base are free is searched again with wider samples, and the better
+    of the two is returned.
+
+    Args:
+        scenario: A scenario, its name or its path, as for `load_scenario`.
+        target: (x, y) or (x, y, z) in mm (default: the scenario's).
+        strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
+            needle itself, not on a softer one).
+        seed: Seed of the search.
+        progress: Called with a dict after each iteration, which has the samples of the search as
+            `planning.horizon.Samples`.
+        threads: Threads of rollouts (default: all cores); changes no result.
+
+    Raises:
+        ScenarioError: The scenario excludes the target.
+        InputError: Another argument cannot be used.
     """
     scenario, seed = load_scenario(scenario), check_whole("seed", seed, 0)
     if strategy not in STRATEGIES:
@@ -79,21 +88,26 @@ def plan(
     check_target(scenario, *goal)
     begun, rng = time.perf_counter(), np.random.default_rng(seed)
     simulator = Simulator(scenario, threads)
-    problem = _problem(scenario, goal, strategy)
-    found = _carried_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
-    if not found.reached and not _bevel_alone(problem):
+    problem = _make_problem(scenario, goal, strategy)
+    found = _carry_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
+    if not found.reached and not _is_bevel_alone(problem):
         # A search that begins with small lateral steps can lose its spread before it gets to a far target.
         usual = found.iterations + scenario.plan.iterations
-        after = counted(progress, found.iterations, usual, found.cost)
-        again = _search(simulator, widened(problem), rng, after)
-        found = _better(found, _carried_out(simulator, problem, strategy, seed, again))
+        after = count_iterations(progress, found.iterations, usual, found.cost)
+        again = _search(simulator, widen_search(problem), rng, after)
+        found = _choose_better(found, _carry_out(simulator, problem, strategy, seed, again))
     return replace(found, seconds=time.perf_counter() - begun)
 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """What one search has found, carried out in one go: poses of the tip (m + 1, 5), nodes of the needle at the end
-    (n, 5), its roll at the start (rad), and the distance from its tip to the target (mm).
+    """Result of one search, carried out without stops.
+
+    Attributes:
+        tips: Poses of the tip (m + 1, 5).
+        needle: Nodes of the needle at the end (n, 5).
+        roll: Its roll at the start (rad).
+        error_mm: Distance from its tip to the target.
     """
 
     tips: Floats
@@ -103,7 +117,7 @@ class Sketch:
 
     @property
     def reached(self) -> bool:
-        """As that of a plan."""
+        """Whether the sketch ends within 1 mm of the target."""
         return self.error_mm <= 1.0
 
 
@@ -115,15 +129,15 @@ def sketch(
     *,
     threads: int | None = None,
 ) -> Sketch:
-    """Search once for an insertion to the scenario's target, as `plan` does, for who needs no plan but a quick look.
+    """Search once for an insertion to the scenario's target, as `plan` does, for a quick preview.
 
     A target that is missed is not searched again, and neither the states between nor what limits the plan are found.
     The bevel alone gets one roll at most, which reaches whatever several reach.
     """
     simulator, goal = Simulator(scenario, threads), scenario.target.position
-    problem = _problem(scenario, goal, strategy)
+    problem = _make_problem(scenario, goal, strategy)
     found = _search(simulator, problem, np.random.default_rng(seed), progress, _ENOUGH_ROLLS)
-    simulator, _ = _entered(simulator, problem, found, strategy)
+    simulator, _ = _fix_entry(simulator, problem, found, strategy)
     rows = _end_at_depth(simulator, found.controls, found.roll, goal[0])
     start = simulator.start(found.roll)
     end, tips = simulator.replay(start, rows)
@@ -131,19 +145,19 @@ def sketch(
     return Sketch(np.vstack([start.tip, tips]), end.nodes, found.roll, error)
 
 
-def _better(first: Plan, second: Plan) -> Plan:
-    """The plan of less cost, the first of two of the same, with the history of both searches."""
+def _choose_better(first: Plan, second: Plan) -> Plan:
+    """Return the plan of less cost, the first if both cost the same, with the history of both searches."""
     later = tuple({**entry, "best": min(entry["best"], first.cost)} for entry in second.history)
     history = (*first.history, *later)
     best = second if second.cost < first.cost else first
     return replace(best, history=history, iterations=len(history))
 
 
-def _carried_out(
+def _carry_out(
     simulator: Simulator, problem: PlanProblem, strategy: str, seed: int, solution: Solution
 ) -> Plan:
-    """The plan that ends at the target's depth, with its entry in the scenario if that was free."""
-    simulator, problem = _entered(simulator, problem, solution, strategy)
+    """Return the plan that ends at the target's depth, with its entry in the scenario if that was free."""
+    simulator, problem = _fix_entry(simulator, problem, solution, strategy)
     goal = problem.target
     rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
     states = [simulator.start(solution.roll)]
@@ -169,21 +183,21 @@ def _carried_out(
     )
 
 
-def _entered(
+def _fix_entry(
     simulator: Simulator, problem: PlanProblem, solution: Solution, strategy: str
 ) -> tuple[Simulator, PlanProblem]:
-    """Simulator and problem with the entry that was found, if it was free."""
+    """Return simulator and problem with the entry that was found, if it was free."""
     if not simulator.scenario.entry.free:
         return simulator, problem
-    scenario = _entering(simulator.scenario, *solution.entry)
-    return Simulator(scenario, simulator.threads), _problem(scenario, problem.target, strategy)
+    scenario = _with_entry(simulator.scenario, *solution.entry)
+    return Simulator(scenario, simulator.threads), _make_problem(scenario, problem.target, strategy)
 
 
 def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
-    """Least and greatest y (mm) at a depth (mm) that the bevel alone can reach, at the z of the needle's axis."""
+    """Return the least and greatest y (mm) at a depth (mm) that the bevel alone reaches, at the axis's z."""
     simulator, axis = Simulator(scenario, threads), scenario.entry.lateral(depth)
-    problem = _problem(scenario, (depth, axis.real, axis.imag), "steering")
-    least, greatest = reach(_rollout(simulator), problem)
+    problem = _make_problem(scenario, (depth, axis.real, axis.imag), "steering")
+    least, greatest = reach(_make_rollout(simulator), problem)
     return axis.real + least, axis.real + greatest
 
 
@@ -194,16 +208,16 @@ def _search(
     progress: OnIteration | None,
     most_rolls: int = MOST_ROLLS,
 ) -> Solution:
-    """The best primitives, or the best rolls where only the bevel is free."""
-    plan, rollout = simulator.scenario.plan, _rollout(simulator)
-    if _bevel_alone(problem):
+    """Return the best primitives, or the best rolls where only the bevel is free."""
+    plan, rollout = simulator.scenario.plan, _make_rollout(simulator)
+    if _is_bevel_alone(problem):
         share = 1 if problem.entry_coordinates or problem.narrow else _SHARE_OF_A_SEARCH
-        search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
-        return steer(rollout, problem, search, rng, progress, most_rolls)
-    return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
+        search = _search_settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
+        return search_rolls(rollout, problem, search, rng, progress, most_rolls)
+    return search_primitives(rollout, problem, _search_settings(plan, plan.samples), rng, progress)
 
 
-def _rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
+def _make_rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
     start, free = simulator.start(), simulator.scenario.entry.free
 
     def rollout(controls: Floats) -> Trajectories:
@@ -216,13 +230,13 @@ def _rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
 
 
 def _mounted_axes(scenario: Scenario, first: Floats) -> Laterals:
-    """Axes (N, 2) of needles that the controls (N, 9) mount: y + iz (mm) at x = 0, and slope (rad)."""
+    """Return the axes (N, 2) of needles that the controls (N, 9) mount: y + iz (mm) at x = 0, and slope (rad)."""
     slope = scenario.entry.slope + first[:, DB_THETA] + 1j * first[:, DB_PSI]
     base = scenario.entry.lateral(scenario.start_base_x) + first[:, DB_Y] + 1j * first[:, DB_Z]
     return np.stack([base - slope * scenario.start_base_x, slope], axis=1)
 
 
-def _settings(plan: PlanSettings, samples: int) -> Search:
+def _search_settings(plan: PlanSettings, samples: int) -> Search:
     return Search(
         samples=samples,
         elite=elite_count(samples, plan.elite_fraction),
@@ -233,11 +247,11 @@ def _settings(plan: PlanSettings, samples: int) -> Search:
     )
 
 
-def _bevel_alone(problem: PlanProblem) -> bool:
+def _is_bevel_alone(problem: PlanProblem) -> bool:
     return not problem.sigma[LATERAL : problem.bevel.start].any()
 
 
-def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
+def _make_problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
     setup, plan = scenario.setup, scenario.plan
     limits = Limits.of(scenario)
     axes = setup.axes
@@ -277,12 +291,12 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
     )
 
 
-def _entering(scenario: Scenario, point: complex, slope: complex) -> Scenario:
-    """The scenario with the entry fixed, changed by `point` (mm) and `slope` (rad)."""
+def _with_entry(scenario: Scenario, point: complex, slope: complex) -> Scenario:
+    """Return the scenario with the entry fixed, changed by `point` (mm) and `slope` (rad)."""
     entry = scenario.entry
 
     def steep(now: float, change: float) -> float:
-        """A slope (mrad) that the search keeps within its limit, up to rounding."""
+        """Return a slope (mrad) that the search keeps within its limit, up to rounding."""
         return max(-STEEPEST_MRAD, min(STEEPEST_MRAD, now + 1e3 * change))
 
     values = {
@@ -327,14 +341,14 @@ def _binding_limit(simulator: Simulator, problem: PlanProblem, rows: Floats, sta
     if rows[:, DB_X].sum() > _AT_LIMIT * setup.stroke_mm and end[X] < problem.target[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
     missed = not problem.narrow or math.dist(end[:3], problem.target) > _REACHED_MM
-    if _bevel_alone(problem) and missed and (beyond := _beyond_the_bevel(simulator, problem)):
+    if _is_bevel_alone(problem) and missed and (beyond := _limit_of_bevel(simulator, problem)):
         return beyond
     if near:
         return ""
     if (
         setup.axes == 2
         and abs(end[Z] - problem.target[2]) > 1.0
-        and (key := _not_along_z(simulator, problem))
+        and (key := _limit_along_z(simulator, problem))
     ):
         return key
     travel = np.abs([state.travel for state in states]).max(axis=0)
@@ -353,9 +367,9 @@ def _binding_limit(simulator: Simulator, problem: PlanProblem, rows: Floats, sta
     return f"plan.{PLAN.key('accuracy')} = {weight:g} (other costs outweigh the miss)"
 
 
-def _beyond_the_bevel(simulator: Simulator, problem: PlanProblem) -> str:
+def _limit_of_bevel(simulator: Simulator, problem: PlanProblem) -> str:
     """Name the key that keeps the bevel alone from the target; empty if nothing does."""
-    scenario, rollout = simulator.scenario, _rollout(simulator)
+    scenario, rollout = simulator.scenario, _make_rollout(simulator)
     least, greatest = reach(rollout, problem)
     if least <= problem.lateral <= greatest:
         return ""
@@ -372,20 +386,18 @@ def _beyond_the_bevel(simulator: Simulator, problem: PlanProblem) -> str:
     return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
 
 
-def _not_along_z(simulator: Simulator, problem: PlanProblem) -> str:
-    """Name the key that keeps the needle from the target's z where neither guide nor base moves along z; empty if they
-    do, or if the bevel reaches it.
-    """
+def _limit_along_z(simulator: Simulator, problem: PlanProblem) -> str:
+    """Name the key that keeps the needle from the target's z; empty if guide, base or bevel reach it."""
     setup = simulator.scenario.setup
     if problem.sigma[LATERAL + 1 : problem.bevel.start : 2].any():
         return ""
     if problem.half_turns:
-        if _bevel_alone(problem):
+        if _is_bevel_alone(problem):
             return f"{setup.half_turns_by} (nothing steers along z)"
         return f"setup.guide_axes = 1 (nothing else steers along z with {setup.half_turns_by})"
-    size = radius(_rollout(simulator), problem)
+    size = radius(_make_rollout(simulator), problem)
     most = size * math.sin(min(problem.rotation, 0.5 * math.pi))
-    if _bevel_alone(problem) or abs(problem.across.imag) <= most:
+    if _is_bevel_alone(problem) or abs(problem.across.imag) <= most:
         return ""
     why = f"along z only the bevel steers, by up to {most:.2f} mm"
     limited = problem.narrow and abs(problem.across.imag) <= size

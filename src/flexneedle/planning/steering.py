@@ -6,8 +6,8 @@ between the ends of the two insertions without any, and no sequence of rolls is 
 lower the cost.
 
 With less than half a turn to either side the bevel cannot face each direction and its opposite, so angles are searched
-as well. The ends of insertions with one angle lie on an arc, and what the bevel reaches is its convex hull. One roll
-still reaches all of it: each point of the hull lies on a chord between two angles ±b in the range.
+as well. The ends of insertions with one angle are on an arc, and the reach of the bevel is its convex hull. One roll
+still reaches all of it: each point of the hull is on a chord between two angles ±b in the range.
 """
 
 from dataclasses import replace
@@ -17,15 +17,15 @@ import numpy as np
 from flexneedle.costs.table import RolloutFunction, Term, Trajectories
 from flexneedle.costs.terms import past_target
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.horizon import Found, OnIteration, Variables, best, counted
+from flexneedle.planning.horizon import Found, OnIteration, Variables, count_iterations, find_best
 from flexneedle.planning.insertion import (
     PlanProblem,
     Solution,
+    drop_small_rolls,
     entry_bounds,
-    entry_of,
-    mounted,
-    solution,
-    without_small_rolls,
+    make_solution,
+    mount_needle,
+    read_entry,
 )
 from flexneedle.simulator.control import controls
 from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
@@ -37,7 +37,7 @@ _WIDE, _NARROW = 0.3, 0.02  # first standard deviations, as shares of the target
 _ROUNDING = 1e-9  # of the reach
 
 
-def steer(
+def search_rolls(
     rollout: RolloutFunction,
     problem: PlanProblem,
     search: Search,
@@ -49,7 +49,7 @@ def steer(
 
     Where the driver's range is less than a turn, the needle's angles before the first roll and after each one are
     searched as well. The best of all is searched once more with the travel that it needs to end at the target's depth:
-    a bent needle ends short of it. `rollout` starts with bevel +1 in air; `search` is that of each number of rolls and
+    a bent needle ends short of it. `rollout` starts with bevel +1 in air; `search` applies to each number of rolls and
     side.
     """
     found: list[tuple[float, int, Found]] = []
@@ -63,32 +63,32 @@ def steer(
             )  # all samples are one
             count = search.elite if alone else search.samples
             depths = np.sort(rng.uniform(size=(count, rolls)), axis=1)
-            entries = _entries(problem, count, rng)
-            angles = _angles(problem, size, side, rolls, entries)
+            entries = _propose_entries(problem, count, rng)
+            angles = _propose_angles(problem, size, side, rolls, entries)
             even = np.arange(1, rolls + 1) / (rolls + 1)
             variables = _variables(problem, side, rolls, np.concatenate([even, angles[0], entries[0]]), _WIDE)
             if problem.narrow:
-                angles = _scattered(problem, angles, rng)
+                angles = _scatter(problem, angles, rng)
             first = np.concatenate([depths, angles, entries], axis=1)
-            shown = _counted(progress, search, [one for *_, one in found])
-            one = best(variables, rollout, charged, search, rng, first=first, progress=shown)
+            shown = _count_iterations(progress, search, [one for *_, one in found])
+            one = find_best(variables, rollout, charged, search, rng, first=first, progress=shown)
             found.append((side, rolls, one))
         if rolls > 0 and min(one.cost for *_, one in found) == before:
             break
     side, rolls, one = min(found, key=lambda each: each[2].cost)
     short = max(0.0, problem.target[0] - float(one.trajectories.tips[0, -1, X]))
     longer = replace(problem, travel=min(problem.travel + short, float(problem.reach[0])))
-    shown = _counted(progress, search, [each for *_, each in found])
+    shown = _count_iterations(progress, search, [each for *_, each in found])
     mean = np.append(np.sort(one.z[:rolls]), one.z[rolls:])
     variables = _variables(longer, side, rolls, mean, _NARROW)
-    return solution(longer, best(variables, rollout, charged, search, rng, progress=shown))
+    return make_solution(longer, find_best(variables, rollout, charged, search, rng, progress=shown))
 
 
 def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
-    """With a free entry, the distance (mm) of the target from the inner half of the bevel's reach, as a miss.
+    """Return the term of a free entry: distance (mm) of the target from the inner half of the bevel's reach, as a miss.
 
-    At the end of its reach the bevel could correct no error to one side. Where the range is less than a turn, that is
-    the inner half of the largest disc in the reach.
+    At the end of its reach the bevel could correct no error to one side. Where the range is less than a turn, the
+    largest disc in the reach is halved.
     """
     if not problem.entry_coordinates:
         return ()
@@ -113,8 +113,10 @@ def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
 
 
 def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigma: float) -> Variables:
-    """The depths of the rolls, as shares of the target's, the needle's angles (rad) before and after them where the
-    range is less than a turn, and the coordinates of the entry; together `mean`.
+    """Return the variables of a search about `mean`.
+
+    They are the depths of the rolls, as shares of the target's; the needle's angles (rad) before and after them where
+    the range is less than a turn; and the coordinates of the entry.
     """
     bounds, last = entry_bounds(problem), mean.size - problem.entry_coordinates
     most = np.concatenate([np.ones(rolls), np.full(last - rolls, problem.rotation), bounds])
@@ -123,29 +125,33 @@ def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigm
 
     def controls_of(z: Floats) -> Floats:
         depths, angles, entry = np.split(z, [rolls, last], axis=1)
-        rows = turned(problem, depths, angles) if problem.narrow else rolled(problem, depths, side)
-        return mounted(problem, rows, entry)
+        rows = (
+            controls_with_angles(problem, depths, angles)
+            if problem.narrow
+            else controls_with_flips(problem, depths, side)
+        )
+        return mount_needle(problem, rows, entry)
 
     return Variables(least, most, mean, sigma * most, controls_of)
 
 
-def _entries(problem: PlanProblem, count: int, rng: np.random.Generator) -> Floats:
-    """Coordinates (count, e) of the entry, the present one first."""
+def _propose_entries(problem: PlanProblem, count: int, rng: np.random.Generator) -> Floats:
+    """Return coordinates (count, e) of the entry, the present one first."""
     bounds = entry_bounds(problem)
     entries = rng.uniform(-1.0, 1.0, (count, bounds.size)) * bounds
     entries[:1] = 0.0
     return entries
 
 
-def _angles(problem: PlanProblem, size: float, side: float, rolls: int, entries: Floats) -> Floats:
-    """Angles (count, rolls + 1) between which an insertion reaches the target, in turn, for coordinates (count, e) of
-    the entry; none where the range is not less than a turn. size: that of the bevel's reach (mm).
+def _propose_angles(problem: PlanProblem, size: float, side: float, rolls: int, entries: Floats) -> Floats:
+    """Return angles (count, rolls + 1) between which an insertion reaches the target, alternately.
 
-    They are ±b on the chord through the target, or through the place in the reach that is nearest to it.
+    They are ±b on the chord through the target, or through the point in the reach that is nearest to it; none where the
+    range is not less than a turn. size: of the bevel's reach (mm); entries: coordinates (count, e) of the entry.
     """
     if not problem.narrow:
         return np.empty((len(entries), 0))
-    point, slope = entry_of(problem, entries)
+    point, slope = read_entry(problem, entries)
     off = (problem.across - point - slope * problem.target[0]) / max(size, np.finfo(float).tiny)
     place = (off / np.maximum(np.abs(off), 1.0)).real
     half = np.arccos(np.maximum(place, np.cos(problem.rotation)))
@@ -153,37 +159,39 @@ def _angles(problem: PlanProblem, size: float, side: float, rolls: int, entries:
     return angles
 
 
-def _scattered(problem: PlanProblem, angles: Floats, rng: np.random.Generator) -> Floats:
-    """Angles (count, k) with deviations that grow from none in the first sample to `_WIDE` of the range."""
+def _scatter(problem: PlanProblem, angles: Floats, rng: np.random.Generator) -> Floats:
+    """Return angles (count, k) with deviations that grow from none in the first sample to `_WIDE` of the range."""
     scale = _WIDE * problem.rotation * np.linspace(0.0, 1.0, len(angles))[:, None]
     return angles + scale * rng.standard_normal(angles.shape)
 
 
-def rolled(problem: PlanProblem, z: Floats, side: float) -> Floats:
-    """Controls (N, m, 9) of an insertion that starts with the bevel to `side` of the problem's direction and flips it
-    at shares z (N, k) of the target's depth, in any order.
+def controls_with_flips(problem: PlanProblem, z: Floats, side: float) -> Floats:
+    """Return controls (N, m, 9) of an insertion with flips at shares z (N, k) of the target's depth, in any order.
+
+    side: of the problem's direction, to which the bevel points at the start.
     """
     start, rolls = float(np.angle(side * problem.direction)), np.full(z.shape, np.pi)
     if np.isfinite(problem.rotation):  # to and fro between two angles in the range
         there = float(np.angle(-side * problem.direction))
         rolls = np.tile((there - start) * (-1.0) ** np.arange(z.shape[1]), (len(z), 1))
-    return _insertion(problem, z, np.full(len(z), start), rolls)
+    return _insert_with_rolls(problem, z, np.full(len(z), start), rolls)
 
 
-def turned(problem: PlanProblem, z: Floats, angles: Floats) -> Floats:
-    """Controls (N, m, 9) of an insertion at the first of angles (N, k + 1), rad, that rolls to the next one at each of
-    the shares z (N, k) of the target's depth, in any order.
+def controls_with_angles(problem: PlanProblem, z: Floats, angles: Floats) -> Floats:
+    """Return controls (N, m, 9) of an insertion at angles (N, k + 1), rad, that rolls from each to the next.
+
+    z (N, k): depths of the rolls as shares of the target's, in any order.
     """
-    kept = without_small_rolls(angles)
-    return _insertion(problem, z, kept[:, 0], np.diff(kept, axis=1))
+    kept = drop_small_rolls(angles)
+    return _insert_with_rolls(problem, z, kept[:, 0], np.diff(kept, axis=1))
 
 
-def _insertion(problem: PlanProblem, z: Floats, start: Floats, rolls: Floats) -> Floats:
-    """Controls (N, m, 9) that begin with the angles `start` (N,) and roll by `rolls` (N, k), rad, in this order at
-    shares z (N, k) of the target's depth, in any order.
+def _insert_with_rolls(problem: PlanProblem, z: Floats, start: Floats, rolls: Floats) -> Floats:
+    """Return controls (N, m, 9) that begin with the angles `start` (N,) and roll by `rolls` (N, k), rad, in this order.
 
-    Its steps are even except where a roll divides one: so no roll changes the other steps, whose length has an effect
-    near the skin, and the end of the tip is continuous in z.
+    z (N, k): depths of the rolls as shares of the target's, in any order. The steps are even except where a roll
+    divides one: so no roll changes the other steps, whose length has an effect near the skin, and the end of the tip is
+    continuous in z.
     """
     n, z = len(z), np.sort(z, axis=1)
     even = np.linspace(0.0, problem.travel, int(np.ceil(problem.travel / problem.step[0] - 1e-9)) + 1)
@@ -198,11 +206,11 @@ def _insertion(problem: PlanProblem, z: Floats, start: Floats, rolls: Floats) ->
 
 
 def reach(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
-    """Least and greatest distance (mm) of the tip from the needle's axis, at the target's depth and in the problem's
-    direction, that the bevel alone can reach.
+    """Return the least and greatest distance (mm) from the needle's axis that the bevel alone reaches.
 
-    Where the range is less than a turn: on the line from the axis to the target, the part in the hull of the arc of
-    ends; the least is infinite and the greatest −infinite if the line passes by the hull.
+    The distances are at the target's depth, in the problem's direction. Where the range is less than a turn: on the
+    line from the axis to the target, the part in the hull of the arc of ends; the least is infinite and the greatest
+    −infinite if the line passes by the hull.
     """
     if not problem.narrow:
         axis = (problem.axis * problem.direction.conjugate()).real
@@ -218,24 +226,28 @@ def reach(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]
 
 
 def radius(rollout: RolloutFunction, problem: PlanProblem) -> float:
-    """Distance (mm) from the needle's axis at the target's depth where an insertion without rolls ends: tissue has no
-    preferred direction, so it is the same for each angle of the bevel.
+    """Return the distance (mm) from the needle's axis at the target's depth where an insertion without rolls ends.
+
+    Tissue has no preferred direction, so it is the same for each angle of the bevel.
     """
     ahead = (problem.target[0], problem.axis.real, problem.axis.imag)
-    end = past_target(rollout(turned(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
+    end = past_target(rollout(controls_with_angles(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
     return float(abs(end[0]))
 
 
 def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
-    """Least and greatest position (mm) in the problem's direction where the two insertions without rolls end."""
+    """Return the least and greatest position (mm), in the problem's direction, of ends of insertions without rolls."""
     ahead = (problem.target[0], 0.0, 0.0)
-    ends = [past_target(rollout(rolled(problem, np.empty((1, 0)), side)), ahead)[0] for side in (-1.0, 1.0)]
+    ends = [
+        past_target(rollout(controls_with_flips(problem, np.empty((1, 0)), side)), ahead)[0]
+        for side in (-1.0, 1.0)
+    ]
     along = [float((end * problem.direction.conjugate()).real) for end in ends]
     return min(along), max(along)
 
 
-def _counted(progress: OnIteration | None, search: Search, found: list[Found]) -> OnIteration | None:
-    """`progress` with iterations and best cost counted through all searches."""
+def _count_iterations(progress: OnIteration | None, search: Search, found: list[Found]) -> OnIteration | None:
+    """Return `progress` with iterations and best cost counted through all searches."""
     before = sum(one.search_state.iterations for one in found)
     usual = _USUAL_SEARCHES * (search.usual or search.iterations)
-    return counted(progress, before, usual, min((one.cost for one in found), default=np.inf))
+    return count_iterations(progress, before, usual, min((one.cost for one in found), default=np.inf))

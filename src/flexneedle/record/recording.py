@@ -8,7 +8,7 @@ from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_li
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Ended, Event, Gate, Iterated, Listener, PeriodEnded, Planned, Stream
 from flexneedle.loop.insert import carry_out, check_choices
-from flexneedle.planning.origin import placed
+from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import Folder
 from flexneedle.record.saving import (
@@ -78,7 +78,7 @@ def record_insertion(
         stream = Stream(tuple(listeners), gate or Gate())
         seed = choices.seed if plan_seed is None else plan_seed
         plan = _plan(folder, scenario, strategy, seed, stream)
-        scenario = placed(scenario, plan)
+        scenario = with_planned_entry(scenario, plan)
         folder.values["scenario"] = scenario.values()
         stream.send(Planned(plan))
         insertion = _insert(folder, scenario, plan, choices, stream)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.arguments import check_path
-from flexneedle.control.controllers import used
+from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import RecordError, describe_error
 from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE, Folder, versions
@@ -28,7 +28,7 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
     """
     scenario, out = scenario_of(record), check_path("folder", folder)
     if isinstance(record, Plan):
-        claimed = Folder.claim(out, "", "plan", used(scenario), record.seed)
+        claimed = Folder.claim(out, "", "plan", with_controller_defaults(scenario), record.seed)
         keep_plan(claimed, record)
         finish_plans(claimed)
     else:

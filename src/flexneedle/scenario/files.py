@@ -1,4 +1,4 @@
-"""Reading scenario files by name or path, and writing them; also files of environments and registrations."""
+"""Scenario files by name or path; also files of environments and registrations."""
 
 from pathlib import Path
 
@@ -22,7 +22,9 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
 
     A scenario is returned unchanged. The name of a preset means the preset, even if a file of that name exists; a name
     that begins with `world:` is a world.
-    Raises ScenarioError with one line for each problem: file, key, value, rule.
+
+    Raises:
+        ScenarioError: One line for each problem: file, key, value, rule.
     """
     if isinstance(source, Scenario):
         return source
@@ -38,10 +40,10 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
 
 
 def load_environment(source: str | Path) -> Environment:
-    """Return the tracker's environment of a shipped name or of a TOML file, whose keys are those of
-    `tracker.environment`.
+    """Return the tracker's environment of a shipped name or of a TOML file with the keys of `tracker.environment`.
 
-    Raises ScenarioError with one line for each problem: file, key, value, rule.
+    Raises:
+        ScenarioError: One line for each problem: file, key, value, rule.
     """
     return ENVIRONMENTS.load(source, Environment)
 

@@ -1,4 +1,4 @@
-"""TOML files of one kind: those of the package by name, a user's by path."""
+"""TOML files of one kind: files of the package by name, files of a user by path."""
 
 import tomllib
 from dataclasses import dataclass
@@ -23,8 +23,11 @@ Model = TypeVar("Model", bound=BaseModel)
 class Library:
     """A kind of TOML file.
 
-    kind: of file, such as "a scenario file"; noun: name for one that comes with the package, such as "preset"; folder:
-    of those, None if there are none; error: type raised, with one line for each problem.
+    Attributes:
+        kind: Name of the kind, such as "a scenario file".
+        noun: Name of a file that comes with the package, such as "preset".
+        folder: Folder of the files that come with the package, None if there are none.
+        error: Type raised, with one line for each problem.
     """
 
     kind: str
@@ -33,29 +36,32 @@ class Library:
     error: type[FileError] = FileError
 
     def names(self) -> list[str]:
-        """Names of the files that come with the package."""
+        """Return the names of the files that come with the package."""
         if self.folder is None:
             return []
         names = (entry.name for entry in self.folder.iterdir())
         return sorted(name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
 
     def shipped(self, name: str) -> dict[str, Any]:
-        """Nested tables of a file that comes with the package."""
+        """Return the nested tables of a file that comes with the package."""
         if self.folder is None:
             raise KeyError(name)
         return tomllib.loads((self.folder / (name + _SUFFIX)).read_text(encoding="utf-8"))
 
     def read(self, source: str | Path) -> dict[str, Any]:
-        """Nested tables of the file of a name or at a path. A name of the package comes before a file of that name.
+        """Return the nested tables of the file of a name or at a path. Names of the package have precedence.
 
-        Raises `error`: file, what is wrong.
+        Raises `error`: file, and what is wrong.
         """
         if isinstance(source, str) and source in self.names():
             return self.shipped(source)
         return self._parsed(self._bytes(source), label(source))
 
     def load(self, source: str | Path, model: type[Model]) -> Model:
-        """The checked contents of a file. Raises `error` with one line for each problem: file, key, value, rule."""
+        """Return the checked contents of a file.
+
+        Raises `error` with one line for each problem: file, key, value, rule.
+        """
         values = self.read(source)
         try:
             return model.model_validate(values)
@@ -93,5 +99,5 @@ class Library:
 
 
 def label(source: str | Path) -> str:
-    """A name or path as it opens a message."""
+    """Return a name or path for the opening of a message."""
     return make_printable(fspath(source)) or '""'

@@ -1,4 +1,4 @@
-"""The scenario: everything that plan and insertion depend on, except the seed."""
+"""The scenario: all inputs of plan and insertion, except the seed."""
 
 from collections.abc import Collection, Mapping
 from itertools import chain
@@ -20,7 +20,7 @@ from flexneedle.scenario.rules import (
     target_problems,
 )
 from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
-from flexneedle.scenario.sections.environment import ENVIRONMENTS, expanded
+from flexneedle.scenario.sections.environment import ENVIRONMENTS, expand_environment
 from flexneedle.scenario.sections.fields import Section, Title
 from flexneedle.scenario.sections.guard import GuardSettings
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -34,7 +34,7 @@ _ENVIRONMENT = "tracker.environment"
 
 
 class Scenario(Section):
-    """A scenario, frozen. Fields keep the names and units of the file.
+    """A scenario, frozen. Fields have the names and units of the file.
 
     Properties without a unit in their name are in mm, N, MPa, rad, s. Raises ScenarioError, one line for each problem.
     """
@@ -119,7 +119,7 @@ class Scenario(Section):
     def first_difference(self, other: "Scenario", sections: Collection[str] | None = None) -> str | None:
         """Return the first key whose value differs, as `tissue[0].alpha`, or None if all are equal.
 
-        sections: those that are compared (default: all).
+        sections: sections to compare (default: all).
         """
         mine, theirs = (flatten(_part(each.values(), sections)) for each in (self, other))
         return next(
@@ -137,12 +137,12 @@ class Scenario(Section):
 
     @property
     def start_base_x(self) -> float:
-        """x of the base clamp at the start, mm."""
+        """Position x of the base clamp at the start, mm."""
         return self.setup.start_tip_x - self.needle.length_mm
 
     @property
     def guide_home(self) -> complex:
-        """y + iz of the guide at the start, mm; 0 without a guide."""
+        """Position y + iz of the guide at the start, mm; 0 without a guide."""
         guide = self.setup.guide_x
         return 0.0 if guide is None else self.entry.lateral(guide)
 
@@ -162,7 +162,7 @@ def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mappin
 def _expanded(key: str, value: Any) -> Any:
     """Return the table of an environment's name, so that later changes apply to it; an unknown name unchanged."""
     known = key == _ENVIRONMENT and value in ENVIRONMENTS.names()
-    return expanded(value) if known else value
+    return expand_environment(value) if known else value
 
 
 def check_target(scenario: Scenario, depth: float, lateral: float, lateral_z: float = 0.0) -> None:

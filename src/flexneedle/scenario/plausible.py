@@ -1,4 +1,4 @@
-"""Valid but implausible values of a scenario: far from those of needles and tissues, or without effect."""
+"""Valid but implausible values of a scenario: far outside the usual range, or without effect."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from flexneedle.scenario.problems import key_path
 
 
 class Range(NamedTuple):
-    """What the size of a quantity usually is, in the unit of its key, and who has measured or made it."""
+    """Usual range of the size of a quantity, in the unit of its key, and its source."""
 
     low: float
     high: float
@@ -86,9 +86,11 @@ USUAL = {
 _FAR = 10**0.5  # ratio to the nearest usual value from which a value is reported: half an order of magnitude
 
 
-def doubts(scenario: Scenario) -> list[str]:
-    """Return a line for each value that is half an order of magnitude and more outside the usual range, or unused, or
-    holds the needle from the start.
+def find_doubts(scenario: Scenario) -> list[str]:
+    """Return a line for each value that is implausible.
+
+    A value is implausible if it is half an order of magnitude or more outside the usual range, if it has no effect, or
+    if it holds the needle from the start.
     """
     return [*_unusual(scenario), *_unused(scenario), *_stale(scenario)]
 
@@ -130,10 +132,10 @@ def _general(key: str) -> str:
 
 
 def _short(ratio: float) -> str:
-    """Three digits, never as 1e+03."""
+    """Return a number with three digits, never as 1e+03."""
     return f"{float(f'{ratio:.3g}'):.0f}" if ratio >= 100.0 else f"{ratio:.3g}"
 
 
 def _ratio(value: float, usual: Range) -> float:
-    """Ratio of the size of a value to the nearest one in a range."""
+    """Return the ratio of the size of a value to the nearest one in a range."""
     return value / min(max(value, usual.low), usual.high)

@@ -18,7 +18,10 @@ _ROUNDING_MM = 1e-9  # of an entry that a plan has chosen
 
 
 def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
-    """Tip before the guide at the start, base behind it (or behind the skin) at full stroke."""
+    """Yield broken rules of the geometry: the tip starts before the guide, and the base ends behind it.
+
+    Without a guide the base ends behind the skin.
+    """
     guide, tip = setup.guide_to_skin_mm, setup.tip_to_skin_mm
     if needle.bevel.length_mm >= needle.length_mm:
         rule = f"must be below needle.length_mm ({needle.length_mm:g})"
@@ -40,7 +43,7 @@ def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
 
 
 def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
-    """At least one layer, a thickness for each but the last, a bevel offset that every layer can hold."""
+    """Yield broken rules of the layers: at least one, a thickness for each but the last, a possible bevel offset."""
     if not tissue:
         yield Problem("tissue", None, "needs at least one layer: add a [[tissue]]")
         return
@@ -57,14 +60,14 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
 
 
 def entry_problems(setup: Setup, entry: Entry) -> Iterator[Problem]:
-    """A needle in the plane enters in the plane."""
+    """Yield broken rules of the entry: a needle in the plane enters in the plane."""
     for key in ("lateral_z_mm", "slope_z_mrad"):
         if setup.axes == 1 and (value := getattr(entry, key)) != 0.0:
             yield Problem(f"entry.{key}", value, "must be 0 with setup.axes = 1")
 
 
 def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Problem]:
-    """Return why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
+    """Yield the reasons why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
     if not (isfinite(depth) and depth > 0):
         yield Problem("target.depth_mm", depth, "must be above 0")
@@ -100,7 +103,7 @@ def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Prob
 
 
 def plan_problems(plan: PlanSettings) -> Iterator[Problem]:
-    """A covariance needs two elite samples."""
+    """Yield broken rules of the planner's settings: a covariance needs two elite samples."""
     if plan.samples * plan.elite_fraction <= 1.0 + 1e-9:
         rule = f"must leave at least 2 elite samples of plan.samples ({plan.samples})"
         yield Problem("plan.elite_fraction", plan.elite_fraction, rule)
@@ -109,7 +112,7 @@ def plan_problems(plan: PlanSettings) -> Iterator[Problem]:
 def grid_problems(
     setup: Setup, contact: Contact, phantom: PhantomSettings, tracker: TrackerSettings
 ) -> Iterator[Problem]:
-    """No spacing or step so small that a run would not end."""
+    """Yield spacings, steps and rates with which a run would not end."""
     smallest = setup.stroke_mm / _MOST_GRID_POINTS
     grids = {
         "setup.max_advance_mm": setup.max_advance_mm,
@@ -138,7 +141,7 @@ def grid_problems(
 
 
 def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iterator[Problem]:
-    """Two frames in the window, or the field would never be known and the needle would never move."""
+    """Yield broken rules of the monitor: a window needs two frames, or the field would never be known."""
     least = _FRAMES_IN_A_WINDOW * tracker.period
     judged = monitor.enabled and monitor.references > 0 and tracker.environment is not None
     if judged and monitor.indicator_window_s < least:

@@ -17,7 +17,7 @@ A world has three cases, which differ only in `[phantom]`: `perfect` has no mism
 (with a guide only) one kind of structural mismatch in addition, see `structural`.
 
 A world is in the plane, or in space with one of the `RIGS`. In space the lateral offset of its target has a uniform
-direction, of a random stream of its own; with half turns and no guide in two axes, where nothing steers along z, it
+direction, from a separate random stream; with half turns and no guide in two axes, where nothing steers along z, it
 stays in the plane of the bevel.
 """
 
@@ -45,14 +45,14 @@ PLANE = "plane"
 
 @dataclass(frozen=True)
 class WorldRig:
-    """The driver of a needle in space. guide_axes: axes in which its guide moves, 0 without a guide."""
+    """Driver of a needle in space. guide_axes: axes in which its guide moves, 0 without a guide."""
 
     guide_axes: int
     half_turns: bool
 
     @property
     def steers_out(self) -> bool:
-        """Whether anything steers out of the plane of the bevel."""
+        """Whether guide or bevel steers out of the plane of the bevel."""
         return self.guide_axes == 2 or not self.half_turns
 
     @property
@@ -107,7 +107,7 @@ def world(number: int, case: str = REAL, rig: str = PLANE) -> Scenario:
 
 
 def has_rig(scenario: Scenario, rig: str) -> bool:
-    """Whether a world can have a rig: one with a guide if it has a guide itself, or that in the plane."""
+    """Return whether a world can have a rig: one with a guide if it has a guide, or the rig in the plane."""
     return rig not in _IN_SPACE or (_IN_SPACE[rig].guide_axes > 0) == scenario.setup.has_guide
 
 
@@ -203,7 +203,7 @@ def _real(number: int) -> Scenario:
 
 
 def _rounded(value: float) -> float:
-    """Three decimals: short, and written to a file without loss."""
+    """Return three decimals: short, and written to a file without loss."""
     return round(float(value), 3)
 
 
@@ -231,7 +231,7 @@ def _tissue(rng: np.random.Generator, depth: float) -> list[dict[str, object]]:
 
 
 def _setup(rng: np.random.Generator, depth: float) -> tuple[dict[str, float], float]:
-    """The apparatus, and a needle long enough for it (mm)."""
+    """Return the apparatus, and a needle long enough for it (mm)."""
     distance = _rounded(rng.uniform(15.0, 60.0)) if rng.random() < 0.8 else None
     gap = _rounded(rng.uniform(1.0, 60.0 if distance is None else 0.9 * distance))
     stroke = _rounded(gap + depth + rng.uniform(5.0, 20.0))

@@ -1,4 +1,4 @@
-"""The limits that control inputs U = (δb, δθ, δψ, δg, roll, spin) must keep, and arrays of them."""
+"""Limits of control inputs U = (δb, δθ, δψ, δg, roll, spin), and arrays of them."""
 
 import math
 from dataclasses import dataclass
@@ -19,8 +19,10 @@ _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 
 
 def controls(*shape: int, **columns: ArrayLike) -> Floats:
-    """Return an array (*shape, 9) of controls: `columns` by name, the others 0. Raises InputError for other names, for
-    sizes that are not whole numbers from 0, and for values that do not broadcast to the shape.
+    """Return an array (*shape, 9) of controls: `columns` by name, the others 0.
+
+    Raises:
+        InputError: Other names, sizes that are not whole numbers from 0, and values that do not broadcast to the shape.
     """
     array = np.zeros((*(check_whole("size", size, 0, _SIZES) for size in shape), len(COLUMNS)))
     for name, values in columns.items():
@@ -33,8 +35,8 @@ def controls(*shape: int, **columns: ArrayLike) -> Floats:
     return array
 
 
-def along_entry(scenario: Scenario, rows: Floats) -> Floats:
-    """Controls (…, m, 9) with the base's advance along the axis on which it is mounted, in place of along x."""
+def drive_along_entry(scenario: Scenario, rows: Floats) -> Floats:
+    """Return controls (…, m, 9) with the base's advance along the axis on which it is mounted, in place of along x."""
     slope = scenario.entry.slope
     if slope == 0.0:
         return rows
@@ -44,17 +46,18 @@ def along_entry(scenario: Scenario, rows: Floats) -> Floats:
     return driven
 
 
-def half_turned(angle: float, roll: float) -> float:
-    """The roll (rad) of a driver that turns the needle between 0 and half a turn, to and fro: from its `angle`, for a
-    `roll` by any number of half turns.
+def limit_half_turn(angle: float, roll: float) -> float:
+    """Return the roll (rad) of a driver that turns the needle between 0 and half a turn only.
+
+    angle: of the needle (rad); roll: any number of half turns (rad).
     """
     if round(roll / math.pi) % 2 == 0:
         return 0.0
     return -angle if round(angle / math.pi) % 2 else math.pi
 
 
-def _fixed_by(setup: Setup) -> tuple[str, ...]:
-    """Why each column of travel may not move, or "" where it may."""
+def _reasons_fixed(setup: Setup) -> tuple[str, ...]:
+    """Return the reason why each column of travel may not move, or "" where it may."""
     plane = "with setup.axes = 1" if setup.axes == 1 else ""
     mounted = "" if setup.has_guide else "without a guide (setup.guide_to_skin_mm)"
     one_axis = "with setup.guide_axes = 1" if setup.guide_axes == 1 else ""
@@ -64,10 +67,14 @@ def _fixed_by(setup: Setup) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest step of each column of travel, and the range of the sum of steps from the start, shapes (7,) and (7, 2).
+    """Limits of commands.
 
-    half_turns: the key and value by which the needle rolls by half turns only, or ""; rotation: largest angle from 0
-    to either side (rad); fixed: for each column of travel why it may not move, or "".
+    Attributes:
+        step: Largest step of each column of travel, (7,).
+        travel: Range of the sum of steps from the start, (7, 2).
+        half_turns: Key and value by which the needle rolls by half turns only, or "".
+        rotation: Largest angle from 0 to either side (rad).
+        fixed: Reason why each column of travel may not move, or "".
     """
 
     step: Floats
@@ -78,7 +85,7 @@ class Limits:
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Limits":
-        """Return the limits of a scenario in mm and rad; without a guide it cannot move."""
+        """Return the limits of a scenario in mm and rad."""
         setup = scenario.setup
         turn, base = setup.max_base_turn_step, setup.max_base_step_mm
         out = 0.0 if setup.axes == 1 else 1.0
@@ -87,7 +94,7 @@ class Limits:
         lateral, reach = setup.max_base_travel_mm, setup.max_guide_travel_mm
         travel = np.array([lateral, lateral, np.inf, np.inf, reach, reach])
         sums = np.array([[0.0, setup.stroke_mm], *np.stack([-travel, travel], axis=1).tolist()])
-        return cls(step, sums, setup.half_turns_by, setup.max_rotation, _fixed_by(setup))
+        return cls(step, sums, setup.half_turns_by, setup.max_rotation, _reasons_fixed(setup))
 
     def check(self, moved: Floats, rows: Floats, roll: float = 0.0) -> None:
         """Raise CommandError for the first value in `rows` (…, m, 9) that breaks a limit.

@@ -20,8 +20,8 @@ from flexneedle.mechanics.lateral import Lateral, turned
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
-from flexneedle.simulator.control import MOVES, Limits, along_entry, controls, half_turned
-from flexneedle.simulator.state import State, load_state, mechanics_difference, solved
+from flexneedle.simulator.control import MOVES, Limits, controls, drive_along_entry, limit_half_turn
+from flexneedle.simulator.state import State, first_mechanics_difference, freeze_solve, load_state
 from flexneedle.types import COLUMNS, ROLL, Control, Floats
 
 _STEPS_WORTH_A_THREAD = 200
@@ -33,10 +33,14 @@ _ALL_CORES = "leave it out for one per core"
 
 
 class Rollout(NamedTuple):
-    """Result of N sequences of m steps: poses of the tip (N, m, 5), strain_energy (N, m) in mJ, converged (N, m).
+    """Result of N sequences of m steps.
 
-    On demand deflection (N, m), the mean square of the needle's distance from its axis in mm², and shapes (N, m, n, 5),
-    poses at its nodes; else their size is 0.
+    Attributes:
+        tips: Poses of the tip (N, m, 5).
+        strain_energy: Strain energy (N, m), mJ.
+        converged: Whether each step converged (N, m).
+        deflection: On demand, the mean square of the needle's distance from its axis (N, m), mm²; else of size 0.
+        shapes: On demand, poses at the needle's nodes (N, m, n, 5); else of size 0.
     """
 
     tips: Floats
@@ -52,7 +56,7 @@ class Rollout(NamedTuple):
 
 
 class Assimilation(NamedTuple):
-    """The state that meets a measurement, and the axial innovation: measured x less the model's (mm)."""
+    """The state that fits a measurement, and the axial innovation: measured x less the model's (mm)."""
 
     state: State
     innovation: float
@@ -61,8 +65,13 @@ class Assimilation(NamedTuple):
 class Simulator:
     """The needle of a scenario in its tissue (the equations: docs/theory.md).
 
-    scenario: also by its name or path, as for `load_scenario`. `threads` is for rollouts (default: all cores that the
-    process may use); results do not depend on it. Raises ScenarioError or InputError for what cannot be used.
+    Args:
+        scenario: A scenario, its name or its path, as for `load_scenario`.
+        threads: Threads of rollouts (default: all cores that the process may use); results do not depend on it.
+
+    Raises:
+        ScenarioError: The scenario cannot be used.
+        InputError: Another argument cannot be used.
     """
 
     def __init__(
@@ -73,7 +82,7 @@ class Simulator:
         constants: model.Model | None = None,
     ) -> None:
         self.scenario = load_scenario(scenario)
-        self.threads = _cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
+        self.threads = _count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
         self._model = constants or _build_model(self.scenario)
         self._limits = Limits.of(self.scenario)
 
@@ -95,62 +104,62 @@ class Simulator:
         bevel, none, entry = turned(roll, one), 0.0 * one, self.scenario.entry
         rest, slope = np.full(self._model.nodes.size, none), across(entry.slope)
         base, tip = (
-            nd.Pose(x, across(entry.lateral(x)), slope)
+            nd.NodePose(x, across(entry.lateral(x)), slope)
             for x in (self.scenario.start_base_x, self.scenario.setup.start_tip_x)
         )
         needle = nd.start(base, tip, bevel, across(self.scenario.guide_home))
         mesh = np.zeros(0)
-        clamp = nd.Pose(0.0, base.y, slope)
+        clamp = nd.NodePose(0.0, base.y, slope)
         state = State(self.scenario, self._model, needle, clamp, rest, rest, mesh, 0.0, float(roll))
-        return self._settled(state, self._model, math.nan * one)
+        return self._settle(state, self._model, math.nan * one)
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
         check_instance("state", state, State, "begin with simulator.start()")
         check_instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
         self.check(state, control)
-        return self._carried_out(state, np.array([control]))[0]
+        return self._carry_out(state, np.array([control]))[0]
 
     def replay(self, state: State, controls: ArrayLike) -> tuple[State, Floats]:
         """Carry out controls (m, 9), m ≥ 1, as repeated `step` does, but without limits.
 
         Returns the state at the end and the tips (m, 5).
         """
-        self._own(state)
-        return self._carried_out(state, np.array(controls, dtype=float))
+        self._check_mechanics(state)
+        return self._carry_out(state, np.array(controls, dtype=float))
 
-    def _carried_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
+    def _carry_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
         out, work = insertion.outputs(1, len(rows)), self._work(state)
         start = state.needle, state.rest, state.compression
-        driven = along_entry(self.scenario, rows)[None]
+        driven = drive_along_entry(self.scenario, rows)[None]
         needle = insertion.rollout(self._model, *start, *work, driven, self._axes(1), 0, 1, out)
-        return solved(
-            replace(state, roll=self._turned(state.roll, rows)), self._model, needle, *work
+        return freeze_solve(
+            replace(state, roll=self._turn(state.roll, rows)), self._model, needle, *work
         ), out.tips[0]
 
     def _axes(self, count: int, axes: ArrayLike | None = None) -> nd.Laterals:
-        """Lines (count, 2) from which a deflection counts, of the type of the state's laterals."""
+        """Return the lines (count, 2) from which a deflection counts, of the type of the state's laterals."""
         entry = self.scenario.entry
         given = np.array([entry.lateral(0.0), entry.slope]) if axes is None else np.asarray(axes)
         lines = np.broadcast_to(given, (count, 2))
         # Row by row in memory: another order would compile a second kernel.
         return np.array(lines.real if self.scenario.setup.axes == 1 else lines + 0j, order="C")
 
-    def _turned(self, angle: float, rows: Floats) -> float:
-        """The needle's angle (rad) after controls (m, 9), summed in order, as repeated steps do."""
+    def _turn(self, angle: float, rows: Floats) -> float:
+        """Return the needle's angle (rad) after controls (m, 9), summed in order, as repeated steps do."""
         if not self.scenario.setup.half_turns:
             return float(np.cumsum(np.append(angle, rows[:, ROLL:].sum(axis=1)))[-1])
         for roll in rows[:, ROLL].tolist():
-            angle += half_turned(angle, roll)
+            angle += limit_half_turn(angle, roll)
         return angle
 
-    def adapted(self, adaptation: model.Adaptation) -> "Simulator":
+    def with_adaptation(self, adaptation: model.Adaptation) -> "Simulator":
         """Return this simulator with the constants that an observer has estimated, for states of the same scenario."""
-        return Simulator(self.scenario, self.threads, constants=model.adapted(self._model, adaptation))
+        return Simulator(self.scenario, self.threads, constants=model.adapt(self._model, adaptation))
 
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
-        self._own(state)
+        self._check_mechanics(state)
         self._limits.check(state.travel, np.array([control]), state.roll)
 
     def rollout(
@@ -164,22 +173,30 @@ class Simulator:
         shapes: bool = False,
         axes: ArrayLike | None = None,
     ) -> Rollout:
-        """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`, see `controls`.
+        """Run each of N sequences of controls (N, m, 9) from `state`. Equal to repeated `step`, bit by bit.
 
-        Equal to repeated `step`, bit by bit; InputError for another shape, CommandError for a value out of range.
-        Without `limits` a step may be longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long
-        predictions with little work.
-        With `deflection` or `shapes` the result has these, too; the deflection of each sequence is that from its line
-        in `axes` (N, 2): y + iz (mm) at x = 0 and slope (rad), by default the axis of the entry.
+        Args:
+            state: The state before the first step.
+            controls: Columns of `Control`.
+            limits: Whether limits of commands apply; without them a step may be longer.
+            rough: Whether each step is solved only to 1e-4 mm, for long predictions with little work.
+            deflection: Whether the result has deflections.
+            shapes: Whether the result has shapes.
+            axes: Lines (N, 2) from which the deflections count: y + iz (mm) at x = 0 and slope (rad) (default: the
+                axis of the entry).
+
+        Raises:
+            InputError: Another shape of the controls.
+            CommandError: A value is out of range.
         """
-        self._own(state)
+        self._check_mechanics(state)
         rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays
         if rows.ndim != 3 or rows.shape[2] != len(COLUMNS):
             rule = f"must be (N, m, {len(COLUMNS)}), sequences of controls with the columns of Control"
             raise make_refusal("shape of controls", rows.shape, rule)
         if limits:
             self._limits.check(state.travel, rows, state.roll)
-        rows = along_entry(self.scenario, rows)
+        rows = drive_along_entry(self.scenario, rows)
         n, m = rows.shape[:2]
         lines = self._axes(n, axes)
         out = insertion.outputs(
@@ -205,13 +222,16 @@ class Simulator:
     ) -> Assimilation:
         """Hold the tip at its measured lateral position, and the needle at further points, as essential conditions.
 
-        Positions are x, y and, in space, z.
+        The last step is solved again, so a contact that it cut is on the measured path. Axial motion is rigid: x is not
+        corrected, its innovation is returned. The next step releases the conditions; `state.reactions.tip_force` is the
+        force (N) on the tip beyond `state.tip_load`.
 
-        The last step is solved again, so a contact that it cut is on the measured path. Axial motion is
-        rigid: x is not corrected, its innovation is returned. The next step releases the conditions;
-        `state.reactions.tip_force` is the force (N) on the tip beyond `state.tip_load`.
+        Args:
+            state: The state after the last step.
+            tip: Measured x, y and, in space, z (mm).
+            points: Measured points along the needle, as `tip`.
         """
-        self._own(state)
+        self._check_mechanics(state)
         axes = self.scenario.setup.axes
         measured = np.array([_point(values, axes) for values in (tip, *points)])
         if not np.isfinite(measured).all():
@@ -222,14 +242,11 @@ class Simulator:
         order = 1 + np.argsort(measured[1:, 0])
         x = measured[order, 0]
         self._check_points(state, x)
-        after = self._assimilated(state, across[0].item(), x, across[order])
+        after = self._assimilate(state, across[0].item(), x, across[order])
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
     def energy_scale(self, depth: float) -> float:
-        """Strain energy (mJ) of all tissue down to `depth` (mm) displaced laterally by 1 mm, weighted by layer.
-
-        It is the scale of a plan's energy.
-        """
+        """Return the strain energy (mJ) of all tissue down to `depth` (mm) displaced by 1 mm, weighted by layer."""
         nodes, total = self._model.nodes, 0.0
         for k, tissue in enumerate(laws_of(self.scenario.tissue)[0]):
             of = nodes[(nodes["x"] < depth) & (nodes["kind"] == model.CONTACT) & (nodes["law"] == k)]
@@ -238,16 +255,16 @@ class Simulator:
         return total
 
     def load(self, path: str | Path) -> State:
-        """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
+        """Read a state that `State.save` wrote. Raises StateError with the differing key under another scenario."""
         return load_state(path, self.start())
 
-    def _assimilated(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
+    def _assimilate(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
         place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
         more = replace(
             state, rest=np.insert(state.rest, place, y), compression=np.insert(state.compression, place, 0.0)
         )
-        return self._settled(more, merged, tip_y)
+        return self._settle(more, merged, tip_y)
 
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
@@ -262,19 +279,19 @@ class Simulator:
                 )
                 raise CommandError("measured point x", float(value), high, rule)
 
-    def _settled(self, state: State, merged: model.Model, held: Lateral) -> State:
+    def _settle(self, state: State, merged: model.Model, held: Lateral) -> State:
         work = self._work(state)
-        return solved(state, merged, insertion.settle(merged, state.needle, *work, held), *work)
+        return freeze_solve(state, merged, insertion.settle(merged, state.needle, *work, held), *work)
 
-    def _own(self, state: State) -> None:
+    def _check_mechanics(self, state: State) -> None:
         if state.scenario is self.scenario:
             return
-        if (key := mechanics_difference(state.scenario, self.scenario)) is not None:
+        if (key := first_mechanics_difference(state.scenario, self.scenario)) is not None:
             theirs, mine = state.scenario.flat().get(key), self.scenario.flat().get(key)
             raise StateError(f"state of another scenario: {key} was {theirs}, is {mine}")
 
     def _work(self, state: State) -> tuple[nd.Laterals, nd.Laterals, nd.Work]:
-        """Copies of rest positions and compressions, and a work array."""
+        """Return copies of rest positions and compressions, and a work array."""
         return state.rest.copy(), state.compression.copy(), nd.work_array(state.rest)
 
     @cached_property
@@ -282,10 +299,10 @@ class Simulator:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="rollout")
 
     def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int, model.Model]]:
-        return _restored, (self.scenario, self.threads, self._model)
+        return _restore, (self.scenario, self.threads, self._model)
 
 
-def _restored(scenario: Scenario, threads: int, constants: model.Model) -> Simulator:
+def _restore(scenario: Scenario, threads: int, constants: model.Model) -> Simulator:
     return Simulator(scenario, threads, constants=constants)
 
 
@@ -297,8 +314,8 @@ def _point(values: Sequence[float], axes: int) -> list[float]:
     return [float(value) for value in values]
 
 
-def _cores() -> int:
-    """Number of cores that the process may use; of all cores where the system does not report that."""
+def _count_cores() -> int:
+    """Return the number of cores that the process may use; of all cores where the system does not report that."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -32,10 +32,17 @@ _ENERGIES = ("energy", "weighted")
 
 
 class Contacts(NamedTuple):
-    """Contact points of the cut channel by depth: x (k,), rest and present positions y, z (k, 2), mm; stretch λ (k,);
-    whether active (k,); index of the tissue's law (k,), as in `laws_of`.
+    """Contact points of the cut channel by depth, (k,).
 
     A point ahead of a tip that was pulled back is not active: it is undisplaced, position = rest and stretch 1.
+
+    Attributes:
+        x: x (mm).
+        rest: Position y, z at rest (k, 2), mm.
+        position: Present position y, z (k, 2), mm.
+        stretch: Stretch λ.
+        active: Whether the point is behind the tip.
+        law: Index of the tissue's law, as in `laws_of`.
     """
 
     x: Floats
@@ -63,16 +70,23 @@ class Reactions(NamedTuple):
 class State:
     """The insertion at one instant. Arrays are read-only; angles in rad, lengths in mm, energies in mJ.
 
-    needle, `rest` (k,) and `compression` (k,) are the input of the next step. clamp: part of the base pose that no
-    command moved. `mesh` (j,) is the solution at the nodes behind the tip, measured points included: x; y, slope,
-    shear, moment and force on the needle; stored energy, the same times w_c. spring_energy: of the tip spring. roll:
-    the needle's angle about its axis, whole turns included; 0 bends the path towards +y, π/2 towards +z.
+    Attributes:
+        scenario: Scenario of the simulator.
+        model: Constants of the simulator.
+        needle: The needle and the channel, input of the next step.
+        clamp: Part of the base pose that no command moved.
+        rest: Rest positions (k,) of the contacts, input of the next step.
+        compression: Compressions (k,) of the contacts, input of the next step.
+        mesh: Solution (j,) at the nodes behind the tip, including measured points: x; y, slope, shear, moment and force
+            on the needle; stored energy, the same times w_c.
+        spring_energy: Energy of the tip spring.
+        roll: The needle's angle about its axis, with whole turns; 0 bends the path towards +y, π/2 towards +z.
     """
 
     scenario: Scenario
     model: Model
-    needle: nd.Needle
-    clamp: nd.Pose
+    needle: nd.NeedleState
+    clamp: nd.NodePose
     rest: Laterals
     compression: Laterals
     mesh: NDArray[Any]
@@ -82,7 +96,7 @@ class State:
     def __setstate__(self, values: dict[str, Any]) -> None:
         """Take the values of a copy or a pickle; for arrays that can be written to, kernels would be compiled again."""
         self.__dict__.update(
-            {name: _frozen(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+            {name: _freeze(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
         )
 
     @property
@@ -102,7 +116,7 @@ class State:
         x = base.x - (self.scenario.start_base_x + clamp.x)
         guide = self.needle.boundary.guide - self.scenario.guide_home
         across = base.y - clamp.y - self.scenario.entry.slope * x
-        return np.array([*_row(nd.Pose(x, across, base.slope - clamp.slope)), *_pair(guide)])
+        return np.array([*_row(nd.NodePose(x, across, base.slope - clamp.slope)), *_pair(guide)])
 
     @property
     def guide(self) -> Lateral:
@@ -139,7 +153,7 @@ class State:
         """Needle state X: poses (n, 5) at n equal arc lengths from base to tip: x, y, z, θ, ψ."""
         nodes = np.empty((self.scenario.needle.nodes, insertion.POSE_SIZE))
         equal_arc_nodes(*self._curve(), nodes)
-        return _frozen(nodes)
+        return _freeze(nodes)
 
     @cached_property
     def contacts(self) -> Contacts:
@@ -156,7 +170,7 @@ class State:
             active,
             nodes["law"],
         )
-        return Contacts(*(_frozen(column[formed]) for column in columns))
+        return Contacts(*(_freeze(column[formed]) for column in columns))
 
     @cached_property
     def strain_energy(self) -> float:
@@ -192,18 +206,16 @@ class State:
     ) -> "State":
         """Return the state with an observer's corrections (mm, rad, N), which take effect in the next solve.
 
-        base, slope, tip_load: y and, in space, z.
-
-        A corrected base position does not count as travel.
+        base, slope, tip_load: y and, in space, z. A corrected base position does not count as travel.
         """
         boundary, clamp = self.needle.boundary, self.clamp
         old = boundary.base
 
         def across(now: complex, given: Sequence[float] | None) -> complex:
-            return now if given is None else lateral(now, *_both(given))
+            return now if given is None else lateral(now, *_with_z(given))
 
-        pose = nd.Pose(old.x if base_x is None else base_x, across(old.y, base), across(old.slope, slope))
-        moved = nd.Pose(
+        pose = nd.NodePose(old.x if base_x is None else base_x, across(old.y, base), across(old.slope, slope))
+        moved = nd.NodePose(
             clamp.x + (pose.x - old.x), clamp.y + (pose.y - old.y), clamp.slope + (pose.slope - old.slope)
         )
         load = across(boundary.load, tip_load)
@@ -218,7 +230,7 @@ class State:
 
     def _arrays(self) -> dict[str, Any]:
         return {
-            "needle": np.array(_flat(self.needle)),
+            "needle": np.array(_flatten(self.needle)),
             "clamp": np.array(self.clamp),
             "rest": self.rest,
             "compression": self.compression,
@@ -227,7 +239,7 @@ class State:
         }
 
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
-        """x, y, slope of base, nodes and tip."""
+        """Return x, y and slope of base, nodes and tip."""
         ends = self.needle.boundary.base, self.needle.solution.tip
         rows = zip(ends[0], (self.mesh[name] for name in ("x", "y", "slope")), ends[1], strict=True)
         first, second, third = (np.concatenate([[base], inner, [tip]]) for base, inner, tip in rows)
@@ -237,7 +249,7 @@ class State:
         return tuple(array.tobytes() for array in self._arrays().values())
 
     def __eq__(self, other: object) -> bool:
-        """Whether scenario and arrays are the same, to the bit: 0 is not −0, and NaN equals the same NaN."""
+        """Return whether scenario and arrays are the same, to the bit: 0 is not −0, and NaN equals the same NaN."""
         if not isinstance(other, State):
             return NotImplemented
         return self._bytes() == other._bytes() and self.scenario == other.scenario
@@ -257,7 +269,7 @@ class State:
         return f"<State {where}, {self.strain_energy:.4g} mJ in the tissue, {ended}>"
 
 
-def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
+def first_mechanics_difference(one: Scenario, other: Scenario) -> str | None:
     """Return the first key on which the mechanics of two scenarios differ, or None."""
     mine, theirs = one.flat(), other.flat()
     for key in [*mine, *(key for key in theirs if key not in mine)]:
@@ -269,7 +281,8 @@ def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
 def load_state(path: str | Path, start: State) -> State:
     """Read a file of `State.save`, for the scenario and model of `start`.
 
-    StateError if it is not one, or of another scenario, with the differing key.
+    Raises:
+        StateError: The file is no state, or a state of another scenario, with the key that differs.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -277,21 +290,21 @@ def load_state(path: str | Path, start: State) -> State:
         saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
     except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
         raise StateError(f"{path}: not a saved state ({error})") from error
-    if (key := mechanics_difference(saved, start.scenario)) is not None:
+    if (key := first_mechanics_difference(saved, start.scenario)) is not None:
         mine, theirs = start.scenario.flat().get(key), saved.flat().get(key)
         raise StateError(f"{path}: saved under another scenario: {key} was {theirs}, is {mine}")
     known = {name: (array.dtype, array.ndim) for name, array in start._arrays().items()}
     if {name: (array.dtype, array.ndim) for name, array in arrays.items()} != known:
         raise StateError(f"{path}: saved by another version of flexneedle")
-    needle = _filled(start.needle, iter(arrays.pop("needle").tolist()))
-    clamp = nd.Pose(*arrays.pop("clamp").tolist())
+    needle = _fill(start.needle, iter(arrays.pop("needle").tolist()))
+    clamp = nd.NodePose(*arrays.pop("clamp").tolist())
     energy, roll = arrays.pop("ends").tolist()
-    parts = {name: _frozen(array) for name, array in arrays.items()}
+    parts = {name: _freeze(array) for name, array in arrays.items()}
     return replace(start, needle=needle, clamp=clamp, spring_energy=energy, roll=roll, **parts)
 
 
-def _both(given: Sequence[float]) -> tuple[float, float]:
-    """y and z, 0 if it is not given."""
+def _with_z(given: Sequence[float]) -> tuple[float, float]:
+    """Return y and z, 0 if it is not given."""
     y, z = (*given, 0.0)[:2]
     return y, z
 
@@ -304,30 +317,33 @@ def _pairs(values: Laterals) -> Floats:
     return np.stack([values.real, values.imag], axis=-1)
 
 
-def _row(pose: nd.Pose) -> Floats:
+def _row(pose: nd.NodePose) -> Floats:
     (y, z), (theta, psi) = _pair(pose.y), _pair(pose.slope)
     return np.array([pose.x, y, z, theta, psi])
 
 
-def _flat(record: tuple[Any, ...]) -> list[Any]:
-    """All numbers of nested records."""
-    return [number for part in record for number in (_flat(part) if isinstance(part, tuple) else [part])]
+def _flatten(record: tuple[Any, ...]) -> list[Any]:
+    """Return all numbers of nested records."""
+    return [number for part in record for number in (_flatten(part) if isinstance(part, tuple) else [part])]
 
 
-def _filled(like: _Record, numbers: Iterator[Any]) -> _Record:
-    """Records as `like`, of these numbers."""
-    parts = (
-        _filled(part, numbers) if isinstance(part, tuple) else _typed(part, next(numbers)) for part in like
-    )
+def _fill(like: _Record, numbers: Iterator[Any]) -> _Record:
+    """Return records as `like`, filled with these numbers."""
+    parts = (_fill(part, numbers) if isinstance(part, tuple) else _cast(part, next(numbers)) for part in like)
     return type(like)(*parts)
 
 
-def _typed(like: Any, number: Any) -> Any:
+def _cast(like: Any, number: Any) -> Any:
     return type(like)(number) if isinstance(like, complex) else type(like)(number.real)
 
 
-def solved(start: State, model: Model, needle: nd.Needle, rest: Laterals, u: Laterals, w: nd.Work) -> State:
-    """Freeze a solve of `model` into a state of `start`'s scenario. `model` may have more essential nodes than it."""
+def freeze_solve(
+    start: State, model: Model, needle: nd.NeedleState, rest: Laterals, u: Laterals, w: nd.Work
+) -> State:
+    """Return the state after a solve of `model`, frozen, for `start`'s scenario.
+
+    `model` may have more essential nodes than the scenario's.
+    """
     count = needle.solution.last.behind
     stored = np.zeros(count)
     spring = insertion.energies(model, needle, u, stored)
@@ -345,13 +361,13 @@ def solved(start: State, model: Model, needle: nd.Needle, rest: Laterals, u: Lat
     return replace(
         start,
         needle=needle,
-        rest=_frozen(rest[own]),
-        compression=_frozen(u[own]),
-        mesh=_frozen(mesh),
+        rest=_freeze(rest[own]),
+        compression=_freeze(u[own]),
+        mesh=_freeze(mesh),
         spring_energy=spring,
     )
 
 
-def _frozen(array: _Array) -> _Array:
+def _freeze(array: _Array) -> _Array:
     array.flags.writeable = False
     return array

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import CommandError
 from flexneedle.estimation.estimate import Estimate
@@ -80,7 +80,7 @@ class ControllerConformance:
         """Require a `Controller` whose settings have valid defaults in the scenario."""
         made = self.make()
         require(isinstance(made, Controller), f"make must return a Controller, not {type(made).__name__}")
-        checked(self.scenario or short_scenario(), made)
+        check_tables(self.scenario or short_scenario(), made)
 
     def test_decides_with_a_reason(self) -> None:
         """Require decisions, each with a reason in one line."""

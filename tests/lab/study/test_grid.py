@@ -10,14 +10,14 @@ import pyarrow as pa
 import pytest
 
 from flexneedle.control.controllers import CONTROLLERS as INCLUDED
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.errors import InputError
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.spec import LARGEST_SEED, STUDIES
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.files import dump_scenario, load_scenario
 
-PHANTOM = checked(load_scenario("phantom"))
+PHANTOM = check_tables(load_scenario("phantom"))
 CONTROLLERS = tuple(INCLUDED)[:2]
 CHOICES = "must be one of " + ", ".join(INCLUDED)
 SEEDS = f"from 0 to {LARGEST_SEED}"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.errors import InputError
 from flexneedle.lab.study import rows
 from flexneedle.lab.study.grid import load_study
@@ -54,7 +54,7 @@ def load(tmp_path):
 def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
     study = load()
     for point in study.points:
-        assert point.scenario == checked(world(point.world, point.case))
+        assert point.scenario == check_tables(world(point.world, point.case))
         assert point.world_case == point.case
         assert "world" not in point.varied
 
@@ -244,7 +244,7 @@ def test_each_world_has_the_rigs_that_it_can_have(load):
         *((FREE, rig, "open-loop") for rig in ("plane", "no-guide", "no-guide-half-turns")),
     }
     for point in study.points:
-        assert point.scenario == checked(world(point.world, "real", point.world_rig))
+        assert point.scenario == check_tables(world(point.world, "real", point.world_rig))
         assert point.varied["world_rig"] == point.world_rig
 
 

@@ -1,4 +1,4 @@
-"""The controllers by name, the default first. A new controller is a file here with a METHOD."""
+"""The controllers by name, the default first. A new controller is a file here with a CONTROLLER."""
 
 import warnings
 from collections.abc import Iterable
@@ -7,55 +7,49 @@ from pkgutil import iter_modules
 from typing import Any
 
 from flexneedle.control.interface import Controller
-from flexneedle.control.tables import completed, unowned
-from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
+from flexneedle.control.tables import complete_tables, find_unowned_tables
+from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.plugins import find_part, is_own, missing_parts, name_kind
 from flexneedle.scenario.model import Scenario
 
 DEFAULT = "adaptive-mpc"
 
 
-def _found() -> dict[str, Controller]:
-    """The METHOD of each module of this package, by name: the default, then in the order of the alphabet."""
+def _find_controllers() -> dict[str, Controller]:
+    """Return the CONTROLLER of each module of this package, by name: the default, then in alphabetical order."""
     modules = [import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__)]
-    methods = [module.METHOD for module in modules if hasattr(module, "METHOD")]
-    methods.sort(key=lambda method: (method.name != DEFAULT, method.name))
-    return {method.name: method for method in methods}
+    controllers = [module.CONTROLLER for module in modules if hasattr(module, "CONTROLLER")]
+    controllers.sort(key=lambda one: (one.name != DEFAULT, one.name))
+    return {one.name: one for one in controllers}
 
 
-CONTROLLERS: dict[str, Controller] = _found()
+CONTROLLERS: dict[str, Controller] = _find_controllers()
 
 
-def method(name: str) -> Controller:
-    """Return the controller of this name. Raises InputError with the choices."""
-    if name not in CONTROLLERS:
-        raise InputError(f"controller = {name!r}: must be one of {', '.join(CONTROLLERS)}")
-    return CONTROLLERS[name]
-
-
-def checked(scenario: Scenario, *own: Controller, source: str = "") -> Scenario:
+def check_tables(scenario: Scenario, *own: Controller, source: str = "") -> Scenario:
     """Return the scenario with all settings of the controllers here and of others (`own`).
 
-    Raises ScenarioError with one line for each problem, which opens with `source`; a table of no controller is one.
+    Raises:
+        ScenarioError: One line for each problem, which opens with `source`; a table of no controller is one.
     """
-    known = _with(own)
-    if lines := unowned(scenario, known, source):
+    known = _with_own(own)
+    if lines := find_unowned_tables(scenario, known, source):
         raise ScenarioError(*lines)
-    return completed(scenario, known, source)
+    return complete_tables(scenario, known, source)
 
 
-def used(scenario: Scenario, *own: Controller, source: str = "") -> Scenario:
-    """Return the scenario as `checked` does, but accept the table of a controller that is not in use.
+def with_controller_defaults(scenario: Scenario, *own: Controller, source: str = "") -> Scenario:
+    """Return the scenario as `check_tables` does, but accept the table of a controller that is not in use.
 
-    It warns (ScenarioWarning) of such a table, in the same words whatever the source, so that it is printed once.
+    A ScenarioWarning reports such a table, in the same words for every source, so that it is printed once.
     """
-    known = _with(own)
-    for line in unowned(scenario, known):
+    known = _with_own(own)
+    for line in find_unowned_tables(scenario, known):
         warnings.warn(f"{line}; it is not used", ScenarioWarning, stacklevel=2)
-    return completed(scenario, known, source)
+    return complete_tables(scenario, known, source)
 
 
-def _with(own: tuple[Controller, ...]) -> list[Controller]:
+def _with_own(own: tuple[Controller, ...]) -> list[Controller]:
     return list(dict.fromkeys((*CONTROLLERS.values(), *own)))
 
 

@@ -17,20 +17,20 @@ from typing import cast
 import numpy as np
 from pydantic import Field
 
-from flexneedle.control.forecast import probability_beyond, size_text
+from flexneedle.control.forecast import format_miss, probability_beyond
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.outlook import UNCORRECTED, Outlook
-from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
+from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.costs.table import Term, Trajectories
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
-from flexneedle.estimation.lateral import facing
+from flexneedle.estimation.lateral import bevel_directions
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.horizon import Found, Variables, best
+from flexneedle.planning.horizon import Found, Variables, find_best
 from flexneedle.scenario.sections.fields import NonNegative, count
 from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
@@ -69,10 +69,16 @@ class AdaptiveMpc(Priors):
 class Memory:
     """The memory from period to period: the current path, and the derivatives ahead of the tip.
 
-    path: as decided; rolled: the same after the roll of the command; roll: the needle's angle (rad) before the command.
-    The next estimate shows which of the two is current: a needle that is held or rests does not roll.
-    scale: energy (mJ) of the tissue down to the target displaced by 1 mm; rests: number of rests already made;
-    blur: standard deviation (mm) of a miss that is corrected as long as it can be.
+    The next estimate shows which of the two paths is current: a needle that is held or rests does not roll.
+
+    Attributes:
+        path: The path as decided.
+        rolled: The same path after the roll of the command.
+        roll: The needle's angle (rad) before the command.
+        scale: Energy (mJ) of the tissue down to the target displaced by 1 mm.
+        outlook: Derivatives ahead of the tip, None before the first decision.
+        rests: Number of rests already made.
+        blur: Standard deviation (mm) of a miss after all corrections that can still take effect.
     """
 
     path: GuidePath
@@ -85,16 +91,16 @@ class Memory:
 
 
 def begin(task: Task) -> Memory:
-    """The memory at the start: the plan's path."""
-    path, scale = of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
+    """Return the memory at the start, with the plan's path."""
+    path, scale = path_of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
     return Memory(path, path, task.plan.roll, scale)
 
 
 def decide(
     task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Memory]:
-    """The first step of the best path found."""
-    fitted = cast(Identified, estimate)  # METHOD below names its observer
+    """Return the first step of the best path found, and the memory after it."""
+    fitted = cast(Identified, estimate)  # CONTROLLER below names its observer
     settings = task.settings
     current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
@@ -103,13 +109,13 @@ def decide(
         return Decision(STILL, "no path converges on the fitted model", found.cost), memory
     outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
-        ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
+        ahead = Ahead.of(task, fitted.state, ahead.correct(found.z))
         found = search_path(task, fitted, ahead, memory, settings.effort, rng)
         outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
-    path = ahead.corrected(found.z)
-    command, rolled = ahead.first(path)
-    rest, rests = _rest(task, memory, fitted, ahead.left)
-    why = f"{_rolls_text(rolled, fitted.axes)}; predicted miss {size_text(miss)} ± {sd:.3f} mm"
+    path = ahead.correct(found.z)
+    command, rolled = ahead.first_command(path)
+    rest, rests = _rest_time(task, memory, fitted, ahead.left)
+    why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
     after = Memory(
         path,
@@ -123,8 +129,8 @@ def decide(
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
 
 
-def _rolls_text(path: GuidePath, axes: int) -> str:
-    """Where the needle rolls, in space with its angles after that."""
+def _describe_rolls(path: GuidePath, axes: int) -> str:
+    """Return the depths of the rolls and, in space, the angles after them."""
     if not len(path.rolls):
         return "no roll"
     if axes == 1:
@@ -132,24 +138,25 @@ def _rolls_text(path: GuidePath, axes: int) -> str:
     return f"rolls at {', '.join(f'{depth:.1f} mm to {math.degrees(angle):.0f}°' for depth, angle in path.rolls)}"
 
 
-def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
-    """Time (s) to rest in this period, and number of rests before the target.
+def _rest_time(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
+    """Return the time (s) to rest in this period, and the number of rests before the target.
 
-    Readings are late: at rest they arrive, and the error that they show can still be corrected. So it rests at a
-    few distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not explain.
+    Readings are late: at rest they arrive, and the error that they show can still be corrected. So the needle rests at
+    a few distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not
+    explain.
     """
     setup = task.scenario.setup
     step = setup.max_advance_mm
     catching_up = fitted.lag + step / setup.insertion_speed_mm_s
     rests = max(memory.rests, sum(left <= distance * step + 1e-9 for distance in _RESTS))
-    if rests > memory.rests or _surprised(fitted):
+    if rests > memory.rests or _is_surprised(fitted):
         # None where the needle was measured at rest for as long already, since the decision came late.
         return max(0.0, catching_up), rests
     return 0.0, rests
 
 
-def _surprised(fitted: Identified) -> bool:
-    """Whether the residual of the fit to the readings of a step in the tissue is improbably large."""
+def _is_surprised(fitted: Identified) -> bool:
+    """Return whether the residual of the fit to the readings of a step in the tissue is improbably large."""
     stepped = bool(fitted.moves) and fitted.moves[-1].applied.db_x > 0.0
     off = math.hypot(*fitted.innovation[1:]) / math.sqrt(fitted.reading_variance)
     return stepped and float(fitted.state.tip[X]) > 0.0 and off > _SURPRISE
@@ -158,31 +165,31 @@ def _surprised(fitted: Identified) -> bool:
 def search_path(
     task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
 ) -> Found:
-    """The best correction of the current path, which is itself among the samples."""
+    """Return the best correction of the current path, which is itself among the samples."""
     settings = task.settings
     samples = effort * settings.samples
-    first = proposals(ahead, samples, rng, _aim(task, fitted, ahead))
+    first = propose_samples(ahead, samples, rng, _aim_of_rolls(task, fitted, ahead))
     lower, upper = ahead.bounds
     variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = elite_count(samples, _ELITE_FRACTION)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
     charged = cost_terms(task, fitted, memory, ahead)
-    return best(variables, partial(measured_rollout, fitted), charged, search, rng, first=first)
+    return find_best(variables, partial(rollout_as_measured, fitted), charged, search, rng, first=first)
 
 
-def _aim(task: Task, fitted: Identified, ahead: Ahead) -> complex:
-    """Direction in which the current path misses the target by too little, for a needle that rolls to any angle."""
+def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
+    """Return the direction from the end of the current path to the target; 1 for a needle that rolls by half turns."""
     if ahead.setup.half_turns:
         return 1.0
-    along = measured_rollout(fitted, ahead.controls(ahead.current[None])[0])
+    along = rollout_as_measured(fitted, ahead.controls(ahead.current[None])[0])
     return complex(-past_target(along, task.plan.target)[0])
 
 
-def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
-    """Trajectories of controls (N, m, 9) on the fitted model; tips as a tracker without errors would measure them."""
+def rollout_as_measured(fitted: Identified, controls: Floats) -> Trajectories:
+    """Return trajectories of controls (N, m, 9) on the fitted model, with tips as a perfect tracker measures them."""
     predicted = fitted.simulator.rollout(fitted.state, controls, limits=False, rough=True)
     tips, energy, converged = predicted[:3]
-    off = fitted.run_out * facing(fitted.state.bevel, controls, fitted.axes) + fitted.residual
+    off = fitted.run_out * bevel_directions(fitted.state.bevel, controls, fitted.axes) + fitted.residual
     tips[:, :, Y] += off.real
     tips[:, :, Z] += off.imag
     return Trajectories(controls, tips, energy, converged)
@@ -228,13 +235,13 @@ def expected_out_of_reach(
     The first distance is for a first roll that turns the bevel by that angle (rad), the second for the opposite roll.
 
     The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
-    the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
-    bounds are normally distributed, `margin` times as widely as the estimate is, since reach that no later step will
-    need may be given away. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the
-    tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects, so that only
-    the distance across it counts.
+    the second step on; the reach of a needle that rolls to any angle is the circle about the middle of such an
+    interval. The bounds are normally distributed, `margin` times as widely as the estimate is, since reach that no
+    later step will need may be given away. With the bevel alone, lost reach cannot be regained; with a guide, the bevel
+    still moves the tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects,
+    so that only the distance across it counts.
     """
-    trajectories = measured_rollout(fitted, ahead.constant)
+    trajectories = rollout_as_measured(fitted, ahead.constant)
     if not trajectories.converged.all():
         return np.zeros(2), 0.0
     past = past_target(trajectories, task.plan.target).reshape(2, 2)
@@ -242,7 +249,7 @@ def expected_out_of_reach(
     if ahead.setup.half_turns:
         low, high = past.real.min(axis=1), past.real.max(axis=1)
         sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-        return above_zero(low, sd) + above_zero(-high, sd), 0.0
+        return mean_above_zero(low, sd) + mean_above_zero(-high, sd), 0.0
     # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
     # the middle towards the target or away from it: the ends are that much farther, or nearer.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
@@ -250,18 +257,18 @@ def expected_out_of_reach(
         away = 1j * away.imag
     sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
     angle = float(np.angle(complex(away) * fitted.state.bevel.conjugate()))
-    return above_zero(abs(away) - radius, sd), angle
+    return mean_above_zero(abs(away) - radius, sd), angle
 
 
 def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
-    """Whether the guide moves along y only, and a bevel that turns to any angle steers along z."""
+    """Return whether the guide moves along y only, so that a bevel that turns to any angle steers alone along z."""
     setup = ahead.setup
     guided = guide_may_move(setup, task.plan.strategy)
     return guided and setup.moved_guide_axes < setup.axes and not setup.half_turns
 
 
-def above_zero(mean: Floats, sd: Floats) -> Floats:
-    """Mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
+def mean_above_zero(mean: Floats, sd: Floats) -> Floats:
+    """Return the mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
     z = mean / np.maximum(sd, _CERTAIN)
     below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
     part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
@@ -271,16 +278,17 @@ def above_zero(mean: Floats, sd: Floats) -> Floats:
 def _forecast(
     task: Task, memory: Memory, fitted: Identified, ahead: Ahead, found: Found
 ) -> tuple[Outlook, complex, float, Shape]:
-    """Derivatives ahead of the tip, the predicted miss (mm; y + iz in space), its standard deviation on an axis (mm),
-    and the predicted shape at the target.
+    """Return the derivatives ahead of the tip, the predicted miss, its standard deviation, and the predicted shape.
+
+    The miss (mm) is y or, in space, y + iz; its standard deviation (mm) is on an axis; the shape is at the target.
     """
     past = complex(past_target(found.trajectories, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
-    both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.leaning(found.z)[None])[0]])
+    both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.lean_guide(found.z)[None])[0]])
     shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, shapes=True).shapes
     nodes, leaning = shapes[:, -1]
     before = memory.outlook or Outlook.of(fitted)
-    outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
+    outlook = before.renew(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     sd = outlook.sd(fitted, task.plan.target[0], miss, guided=guided)
     by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]
@@ -292,7 +300,7 @@ def _forecast(
     return outlook, miss, sd, Shape(nodes, outlook.shape_sd(fitted, task.plan.target[0], lever, sd))
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "adaptive-mpc",
     "plans to the target each period, with a model that is fitted to the readings",
     Identification(),

@@ -18,11 +18,11 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     """Advance by the largest step, with the bevel towards the target."""
     scenario = task.scenario
     advance = min(scenario.setup.max_advance_mm, travel_left(scenario, task.plan, estimate.state))
-    roll, why = bang_bang.decide(task, estimate, task.settings)
+    roll, why = bang_bang.decide_roll(task, estimate, task.settings)
     return Decision(Control(db_x=advance, roll=roll), why), memory
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "bevel-only",
     "bang-bang steering by the bevel, without guide motion",
     StateCorrection(),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.control.interface import Controller, Decision, travel_left
-from flexneedle.control.mpc import planned_base
+from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
@@ -44,10 +44,12 @@ class BroydenMpc(Section):
 
 @dataclass(frozen=True, eq=False)
 class JacobianEstimate:
-    """Jacobian (1 + a, 1 + g) from insertion and guide, on g axes, to the tip, on a lateral axes; the last (tip x,
-    insertion, guide) as commanded.
+    """Jacobian from insertion and guide to the tip, and the recorded inputs.
 
-    last_update: tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading.
+    Attributes:
+        jacobian: Derivatives (1 + a, 1 + g) of the tip on a lateral axes, for a guide on g axes.
+        history: The last rows (tip x, insertion, guide), as commanded.
+        last_update: Tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading.
     """
 
     jacobian: Floats
@@ -56,7 +58,7 @@ class JacobianEstimate:
 
 
 def begin(task: Task) -> JacobianEstimate:
-    """The initial Jacobian: a tip that continues straight and follows the guide laterally."""
+    """Return the initial Jacobian, of a tip that continues straight and follows the guide laterally."""
     setup = task.scenario.setup
     jacobian = np.eye(1 + setup.axes, 1 + setup.moved_guide_axes)
     jacobian[1:, 1:] *= task.settings.guide_effect
@@ -70,58 +72,64 @@ def decide(
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
     inputs = np.array([state.travel[DB_X], *state.guide[: setup.moved_guide_axes]])
-    estimated = remember(estimated, float(state.tip[X]), inputs)
+    estimated = record_inputs(estimated, float(state.tip[X]), inputs)
     left = travel_left(scenario, task.plan, state)
     advance = min(setup.max_advance_mm, left)
-    row = Control(advance, *planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist())
+    row = Control(
+        advance, *steps_to_planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist()
+    )
     if estimate.measured is None or left <= 0.0:
         return Decision(row, "no reading yet"), estimated
     tip = np.array(estimate.measured[: 1 + setup.axes])
-    then = inputs_at(estimated, float(tip[0]))
-    estimated = updated(estimated, tip, then, settings.update_gain)
+    then = interpolate_inputs(estimated, float(tip[0]))
+    estimated = update_jacobian(estimated, tip, then, settings.update_gain)
     tip = tip + estimated.jacobian @ (inputs - then)
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
-    moves, cost = guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
+    moves, cost = solve_guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
     slopes, effects = estimated.jacobian[1:, 0], np.diag(estimated.jacobian[1:, 1:])
-    moves_by = f"tip moves {_listed(slopes)} laterally with insertion, {_listed(effects)} with the guide"
+    moves_by = (
+        f"tip moves {_join_values(slopes)} laterally with insertion, {_join_values(effects)} with the guide"
+    )
     why = f"bevel kept: never rolled; {moves_by}"
     return Decision(Control(*row[:DG_Y], *moves[0].tolist()), why, cost), estimated
 
 
-def _listed(values: Floats) -> str:
-    """A number for each axis."""
+def _join_values(values: Floats) -> str:
+    """Return the numbers of all axes, joined by "and"."""
     return " and ".join(f"{value:.3f}" for value in values.tolist())
 
 
-def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
+def record_inputs(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
     """Record the inputs with the tip at depth x (mm), to which later readings are assigned."""
     history = (*estimated.history, (x, *inputs.tolist()))[-_KEPT:]
     return JacobianEstimate(estimated.jacobian, history, estimated.last_update)
 
 
-def inputs_at(estimated: JacobianEstimate, x: float) -> Floats:
-    """Inputs (1 + g,) with the tip at depth x (mm), within the recorded range."""
+def interpolate_inputs(estimated: JacobianEstimate, x: float) -> Floats:
+    """Return the inputs (1 + g,) with the tip at depth x (mm), within the recorded range."""
     depth, *inputs = np.array(estimated.history).T
     return np.array([np.interp(x, depth, values) for values in inputs])
 
 
-def updated(estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float) -> JacobianEstimate:
-    """The estimate updated by a reading of the tip, if the insertion since the last update is long enough."""
+def update_jacobian(
+    estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float
+) -> JacobianEstimate:
+    """Return the estimate updated by a reading of the tip, if the insertion since the last update is long enough."""
     if estimated.last_update is None:
         return JacobianEstimate(estimated.jacobian, estimated.history, (tip, inputs))
     last_tip, last_inputs = estimated.last_update
     if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
         return estimated
-    jacobian = broyden(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
+    jacobian = broyden_update(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
     return JacobianEstimate(jacobian, estimated.history, (tip, inputs))
 
 
-def broyden(jacobian: Floats, moved: Floats, measured: Floats, gain: float) -> Floats:
-    """The nearest matrix that maps `moved` to `measured` (Broyden 1965), or the share `gain` of that change."""
+def broyden_update(jacobian: Floats, moved: Floats, measured: Floats, gain: float) -> Floats:
+    """Return the nearest matrix that maps `moved` to `measured` (Broyden 1965), or the share `gain` of that change."""
     return jacobian + gain * np.outer(measured - jacobian @ moved, moved) / (moved @ moved)
 
 
-def guide_moves(
+def solve_guide_moves(
     settings: BroydenMpc,
     scenario: Scenario,
     plan: Plan,
@@ -130,13 +138,13 @@ def guide_moves(
     ahead: Floats,
     guide: Floats,
 ) -> tuple[Floats, float]:
-    """Guide positions (n, g), mm, relative to the present ones (g,), after n steps that end `ahead` (n,) of the tip,
-    and their cost.
+    """Return guide positions (n, g), mm, relative to the present ones (g,), and their cost.
 
-    Cost: squared distance (mm²) of tip and planned path, and `guide_weight` times the squared guide steps.
+    ahead (n,): travel of the tip (mm) at the end of each of n steps. Cost: squared distance (mm²) of tip and planned
+    path, and `guide_weight` times the squared guide steps.
     """
     n, axes = len(ahead), guide.size
-    goal = np.array([np.interp(tip[0] + ahead, *_path(plan, k)) for k in range(1, tip.size)])
+    goal = np.array([np.interp(tip[0] + ahead, *_planned_path(plan, k)) for k in range(1, tip.size)])
     effort = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
     matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort)])
     left = goal - tip[1:, None] - np.multiply.outer(jacobian[1:, 0], ahead)
@@ -150,14 +158,14 @@ def guide_moves(
     return moves.reshape(axes, n).T, float(np.sum((matrix @ moves - right) ** 2))
 
 
-def _path(plan: Plan, k: int) -> tuple[Floats, Floats]:
-    """Depth and a lateral position, column k, of the planned path, with the target as its end."""
+def _planned_path(plan: Plan, k: int) -> tuple[Floats, Floats]:
+    """Return the depths and lateral positions (column k) of the planned path, with the target as its end."""
     depth, lateral = (np.append(plan.tips[:-1, column], plan.target[column]) for column in (0, k))
     return depth, lateral
 
 
 def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:
-    """Least ‖A z − b‖² for lower ≤ 0 ≤ upper, exact: the primal active-set method from z = 0.
+    """Return the exact least ‖A z − b‖² for lower ≤ 0 ≤ upper, by the primal active-set method from z = 0.
 
     For a singular A the solution nearest to 0, by a ridge.
     """
@@ -184,7 +192,7 @@ def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: F
     return z
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "broyden-mpc",
     "guide by linear MPC with a Jacobian estimated from readings (Broyden), no model",
     StateCorrection(),

@@ -16,12 +16,12 @@ from flexneedle.estimation.task import Task
 
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
-    roll, why = bang_bang.decide(task, estimate, task.settings)
-    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, task.settings, roll=roll, rng=rng)
+    roll, why = bang_bang.decide_roll(task, estimate, task.settings)
+    choice = mpc.choose_step(estimate.simulator, task.plan, estimate.state, task.settings, roll=roll, rng=rng)
     return Decision(choice.command, why, choice.cost, choice.spread, samples=choice.samples), memory
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "ce-mpc",
     "the paper's: the measured tip is released in the prediction",
     StateCorrection(fits_start=False, estimates_load=False),

@@ -1,4 +1,4 @@
-"""`open-loop`: the plan replayed, whatever the tracker measures."""
+"""`open-loop`: the plan replayed, without regard to the tracker."""
 
 import numpy as np
 
@@ -23,16 +23,16 @@ def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator)
     ), done + 1
 
 
-def arrived(task: Task, done: int, _estimate: Estimate) -> bool:
-    """Whether the planned steps are used up."""
+def has_arrived(task: Task, done: int, _estimate: Estimate) -> bool:
+    """Return whether all planned steps are done."""
     return done >= len(task.plan.controls)
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "open-loop",
     "the plan replayed, without feedback",
     StateCorrection(),
     begin=lambda _task: 0,
     decide=decide,
-    arrived=arrived,
+    arrived=has_arrived,
 )

@@ -2,11 +2,11 @@
 
 Steering from the base with the Jacobian of a mechanical model of needle and tissue: DiMaio and Salcudean, Needle
 insertion modeling and simulation (IEEE Trans. Robot. Autom. 2003) and Needle steering and motion planning in soft
-tissues (IEEE Trans. Biomed. Eng. 2005); Glozman and Shoham, Image-guided robotic flexible needle steering (IEEE
-Trans. Robot. 2007). Here the Jacobian is that of the tip's position a little ahead, by a small disturbance of the
-guide, and the plan gives the nominal motion of the guide. The newest innovation is
-taken as constant; otherwise the model, released from the measured tip, would return to its own equilibrium. The
-advance needs no Jacobian: the tip's depth follows the base one to one.
+tissues (IEEE Trans. Biomed. Eng. 2005); Glozman and Shoham, Image-guided robotic flexible needle steering (IEEE Trans.
+Robot. 2007). Here the Jacobian is taken for the tip's position a little ahead, by a small disturbance of the guide, and
+the plan gives the nominal motion of the guide. The newest innovation is taken as constant; otherwise the model,
+released from the measured tip, would return to its own equilibrium. The advance needs no Jacobian: the tip's depth
+follows the base one to one.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 from flexneedle.control import bang_bang
 from flexneedle.control.guide import guide_reach
 from flexneedle.control.interface import Controller, Decision, travel_left
-from flexneedle.control.mpc import planned_base
+from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
@@ -51,16 +51,16 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
     left = travel_left(scenario, task.plan, state)
-    roll, why = bang_bang.decide(task, estimate, settings)
+    roll, why = bang_bang.decide_roll(task, estimate, settings)
     if left <= 0.0:
         return Decision(STILL, "at the target depth"), memory
     disturbance = min(_DISTURBANCE_MM, 0.5 * setup.max_guide_step_mm, 0.5 * setup.max_guide_travel_mm)
     travel = min(left, max(setup.max_advance_mm, settings.lookahead_mm))
-    rows = nominal(scenario, task.plan, state, travel, disturbance, roll)
-    end, jacobian = sensitivity(estimate.simulator, state, rows, disturbance, setup.moved_guide_axes)
-    off = planned_lateral(task.plan, float(end[X])) - end[Y : Z + 1] - estimate.innovation[1:]
+    rows = nominal_controls(scenario, task.plan, state, travel, disturbance, roll)
+    end, jacobian = guide_jacobian(estimate.simulator, state, rows, disturbance, setup.moved_guide_axes)
+    off = planned_offset(task.plan, float(end[X])) - end[Y : Z + 1] - estimate.innovation[1:]
     moved = slice(DG_Y, DG_Y + setup.moved_guide_axes)
-    wanted = rows[0, moved] + settings.gain * damped_solution(jacobian, off, settings.damping)
+    wanted = rows[0, moved] + settings.gain * solve_damped(jacobian, off, settings.damping)
     step = np.clip(wanted, -setup.max_guide_step_mm, setup.max_guide_step_mm)
     place = np.array(state.guide[: len(step)])
     least, greatest = np.transpose([guide_reach(scenario, axis) for axis in range(len(step))])
@@ -70,12 +70,12 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     return Decision(Control.of(rows[0].tolist()), why), memory
 
 
-def nominal(
+def nominal_controls(
     scenario: Scenario, plan: Plan, state: State, travel: float, margin: float, roll: float
 ) -> Floats:
-    """Controls (n, 9) that insert by `travel` (mm) as planned, the guide `margin` (mm) inside its limits.
+    """Return controls (n, 9) that insert by `travel` (mm) as planned, the guide `margin` (mm) inside its limits.
 
-    roll: that of the first step (rad).
+    roll: roll in the first step (rad).
     """
     setup = scenario.setup
     count = max(1, math.ceil(travel / setup.max_advance_mm - 1e-9))
@@ -89,16 +89,17 @@ def nominal(
         wanted = place + np.cumsum(np.clip(steps, -limit, limit))
         guide = np.clip(wanted, least + margin, greatest - margin)
         rows[:, DG_Y + axis] = np.diff(guide, prepend=place)
-    rows[:, DB_Y:DG_Y] = planned_base(setup, plan, state, depth[1:])
+    rows[:, DB_Y:DG_Y] = steps_to_planned_base(setup, plan, state, depth[1:])
     rows[0, ROLL] = roll
     return rows
 
 
-def sensitivity(
+def guide_jacobian(
     simulator: Simulator, state: State, rows: Floats, disturbance: float, axes: int = 1
 ) -> tuple[Floats, Floats]:
-    """Tip pose (5,) after controls `rows` (n, 9), and its motion y, z for that of the guide in their first step (2,
-    axes).
+    """Return the tip pose (5,) after controls `rows` (n, 9), and its Jacobian (2, axes) for the guide's first step.
+
+    The Jacobian is the lateral motion y, z of the tip for the motion of the guide on each axis.
     """
     tried = np.stack([rows] * (1 + 2 * axes))
     for axis in range(axes):
@@ -108,22 +109,22 @@ def sensitivity(
     return end, (across[::2] - across[1::2]).T / (2.0 * disturbance)
 
 
-def planned_lateral(plan: Plan, x: float) -> Floats:
-    """Lateral position y, z (mm) of the planned path at depth x, with the target as its end."""
+def planned_offset(plan: Plan, x: float) -> Floats:
+    """Return the lateral position y, z (mm) of the planned path at depth x, with the target as its end."""
     depth = np.append(plan.tips[:-1, X], plan.target[0])
     return np.array(
         [np.interp(x, depth, np.append(plan.tips[:-1, k], plan.target[k])) for k in (Y, Z)], dtype=float
     )
 
 
-def damped_solution(jacobian: Floats, off: Floats, damping: float) -> Floats:
-    """The least u that minimises ‖J u − off‖² + λ² ‖u‖²."""
+def solve_damped(jacobian: Floats, off: Floats, damping: float) -> Floats:
+    """Return the u that minimises ‖J u − off‖² + λ² ‖u‖²."""
     axes = jacobian.shape[1]
     matrix, right = np.vstack([jacobian, damping * np.eye(axes)]), np.append(off, np.zeros(axes))
     return np.asarray(np.linalg.lstsq(matrix, right)[0], dtype=float)
 
 
-METHOD = Controller(
+CONTROLLER = Controller(
     "resolved-rate",
     "guide by the damped inverse of the model's Jacobian, bevel by the rule",
     StateCorrection(),

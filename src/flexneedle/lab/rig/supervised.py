@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.errors import DriverError, RefusedError, RigError
-from flexneedle.estimation.estimate import Estimate, after
+from flexneedle.estimation.estimate import Estimate, carry_out
 from flexneedle.lab.rig.dry_run import in_memory
 from flexneedle.lab.rig.fit import fit_problems, start_problems
 from flexneedle.lab.rig.rig_file import RigFile, load_rig
@@ -23,7 +23,7 @@ from flexneedle.loop.events import Event, Stream
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.control import MOVES, Limits, half_turned
+from flexneedle.simulator.control import MOVES, Limits, limit_half_turn
 from flexneedle.simulator.pace import ROUNDING_S, roll_time, travel_time
 from flexneedle.types import (
     DB_X,
@@ -153,7 +153,7 @@ class SupervisedDriver:
 
     def expect(self, estimate: Estimate, command: Control) -> None:
         """Take the estimated tip before a command, and where about it will be after it, for the check of readings."""
-        moved = after(estimate.simulator, estimate.state, command).tip - estimate.state.tip
+        moved = carry_out(estimate.simulator, estimate.state, command).tip - estimate.state.tip
         x, y, z = (estimate.tip + moved)[: Z + 1].tolist()
         limit = self._scenario.control.innovation_limit_mm + _SDS * estimate.tip_sd
         self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit)
@@ -170,7 +170,7 @@ class SupervisedDriver:
             raise RefusedError(
                 f"travel in {duration:g} s: must take at least {shortest:g} s, at the speeds of the scenario"
             )
-        roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
+        roll = limit_half_turn(self._rolled, command.roll) if self._limits.half_turns else command.roll
         travel, roll_duration = self._columns.travel(command), roll_time(self._scenario.setup, roll)
         done = self._supervisor.step(roll, travel, duration, self._expected, roll_duration)
         row = self._columns.control(done.travelled, *self._rotation(done, command, roll))

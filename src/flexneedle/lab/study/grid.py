@@ -12,7 +12,7 @@ from typing import Any
 from flexneedle.control.controllers import (
     CONTROLLERS,
     DEFAULT,
-    checked,
+    check_tables,
     find_controller,
     find_own_controllers,
 )
@@ -208,7 +208,7 @@ def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
     fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
     names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
     own = find_own_controllers(names["controller"])
-    base = checked(base, *own)
+    base = check_tables(base, *own)
     _check_without(settings["without"], base)
     left_out, targets, reaching = (settings[key] for key in ("without", "targets", "reach"))
     parts = _Parts(base, dict.fromkeys(left_out), fixed, cases or {"": {}}, targets, reaching, axes, own)
@@ -378,7 +378,7 @@ def _check_run(run: Mapping[str, Any]) -> None:
 
 def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Controller, ...], at: str) -> Scenario:
     try:
-        return checked(base.with_values(settings), *own)
+        return check_tables(base.with_values(settings), *own)
     except ScenarioError as error:
         further = (_FURTHER_KEYS if "unknown key" in problem else "" for problem in error.problems)
         lines = (problem + more + _suffix(at) for problem, more in zip(error.problems, further, strict=True))

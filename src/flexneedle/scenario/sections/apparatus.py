@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from flexneedle.scenario.sections.environment import AnySeed, Environment, Vector, expanded
+from flexneedle.scenario.sections.environment import AnySeed, Environment, Vector, expand_environment
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, count
 from flexneedle.scenario.sections.registration import Registration
 
@@ -72,14 +72,14 @@ class Setup(Section):
 
     @property
     def half_turns_by(self) -> str:
-        """The key and value by which the needle rolls by half turns only; empty if it rolls to any angle."""
+        """Key and value by which the needle rolls by half turns only; empty if it rolls to any angle."""
         if self.axes == 1:
             return "setup.axes = 1"
         return 'setup.rotation = "half-turns"' if self.half_turns else ""
 
     @property
     def turns(self) -> str:
-        """What rolls of the bevel are called."""
+        """Name for rolls of the bevel: flips in the plane."""
         return "bevel flips" if self.half_turns else "bevel rolls"
 
     @property
@@ -99,12 +99,12 @@ class Setup(Section):
 
     @property
     def guide_x(self) -> float | None:
-        """x of the guide, mm: −G, or None without a guide."""
+        """Position x of the guide, mm: −G, or None without a guide."""
         return None if self.guide_to_skin_mm is None else -self.guide_to_skin_mm
 
     @property
     def start_tip_x(self) -> float:
-        """x of the tip at the start, mm."""
+        """Position x of the tip at the start, mm."""
         return -self.tip_to_skin_mm
 
     @property
@@ -149,7 +149,10 @@ class Setup(Section):
 
 
 class Entry(Section):
-    """Section `entry`: where and how the needle enters the skin. Base and guide are mounted on its axis."""
+    """Section `entry`: point and direction at which the needle enters the skin.
+
+    Base and guide are mounted on the needle's axis.
+    """
 
     lateral_mm: float = 0.0
     """y of the entry point, where the needle's axis meets the skin."""
@@ -175,11 +178,11 @@ class Entry(Section):
         return 1e-3 * complex(self.slope_mrad, self.slope_z_mrad)
 
     def lateral(self, x: float) -> complex:
-        """y + iz of the axis at x, mm."""
+        """Return y + iz of the axis at x, mm."""
         return complex(self.lateral_mm, self.lateral_z_mm) + self.slope * x
 
     def steepening(self, change: complex) -> complex:
-        """The nearest change (rad) to this one that is free and keeps the slope on each axis within its limit."""
+        """Return the nearest permitted change of the slope (rad) that keeps its limit on each axis."""
         most = 1e-3 * self.free_slope_mrad
         free = _within(change, most)
         y, z = self._kept(free)
@@ -190,16 +193,16 @@ class Entry(Section):
         return complex(*self._kept(complex(y, z)))
 
     def _kept(self, change: complex) -> tuple[float, float]:
-        """A change of the slope with each coordinate clipped so that the slope's keeps its limit."""
+        """Return the change of the slope with each coordinate clipped so that the slope keeps its limit."""
         steepest, now = 1e-3 * STEEPEST_MRAD, self.slope
         y = max(-steepest - now.real, min(steepest - now.real, change.real))
         return y, max(-steepest - now.imag, min(steepest - now.imag, change.imag))
 
     def nearest(self, off: complex, depth: float, most: float) -> tuple[complex, complex]:
-        """Changes of the point (mm) and the slope (rad), within what is free, after which a target at a depth (mm) is
-        at most `most` (mm) from the axis on each lateral axis, or as near to that as can be.
+        """Return permitted changes of the point (mm) and the slope (rad) after which a target is in reach.
 
-        off: y + iz from the present axis to the target (mm).
+        It is in reach at most `most` (mm) from the axis on each lateral axis, at the depth (mm). If no change suffices,
+        the nearest is returned. off: y + iz from the present axis to the target (mm).
         """
         point = slope = 0j
         for _ in range(_ROUNDS):
@@ -213,7 +216,7 @@ def _within(vector: complex, size: float) -> complex:
 
 
 def _beyond(off: complex, most: float) -> complex:
-    """The part of each coordinate beyond ±most."""
+    """Return the part of each coordinate beyond ±most."""
     parts = ((part, max(0.0, abs(part) - most)) for part in (off.real, off.imag))
     return complex(*(copysign(size, part) for part, size in parts))
 
@@ -235,7 +238,9 @@ class TrackerSettings(Section):
     """Seed of the environment's error field. Not set: each insertion draws a field from its seed."""
     environment: Annotated[
         Environment | None,
-        BeforeValidator(expanded, json_schema_input_type=Environment | Literal["ideal", "noisy"] | None),
+        BeforeValidator(
+            expand_environment, json_schema_input_type=Environment | Literal["ideal", "noisy"] | None
+        ),
     ] = None
     """"ideal", "noisy" or a table. "none" or not set: white noise."""
 

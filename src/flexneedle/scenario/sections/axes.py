@@ -1,6 +1,6 @@
-"""Axes of a rig: how lengths and angles of the needle map to motors, with limits and tolerances.
+"""Axes of a rig: map from lengths and angles of the needle to motors, with limits and tolerances.
 
-Lengths are in mm, angles in degrees; counts are those of the motor's encoder.
+Lengths are in mm, angles in degrees; counts are the encoder counts of the motor.
 """
 
 from abc import ABC, abstractmethod
@@ -96,8 +96,10 @@ class Axis(Section, ABC):
 
     @property
     def uncertainty(self) -> float:
-        """How far a motor at rest may be from where it was sent, mm or rad: its tolerance, and half of the lost motion,
-        whose side is unknown before the first motion."""
+        """Largest distance (mm or rad) of a motor at rest from its goal.
+
+        The tolerance, and half of the lost motion, whose side is unknown before the first motion.
+        """
         return self.tolerance + 0.5 * self.backlash
 
     @property
@@ -120,7 +122,7 @@ class Axis(Section, ABC):
         return self.direction * {"forward-limit": 1, "reverse-limit": -1}.get(self.home, 0)
 
     def shown(self, value: float) -> str:
-        """A position, distance or speed (mm or rad, and s) as a number in the unit of the file, such as "12.5"."""
+        """Return a position, distance or speed (mm or rad, and s) as text in the unit of the file, such as "12.5"."""
         return f"{round(value / self.size, 6) + 0.0:.7g}"  # not -0
 
     @model_validator(mode="after")
@@ -253,7 +255,7 @@ class RotaryAxis(Axis):
 
 
 def _problems_of(axis: Axis) -> Iterator[Problem]:
-    """The rules between the keys of an axis. Keys end in the axis's unit."""
+    """Yield broken rules between the keys of an axis. Keys end in the axis's unit."""
     unit, shown, (low, high) = axis.unit, axis.shown, axis.limits
     limits = [float(shown(low)), float(shown(high))]
     if low >= high:
@@ -270,7 +272,7 @@ def _problems_of(axis: Axis) -> Iterator[Problem]:
 
 
 def _misplaced(axis: Axis, low: float, high: float) -> str:
-    """The rule that the home of an axis breaks, or "". A limit switch is not between the soft limits."""
+    """Return the rule that the home of an axis breaks, or "". A limit switch is not between the soft limits."""
     home, end = axis.at_home, axis.to_home
     if end == 0 and not low - _ROUNDING <= home <= high + _ROUNDING:
         return f"must be within range_{axis.unit}, {axis.shown(low)} to {axis.shown(high)}"
@@ -307,4 +309,8 @@ def _shared_channels(axes: Axes) -> Iterator[Problem]:
     channels: dict[str, str] = {}
     for name, axis in axes.items():
         if (other := channels.setdefault(axis.channel, name)) != name:
-            yield Problem(f"{name}.channel", axis.channel, f"is that of {other}, too: each axis has its own")
+            yield Problem(
+                f"{name}.channel",
+                axis.channel,
+                f"is also the channel of {other}: give each axis its own",
+            )

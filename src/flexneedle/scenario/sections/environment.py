@@ -60,8 +60,9 @@ class ReferenceSensor(Section):
 
 
 class Plate(Section):
-    """Section `tracker.environment.plate`: a metal plate. Distortions are RMS lengths over the workspace with the plate
-    100 mm from its center.
+    """Section `tracker.environment.plate`: a metal plate.
+
+    Distortions are RMS lengths over the workspace with the plate 100 mm from its center.
     """
 
     distance_mm: Annotated[float, Field(ge=0, le=LARGEST)] = 100.0
@@ -112,7 +113,7 @@ class Environment(Section):
     """Metal plate. Not set: none."""
 
 
-def expanded(value: Any) -> Any:
+def expand_environment(value: Any) -> Any:
     """Return the table of a shipped environment's name, None for "none"; a table or None unchanged.
 
     Raises ValueError for anything else.

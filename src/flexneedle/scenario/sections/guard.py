@@ -1,4 +1,4 @@
-"""Limits of what a command may do to needle and tissue."""
+"""Limits on the effect of a command on needle and tissue."""
 
 from typing import Annotated
 
@@ -8,7 +8,7 @@ from flexneedle.scenario.sections.fields import Positive, Section
 
 
 class GuardSettings(Section):
-    """Section `guard`: limits of the predicted state after a command. One that would exceed them is not carried out."""
+    """Section `guard`: limits of the predicted state. A command that would exceed them is not carried out."""
 
     least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Least stretch λ of the tissue along the needle. Not set: at 19/20 of the compression limit of each

@@ -41,7 +41,7 @@ class Structure(Section):
 
 
 def structure_problems(needle: Needle, setup: Setup, structure: Structure) -> Iterator[Problem]:
-    """A bevel shorter than the needle; a guide, if it is shifted, behind the tip and before the base."""
+    """Yield broken rules of the structure: bevel length and shift of the guide."""
     bevel = structure.bevel_length_factor * needle.bevel.length_mm
     if bevel >= needle.length_mm and needle.bevel.length_mm < needle.length_mm:
         rule = f"makes the bevel {bevel:g} mm long: must be below needle.length_mm ({needle.length_mm:g})"

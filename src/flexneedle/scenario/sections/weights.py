@@ -1,4 +1,4 @@
-"""The weights of a cost as settings, and cost terms of the user's own."""
+"""Weights of a cost as settings, and cost terms of the user."""
 
 from collections.abc import Callable, Iterable
 from inspect import Parameter, signature

@@ -22,7 +22,7 @@ _AGREEMENT = 0.01  # relative difference of a function and the integral of the n
 
 
 def _found() -> Iterator[tuple[str, type[Layer]]]:
-    """The subclass of Layer in each file of this folder, by the file's name."""
+    """Yield the subclass of Layer in each file of this folder, by the file's name."""
     folder = __name__.rpartition(".")[0]
     for file in iter_modules([str(Path(__file__).parent)]):
         if file.name != "laws":
@@ -40,7 +40,7 @@ LAWS: dict[str, type[Layer]] = dict(_found())
 
 
 def _layer(value: Any, _validate: ValidatorFunctionWrapHandler) -> Layer:
-    """The layer of the law that a table names."""
+    """Return the layer of the law in a table."""
     if isinstance(value, Layer):
         return value
     if not isinstance(value, Mapping):
@@ -77,7 +77,7 @@ def _has(law: type[Layer], part: str) -> bool:
 
 
 def _broken_rule(layer: Layer) -> str:
-    """The first rule of laws that a law of the user's own breaks, or ""."""
+    """Return the first rule of laws that a user's law breaks, or ""."""
     import numpy as np  # only here: a scenario of the package's laws is read without it
 
     if not 0.0 < layer.limit < 1.0:

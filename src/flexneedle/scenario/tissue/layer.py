@@ -1,4 +1,4 @@
-"""A layer of tissue: what all laws have in common, and the contact points between tissue and needle."""
+"""A layer of tissue: the common part of all laws, and the contact points between tissue and needle."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ class Layer(Section):
     """One `[[tissue]]`. A law is a subclass, alone in a file of this folder: its parameters and three functions.
 
     A lateral displacement u of the needle compresses tissue of length h radially by e = |u|/h. A law gives energy,
-    force and stiffness over e, divided by k h², k h and k, where k is the stiffness at e = 0: that of 1 mm of needle
-    is `modulus` w/h. So for small e the energy is e²/2, the force, its derivative, e, and the stiffness 1.
-    The stiffness must be positive up to `limit`, beyond which the force continues linearly.
+    force and stiffness over e, divided by k h², k h and k, where k is the stiffness at e = 0, `modulus` w/h for 1 mm of
+    needle. So for small e the energy is e²/2, the force, its derivative, e, and the stiffness 1. The stiffness must be
+    positive up to `limit`, beyond which the force continues linearly.
     """
 
     limit: ClassVar[float]
@@ -64,15 +64,15 @@ class Layer(Section):
 
     @abstractmethod
     def energy(self, e: "Floats") -> "Floats":
-        """Energy at relative compressions e in [0, limit], over k h²."""
+        """Return the energy at relative compressions e in [0, limit], over k h²."""
 
     @abstractmethod
     def force(self, e: "Floats") -> "Floats":
-        """Force, over k h."""
+        """Return the force, over k h."""
 
     @abstractmethod
     def stiffness(self, e: "Floats") -> "Floats":
-        """Stiffness, over k."""
+        """Return the stiffness, over k."""
 
 
 def laws_of(tissue: Sequence[Layer]) -> tuple[list[Layer], list[int]]:
@@ -84,7 +84,7 @@ def laws_of(tissue: Sequence[Layer]) -> tuple[list[Layer], list[int]]:
 
 
 def _law_key(layer: Layer) -> tuple[Any, ...]:
-    """Equal for layers of the same law and parameters, whatever their stiffness and size."""
+    """Return a key that is equal for layers of the same law and parameters, whatever their stiffness and size."""
     own = {*type(layer).model_fields} - {*Layer.model_fields}
     return type(layer), *(getattr(layer, name) for name in sorted(own))
 

@@ -17,13 +17,13 @@ class Linear(Layer):
     """Law of radial compression."""
 
     def energy(self, e: "Floats") -> "Floats":
-        """Energy at relative compressions e, over k h²."""
+        """Return the energy at relative compressions e, over k h²."""
         return 0.5 * e**2
 
     def force(self, e: "Floats") -> "Floats":
-        """Force, over k h."""
+        """Return the force, over k h."""
         return 1.0 * e
 
     def stiffness(self, e: "Floats") -> "Floats":
-        """Stiffness, over k."""
+        """Return the stiffness, over k."""
         return 1.0 + 0.0 * e

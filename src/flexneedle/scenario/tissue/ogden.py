@@ -35,7 +35,7 @@ class Ogden(Layer):
     """α, exponent of the Ogden law."""
 
     def energy(self, e: "Floats") -> "Floats":
-        """Energy at relative compressions e, over k h²."""
+        """Return the energy at relative compressions e, over k h²."""
         import numpy as np  # here: scenarios are read without it
 
         # 2 t + t⁻² − 3 with t = λ^(−α/2) = 1 + d, without the cancellation at small e
@@ -44,7 +44,7 @@ class Ogden(Layer):
         return (2.0 / (3.0 * self.alpha**2)) * d * d * (3.0 + 2.0 * d) * np.exp(self.alpha * log)
 
     def force(self, e: "Floats") -> "Floats":
-        """Force, over k h."""
+        """Return the force, over k h."""
         import numpy as np
 
         log = np.log1p(-e)
@@ -53,7 +53,7 @@ class Ogden(Layer):
         )
 
     def stiffness(self, e: "Floats") -> "Floats":
-        """Stiffness, over k."""
+        """Return the stiffness, over k."""
         stretch, a = 1.0 - e, self.alpha
         powers = (a - 1.0) * stretch ** (a - 2.0) + (0.5 * a + 1.0) * stretch ** (-0.5 * a - 2.0)
         return (2.0 / (3.0 * a)) * powers

@@ -6,7 +6,7 @@ from pathlib import Path
 from flexneedle.errors import InputError, RigError
 from flexneedle.lab.emulators.emulated_rig.axes import carriages_of
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.planning.origin import check_origin, placed
+from flexneedle.planning.origin import check_origin, with_planned_entry
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Insertion, Plan
 
@@ -49,7 +49,7 @@ def make_job(
         raise InputError("tracker.environment: the emulated tracker has white noise only; leave it out")
     plan = record.plan if isinstance(record, Insertion) else record
     if isinstance(plan, Plan):
-        scenario = placed(scenario, plan)
+        scenario = with_planned_entry(scenario, plan)
         check_origin(plan, scenario)
     elif plan is not None:
         raise InputError(

@@ -22,8 +22,8 @@ class Catalog:
 def build_catalog() -> Catalog:
     """Return the choices. The first call imports the controllers, which takes about 0.6 s."""
     from flexneedle.control.controllers import CONTROLLERS
-    from flexneedle.control.tables import typed_scenario
+    from flexneedle.control.tables import scenario_class
 
     controllers = [{"name": one.name, "summary": one.summary} for one in CONTROLLERS.values()]
-    schema = typed_scenario(tuple(CONTROLLERS.values())).model_json_schema()
+    schema = scenario_class(tuple(CONTROLLERS.values())).model_json_schema()
     return Catalog(controllers, json.dumps(schema, ensure_ascii=False).encode())

@@ -15,7 +15,7 @@ from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.plausible import doubts
+from flexneedle.scenario.plausible import find_doubts
 from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.sections.needle import GAUGES, Needle
 from flexneedle.scenario.sections.settings import Target
@@ -96,7 +96,7 @@ class PageSession:
             name=self.name,
             values=values,
             changed=[key for key in before | values if before.get(key) != values.get(key)],
-            doubts=[*self.notes, *doubts(self.scenario)],
+            doubts=[*self.notes, *find_doubts(self.scenario)],
             seed=self.seed,
             strategy=self.strategy,
             controller=self.controller,

@@ -12,7 +12,7 @@ from flexneedle.lab.page.worker.rig_insertion import insert_on_rig
 from flexneedle.lab.page.worker.task import Cancelled, JobControl, WorkerTask
 from flexneedle.loop.events import Event, Iterated, PeriodEnded
 from flexneedle.loop.insert import insert
-from flexneedle.planning.origin import placed
+from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.types import Insertion
 
@@ -57,7 +57,7 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
 
     plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, progress=planning)
     reporter.report_plan(plan)
-    disturber = Disturber(placed(task.scenario, plan), task.report)
+    disturber = Disturber(with_planned_entry(task.scenario, plan), task.report)
 
     def disturb() -> None:
         for one in control.take_disturbs():

@@ -10,7 +10,7 @@ from time import monotonic
 from typing import Any
 
 from flexneedle.cli.common import SWITCHED_ON
-from flexneedle.control.controllers import used
+from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import StoppedError
 from flexneedle.files import create_folder
 from flexneedle.lab.page.job_orders import SILENT_S, RigReport
@@ -57,7 +57,7 @@ def insert_on_rig(reporter: InsertionReporter) -> Insertion:
     Raises StoppedError if it is stopped while it plans, and otherwise as `record_insertion`.
     """
     task, order = reporter.task, reporter.task.order
-    rig, scenario = usable_rig(order.rig), used(task.scenario)
+    rig, scenario = usable_rig(order.rig), with_controller_defaults(task.scenario)
     reporter.rig = rig.name
     choices = Choices.of(order.seed, task.controller, SupervisedRig(rig))
     check_choices(scenario, order.strategy, choices)

@@ -6,7 +6,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from flexneedle.control.controllers import checked
+from flexneedle.control.controllers import check_tables
 from flexneedle.errors import ScenarioError
 from flexneedle.files import replace_file
 from flexneedle.lab.study.findings.rows import Rows
@@ -26,7 +26,7 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
     Scenarios that are neither presets nor worlds are written to that folder.
     The command is "" if the settings of the row are not a valid scenario of this version.
     """
-    sources = {_without_target(checked(load_scenario(name))): name for name in PRESETS.names()}
+    sources = {_without_target(check_tables(load_scenario(name))): name for name in PRESETS.names()}
     numbers = count(1)
     found = {}
     for row in dict.fromkeys(listed):
@@ -36,7 +36,7 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
             continue
         key = _without_target(scenario)
         if name := _world_of(rows, row):
-            sources.setdefault(_without_target(checked(load_scenario(name))), name)
+            sources.setdefault(_without_target(check_tables(load_scenario(name))), name)
         if key not in sources:
             sources[key] = f"scenario-{next(numbers)}.toml"
             replace_file(folder / sources[key], dump_scenario(scenario).encode())

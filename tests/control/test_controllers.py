@@ -10,7 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.controllers import CONTROLLERS, DEFAULT, method
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, find_controller
 from flexneedle.control.interface import travel_left
 from flexneedle.errors import InputError
 from flexneedle.phantom.plants import PLANTS
@@ -46,10 +46,10 @@ def test_they_are_there_under_their_names():
     assert set(FIELD) <= set(CONTROLLERS)
     assert DEFAULT not in FIELD
     for name in FIELD:
-        assert method(name).name == name
-        assert method(name).summary
+        assert find_controller(name)[1].name == name
+        assert find_controller(name)[1].summary
     with pytest.raises(InputError, match=r"controller = 'pid': must be one of .*broyden-mpc"):
-        method("pid")
+        find_controller("pid")
 
 
 @pytest.mark.long
