@@ -14,7 +14,7 @@ from math import pi, radians
 import numpy as np
 
 import flexneedle
-from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.worlds import world

@@ -41,7 +41,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import flexneedle
 from decision_time import MOST_GROWTH_MM, MOST_INNOVATION_MM, TARGETS
-from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 from rig_trials import Witness, axial_innovation, inserted, resumed, witness
 

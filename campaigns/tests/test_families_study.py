@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import protocol
 from stages import Bench, Moves, Stage

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
-from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "campaigns"))

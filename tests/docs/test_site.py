@@ -16,7 +16,7 @@ import flexneedle
 import math_fence
 import rig_reference
 import scenario_reference
-from flexneedle.lab.rig.fit import fit_problems
+from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
 from markdown_examples import ROOT, blocks

@@ -131,8 +131,13 @@ def _check_readings(
 ) -> tuple[Monitor, tuple[CheckedMeasurement, ...]]:
     """Check measurements, oldest first, each with its largest age (s)."""
     readings = []
-    limit = scenario.control.innovation_limit_mm + _PREDICTION_SDS * predicted.tip_sd
+    limit = innovation_limit(scenario, predicted.tip_sd)
     for measurement, max_age in zip(measurements, max_ages, strict=True):
         monitor, verdict = monitor.check(measurement, predicted.tip_at, now, max_age, limit)
         readings.append(CheckedMeasurement(measurement, verdict))
     return monitor, tuple(readings)
+
+
+def innovation_limit(scenario: Scenario, tip_sd: float) -> float:
+    """Return the largest distance (mm) of a reading from a prediction of the tip with this standard deviation (mm)."""
+    return scenario.control.innovation_limit_mm + _PREDICTION_SDS * tip_sd

@@ -19,7 +19,7 @@ from flexneedle.control.interface import Decision
 from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import load_rig
-from flexneedle.lab.rig.supervised import Columns, SupervisedDriver, SupervisedRig, Tick
+from flexneedle.lab.rig.supervised import AxisColumns, SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepRequest, TickReport
@@ -41,20 +41,20 @@ STEPS = st.floats(-1.0, 1.0)
 
 @given(st.lists(STEPS, min_size=5, max_size=5), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), STEPS)
 def test_travelled_axes_give_the_control_that_has_moved_them(steps, slope_y, slope_z, spin):
-    columns = Columns(complex(slope_y, slope_z))
+    columns = AxisColumns(complex(slope_y, slope_z))
     db_x, db_y, db_z, dg_y, dg_z = steps
     row = Control(db_x=db_x, db_y=db_y, db_z=db_z, dg_y=dg_y, dg_z=dg_z, spin=spin)
-    np.testing.assert_allclose(columns.control(columns.travel(row), 0.0, spin), row, atol=1e-9)
+    np.testing.assert_allclose(columns.to_control(columns.to_travel(row), 0.0, spin), row, atol=1e-9)
 
 
 def test_along_a_tilted_entry_only_the_insertion_axis_moves():
-    columns = Columns(0.1 - 0.05j)
-    travel = columns.travel(Control(db_x=1.0, db_y=0.1, db_z=-0.05))
+    columns = AxisColumns(0.1 - 0.05j)
+    travel = columns.to_travel(Control(db_x=1.0, db_y=0.1, db_z=-0.05))
     assert travel == {"insertion": pytest.approx(math.sqrt(1.0 + 0.1**2 + 0.05**2))}
 
 
 def test_a_turn_of_the_base_is_an_axis_that_no_rig_has():
-    travel = Columns(0j).travel(Control(db_x=1.0, db_theta=0.003, db_psi=-0.002))
+    travel = AxisColumns(0j).to_travel(Control(db_x=1.0, db_theta=0.003, db_psi=-0.002))
     assert travel == {"insertion": 1.0, "base_theta": 0.003, "base_psi": -0.002}
     for axis in ("base_theta", "base_psi"):
         bench = Bench().armed()
@@ -210,7 +210,7 @@ def opened(monkeypatch):
     """Return a function that opens a rig at rest for a plan 40 mm deep; return what was done, asked included."""
 
     def open_rig(rest, dry=False, scenario=PHANTOM):
-        monkeypatch.setattr("flexneedle.lab.rig.supervised.Supervisor", rest)
+        monkeypatch.setattr("flexneedle.lab.rig.supervised.SupervisorClient", rest)
         plan, gate = make_plan("manipulation", (40.0, 5.0, 0.0), 0), Gate()
         gate.confirm = lambda _supervisor: rest.calls.append("asked")
         with opened_rig(rest, scenario, plan, dry_run=dry, stream=Stream(gate=gate)):
@@ -223,7 +223,7 @@ def opened(monkeypatch):
 def test_the_loop_has_the_time_of_a_decision_and_tells_where_the_tip_will_be(monkeypatch):
     rest = Resting()
     rest.rig = rest.rig.model_copy(update={"loop": rest.rig.loop.model_copy(update={"decision_ms": 70.0})})
-    monkeypatch.setattr("flexneedle.lab.rig.supervised.Supervisor", rest)
+    monkeypatch.setattr("flexneedle.lab.rig.supervised.SupervisorClient", rest)
     with opened_rig(rest, PHANTOM, make_plan("manipulation", (40.0, 5.0, 0.0), 0)) as ports:
         assert ports.deadline == pytest.approx(0.07)
         assert ports.expect == ports.driver.expect

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from flexneedle.lab.rig.supervised import Ticks
+from flexneedle.lab.rig.supervised import TickStatistics
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import AxisState, TickReport
 from flexneedle.ports import MotorState
@@ -13,10 +13,10 @@ REST = MotorState(0.0, 0.0)
 
 
 def ticks(*reports):
-    found = Ticks(started=100.0)
+    found = TickStatistics(started=100.0)
     for report in reports:
         found.add(report)
-    return found.summary()
+    return found.summarize()
 
 
 def test_late_and_work_are_summed_for_each_tick():

@@ -165,11 +165,11 @@ class _UserGate(Gate):
 
     def confirm(self, rig: Any) -> None:
         """Ask. Raises RunError for any answer but yes."""
-        from flexneedle.lab.rig.start import announced
+        from flexneedle.lab.rig.preflight.moves import describe_insertion
 
         rig.take_signals()
         if not self._moves:
             return
         with self._progress.paused():
-            lines = [*announced(rig.rig, self._scenario, rig.positions), ARMS]
+            lines = [*describe_insertion(rig.rig, self._scenario, rig.positions), ARMS]
             confirm_motions(lines, self._question)

@@ -15,8 +15,8 @@ from flexneedle.cli.values import finite, positive
 from flexneedle.errors import DriverError
 
 if TYPE_CHECKING:
-    from flexneedle.lab.rig.check import Finding, Wanted
-    from flexneedle.lab.rig.moves import Homing, Move
+    from flexneedle.lab.rig.preflight.check import Finding, IntendedInsertion
+    from flexneedle.lab.rig.preflight.moves import AxisHoming, AxisMove
     from flexneedle.lab.rig.rig_file import RigFile
 
 _SECONDS = 2.0
@@ -214,8 +214,8 @@ def _add_yes(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.check import check_rig
     from flexneedle.lab.rig.devices.clock import WallClock
+    from flexneedle.lab.rig.preflight.check import check_rig
     from flexneedle.lab.rig.rig_file import load_rig
     from flexneedle.lab.ros.check import check_ros
 
@@ -233,11 +233,11 @@ def _check(args: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
-def _wanted(args: argparse.Namespace) -> Wanted | None:
-    from flexneedle.lab.rig.check import Wanted
+def _wanted(args: argparse.Namespace) -> IntendedInsertion | None:
+    from flexneedle.lab.rig.preflight.check import IntendedInsertion
     from flexneedle.scenario.files import load_scenario
 
-    return None if args.scenario is None else Wanted(load_scenario(args.scenario), args.strategy)
+    return None if args.scenario is None else IntendedInsertion(load_scenario(args.scenario), args.strategy)
 
 
 def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
@@ -266,23 +266,23 @@ def _counted(problems: int) -> str:
 
 
 def _jog(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.moves import axis_of, jog
+    from flexneedle.lab.rig.preflight.moves import find_axis, plan_jog
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    axis_of(rig, args.axis)
-    move = jog(rig, args.axis, args.distance, _read_positions(rig)[args.axis], args.speed)
+    find_axis(rig, args.axis)
+    move = plan_jog(rig, args.axis, args.distance, _read_positions(rig)[args.axis], args.speed)
     return _confirm_and_move(
         rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
     )
 
 
 def _home(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.moves import homings
+    from flexneedle.lab.rig.preflight.moves import plan_homings
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    chosen = homings(rig, args.axes)
+    chosen = plan_homings(rig, args.axes)
     if not chosen:
         print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
         return 0
@@ -297,14 +297,14 @@ def _home(args: argparse.Namespace) -> int:
 
 
 def _retract(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.moves import retraction, withdrawn
+    from flexneedle.lab.rig.preflight.moves import plan_retraction, withdrawn_position
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
     position = _read_positions(rig)["insertion"]
-    move = retraction(rig, position, args.to, args.speed)
+    move = plan_retraction(rig, position, args.to, args.speed)
     if move is None:
-        at, end = map(rig.axes.insertion.shown, (position, withdrawn(rig)))
+        at, end = map(rig.axes.insertion.shown, (position, withdrawn_position(rig)))
         print(
             f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
             file=sys.stderr,
@@ -314,11 +314,13 @@ def _retract(args: argparse.Namespace) -> int:
 
 
 def _off(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.moves import switched_off
+    from flexneedle.lab.rig.preflight.moves import describe_power_off
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    confirm_motions([*switched_off(rig, _read_positions(rig)), _FALLS], "" if args.yes else "Switch off?")
+    confirm_motions(
+        [*describe_power_off(rig, _read_positions(rig)), _FALLS], "" if args.yes else "Switch off?"
+    )
     with open_supervisor(rig) as operator, _stop_on_error(operator):
         operator.off()
     print("done", file=sys.stderr)
@@ -344,18 +346,18 @@ def _read_positions(rig: RigFile) -> dict[str, float]:
 
 def _confirm_and_move(
     rig: RigFile,
-    moves: Sequence[Move | Homing],
+    moves: Sequence[AxisMove | AxisHoming],
     yes: bool,
     command: Callable[[RigOperator], object],
     *notes: str,
 ) -> int:
     """Print the motions, command them once they are confirmed, and return the exit status."""
-    from flexneedle.lab.rig.moves import Move, require_start
+    from flexneedle.lab.rig.preflight.moves import AxisMove, require_start
 
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with open_supervisor(rig) as operator, _stop_on_error(operator):
         for move in moves:
-            if isinstance(move, Move):
+            if isinstance(move, AxisMove):
                 require_start(move, operator.positions[move.name])
         _arm(operator)
         command(operator)

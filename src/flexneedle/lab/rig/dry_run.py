@@ -1,4 +1,4 @@
-"""The ports of a dry run: the supervisor goes through all motions in memory, and the needle is a virtual one."""
+"""Ports of a dry run: the supervisor simulates all motions, and the needle is the virtual phantom's."""
 
 from flexneedle.errors import InputError
 from flexneedle.loop.rig import Rig
@@ -6,14 +6,14 @@ from flexneedle.phantom.phantom import Condition, Phantom
 from flexneedle.types import Control, Measurement, Motion
 
 
-class Imagined:
+class DryRunPorts:
     """Clock, driver and tracker of a supervised rig whose motors do not move, with a virtual needle that does."""
 
     def __init__(self, supervised: Rig, virtual: Rig, phantom: Phantom) -> None:
         self._supervised, self._virtual, self._phantom = supervised, virtual, phantom
 
     def now(self) -> float:
-        """Seconds since the start of the run."""
+        """Return the seconds since the start of the run."""
         return self._supervised.clock.now()
 
     def wait(self, seconds: float) -> None:
@@ -22,7 +22,7 @@ class Imagined:
         self._rest_until(self.now())
 
     def apply(self, command: Control, duration: float) -> Motion:
-        """Let the supervisor go through a motion, and the virtual needle make it."""
+        """Apply a motion to the supervisor's simulated motors, and to the virtual needle."""
         motion = self._supervised.driver.apply(command, duration)
         self._rest_until(motion.begun)
         done = motion.control if motion.held else command
@@ -30,11 +30,11 @@ class Imagined:
         return motion
 
     def stop(self) -> None:
-        """Stop."""
+        """Stop the simulated motors."""
         self._supervised.driver.stop()
 
     def read(self) -> tuple[Measurement, ...]:
-        """The readings of the virtual tracker since the last call."""
+        """Return the readings of the virtual tracker since the last call."""
         self._rest_until(self.now())
         return self._virtual.tracker.read()
 
@@ -44,7 +44,7 @@ class Imagined:
         return self._virtual.tracker.status
 
     def condition(self) -> Condition:
-        """State of the virtual needle."""
+        """Return the state of the virtual needle."""
         return self._phantom.condition()
 
     def _rest_until(self, time: float) -> None:
@@ -54,12 +54,12 @@ class Imagined:
             self._phantom.wait(left)
 
 
-def in_memory(supervised: Rig, virtual: Rig) -> Rig:
+def dry_run_ports(supervised: Rig, virtual: Rig) -> Rig:
     """Return the rig of a dry run: supervised motions, and the needle and tracker of a virtual rig.
 
     Raises InputError if that has no phantom.
     """
     if not isinstance(virtual.driver, Phantom):
         raise InputError("a dry run needs a virtual phantom")
-    ports = Imagined(supervised, virtual, virtual.driver)
+    ports = DryRunPorts(supervised, virtual, virtual.driver)
     return Rig(ports, ports, ports, ports.condition)

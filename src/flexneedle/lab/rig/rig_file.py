@@ -1,6 +1,6 @@
-"""The rig file: the motors, trackers and links of a laboratory.
+"""Rig file: the motors, trackers and links of a laboratory.
 
-A driver or tracker has settings of its own beside `kind`, which it checks itself.
+A driver or tracker has further settings beside `kind`, which it checks itself.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,7 +29,7 @@ _LEAST_QUEUE = 2.0  # tolerances
 _ROUNDING = 1e-9
 
 
-class Part(Section):
+class DeviceSection(Section):
     """Kind of a device and its settings, which the device checks."""
 
     model_config = ConfigDict(extra="allow")
@@ -79,7 +79,8 @@ class LoopSettings(Section):
         return 1e-3 * (min(ticks, _LONGEST_QUEUE_MS) if self.queue_ms is None else self.queue_ms)
 
     def queue_of(self, axis: Axis, speed: float) -> float:
-        """Largest distance (mm or rad) of an axis from its target, in a motion with this speed (mm/s or rad/s).
+        """Return the largest distance (mm or rad) of an axis from its target, in a motion with this speed (mm/s or
+        rad/s).
 
         It is at least two tolerances: a motor may rest within one, and shall move on.
         """
@@ -103,9 +104,9 @@ class RigFile(Section):
 
     name: Title
     """Title in messages and records."""
-    driver: Part
+    driver: DeviceSection
     axes: Axes
-    tracker: Part
+    tracker: DeviceSection
     registration: Registration | None = None
     """Replaces the registration of the scenario."""
     loop: LoopSettings = LoopSettings()
@@ -114,12 +115,12 @@ class RigFile(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse(_short_queue(self))
+        refuse(_queue_problems(self))
         return self
 
 
-def _short_queue(rig: RigFile) -> Iterator[Problem]:
-    """A queue from which a motor may not move on."""
+def _queue_problems(rig: RigFile) -> Iterator[Problem]:
+    """Yield the problem of a queue from which a motor may not move on."""
     linear = [(name, axis) for name, axis in rig.axes.items() if axis.unit == "mm"]
     name, axis = max(linear, key=lambda one: one[1].tolerance)
     least = _LEAST_QUEUE * axis.tolerance

@@ -1,4 +1,4 @@
-"""A rig of a rig file with the ports of the closed loop: its driver, tracker and clock are those of a supervisor."""
+"""Rig of a rig file with the ports of the closed loop: driver, tracker and clock of a supervisor."""
 
 import math
 from collections import deque
@@ -13,13 +13,20 @@ import numpy as np
 
 from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.estimate import Estimate, carry_out
-from flexneedle.lab.rig.dry_run import in_memory
-from flexneedle.lab.rig.fit import fit_problems, start_problems
+from flexneedle.lab.rig.dry_run import dry_run_ports
+from flexneedle.lab.rig.preflight.fit import (
+    axis_stretch,
+    check_start,
+    deepest_advance,
+    fit_problems,
+    needed_advance,
+    start_problems,
+)
 from flexneedle.lab.rig.rig_file import RigFile, load_rig
-from flexneedle.lab.rig.start import checked_start, deepest, needed
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.protocol import Expectation, MotionResult, SupervisorTask, TickReport
 from flexneedle.loop.events import Event, Stream
+from flexneedle.loop.measuring import innovation_limit
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.scenario.model import Scenario
@@ -41,28 +48,23 @@ from flexneedle.types import (
     Z,
 )
 
-_SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
 _MOST_TICKS = 200_000  # an hour and more
 _MOST_KEPT = 10_000
 _GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Columns of a control as travel of the rig's axes. slope: dy/dx + i dz/dx of the axis on which the base moves."""
+class AxisColumns:
+    """Conversion between columns of a control and travel of the rig's axes. slope: dy/dx + i dz/dx of the base's
+    axis."""
 
     slope: complex
 
-    @property
-    def _stretch(self) -> float:
-        """Length of the insertion axis for each mm along x."""
-        return math.sqrt(1.0 + abs(self.slope) ** 2)
-
-    def travel(self, row: Control) -> dict[str, float]:
-        """Travel (mm or rad) by axis, of the axes that move."""
+    def to_travel(self, row: Control) -> dict[str, float]:
+        """Return the travel (mm or rad) by axis, of the axes that move."""
         base_y, base_z = row.db_y - self.slope.real * row.db_x, row.db_z - self.slope.imag * row.db_x
         travel = {
-            "insertion": self._stretch * row.db_x,
+            "insertion": axis_stretch(self.slope) * row.db_x,
             "base_y": base_y,
             "base_z": base_z,
             "rotation": row.spin,
@@ -72,10 +74,11 @@ class Columns:
         }
         return {name: way for name, way in travel.items() if abs(way) > 1e-12}
 
-    def control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
-        """The control that travelled axes have carried out, with the roll and the spin (rad) of their rotation."""
+    def to_control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
+        """Return the control that travelled axes have carried out, with the roll and the spin (rad) of their
+        rotation."""
         row = np.zeros(len(STILL))
-        row[DB_X] = travelled.get("insertion", 0.0) / self._stretch
+        row[DB_X] = travelled.get("insertion", 0.0) / axis_stretch(self.slope)
         row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
         row[DB_Z] = travelled.get("base_z", 0.0) + self.slope.imag * row[DB_X]
         for name, column in _GUIDE.items():
@@ -85,12 +88,12 @@ class Columns:
 
 
 @dataclass
-class Ticks:
-    """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
-    those before which others were left out; changes of the rig's state, at the end of the tick that found them. Times
-    are on the monotonic clock.
+class TickStatistics:
+    """Times of the supervisor's ticks and changes of the rig's state.
 
-    queued: the largest motion in the queue of each axis (mm or rad).
+    late, work: delay and duration of each tick (s); stalls: times of ticks before which others were left out, with
+    their delay; states: changes of the state, at the end of the tick that found them; times are on the monotonic
+    clock; queued: the largest motion in the queue of each axis (mm or rad).
     """
 
     started: float = 0.0
@@ -114,8 +117,10 @@ class Ticks:
         if not self.states or self.states[-1][1:] != (report.state, report.why):
             self.states.append((time + report.work, report.state, report.why))
 
-    def summary(self) -> dict[str, Any]:
-        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and
+    def summarize(self) -> dict[str, Any]:
+        """Return counts and percentiles for the record.
+
+        Number of ticks, ticks left out; delay, duration and their sum, in ms: median, 99 % and largest; stalls and
         states; largest motion in the queue by axis, in mm or degrees.
         """
         found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
@@ -125,12 +130,12 @@ class Ticks:
                 found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
         found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
         found["states"] = [{"time_s": time, "state": state, "why": why} for time, state, why in self.states]
-        found["queued"] = dict(_with_unit(name, way) for name, way in self.queued.items())
+        found["queued"] = dict(_to_file_unit(name, way) for name, way in self.queued.items())
         return found
 
 
-def _with_unit(axis: str, way: float) -> tuple[str, float]:
-    """Key and value of a way (mm or rad) of an axis in a record: in mm or degrees."""
+def _to_file_unit(axis: str, way: float) -> tuple[str, float]:
+    """Return key and value of a distance (mm or rad) of an axis in a record: in mm or degrees."""
     return (f"{axis}_deg", math.degrees(way)) if axis == "rotation" else (f"{axis}_mm", way)
 
 
@@ -146,16 +151,16 @@ class SupervisedDriver:
 
     def __init__(self, supervisor: SupervisorClient, scenario: Scenario, roll: float) -> None:
         self._supervisor, self._scenario = supervisor, scenario
-        self._columns = Columns(scenario.entry.slope)
+        self._columns = AxisColumns(scenario.entry.slope)
         self._limits = Limits.of(scenario)
         self._moved, self._rolled = np.zeros(MOVES), roll
         self._expected: Expectation | None = None
 
     def expect(self, estimate: Estimate, command: Control) -> None:
-        """Take the estimated tip before a command, and where about it will be after it, for the check of readings."""
+        """Set the expected tip before and after a command, for the check of readings."""
         moved = carry_out(estimate.simulator, estimate.state, command).tip - estimate.state.tip
         x, y, z = (estimate.tip + moved)[: Z + 1].tolist()
-        limit = self._scenario.control.innovation_limit_mm + _SDS * estimate.tip_sd
+        limit = innovation_limit(self._scenario, estimate.tip_sd)
         self._expected = Expectation(Pose.of(estimate.tip).point, (x, y, z), limit)
 
     def apply(self, command: Control, duration: float) -> Motion:
@@ -171,18 +176,18 @@ class SupervisedDriver:
                 f"travel in {duration:g} s: must take at least {shortest:g} s, at the speeds of the scenario"
             )
         roll = limit_half_turn(self._rolled, command.roll) if self._limits.half_turns else command.roll
-        travel, roll_duration = self._columns.travel(command), roll_time(self._scenario.setup, roll)
+        travel, roll_duration = self._columns.to_travel(command), roll_time(self._scenario.setup, roll)
         done = self._supervisor.step(roll, travel, duration, self._expected, roll_duration)
-        row = self._columns.control(done.travelled, *self._rotation(done, command, roll))
+        row = self._columns.to_control(done.travelled, *self._split_rotation(done, command, roll))
         self._moved += np.array(row[:MOVES])
         self._rolled += row.roll + row.spin
         return Motion(row, done.begun, done.ended, done.turned, done.why)
 
-    def _rotation(self, done: MotionResult, command: Control, roll: float) -> tuple[float, float]:
-        """Roll and spin of what was turned.
+    def _split_rotation(self, done: MotionResult, command: Control, roll: float) -> tuple[float, float]:
+        """Return roll and spin of a measured rotation.
 
-        A half turn was confirmed by its position and counts as one, so that half turns to and fro do not drift. Else
-        all rotation is the roll, or the spin after it where one was commanded.
+        A half turn was confirmed by its position and counts as one, so that repeated half turns do not drift.
+        Otherwise all rotation is the roll, or after it the spin if one was commanded.
         """
         turned = done.travelled.get("rotation", 0.0)
         if not self._limits.half_turns:
@@ -203,20 +208,18 @@ class SupervisedDriver:
         self._supervisor.stop()
 
 
-def start_advance(
-    supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, dry: bool = False
-) -> float:
-    """How far the base may advance (mm) for a plan, from where it is and the tip is measured now.
+def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, dry: bool = False) -> float:
+    """Return the largest advance of the base (mm) for a plan, from the measured tip and the present positions.
 
     dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
     """
     supervisor.read()  # measurements before may be of a needle that somebody has moved since
-    measured = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
+    measured = check_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
     depth, tip = plan.target[0], None if dry else measured[0]
-    need = needed(scenario, depth, tip)
+    need = needed_advance(scenario, depth, tip)
     if problems := start_problems(supervisor.rig, scenario, supervisor.positions, plan.strategy, need):
         raise RigError(*problems)
-    return deepest(scenario, depth, tip)
+    return deepest_advance(scenario, depth, tip)
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
@@ -236,7 +239,7 @@ class SupervisedRig:
 
     def __init__(self, file: str | Path | RigFile, *, dry_run: bool = False) -> None:
         self.file, self.dry_run = file if isinstance(file, RigFile) else load_rig(file), dry_run
-        self.ticks = Ticks()
+        self.ticks = TickStatistics()
 
     @property
     def names(self) -> dict[str, Any]:
@@ -255,7 +258,7 @@ class SupervisedRig:
 
     def results(self) -> dict[str, Any]:
         """Summary of the ticks."""
-        return {"ticks": self.ticks.summary()}
+        return {"ticks": self.ticks.summarize()}
 
     @contextmanager
     def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
@@ -290,9 +293,9 @@ class SupervisedRig:
 
         with SupervisorClient(task, report) as supervisor:
             # What cannot begin is refused before anybody is asked.
-            start_advance(supervisor, scenario, plan, dry=self.dry_run)
+            check_room(supervisor, scenario, plan, dry=self.dry_run)
             stream.gate.confirm(supervisor)
-            supervisor.arm(start_advance(supervisor, scenario, plan, dry=self.dry_run))
+            supervisor.arm(check_room(supervisor, scenario, plan, dry=self.dry_run))
             if rig.axes.rotation is not None:
                 speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
                 supervisor.move_to("rotation", plan.roll, speed)
@@ -304,5 +307,5 @@ class SupervisedRig:
             deadline = 1e-3 * rig.loop.decision_ms
             ports = Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
             if self.dry_run:
-                ports = in_memory(ports, virtual_rig(virtual, plan.roll, Seeds.of(seed)))
+                ports = dry_run_ports(ports, virtual_rig(virtual, plan.roll, Seeds.of(seed)))
             yield ports

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from flexneedle.lab.rig.check import Finding, with_device
-from flexneedle.lab.rig.rig_file import Part, RigFile, RosSettings
+from flexneedle.lab.rig.preflight.check import Finding, check_device
+from flexneedle.lab.rig.rig_file import DeviceSection, RigFile, RosSettings
 from flexneedle.lab.ros.bridge import load_checked_profile
 from flexneedle.lab.ros.client import check_installed
 from flexneedle.lab.ros.profile import INSERTION_KEYS
@@ -26,7 +26,7 @@ def check_ros(rig: RigFile, clock: Clock, seconds: float) -> list[Finding]:
     settings = rig.ros
     if settings is None:
         return []
-    return with_device(
+    return check_device(
         "ros",
         settings.profile,
         lambda: _open_listener(settings),
@@ -75,7 +75,7 @@ def _list_used(rig: RigFile, settings: RosSettings) -> set[str]:
     return {"stop", "arm", *devices, *(("target",) if settings.target else ())}
 
 
-def _get_profile(part: Part) -> str | None:
+def _get_profile(part: DeviceSection) -> str | None:
     """Return the profile of a driver or tracker of topics, None for others."""
     return str(part.settings.get("profile", "neutral")) if part.kind == "ros" else None
 

@@ -14,7 +14,7 @@ from flexneedle.lab.rig.devices import lock
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.devices.lock import held, lock_file, this_program
 from flexneedle.lab.rig.devices.opening import address_of
-from flexneedle.lab.rig.rig_file import Part
+from flexneedle.lab.rig.rig_file import DeviceSection
 from galil_peer import peer
 
 HOLDING = """
@@ -98,7 +98,7 @@ def test_a_file_that_is_no_lock_is_an_error_and_is_not_followed(folder):
 
 
 def test_motors_have_the_address_of_their_driver_else_its_kind_and_settings():
-    part = Part(kind="mylab:open_stage", port="/dev/ttyACM0", axes=2)
+    part = DeviceSection(kind="mylab:open_stage", port="/dev/ttyACM0", axes=2)
     motors = Motors()
     assert address_of(part, motors) == 'mylab:open_stage {"axes": 2, "port": "/dev/ttyACM0"}'
     motors.address = "/dev/ttyACM0"
@@ -110,5 +110,5 @@ def test_a_controller_has_one_address_by_any_of_its_names():
         found = set()
         for host in ("127.0.0.1", "localhost"):
             with factory({"address": f"{host}:{device.port}"}, ["A"]) as motors:
-                found.add(address_of(Part(kind="galil"), motors))
+                found.add(address_of(DeviceSection(kind="galil"), motors))
     assert found == {f"127.0.0.1:{device.port}"}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.moves import homings
+from flexneedle.lab.rig.preflight.moves import plan_homings
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from stages import TICK_S, Bench, Stage, rig_file
@@ -110,7 +110,7 @@ def test_an_axis_that_never_rests_at_its_switch_is_a_fault():
 
 def test_a_search_moves_as_it_is_announced():
     rig = rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})
-    (announced,) = homings(rig, ["guide_y"])
+    (announced,) = plan_homings(rig, ["guide_y"])
     assert str(announced) == (
         "guide_y: in its negative direction to the forward limit switch, by at most 33.5 mm at 1 mm/s; the position "
         "there is called -15.5 mm; then in its positive direction by 1.1 mm at 1 mm/s, off the switch to -14.4 mm. "

@@ -18,7 +18,7 @@ from emulated import until
 from flexneedle.errors import DriverError, RefusedError, RigError, RunError, StoppedError
 from flexneedle.geometry.registration import identity
 from flexneedle.interrupts import SIGNALS
-from flexneedle.lab.rig.rig_file import Part
+from flexneedle.lab.rig.rig_file import DeviceSection
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
@@ -30,7 +30,7 @@ TESTS = Path(__file__).parents[3]
 
 def task(driver="stages:real_motors", tracker="stages:Still", **settings):
     rig = rig_file().model_copy(
-        update={"driver": Part(kind=driver, **settings), "tracker": Part(kind=tracker)}
+        update={"driver": DeviceSection(kind=driver, **settings), "tracker": DeviceSection(kind=tracker)}
     )
     return protocol.SupervisorTask(rig, monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
 
@@ -344,9 +344,9 @@ from threading import Condition, Thread, current_thread, main_thread
 sys.path.insert(0, {tests!r})
 from lab.rig.supervisor.test_process import task
 from flexneedle.errors import FlexneedleError
-from flexneedle.lab.rig.supervisor.client import Supervisor
+from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
-made = Supervisor(task("stages:noting_motors", file={file!r}))
+made = SupervisorClient(task("stages:noting_motors", file={file!r}))
 made.arm()
 made.step(0.0, {{"insertion": 1.0}}, 0.2)
 print(made.pid, flush=True)

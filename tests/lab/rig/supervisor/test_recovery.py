@@ -11,7 +11,7 @@ from commands import run
 from emulated import emulator
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices.galil.motors import factory
-from flexneedle.lab.rig.rig_file import Part
+from flexneedle.lab.rig.rig_file import DeviceSection
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
@@ -113,7 +113,7 @@ def controller():
 
 
 def supervised(address):
-    driver = Part(kind="galil", address=address, reply_timeout_ms=1000.0)
+    driver = DeviceSection(kind="galil", address=address, reply_timeout_ms=1000.0)
     return SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver}))
 
 

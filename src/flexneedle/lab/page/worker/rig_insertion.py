@@ -18,9 +18,9 @@ from flexneedle.lab.page.protocol import RigCheckMessage
 from flexneedle.lab.page.rigs import usable_rig
 from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
 from flexneedle.lab.page.worker.task import WorkerTask
-from flexneedle.lab.rig.check import Wanted, check_rig
 from flexneedle.lab.rig.devices.clock import WallClock
-from flexneedle.lab.rig.start import announced
+from flexneedle.lab.rig.preflight.check import IntendedInsertion, check_rig
+from flexneedle.lab.rig.preflight.moves import describe_insertion
 from flexneedle.lab.rig.supervised import SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import CONTROLLER, SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
@@ -43,7 +43,11 @@ _POLL_S = 0.05
 
 def check(task: WorkerTask) -> None:
     """Compare the rig with its file and the scenario, and report the findings. Nothing moves."""
-    rig, clock, wanted = usable_rig(task.order.rig), WallClock(), Wanted(task.scenario, task.order.strategy)
+    rig, clock, wanted = (
+        usable_rig(task.order.rig),
+        WallClock(),
+        IntendedInsertion(task.scenario, task.order.strategy),
+    )
     task.report_job("running", text="each device is read, nothing moves")
     findings = [*check_rig(rig, clock, _CHECKED_S, wanted), *check_ros(rig, clock, _CHECKED_S)]
     task.report(
@@ -106,7 +110,7 @@ class RigGate(Gate):
         self._supervisor = supervisor
         if self._control.stopped:
             raise StoppedError(f"stopped: {self._control.stopped}")
-        self._wait([*announced(supervisor.rig, self._scenario, supervisor.positions), SWITCHED_ON])
+        self._wait([*describe_insertion(supervisor.rig, self._scenario, supervisor.positions), SWITCHED_ON])
         self._reporter.announce("ready")
         while self._control.held:
             supervisor.wait(_POLL_S)
@@ -116,7 +120,7 @@ class RigGate(Gate):
         """Return the reason to hold, "" without one. Raises StoppedError after a stop, DriverError after a fault."""
         held, waits = self._control.held, self._waits > 0
         if held and not waits:
-            self._wait(announced(self._opened.rig, self._scenario, self._opened.positions))
+            self._wait(describe_insertion(self._opened.rig, self._scenario, self._opened.positions))
             self._reporter.announce("holding", held)
         elif waits and not held:
             self._go()

@@ -21,8 +21,8 @@ import numpy as np
 
 from flexneedle.arguments import shorten
 from flexneedle.errors import DriverError, FlexneedleError, InputError, RigError, make_printable, one_line
-from flexneedle.lab.rig.rig_file import Part, RigFile
-from flexneedle.lab.rig.speeds import pace_problems
+from flexneedle.lab.rig.preflight.speeds import pace_problems
+from flexneedle.lab.rig.rig_file import DeviceSection, RigFile
 from flexneedle.plugins import (
     convert_exceptions,
     function_rule,
@@ -104,13 +104,15 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
     return tracker
 
 
-def address_of(part: Part, motors: Motors) -> str:
+def address_of(part: DeviceSection, motors: Motors) -> str:
     """Return a name of the motors on this machine: the driver's `address`, else its kind and settings."""
     given: str = getattr(motors, "address", "")
     return given or f"{part.kind} {json.dumps(part.settings, sort_keys=True, default=str)}"
 
 
-def _load_factory(section: str, group: str, part: Part, arguments: tuple[str, ...]) -> Callable[..., Any]:
+def _load_factory(
+    section: str, group: str, part: DeviceSection, arguments: tuple[str, ...]
+) -> Callable[..., Any]:
     try:
         names = sorted(entry_points(group=group).names)
         found: Callable[..., Any] = load_part(part.kind, names or ("(none is installed)",), group)
@@ -122,7 +124,7 @@ def _load_factory(section: str, group: str, part: Part, arguments: tuple[str, ..
     return found
 
 
-def _call_factory(section: str, part: Part, make: Callable[[], Any]) -> Any:
+def _call_factory(section: str, part: DeviceSection, make: Callable[[], Any]) -> Any:
     """Return the device of a factory. Raises RigError with section and kind before each line of its InputError."""
     try:
         return make()
@@ -130,18 +132,18 @@ def _call_factory(section: str, part: Part, make: Callable[[], Any]) -> Any:
         raise RigError(*(f"{_label(section, part)}: {line}" for line in str(error).splitlines())) from error
 
 
-def _check_parts(section: str, part: Part, made: object, wanted: Sequence[str]) -> None:
+def _check_parts(section: str, part: DeviceSection, made: object, wanted: Sequence[str]) -> None:
     if missing := missing_parts(made, wanted):
         if hasattr(made, "close"):
             made.close()
         raise _refusal(section, part, f"made {name_kind(made)} without {missing}")
 
 
-def _label(section: str, part: Part) -> str:
+def _label(section: str, part: DeviceSection) -> str:
     return make_printable(f"{section} {part.kind}")
 
 
-def _refusal(section: str, part: Part, rule: str) -> RigError:
+def _refusal(section: str, part: DeviceSection, rule: str) -> RigError:
     return RigError(make_printable(f'{section}.kind = "{part.kind}": {rule}'))
 
 
@@ -163,7 +165,7 @@ class _Entered:
         self.manager.__exit__(None, None, None)
 
 
-def _with_close(part: Part, made: Any) -> OpenTracker:
+def _with_close(part: DeviceSection, made: Any) -> OpenTracker:
     """Return a tracker with `close`, of a tracker or a context manager. Raises RigError for anything else."""
     if hasattr(made, "close"):
         _check_parts("tracker", part, made, parts_of(Tracker))

@@ -1,27 +1,30 @@
-"""Whether a rig can do what a scenario needs, before anything is connected. Pure functions.
+"""Fit of a rig to a scenario, before and after the devices are connected. Pure functions.
 
 An insertion starts where base and guide are when it begins. The base needs room for its advance from the tip to as far
 past the target as the needle may be, the guide for the travel that the scenario allows to either side; the angle of the
-rotation is that of the needle, 0 or 180° at the start.
+rotation is the angle of the needle, 0 or 180° at the start.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from flexneedle.errors import RigError
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
-from flexneedle.lab.rig.start import needed
+from flexneedle.loop.measuring import innovation_limit
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.axes import Axis
+from flexneedle.types import Point
 
 _ROUNDING = 1e-9
+_SDS = 3.0  # standard deviations of the start that a tip may be off
 _STILL = "steering"  # the strategy that moves neither guide nor base laterally
 
 
 @dataclass(frozen=True)
-class Need:
-    """What a scenario needs of a linear axis.
+class AxisNeed:
+    """Requirement of a scenario for a linear axis.
 
     travel: largest, to the positive side, or to both (mm); reason: of it, for messages; step_key, step: largest travel
     in a control step (mm); why: the axis is needed.
@@ -46,23 +49,31 @@ class Need:
         return self.travel + self.back
 
 
-def needs(scenario: Scenario, strategy: str, advance: float) -> tuple[Need, ...]:
-    """Return what a scenario needs of each linear axis, with the strategy of its plan and this advance (mm)."""
-    return (_insertion(scenario, advance), *_guide(scenario, strategy), *_base(scenario, strategy))
+def axis_needs(scenario: Scenario, strategy: str, advance: float) -> tuple[AxisNeed, ...]:
+    """Return the requirements for each linear axis, with the strategy of the plan and this advance (mm)."""
+    return (
+        _insertion_need(scenario, advance),
+        *_guide_needs(scenario, strategy),
+        *_base_needs(scenario, strategy),
+    )
 
 
-def _planned(scenario: Scenario, strategy: str) -> tuple[Need, ...]:
-    """What a scenario needs before its tip is measured."""
-    return needs(scenario, strategy, needed(scenario, scenario.target.depth_mm))
+def _needs_before_start(scenario: Scenario, strategy: str) -> tuple[AxisNeed, ...]:
+    """Return the requirements before the tip is measured."""
+    return axis_needs(scenario, strategy, needed_advance(scenario, scenario.target.depth_mm))
 
 
 def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation") -> list[str]:
-    """Return one line for each thing that the scenario needs and the rig cannot; empty if the rig can all."""
+    """Return one line for each requirement of the scenario that the rig does not meet."""
     found = [
-        *(problem for need in _planned(scenario, strategy) for problem in _linear(rig, scenario, need)),
-        *_turning_base(scenario, strategy),
-        *_rotation(rig, scenario),
-        *_rate(rig, scenario),
+        *(
+            problem
+            for need in _needs_before_start(scenario, strategy)
+            for problem in _linear_problems(rig, scenario, need)
+        ),
+        *_base_turn_problems(scenario, strategy),
+        *_rotation_problems(rig, scenario),
+        *_rate_problems(rig, scenario),
     ]
     return [to_line(problem) for problem in found]
 
@@ -71,7 +82,7 @@ def room_problems(
     rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str = "manipulation"
 ) -> list[tuple[str, str]]:
     """Return axis and line for each axis from whose position (mm) the scenario's travel would pass a soft limit."""
-    return _rooms(rig, _planned(scenario, strategy), positions)
+    return _room_problems(rig, _needs_before_start(scenario, strategy), positions)
 
 
 def start_problems(
@@ -79,22 +90,24 @@ def start_problems(
 ) -> list[str]:
     """Return one line for each axis that is beyond its soft limits (positions: mm or rad), or has no room from there
     for an insertion with this advance of the base (mm)."""
-    outside = [(name, _outside(axis, positions[name])) for name, axis in rig.axes.items()]
-    found = [*outside, *_rooms(rig, needs(scenario, strategy, advance), positions)]
+    outside = [(name, _outside_problem(axis, positions[name])) for name, axis in rig.axes.items()]
+    found = [*outside, *_room_problems(rig, axis_needs(scenario, strategy, advance), positions)]
     return [f"{name}: {line}" for name, line in found if line]
 
 
-def _rooms(rig: RigFile, needed: Iterable[Need], positions: Mapping[str, float]) -> list[tuple[str, str]]:
+def _room_problems(
+    rig: RigFile, needed_advance: Iterable[AxisNeed], positions: Mapping[str, float]
+) -> list[tuple[str, str]]:
     axes = dict(rig.axes.items())
     return [
         (need.axis, line)
-        for need in needed
+        for need in needed_advance
         if need.axis in positions and need.axis in axes
-        for line in _room(axes[need.axis], need, positions[need.axis])
+        for line in _room_lines(axes[need.axis], need, positions[need.axis])
     ]
 
 
-def _outside(axis: Axis, position: float) -> str:
+def _outside_problem(axis: Axis, position: float) -> str:
     low, high = axis.limits
     if low - axis.uncertainty <= position <= high + axis.uncertainty:
         return ""
@@ -102,13 +115,13 @@ def _outside(axis: Axis, position: float) -> str:
     return f"at {axis.shown(position)} {axis.unit}: beyond the soft limits, {limits}: jog it back"
 
 
-def queued(rig: RigFile) -> list[tuple[str, str]]:
-    """Return for each axis its name and what it still moves after the computer has stopped, at its largest speed."""
-    return [(name, _queued(axis, rig.loop)) for name, axis in rig.axes.items()]
+def describe_queues(rig: RigFile) -> list[tuple[str, str]]:
+    """Return for each axis its name and its motion after a failure of the computer, at its largest speed."""
+    return [(name, _describe_queue(axis, rig.loop)) for name, axis in rig.axes.items()]
 
 
-def _queued(axis: Axis, loop: LoopSettings) -> str:
-    """Such as `0.375 mm (5 mm/s × 75 ms)`, or `0.5 mm (loop.queue_mm)`."""
+def _describe_queue(axis: Axis, loop: LoopSettings) -> str:
+    """Return a text such as `0.375 mm (5 mm/s × 75 ms)`, or `0.5 mm (loop.queue_mm)`."""
     distance, by_time, unit = loop.queue_of(axis, axis.speed), axis.speed * loop.queue, axis.unit
     why = f"{axis.shown(axis.speed)} {unit}/s × {1e3 * loop.queue:g} ms"
     if distance != by_time:
@@ -116,9 +129,9 @@ def _queued(axis: Axis, loop: LoopSettings) -> str:
     return f"{axis.shown(distance)} {unit} ({why})"
 
 
-def _insertion(scenario: Scenario, advance: float) -> Need:
+def _insertion_need(scenario: Scenario, advance: float) -> AxisNeed:
     setup, past = scenario.setup, scenario.guard.past_target_mm
-    return Need(
+    return AxisNeed(
         "insertion",
         advance,
         f"the advance to guard.past_target_mm = {past:g} past the target is {advance:.6g} mm",
@@ -129,17 +142,17 @@ def _insertion(scenario: Scenario, advance: float) -> Need:
     )
 
 
-def _guide(scenario: Scenario, strategy: str) -> Iterator[Need]:
+def _guide_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
     setup = scenario.setup
     moved = 0 if strategy == _STILL else setup.moved_guide_axes
     why = f"the guide moves on {moved} axes" if moved > 1 else "the guide moves"
     for name in ("guide_y", "guide_z")[:moved]:
         reason = f"setup.max_guide_travel_mm is {setup.max_guide_travel_mm:g}, to either side"
         step = "setup.max_guide_step_mm", setup.max_guide_step_mm
-        yield Need(name, setup.max_guide_travel_mm, reason, *step, why)
+        yield AxisNeed(name, setup.max_guide_travel_mm, reason, *step, why)
 
 
-def _base(scenario: Scenario, strategy: str) -> Iterator[Need]:
+def _base_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
     setup, sigma = scenario.setup, scenario.plan.base_sigma_mm
     if sigma == 0.0 or strategy == _STILL:
         return
@@ -147,26 +160,26 @@ def _base(scenario: Scenario, strategy: str) -> Iterator[Need]:
     for name in ("base_y", "base_z")[: setup.axes]:
         reason = f"setup.max_base_travel_mm is {setup.max_base_travel_mm:g}, to either side"
         step = "setup.max_base_step_mm", setup.max_base_step_mm
-        yield Need(name, setup.max_base_travel_mm, reason, *step, why)
+        yield AxisNeed(name, setup.max_base_travel_mm, reason, *step, why)
 
 
-def _linear(rig: RigFile, scenario: Scenario, need: Need) -> Iterator[Problem]:
+def _linear_problems(rig: RigFile, scenario: Scenario, need: AxisNeed) -> Iterator[Problem]:
     axis = dict(rig.axes.items()).get(need.axis)
     if axis is None:
         yield Problem(f"axes.{need.axis}", None, f"missing: {need.why}")
         return
-    yield from _too_far(axis, need)
-    yield from _too_fast(axis, scenario, need)
+    yield from _range_problems(axis, need)
+    yield from _speed_problems(axis, scenario, need)
 
 
-def _too_far(axis: Axis, need: Need) -> Iterator[Problem]:
+def _range_problems(axis: Axis, need: AxisNeed) -> Iterator[Problem]:
     low, high = axis.limits
     if need.width > high - low + _ROUNDING:
         rule = f"must be at least {need.width:.6g} wide: {need.reason}"
         yield Problem(f"axes.{need.axis}.range_mm", [low, high], rule)
 
 
-def _too_fast(axis: Axis, scenario: Scenario, need: Need) -> Iterator[Problem]:
+def _speed_problems(axis: Axis, scenario: Scenario, need: AxisNeed) -> Iterator[Problem]:
     speed = scenario.setup.insertion_speed_mm_s
     if need.axis == "insertion":
         if speed > axis.speed + _ROUNDING:
@@ -180,7 +193,7 @@ def _too_fast(axis: Axis, scenario: Scenario, need: Need) -> Iterator[Problem]:
         yield Problem(need.step_key, need.step, f"{rule} {time:g} s ({advance})")
 
 
-def _room(axis: Axis, need: Need, position: float) -> Iterator[str]:
+def _room_lines(axis: Axis, need: AxisNeed, position: float) -> Iterator[str]:
     low, high = axis.limits
     for end, at, travel, room in (
         ("low", low, need.back, position - low),
@@ -189,13 +202,13 @@ def _room(axis: Axis, need: Need, position: float) -> Iterator[str]:
         left = max(room, 0.0)
         if travel > left + axis.tolerance:
             limit = f"{left:.6g} mm to the {end} end of range_mm ({at:g})"
-            yield f"at {position:.6g} mm, {limit}: {need.reason}{_remedy(axis, need)}"
+            yield f"at {position:.6g} mm, {limit}: {need.reason}{_describe_remedy(axis, need)}"
 
 
-def _remedy(axis: Axis, need: Need) -> str:
-    """Where to jog an axis that has too little room, if there is such a place, at which it is also found to be.
+def _describe_remedy(axis: Axis, need: AxisNeed) -> str:
+    """Return the positions to which an axis with too little room can be jogged, and found with its backlash, or "".
 
-    There is none of the insertion axis: what is jogged back is to be advanced again.
+    The insertion axis has none: it must advance again after a jog back.
     """
     low, high = axis.limits[0] + need.back, axis.limits[1] - need.travel
     if not need.both or low > high + _ROUNDING:
@@ -208,13 +221,13 @@ def _remedy(axis: Axis, need: Need) -> str:
     return f"; jog it {where}"
 
 
-def _turning_base(scenario: Scenario, strategy: str) -> Iterator[Problem]:
+def _base_turn_problems(scenario: Scenario, strategy: str) -> Iterator[Problem]:
     turn = scenario.plan.base_turn_sigma_mrad
     if turn > 0.0 and strategy != _STILL:
         yield Problem("plan.base_turn_sigma_mrad", turn, "must be 0: no axis of a rig rotates the base")
 
 
-def _rotation(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
+def _rotation_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
     setup, axis = scenario.setup, rig.axes.rotation
     if axis is None:
         yield Problem("axes.rotation", None, f"missing: the needle is rolled ({setup.turns})")
@@ -237,10 +250,62 @@ def _rotation(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
         yield Problem("setup.max_rotation_deg", free, f"must be at most {most:g}, {shown}")
 
 
-def _rate(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
+def _rate_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
     tracker, loop = scenario.tracker.rate_hz, rig.loop.rate_hz
     if loop < tracker and not math.isclose(loop, tracker):
         rule = (
             f"must be at least {tracker:g}, tracker.rate_hz of the scenario: readings would wait for a tick"
         )
         yield Problem("loop.rate_hz", loop, rule)
+
+
+# The start
+
+
+def check_start(scenario: Scenario, tip: Point | None) -> Point:
+    """Return the measured tip if it is at the scenario's start, so that nothing moves from an unexpected position.
+
+    It may differ from the start by the limit of a first reading's innovation. Raises RigError.
+
+    It may be as far from there as the first reading may be from its prediction. Raises RigError.
+    """
+    control, x = scenario.control, scenario.setup.start_tip_x
+    at = scenario.entry.lateral(x)
+    expected = (x, at.real, at.imag)
+    if tip is None:
+        raise RigError(f"tip: not measured for {control.hold_limit_s:g} s: it must be before anything moves")
+    turned = 1e-3 * control.start_angle_sd_mrad * scenario.needle.length_mm
+    sd = math.hypot(control.start_axial_sd_mm, control.start_offset_sd_mm, turned)
+    off, limit = math.dist(tip, expected), innovation_limit(scenario, sd)
+    if off > limit:
+        rule = f"must be within {limit:.1f} mm of the scenario's start, {_format_point(expected)}"
+        remedy = "retract the needle, jog the guide, or check the registration"
+        raise RigError(f"tip = {_format_point(tip)}: {rule} (setup.tip_to_skin_mm): {remedy}")
+    return tip
+
+
+def _format_point(point: Point) -> str:
+    return ", ".join(f"{one:.1f}" for one in point) + " mm"
+
+
+def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> float:
+    """Return the advance (mm) at which a straight needle is as far past a target at this depth (mm) as the guard
+    allows.
+
+    tip: its measured depth at the start (mm); None: three standard deviations behind the scenario's.
+    """
+    start = scenario.setup.start_tip_x - _SDS * scenario.control.start_axial_sd_mm if tip is None else tip
+    return (target + scenario.guard.past_target_mm - start) * axis_stretch(scenario.entry.slope)
+
+
+def needed_advance(scenario: Scenario, target: float, tip: float | None = None) -> float:
+    """Return the advance (mm) of the base for which an insertion needs room: `deepest_advance` within the scenario's
+    stroke."""
+    return min(
+        deepest_advance(scenario, target, tip), scenario.setup.stroke_mm * axis_stretch(scenario.entry.slope)
+    )
+
+
+def axis_stretch(slope: complex) -> float:
+    """Return the length of the insertion axis for each mm along x. slope: dy/dx + i dz/dx of the axis."""
+    return math.sqrt(1.0 + abs(slope) ** 2)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench_rig import VALUES, rig
-from flexneedle.lab.rig.fit import fit_problems, queued, room_problems, start_problems
+from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, room_problems, start_problems
 from flexneedle.scenario.files import load_scenario
 
 PLANE, SPACE = load_scenario("phantom"), load_scenario("phantom3d")
@@ -205,13 +205,13 @@ def test_it_is_said_where_to_jog_an_axis_or_why_no_jog_helps(low, backlash, reme
 
 def test_what_is_queued_is_the_largest_speed_times_the_queue_within_its_distance():
     changes = {"axes__insertion__speed_mm_s": 12.0, "axes__guide_y__tolerance_mm": 0.13}
-    found = dict(queued(rig(loop__queue_ms=50, **changes)))
+    found = dict(describe_queues(rig(loop__queue_ms=50, **changes)))
     assert found == {
         "insertion": "0.5 mm (loop.queue_mm)",
         "rotation": "18 deg (360 deg/s × 50 ms)",
         "guide_y": "0.26 mm (twice tolerance_mm)",
     }
-    assert dict(queued(rig(loop__queue_ms=50)))["guide_y"] == "0.25 mm (5 mm/s × 50 ms)"
+    assert dict(describe_queues(rig(loop__queue_ms=50)))["guide_y"] == "0.25 mm (5 mm/s × 50 ms)"
 
 
 HERE = {"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}

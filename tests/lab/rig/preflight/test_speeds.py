@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.lab.rig.speeds import attained, kept, step_time
+from flexneedle.lab.rig.preflight.speeds import attained_speed, describe_speeds, step_time
 from flexneedle.lab.rig.supervisor import protocol
 from stages import TICK_S, Bench, rig_file
 
@@ -22,7 +22,7 @@ def test_an_axis_keeps_the_speed_that_it_can_brake_from_within_the_queue(speed, 
             bench.tick()
         times.append(len(bench.reports) * TICK_S)
     measured = 6.0 / (times[1] - times[0])
-    assert attained(rig.axes.insertion, rig.loop, speed) == pytest.approx(measured, rel=0.1)
+    assert attained_speed(rig.axes.insertion, rig.loop, speed) == pytest.approx(measured, rel=0.1)
 
 
 @pytest.mark.parametrize("acceleration", [200.0, 50.0, 10.0, 5.0, 1.0])
@@ -36,7 +36,7 @@ def test_a_step_takes_the_time_that_its_acceleration_needs(acceleration):
 
 
 def test_a_speed_that_an_axis_does_not_keep_is_printed_with_its_reason():
-    assert dict(kept(slow(10.0, 50.0))) == {
+    assert dict(describe_speeds(slow(10.0, 50.0))) == {
         "insertion": "5.93 of 10 mm/s: acceleration_mm_s2 = 50 brakes from no more within the queue",
         "rotation": "360 deg/s",
         "guide_y": "10 mm/s",

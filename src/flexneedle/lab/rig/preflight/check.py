@@ -1,4 +1,4 @@
-"""Comparing a rig with its file: it reads each device, and moves, powers and changes nothing."""
+"""Comparison of a rig with its file: each device is read; nothing is moved, powered or changed."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -9,10 +9,10 @@ from typing import Protocol, TypeVar
 
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
-from flexneedle.lab.rig.fit import fit_problems, queued, room_problems
-from flexneedle.lab.rig.moves import uncertain
+from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, room_problems
+from flexneedle.lab.rig.preflight.moves import describe_uncertainty
+from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.speeds import kept, step_time
 from flexneedle.lab.rig.supervisor.checks import resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.phantom.tracking.table import TIP
@@ -38,8 +38,7 @@ Device = TypeVar("Device", bound=_Closable)
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the check: the part of the rig, what was checked, what was found, and the problem, "" if there is
-    none."""
+    """One line of the check: the part of the rig, the item, the value found, and the problem, "" if there is none."""
 
     part: str
     item: str
@@ -48,67 +47,69 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A scenario, and the strategy of its plan, that the rig is checked for."""
+class IntendedInsertion:
+    """Scenario, and strategy of its plan, that the rig is checked for."""
 
     scenario: Scenario
     strategy: str = "manipulation"
 
 
-def check_rig(rig: RigFile, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
-    """Return what was found at each device. seconds: for which frames of the tracker are counted; clock: real time.
+def check_rig(
+    rig: RigFile, clock: Clock, seconds: float, wanted: IntendedInsertion | None = None
+) -> list[Finding]:
+    """Return the findings at each device. seconds: for which frames of the tracker are counted; clock: real time.
 
     A device that cannot be reached is a finding, too.
     """
-    found = [*_of_file(rig), *(_of_scenario(rig, wanted) if wanted is not None else ())]
-    found += with_device(
-        "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: motors(rig, m, clock, wanted)
+    found = [*_file_findings(rig), *(_scenario_findings(rig, wanted) if wanted is not None else ())]
+    found += check_device(
+        "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: check_motors(rig, m, clock, wanted)
     )
-    found += with_device(
+    found += check_device(
         "tracker",
         rig.tracker.kind,
         lambda: open_tracker(rig, clock),
-        lambda t: tracker(t, clock, seconds, wanted),
+        lambda t: check_tracker(t, clock, seconds, wanted),
     )
     return found
 
 
-def with_device(
+def check_device(
     part: str, kind: str, connect: Callable[[], Device], read: Callable[[Device], list[Finding]]
 ) -> list[Finding]:
-    """Return the findings of one device; where it fails, its error in place of what was not found."""
+    """Return the findings of one device; after a failure its error replaces the findings that are missing."""
     connected: list[Finding] = []
     try:
         with closing(connect()) as device:
-            connected = [Finding(part, "connection", f"{kind}{_identity(device)}")]
+            connected = [Finding(part, "connection", f"{kind}{_format_identity(device)}")]
             return connected + read(device)
     except FlexneedleError as error:
         return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
 
 
-def _identity(device: object) -> str:
+def _format_identity(device: object) -> str:
     identity = getattr(device, "identity", "")
     return f", {identity}" if identity else ""
 
 
-def _of_file(rig: RigFile) -> Iterator[Finding]:
-    for name, distance in queued(rig):
+def _file_findings(rig: RigFile) -> Iterator[Finding]:
+    for name, distance in describe_queues(rig):
         yield Finding(name, "queued motion", distance)
-    for name, speed in kept(rig):
+    for name, speed in describe_speeds(rig):
         yield Finding(name, "speed", speed)
 
 
-def _of_scenario(rig: RigFile, wanted: Wanted) -> list[Finding]:
+def _scenario_findings(rig: RigFile, wanted: IntendedInsertion) -> list[Finding]:
     problems = fit_problems(rig, wanted.scenario, wanted.strategy)
     name = wanted.scenario.name
     found = [Finding("scenario", "fit", name, line) for line in problems] or [
         Finding("scenario", "fit", name)
     ]
-    return [*found, _step(rig, wanted.scenario)]
+    return [*found, _step_finding(rig, wanted.scenario)]
 
 
-def _step(rig: RigFile, scenario: Scenario) -> Finding:
-    """How long the largest step takes: with a slow acceleration an insertion is slower than its scenario."""
+def _step_finding(rig: RigFile, scenario: Scenario) -> Finding:
+    """Return the time of the largest step: with a slow acceleration an insertion is slower than its scenario."""
     way, planned = scenario.setup.max_advance_mm, scenario.setup.step_time
     time = step_time(rig.axes.insertion, rig.loop, way, planned)
     return Finding("insertion", "largest step", f"{way:g} mm in {time:.2g} s, planned for {planned:.2g} s")
@@ -117,11 +118,13 @@ def _step(rig: RigFile, scenario: Scenario) -> Finding:
 # Motors
 
 
-def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = None) -> list[Finding]:
-    """Return what a few readings of the motors show. Raises DriverError if they cannot be read."""
-    states, seconds = _read(device, clock)
-    found = [_reply(rig, seconds)]
-    setups = _setups(device)
+def check_motors(
+    rig: RigFile, device: Motors, clock: Clock, wanted: IntendedInsertion | None = None
+) -> list[Finding]:
+    """Return the findings of a few readings of the motors. Raises DriverError if they cannot be read."""
+    states, seconds = _read_motors(device, clock)
+    found = [_reply_finding(rig, seconds)]
+    setups = _read_setups(device)
     positions: dict[str, float] = {}
     for name, axis in rig.axes.items():
         state = states.get(axis.channel)
@@ -129,15 +132,15 @@ def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = N
             rule = f"the driver has no channel {axis.channel}; it has {', '.join(states) or 'none'}"
             found.append(Finding(name, "motor", axis.channel, rule))
             continue
-        found += _of_axis(name, axis, state)
+        found += _axis_findings(name, axis, state)
         if axis.channel in setups:
-            found += _of_setup(name, axis, setups[axis.channel])
+            found += _setup_findings(name, axis, setups[axis.channel])
         positions[name] = state.position / axis.scale
-    return found + _rooms(rig, positions, wanted)
+    return found + _room_findings(rig, positions, wanted)
 
 
-def _read(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
-    """The last of a few readings, and the median time (s) of one."""
+def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
+    """Return the last of a few readings, and the median time (s) of one."""
     states: Mapping[str, MotorState] = {}
     times = []
     for _ in range(_READINGS):
@@ -147,30 +150,32 @@ def _read(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float
     return states, median(times)
 
 
-def _setups(device: Motors) -> Mapping[str, MotorSetup]:
-    """How the controller is set up, by channel; empty where its driver does not report that."""
+def _read_setups(device: Motors) -> Mapping[str, MotorSetup]:
+    """Return the setup of the controller by channel; empty if its driver does not report it."""
     found: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
     return found
 
 
-def _reply(rig: RigFile, seconds: float) -> Finding:
+def _reply_finding(rig: RigFile, seconds: float) -> Finding:
     tick = 1.0 / rig.loop.rate_hz
     late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
     return Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)
 
 
-def _of_axis(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
-    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _at_rest(state))
-    yield Finding(name, "position", _position(axis, state.position), _beyond(axis, state.position))
+def _axis_findings(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
+    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _motion_problem(state))
     yield Finding(
-        name, "limit switches", _switches(state) or "none active", _switch_problem(name, axis, state)
+        name, "position", _format_position(axis, state.position), _limit_problem(axis, state.position)
+    )
+    yield Finding(
+        name, "limit switches", _format_switches(state) or "none active", _switch_problem(name, axis, state)
     )
     if state.on:
-        yield _following(name, axis, state)
+        yield _following_finding(name, axis, state)
 
 
-def _of_setup(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
-    """What the controller itself does at limits and errors, beside what the rig file has."""
+def _setup_findings(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
+    """Yield the controller's own reactions to limits and errors, compared with the rig file."""
     off = f"{setup.disabled} disabled in the controller: it does not stop the motor" if setup.disabled else ""
     yield Finding(name, "switches in use", "all" if not off else "not all", off)
     low, high = sorted((setup.lowest / axis.scale, setup.highest / axis.scale))
@@ -178,19 +183,19 @@ def _of_setup(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
     held = ", also while its home is searched" if axis.to_home and (isfinite(low) or isfinite(high)) else ""
     limits = f"{axis.shown(axis.limits[0])} to {axis.shown(axis.limits[1])} {axis.unit}"
     rule = f"narrower than range_{axis.unit}, {limits}: motions would end there" if narrow else ""
-    yield Finding(name, "controller's limits", _limits(axis, low, high) + held, rule)
-    yield _error_limit(name, axis, setup)
+    yield Finding(name, "controller's limits", _format_limits(axis, low, high) + held, rule)
+    yield _error_limit_finding(name, axis, setup)
 
 
-def _limits(axis: Axis, low: float, high: float) -> str:
+def _format_limits(axis: Axis, low: float, high: float) -> str:
     if not (isfinite(low) or isfinite(high)):
         return "none"
     ends = (axis.shown(end) if isfinite(end) else "none" for end in (low, high))
     return f"{' to '.join(ends)} {axis.unit}"
 
 
-def _error_limit(name: str, axis: Axis, setup: MotorSetup) -> Finding:
-    """The controller's own reaction to an error; it shall not come before that of the supervisor."""
+def _error_limit_finding(name: str, axis: Axis, setup: MotorSetup) -> Finding:
+    """Return the controller's own reaction to an error, which must not come before the supervisor's."""
     error = setup.most_error / abs(axis.scale)
     if not (setup.off_on_error and isfinite(error)):
         return Finding(name, "motor off on error", "no")
@@ -201,17 +206,17 @@ def _error_limit(name: str, axis: Axis, setup: MotorSetup) -> Finding:
     return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
 
 
-def _at_rest(state: MotorState) -> str:
+def _motion_problem(state: MotorState) -> str:
     moving = "moves, though this command does not move it" if state.moving else ""
     return "; ".join(filter(None, (moving, state.stopped)))
 
 
-def _position(axis: Axis, counts: float) -> str:
-    slack = f", {uncertain(axis)}" if axis.backlash else ""
+def _format_position(axis: Axis, counts: float) -> str:
+    slack = f", {describe_uncertainty(axis)}" if axis.backlash else ""
     return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts){slack}"
 
 
-def _beyond(axis: Axis, counts: float) -> str:
+def _limit_problem(axis: Axis, counts: float) -> str:
     position, (low, high) = counts / axis.scale, axis.limits
     if not isfinite(position):
         return "is not a number"
@@ -220,17 +225,17 @@ def _beyond(axis: Axis, counts: float) -> str:
     return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
 
 
-def _switches(state: MotorState) -> str:
+def _format_switches(state: MotorState) -> str:
     active = ("reverse", state.reverse_limit), ("forward", state.forward_limit)
     return " and ".join(name for name, is_active in active if is_active)
 
 
 def _switch_problem(name: str, axis: Axis, state: MotorState) -> str:
-    """An axis may rest at the switch of its home, where that is."""
+    """Return the problem of active limit switches; an axis may rest at the switch of its home."""
     return resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
 
 
-def _following(name: str, axis: Axis, state: MotorState) -> Finding:
+def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
     error = abs((state.commanded - state.position) / axis.scale)
     most = axis.max_error
     limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
@@ -238,8 +243,10 @@ def _following(name: str, axis: Axis, state: MotorState) -> Finding:
     return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
 
 
-def _rooms(rig: RigFile, positions: Mapping[str, float], wanted: Wanted | None) -> list[Finding]:
-    """Whether the insertion of a scenario could start from where the axes are."""
+def _room_findings(
+    rig: RigFile, positions: Mapping[str, float], wanted: IntendedInsertion | None
+) -> list[Finding]:
+    """Return the axes from whose positions the insertion of a scenario could not start."""
     if wanted is None:
         return []
     return [
@@ -251,22 +258,24 @@ def _rooms(rig: RigFile, positions: Mapping[str, float], wanted: Wanted | None) 
 # Tracker
 
 
-def tracker(device: OpenTracker, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
-    """Return what the frames of `seconds` show. Raises RunError if the tracker fails."""
-    frames = _frames(device, clock, seconds)
+def check_tracker(
+    device: OpenTracker, clock: Clock, seconds: float, wanted: IntendedInsertion | None = None
+) -> list[Finding]:
+    """Return the findings of the frames of `seconds`. Raises RunError if the tracker fails."""
+    frames = _collect_frames(device, clock, seconds)
     if not frames:
         reason = "no frame" if device.status == VISIBLE else f"no frame: {device.status}"
         return [Finding("tracker", "frames", f"none in {seconds:g} s", reason)]
     status = device.status
     return [
-        _rate(frames, wanted),
+        _rate_finding(frames, wanted),
         Finding("tracker", "status", status, "" if status == VISIBLE else "must be ok while frames arrive"),
-        *_sensors(frames),
-        *_needed_sensors(frames, wanted),
+        *_sensor_findings(frames),
+        *_needed_sensor_findings(frames, wanted),
     ]
 
 
-def _frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
+def _collect_frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
     begun, frames = clock.now(), list[Frame]()
     while clock.now() - begun < seconds:
         frames += device.read()
@@ -274,7 +283,7 @@ def _frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
     return frames
 
 
-def _rate(frames: Sequence[Frame], wanted: Wanted | None) -> Finding:
+def _rate_finding(frames: Sequence[Frame], wanted: IntendedInsertion | None) -> Finding:
     span, missed = frames[-1].time - frames[0].time, frames[-1].number - frames[0].number + 1 - len(frames)
     rate = (len(frames) - 1) / span if span > 0.0 else 0.0
     shown = f"{rate:.1f} Hz, {len(frames)} frames, {missed} missed"
@@ -286,7 +295,7 @@ def _rate(frames: Sequence[Frame], wanted: Wanted | None) -> Finding:
     return Finding("tracker", "frames", shown)
 
 
-def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
+def _sensor_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
     names = dict.fromkeys(name for frame in frames for name in frame.readings)
     for name in names:
         readings = [frame.readings[name] for frame in frames if name in frame.readings]
@@ -302,7 +311,7 @@ def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
         yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)
 
 
-def _needed_sensors(frames: Sequence[Frame], wanted: Wanted | None) -> Iterator[Finding]:
+def _needed_sensor_findings(frames: Sequence[Frame], wanted: IntendedInsertion | None) -> Iterator[Finding]:
     names = {name for frame in frames for name in frame.readings}
     if TIP not in names:
         yield Finding(

@@ -9,13 +9,19 @@ import bench_rig
 from bench_rig import Clock, Motors, Tracker, rig
 from flexneedle.errors import RunError
 from flexneedle.lab.emulators.galil.controller import reply
-from flexneedle.lab.rig.check import Finding, Wanted, check_rig, motors, tracker
 from flexneedle.lab.rig.devices.galil.motors import factory
+from flexneedle.lab.rig.preflight.check import (
+    Finding,
+    IntendedInsertion,
+    check_motors,
+    check_rig,
+    check_tracker,
+)
 from flexneedle.scenario.files import load_scenario
 from flexneedle.types import VISIBLE, Frame, SensorReading
 from galil_peer import peer
 
-PLANE = Wanted(load_scenario("phantom").with_values({"monitor.references": 0}))
+PLANE = IntendedInsertion(load_scenario("phantom").with_values({"monitor.references": 0}))
 FAR_OFF = "must be at most max_error_mm (0.2): free the axis; the next motion begins where it then is"
 KINDS = {"driver__kind": "bench_rig:drivers", "tracker__kind": "bench_rig:trackers"}
 
@@ -56,7 +62,7 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
     device = motors_with("A", position=12345.0, commanded=12345.0)
     device.set("B", position=9000.0, commanded=9000.0)
     device.set("C", position=-1500.0, commanded=-1500.0)
-    findings = motors(rig(), device, Clock())
+    findings = check_motors(rig(), device, Clock())
     shown = {name: of(findings, name, "position").found for name in ("insertion", "rotation", "guide_y")}
     assert shown == {
         "insertion": "12.345 mm (12345 counts)",
@@ -70,7 +76,7 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
 )
 def test_a_position_may_seem_beyond_the_limits_by_half_the_backlash(backlash, counts, fits):
     found = problems(
-        motors(rig(axes__insertion__backlash_mm=backlash), motors_with("A", position=counts), Clock())
+        check_motors(rig(axes__insertion__backlash_mm=backlash), motors_with("A", position=counts), Clock())
     )
     assert (("insertion", "position") not in found) == fits
 
@@ -95,7 +101,7 @@ def test_a_position_may_seem_beyond_the_limits_by_half_the_backlash(backlash, co
     ids=str,
 )
 def test_what_a_motor_should_not_be_is_a_problem(state, item, problem):
-    found = problems(motors(rig(), motors_with("A", **state), Clock()))
+    found = problems(check_motors(rig(), motors_with("A", **state), Clock()))
     assert found[("insertion", item)] == problem
     assert set(found) <= {("insertion", item), ("insertion", "commanded - measured")}
 
@@ -111,7 +117,7 @@ def test_what_a_motor_should_not_be_is_a_problem(state, item, problem):
     ids=str,
 )
 def test_what_a_motor_may_be_is_none(state):
-    assert problems(motors(rig(), motors_with("A", **state), Clock())) == {}
+    assert problems(check_motors(rig(), motors_with("A", **state), Clock())) == {}
 
 
 def test_the_limits_of_a_motor_that_turns_the_other_way_are_those_of_its_axis():
@@ -119,19 +125,19 @@ def test_the_limits_of_a_motor_that_turns_the_other_way_are_those_of_its_axis():
     inside, outside = (
         {"position": counts, "commanded": counts} for counts in (-7000.0, 7000.0)
     )  # 14 and -14 mm
-    assert problems(motors(found, motors_with("C", **inside), Clock())) == {}
-    assert problems(motors(found, motors_with("C", **outside), Clock())) == {
+    assert problems(check_motors(found, motors_with("C", **inside), Clock())) == {}
+    assert problems(check_motors(found, motors_with("C", **outside), Clock())) == {
         ("guide_y", "position"): "beyond the soft limits, -5 to 15 mm"
     }
 
 
 def test_a_motor_that_is_off_is_found_off():
-    findings = motors(rig(), motors_with("B", on=False), Clock())
+    findings = check_motors(rig(), motors_with("B", on=False), Clock())
     assert [of(findings, name, "motor").found for name in ("insertion", "rotation")] == ["A, on", "B, off"]
 
 
 def test_a_channel_that_the_driver_lacks_is_a_problem():
-    found = problems(motors(rig(), Motors(("A", "C", "D")), Clock()))
+    found = problems(check_motors(rig(), Motors(("A", "C", "D")), Clock()))
     assert found == {("rotation", "motor"): "the driver has no channel B; it has A, C, D"}
 
 
@@ -142,14 +148,14 @@ def test_a_slow_controller_is_a_problem():
             return super().read()
 
     clock = Clock()
-    found = problems(motors(rig(), Slow(), clock))
+    found = problems(check_motors(rig(), Slow(), clock))
     assert found == {("driver", "reply"): "longer than a tick of the loop, 25 ms"}
 
 
 def test_an_insertion_that_cannot_start_from_here_is_a_problem():
     for position, count in ((30_000.0, 0), (50_000.0, 1)):  # 40 mm deep need less than the stroke of 110 mm
         device = motors_with("A", position=position, commanded=position)
-        found = problems(motors(rig(), device, Clock(), PLANE))
+        found = problems(check_motors(rig(), device, Clock(), PLANE))
         assert len(found) == count
     assert found[("insertion", "room")] == (
         "at 50 mm, 70 mm to the high end of range_mm (120): the advance to guard.past_target_mm = 2 past the target "
@@ -158,7 +164,7 @@ def test_an_insertion_that_cannot_start_from_here_is_a_problem():
 
 
 def test_a_position_that_is_uncertain_by_backlash_is_said_so():
-    findings = motors(rig(axes__guide_y__backlash_mm=0.08), Motors(), Clock())
+    findings = check_motors(rig(axes__guide_y__backlash_mm=0.08), Motors(), Clock())
     assert of(findings, "guide_y", "position").found == (
         "0 mm (0 counts), uncertain by 0.04 mm (half of backlash_mm)"
     )
@@ -177,26 +183,26 @@ def test_a_rig_that_is_slower_than_its_scenario_is_said_so():
 @pytest.mark.parametrize("rate", [40.0, 20.0])
 def test_the_rate_of_the_frames_is_measured(rate):
     clock = Clock()
-    found = tracker(Tracker(clock, rate=rate), clock, 2.0)
+    found = check_tracker(Tracker(clock, rate=rate), clock, 2.0)
     assert of(found, "tracker", "frames").found.startswith(f"{rate:.1f} Hz, ")
     assert problems(found) == {}
 
 
 def test_another_rate_than_the_scenarios_is_a_problem():
     clock = Clock()
-    found = problems(tracker(Tracker(clock, rate=20.0), clock, 2.0, PLANE))
+    found = problems(check_tracker(Tracker(clock, rate=20.0), clock, 2.0, PLANE))
     assert found == {("tracker", "frames"): "tracker.rate_hz of the scenario is 40"}
 
 
 def test_a_tracker_without_frames_is_a_problem_with_its_status():
     clock = Clock()
-    found = tracker(Tracker(clock, rate=0.0, status="no reply to INIT"), clock, 1.0)
+    found = check_tracker(Tracker(clock, rate=0.0, status="no reply to INIT"), clock, 1.0)
     assert found == [Finding("tracker", "frames", "none in 1 s", "no frame: no reply to INIT")]
 
 
 def test_a_single_frame_has_no_rate():
     clock = Clock()
-    found = problems(tracker(Tracker(clock, rate=1.0), clock, 1.5))
+    found = problems(check_tracker(Tracker(clock, rate=1.0), clock, 1.5))
     assert found == {("tracker", "frames"): "too few for a rate"}
 
 
@@ -207,13 +213,13 @@ def test_missed_frames_are_counted():
         def read(self):
             return tuple(frame for frame in super().read() if frame.number % 4)
 
-    found = tracker(Skipping(clock), clock, 1.0)
+    found = check_tracker(Skipping(clock), clock, 1.0)
     assert of(found, "tracker", "frames").found.endswith(" 29 frames, 9 missed")
 
 
 def test_a_needle_without_a_sensor_is_a_problem():
     clock = Clock()
-    found = tracker(Tracker(clock, sensors=("ref1", "ref2")), clock, 1.0)
+    found = check_tracker(Tracker(clock, sensors=("ref1", "ref2")), clock, 1.0)
     assert problems(found) == {("tracker", "sensor tip"): "the needle's sensor must have the name tip"}
     assert of(found, "tracker", "sensor ref1").found == "measured in 100% at 1.00, 2.00, 3.00 mm"
 
@@ -229,7 +235,7 @@ def test_a_sensor_that_is_seldom_measured_is_a_problem():
                 for frame in super().read()
             )
 
-    found = tracker(Seldom(clock), clock, 2.0)
+    found = check_tracker(Seldom(clock), clock, 2.0)
     assert problems(found) == {("tracker", "sensor tip"): "measured in too few frames: out of volume"}
 
 
@@ -245,7 +251,7 @@ def test_one_frame_without_a_position_is_no_problem_however_few_there_are(lost):
                 for frame in super().read()
             )
 
-    found = tracker(Short(clock), clock, 0.2)
+    found = check_tracker(Short(clock), clock, 0.2)
     assert of(found, "tracker", "frames").found.endswith(" 7 frames, 0 missed")
     assert bool(problems(found)) == (lost > 1)
 
@@ -259,19 +265,19 @@ def test_a_position_that_is_not_a_number_is_not_measured(place):
             tip = SensorReading(place, status=VISIBLE)
             return tuple(Frame(frame.time, frame.number, {"tip": tip}) for frame in super().read())
 
-    found = tracker(Wrong(clock), clock, 2.0)
+    found = check_tracker(Wrong(clock), clock, 2.0)
     why = "measured in too few frames: its position is not a number"
     assert problems(found) == {("tracker", "sensor tip"): why}
 
 
 def test_the_references_that_the_monitor_needs_are_counted():
     clock = Clock()
-    needs = Wanted(load_scenario("phantom"))
-    found = problems(tracker(Tracker(clock, sensors=("tip", "ref1")), clock, 1.0, needs))
+    needs = IntendedInsertion(load_scenario("phantom"))
+    found = problems(check_tracker(Tracker(clock, sensors=("tip", "ref1")), clock, 1.0, needs))
     rule = "monitor.references of the scenario is 3: a sensor whose name begins with ref is one"
     assert found == {("tracker", "reference sensors"): rule}
     all_there = Tracker(Clock(), sensors=("tip", "ref1", "ref2", "ref3"))
-    assert problems(tracker(all_there, all_there.clock, 1.0, needs)) == {}
+    assert problems(check_tracker(all_there, all_there.clock, 1.0, needs)) == {}
 
 
 def test_a_device_that_cannot_be_reached_does_not_hide_the_other(monkeypatch):
@@ -322,7 +328,7 @@ def set_up(commands):
         device.device, _ = reply(device.device, commands)
         given = {"address": f"127.0.0.1:{device.port}", "reply_timeout_ms": 1000}
         with closing(factory(given, ("A", "B", "C"))) as connected:
-            return motors(rig(), connected, Clock())
+            return check_motors(rig(), connected, Clock())
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 
 from bench_rig import rig
 from flexneedle.errors import InputError
-from flexneedle.lab.rig.moves import distance_of, homings, jog, resting, retraction
+from flexneedle.lab.rig.preflight.moves import (
+    describe_axes,
+    parse_distance,
+    plan_homings,
+    plan_jog,
+    plan_retraction,
+)
 
 RIG = rig()
 
@@ -27,7 +33,7 @@ RIG = rig()
     ],
 )
 def test_a_jog_ends_at_the_distance_from_the_start(name, distance, position, goal, speed):
-    move = jog(RIG, name, distance, position)
+    move = plan_jog(RIG, name, distance, position)
     assert (move.start, move.goal, move.speed) == pytest.approx((position, goal, speed))
 
 
@@ -58,7 +64,7 @@ def test_a_jog_ends_at_the_distance_from_the_start(name, distance, position, goa
 )
 def test_another_jog_is_refused(name, distance, position, line):
     with pytest.raises(InputError) as caught:
-        jog(RIG, name, distance, position)
+        plan_jog(RIG, name, distance, position)
     assert str(caught.value).startswith(line)
 
 
@@ -67,19 +73,19 @@ def test_another_jog_is_refused(name, distance, position, line):
     [("insertion", 10.0, 10.0), ("insertion", 0.5, 0.5), ("rotation", 90.0, math.pi / 2)],
 )
 def test_a_jog_is_as_fast_as_asked(name, speed, taken):
-    assert jog(RIG, name, "5", 0.0, speed).speed == pytest.approx(taken)
+    assert plan_jog(RIG, name, "5", 0.0, speed).speed == pytest.approx(taken)
 
 
 @pytest.mark.parametrize("speed", [10.01, 0.0, -1.0, math.nan])
 def test_a_jog_faster_than_the_axis_is_refused(speed):
     with pytest.raises(InputError, match="must be above 0 and at most 10, speed_mm_s of insertion"):
-        jog(RIG, "insertion", "5", 0.0, speed)
+        plan_jog(RIG, "insertion", "5", 0.0, speed)
 
 
 @given(st.floats(-200, 200), st.floats(-300, 300))
 def test_no_jog_goes_further_beyond_the_limits_than_it_is(position, distance):
     try:
-        move = jog(RIG, "insertion", repr(distance), position)
+        move = plan_jog(RIG, "insertion", repr(distance), position)
     except InputError:
         return
     outside = [max(0.0, -x, x - 120.0) for x in (position, move.goal)]
@@ -88,15 +94,15 @@ def test_no_jog_goes_further_beyond_the_limits_than_it_is(position, distance):
 
 @pytest.mark.parametrize(("to", "goal"), [(None, 2.4), (10.0, 10.0), (0.2, 0.2), (29.9, 29.9)])
 def test_a_retraction_goes_back_at_the_speed_of_a_jog(to, goal):
-    move = retraction(RIG, 30.0, to)
+    move = plan_retraction(RIG, 30.0, to)
     assert (move.name, move.start, move.goal, move.speed) == ("insertion", 30.0, goal, 2.0)
-    assert move.speed == jog(RIG, "insertion", "1", 30.0).speed
-    assert retraction(RIG, 30.0, to, 0.5).speed == 0.5
+    assert move.speed == plan_jog(RIG, "insertion", "1", 30.0).speed
+    assert plan_retraction(RIG, 30.0, to, 0.5).speed == 0.5
 
 
 def test_a_retraction_faster_than_the_axis_is_refused():
     with pytest.raises(InputError, match="speed 11: must be above 0 and at most 10, speed_mm_s of insertion"):
-        retraction(RIG, 30.0, None, 11.0)
+        plan_retraction(RIG, 30.0, None, 11.0)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +119,7 @@ def test_a_retraction_faster_than_the_axis_is_refused():
 )
 def test_a_retraction_ends_off_the_switch_behind_the_base_or_at_its_lowest_position(changes, goal):
     found = rig(**{f"axes__insertion__{key}": value for key, value in changes.items()})
-    assert retraction(found, 30.0).goal == pytest.approx(goal)
+    assert plan_retraction(found, 30.0).goal == pytest.approx(goal)
 
 
 @given(home=st.floats(-20.0, 0.0), most=st.none() | st.floats(0.1, 5.0), to=st.none() | st.floats(-1.0, 30.0))
@@ -121,7 +127,7 @@ def test_no_retraction_ends_where_the_base_may_be_at_the_switch(home, most, to):
     most = {} if most is None else {"axes__insertion__max_error_mm": most}
     found = rig(axes__insertion__home_mm=home, **most)
     try:
-        move = retraction(found, 30.0, to)
+        move = plan_retraction(found, 30.0, to)
     except InputError:
         return
     assert move.goal >= max(0.0, home + min(found.axes.insertion.max_error, 2.4)) - 1e-6
@@ -142,25 +148,31 @@ def test_no_retraction_ends_where_the_base_may_be_at_the_switch(home, most, to):
 )
 def test_a_retraction_never_goes_forwards_or_beyond(to, line):
     with pytest.raises(InputError) as caught:
-        retraction(RIG, 30.0, to)
+        plan_retraction(RIG, 30.0, to)
     assert str(caught.value) == line
 
 
 def test_axes_are_homed_in_the_order_of_the_file():
-    assert [homing.name for homing in homings(RIG, ["rotation", "insertion"])] == ["insertion", "rotation"]
-    assert [homing.name for homing in homings(RIG, [])] == ["insertion", "rotation"]  # guide_y is absolute
+    assert [homing.name for homing in plan_homings(RIG, ["rotation", "insertion"])] == [
+        "insertion",
+        "rotation",
+    ]
+    assert [homing.name for homing in plan_homings(RIG, [])] == [
+        "insertion",
+        "rotation",
+    ]  # guide_y is absolute
 
 
 def test_an_absolute_encoder_is_not_homed():
     with pytest.raises(InputError, match='axis guide_y: has home = "absolute": its encoder needs no homing'):
-        homings(RIG, ["guide_y"])
+        plan_homings(RIG, ["guide_y"])
     with pytest.raises(InputError, match="axis 'guide_x': must be one of insertion, rotation, guide_y"):
-        homings(RIG, ["guide_x"])
+        plan_homings(RIG, ["guide_x"])
 
 
 def test_what_would_move_is_a_line():
     turned = rig(axes__insertion__direction=-1, axes__insertion__home_mm=121.5)
-    lines = [str(homing) for homing in (*homings(RIG, []), *homings(turned, ["insertion"]))]
+    lines = [str(homing) for homing in (*plan_homings(RIG, []), *plan_homings(turned, ["insertion"]))]
     assert lines == [
         "insertion: in its negative direction to the reverse limit switch, by at most 132 mm at 1 mm/s; "
         "the position there is called 0 mm; then in its positive direction by 2.4 mm at 1 mm/s, off the switch to "
@@ -170,18 +182,23 @@ def test_what_would_move_is_a_line():
         "the position there is called 121.5 mm; then in its negative direction by 3.9 mm at 1 mm/s, off the switch to "
         "117.6 mm. If the switch is active now, first in its negative direction by 3.9 mm at 1 mm/s",
     ]
-    assert str(jog(RIG, "rotation", "90", 0.0)) == "rotation: from 0 to 90 deg (90 deg), at most at 72 deg/s"
-    assert retraction(RIG, 2.4) is retraction(RIG, 0.0) is retraction(RIG, -0.5) is None, "it is there"
-    assert str(retraction(RIG, 30.0)) == "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s"
+    assert (
+        str(plan_jog(RIG, "rotation", "90", 0.0))
+        == "rotation: from 0 to 90 deg (90 deg), at most at 72 deg/s"
+    )
+    assert plan_retraction(RIG, 2.4) is plan_retraction(RIG, 0.0) is plan_retraction(RIG, -0.5) is None, (
+        "it is there"
+    )
+    assert str(plan_retraction(RIG, 30.0)) == "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s"
 
 
 def test_a_start_that_is_uncertain_by_backlash_is_said_so():
     loose = rig(axes__insertion__backlash_mm=0.1, axes__rotation__backlash_deg=0.9)
-    assert str(jog(loose, "insertion", "5", 10.0)) == (
+    assert str(plan_jog(loose, "insertion", "5", 10.0)) == (
         "insertion: from 10 to 15 mm (5 mm), at most at 2 mm/s; the start is uncertain by 0.05 mm "
         "(half of backlash_mm)"
     )
-    assert resting(loose, {"insertion": 10.0, "rotation": 0.0, "guide_y": 0.0}) == [
+    assert describe_axes(loose, {"insertion": 10.0, "rotation": 0.0, "guide_y": 0.0}) == [
         "insertion: at 10 mm, moves at most at 10 mm/s; the start is uncertain by 0.05 mm (half of backlash_mm)",
         "rotation: at 0 deg, moves at most at 360 deg/s; the start is uncertain by 0.45 deg (half of backlash_deg)",
         "guide_y: at 0 mm, moves at most at 5 mm/s",
@@ -190,4 +207,4 @@ def test_a_start_that_is_uncertain_by_backlash_is_said_so():
 
 @given(st.floats(-1e5, 1e5), st.sampled_from(["", "mm", " mm"]))
 def test_a_distance_is_the_number_that_is_written(value, unit):
-    assert distance_of(f"{value!r}{unit}", "insertion", RIG.axes.insertion) == value
+    assert parse_distance(f"{value!r}{unit}", "insertion", RIG.axes.insertion) == value

@@ -1,4 +1,4 @@
-"""How fast the axes of a rig are with their acceleration and the queue of the loop. Pure functions."""
+"""Speeds of the axes of a rig with their acceleration and the queue of the loop. Pure functions."""
 
 import math
 from collections.abc import Iterator
@@ -14,8 +14,8 @@ _ROUNDING = 1e-9
 _SHOWN = 1e6  # digits of a limit in a message
 
 
-def attained(axis: Axis, loop: LoopSettings, speed: float) -> float:
-    """Return the speed (mm/s or rad/s) that an axis keeps in a long motion at `speed`, at most that.
+def attained_speed(axis: Axis, loop: LoopSettings, speed: float) -> float:
+    """Return the speed (mm/s or rad/s) that an axis attains in a long motion at `speed`, at most that.
 
     A motor goes no faster than it can brake from before its target, v²/2a. That is a queue ahead of it, less the way
     v/f of a tick, after which it gets the next one.
@@ -29,15 +29,18 @@ def step_time(axis: Axis, loop: LoopSettings, way: float, duration: float) -> fl
     channel, drive = axis.channel, Drive("", axis)
     made = plan_trajectory({channel: drive}, {channel: 0.0}, {channel: drive.to_counts(way)}, duration)
     fastest = made.speeds[channel] / abs(axis.scale)
-    return max(made.duration, shortest_duration(way, attained(axis, loop, fastest), axis.acceleration))
+    return max(made.duration, shortest_duration(way, attained_speed(axis, loop, fastest), axis.acceleration))
 
 
-def kept(rig: RigFile) -> list[tuple[str, str]]:
-    """Return for each axis its name and the speed that it keeps, such as `10 mm/s`, or `5.93 of 10 mm/s: …`."""
-    return [(name, _kept(axis, attained(axis, rig.loop, axis.speed))) for name, axis in rig.axes.items()]
+def describe_speeds(rig: RigFile) -> list[tuple[str, str]]:
+    """Return for each axis its name and its attained speed, such as `10 mm/s`, or `5.93 of 10 mm/s: …`."""
+    return [
+        (name, _describe_speed(axis, attained_speed(axis, rig.loop, axis.speed)))
+        for name, axis in rig.axes.items()
+    ]
 
 
-def _kept(axis: Axis, speed: float) -> str:
+def _describe_speed(axis: Axis, speed: float) -> str:
     unit, most = axis.unit, axis.shown(axis.speed)
     if speed >= axis.speed * (1.0 - _ROUNDING):
         return f"{most} {unit}/s"

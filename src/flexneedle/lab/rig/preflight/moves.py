@@ -1,4 +1,4 @@
-"""Motions that an operator commands, outside of an insertion: what would move, from where to where. Pure functions."""
+"""Motions that an operator commands, outside of an insertion, and their descriptions. Pure functions."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,6 +10,7 @@ from flexneedle.errors import InputError, RefusedError
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import STILL
 from flexneedle.lab.rig.supervisor.drives import homing_reach, homing_speed, position_after_homing
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.axes import Axis
 
 _SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
@@ -19,7 +20,7 @@ _DISTANCE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z°]*
 
 
 @dataclass(frozen=True)
-class Move:
+class AxisMove:
     """A motion of one axis from `start` to `goal` (mm or rad), at most at `speed` (mm/s or rad/s)."""
 
     name: str
@@ -36,12 +37,12 @@ class Move:
     def __str__(self) -> str:
         at, unit = self.axis.shown, self.axis.unit
         way = f"from {at(self.start)} to {at(self.goal)} {unit} ({at(self.distance)} {unit})"
-        slack = f"; the start is {uncertain(self.axis)}" if self.axis.backlash else ""
+        slack = f"; the start is {describe_uncertainty(self.axis)}" if self.axis.backlash else ""
         return f"{self.name}: {way}, at most at {at(self.speed)} {unit}/s{slack}"
 
 
-def require_start(move: Move, position: float) -> None:
-    """Raise RefusedError if an axis at a position (mm, rad) is not where its motion begins, or beyond its goal."""
+def require_start(move: AxisMove, position: float) -> None:
+    """Raise RefusedError if an axis has left the start of its motion, or is beyond its goal (position: mm, rad)."""
     axis, turns = move.axis, (move.goal - position) * move.distance <= 0.0
     if turns or not abs(position - move.start) <= STILL * axis.tolerance:
         now, then = (_with_unit(axis, at) for at in (position, move.start))
@@ -51,8 +52,8 @@ def require_start(move: Move, position: float) -> None:
 
 
 @dataclass(frozen=True)
-class Homing:
-    """Finding the home of one axis."""
+class AxisHoming:
+    """Search of the home of one axis."""
 
     name: str
     axis: Axis
@@ -64,18 +65,18 @@ class Homing:
             return f"{self.name}: stays where it is, and its position is called {home}"
         reach, back = homing_reach(axis), position_after_homing(axis) - axis.at_home
         speed = f"at {_with_unit(axis, homing_speed(axis))}/s"
-        search = f"in its {_direction(reach)} direction to the {_switch(axis)}"
+        search = f"in its {_name_direction(reach)} direction to the {_name_switch(axis)}"
         there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
-        off = f"in its {_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
+        off = f"in its {_name_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
         to = f"off the switch to {_with_unit(axis, position_after_homing(axis))}"
         return f"{self.name}: {search}, {there}; then {off}, {to}. If the switch is active now, first {off}"
 
 
-def _direction(travel: float) -> str:
+def _name_direction(travel: float) -> str:
     return "positive" if travel > 0.0 else "negative"
 
 
-def _switch(axis: Axis) -> str:
+def _name_switch(axis: Axis) -> str:
     return f"{axis.home.replace('-', ' ')} switch"
 
 
@@ -83,29 +84,38 @@ def _with_unit(axis: Axis, value: float) -> str:
     return f"{axis.shown(value)} {axis.unit}"
 
 
-def uncertain(axis: Axis) -> str:
-    """Return by how much the position of an axis with backlash is uncertain before its first motion, in words."""
+def describe_uncertainty(axis: Axis) -> str:
+    """Return the uncertainty of the position of an axis with backlash before its first motion, in words."""
     return f"uncertain by {_with_unit(axis, 0.5 * axis.backlash)} (half of backlash_{axis.unit})"
 
 
-def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
-    """Return one line for each axis: where it is (mm or rad, by name), and how fast it moves at most."""
+def describe_axes(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis: its position (mm or rad, by name), and its largest speed."""
     return [
         f"{name}: at {_with_unit(axis, positions[name])}, moves at most at {_with_unit(axis, axis.speed)}/s"
-        + (f"; the start is {uncertain(axis)}" if axis.backlash else "")
+        + (f"; the start is {describe_uncertainty(axis)}" if axis.backlash else "")
         for name, axis in rig.axes.items()
     ]
 
 
-def switched_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
-    """Return one line for each axis whose motor is switched off: where it is (mm or rad, by name)."""
+def describe_insertion(rig: RigFile, scenario: Scenario, positions: Mapping[str, float]) -> list[str]:
+    """Return a line for the needle, and one for each axis with its position (mm or rad) and speed, before an
+    insertion."""
+    depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
+    to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
+    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
+    return [first, *describe_axes(rig, positions)]
+
+
+def describe_power_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis whose motor is switched off, with its position (mm or rad, by name)."""
     return [
         f"{name}: at {axis.shown(positions[name])} {axis.unit}, its motor will be switched off"
         for name, axis in rig.axes.items()
     ]
 
 
-def axis_of(rig: RigFile, name: str) -> Axis:
+def find_axis(rig: RigFile, name: str) -> Axis:
     """Return an axis by its name. Raises InputError, with the axes of the rig, for another name."""
     axes = dict(rig.axes.items())
     if name not in axes:
@@ -113,7 +123,7 @@ def axis_of(rig: RigFile, name: str) -> Axis:
     return axes[name]
 
 
-def distance_of(text: str, name: str, axis: Axis) -> float:
+def parse_distance(text: str, name: str, axis: Axis) -> float:
     """Return the distance (mm or rad) of a text such as "5", "-2.5mm" or "90deg". Raises InputError."""
     found = _DISTANCE.fullmatch(text.strip())
     units = (axis.unit, "°") if axis.unit == "deg" else (axis.unit,)
@@ -124,14 +134,20 @@ def distance_of(text: str, name: str, axis: Axis) -> float:
     return float(found[1]) * axis.size
 
 
-def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | None = None) -> Move:
+def plan_jog(rig: RigFile, name: str, distance: str, position: float, speed: float | None = None) -> AxisMove:
     """Return the motion of one axis by a distance from its position (mm or rad). speed: in the unit of the axis, per s.
 
     Raises InputError for another axis or unit, no distance, a goal beyond the soft limits, a speed above the axis's.
     """
-    axis = axis_of(rig, name)
-    move = _checked(
-        Move(name, axis, position, position + distance_of(distance, name, axis), _speed(name, axis, speed))
+    axis = find_axis(rig, name)
+    move = _check_move(
+        AxisMove(
+            name,
+            axis,
+            position,
+            position + parse_distance(distance, name, axis),
+            _parse_speed(name, axis, speed),
+        )
     )
     # A driver whose counts are no steps of an encoder, such as m, has a finer resolution.
     if abs(move.distance) < min(1.0 / abs(axis.scale), axis.tolerance):
@@ -139,26 +155,25 @@ def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | 
     return move
 
 
-def withdrawn(rig: RigFile) -> float:
-    """Return where a retraction ends (mm): where homing leaves the base off a switch behind it, else its lowest
-    position."""
+def withdrawn_position(rig: RigFile) -> float:
+    """Return the end of a retraction (mm): off a home switch behind the base, otherwise the lowest position."""
     axis = rig.axes.insertion
     return position_after_homing(axis) if axis.to_home < 0 else axis.limits[0]
 
 
-def retraction(
+def plan_retraction(
     rig: RigFile, position: float, to_mm: float | None = None, speed: float | None = None
-) -> Move | None:
-    """Return the motion of the base back to `to_mm`; without it to where it is withdrawn, None if it is there.
+) -> AxisMove | None:
+    """Return the motion of the base back to `to_mm` (default: withdrawn position); None if the base is there.
 
     speed: mm/s. Raises InputError if that is not backwards, beyond the soft limits or at the limit switch of the home,
     or for a speed above the axis's.
     """
     axis = rig.axes.insertion
-    if to_mm is None and position - withdrawn(rig) < 1.0 / abs(axis.scale):
+    if to_mm is None and position - withdrawn_position(rig) < 1.0 / abs(axis.scale):
         return None
-    goal = withdrawn(rig) if to_mm is None else to_mm
-    move = _checked(Move("insertion", axis, position, goal, _speed("insertion", axis, speed)))
+    goal = withdrawn_position(rig) if to_mm is None else to_mm
+    move = _check_move(AxisMove("insertion", axis, position, goal, _parse_speed("insertion", axis, speed)))
     _check_switch(axis, goal)
     if move.distance > -1.0 / abs(axis.scale):
         at = axis.shown(position)
@@ -173,24 +188,26 @@ def _check_switch(axis: Axis, goal: float) -> None:
     least = axis.at_home + axis.max_error
     if axis.to_home < 0 and goal < least - _ROUNDING:
         at = axis.shown
-        why = f"the {_switch(axis)} is at {at(axis.at_home)} mm, and max_error_mm is {at(axis.max_error)}"
+        why = (
+            f"the {_name_switch(axis)} is at {at(axis.at_home)} mm, and max_error_mm is {at(axis.max_error)}"
+        )
         raise InputError(f"to {at(goal)} mm: must be at least {at(least)} mm: {why}")
 
 
-def homings(rig: RigFile, names: Iterable[str]) -> list[Homing]:
-    """Return how axes find their homes, in the order of the file, the insertion first; all that need it, without names.
+def plan_homings(rig: RigFile, names: Iterable[str]) -> list[AxisHoming]:
+    """Return the searches of homes, in the order of the file, the insertion first (default: all axes that need it).
 
     Raises InputError for another axis, or one with an absolute encoder.
     """
     chosen = list(names)
     for name in chosen:
-        if axis_of(rig, name).home == "absolute":
+        if find_axis(rig, name).home == "absolute":
             raise InputError(f'axis {name}: has home = "absolute": its encoder needs no homing')
-    wanted = [Homing(name, axis) for name, axis in rig.axes.items() if name in chosen or not chosen]
+    wanted = [AxisHoming(name, axis) for name, axis in rig.axes.items() if name in chosen or not chosen]
     return [homing for homing in wanted if homing.axis.home != "absolute"]
 
 
-def _speed(name: str, axis: Axis, given: float | None) -> float:
+def _parse_speed(name: str, axis: Axis, given: float | None) -> float:
     if given is None:
         return _SHARE * axis.speed
     speed = given * axis.size
@@ -200,8 +217,8 @@ def _speed(name: str, axis: Axis, given: float | None) -> float:
     return speed
 
 
-def _checked(move: Move) -> Move:
-    """The move. Raises InputError if it leaves the soft limits; from beyond them it may return."""
+def _check_move(move: AxisMove) -> AxisMove:
+    """Return the motion. Raises InputError if it leaves the soft limits; from beyond them it may return."""
     axis, (low, high) = move.axis, move.axis.limits
     if not (isfinite(move.start) and isfinite(move.goal)):
         raise InputError(f"{move.name}: its position is not a number")
