@@ -3,32 +3,39 @@
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
+CORE := .venv/.core
 STAMP := .venv/.installed
+PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 # True for an interpreter that runs, fits, and can make a virtual environment.
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
 
-setup: $(STAMP)  ## install the package with its tools into .venv (PYTHON=… chooses the interpreter)
-
-$(STAMP): pyproject.toml
+$(CORE): pyproject.toml
 	@if ! $(BIN)/python $(FITS); then \
 	  for python in $(PYTHON) python3 python3.13 python3.12 python3.11 none; do \
 	    if $$python $(FITS); then break; fi; \
 	  done; \
 	  if [ $$python = none ]; then \
-	    echo "make setup: no Python 3.11, 3.12 or 3.13 with venv found; name one with PYTHON=/path/to/python" >&2; \
+	    echo "make: no Python 3.11, 3.12 or 3.13 with venv found; name one with PYTHON=/path/to/python" >&2; \
 	    exit 1; \
 	  fi; \
 	  echo "Making .venv with $$($$python --version)" >&2; \
 	  $$python -m venv --clear .venv; \
 	fi
-	@echo "Installing flexneedle and its tools into .venv" >&2
-	@$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@echo "Installing flexneedle into .venv" >&2
+	@$(PIP) .
 	@touch $@
 
-demo: setup  ## plan and steer one insertion on the phantom
+setup: $(STAMP)  ## install the package with its extras and tools into .venv (PYTHON=… chooses the interpreter)
+
+$(STAMP): $(CORE)
+	@echo "Installing extras and tools into .venv" >&2
+	@$(PIP) '.[dev]'
+	@touch $@
+
+demo: $(CORE)  ## plan and steer one insertion on the phantom
 	@$(BIN)/flexneedle insert phantom --seed 0
 
 kernels: setup  ## compile the kernels, once before the tests start in several processes

@@ -32,7 +32,7 @@ FIRST_USE = """
 import time; begun = time.perf_counter()
 import flexneedle
 from flexneedle.phantom.kernels import compile_kernels
-compile_kernels()
+compile_kernels(1)
 simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
 state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))
 simulator.rollout(state, [[flexneedle.Control(db_x=1.0)]])

@@ -45,7 +45,8 @@ def main() -> None:
         "--threads", type=int, default=None, metavar="N", help="threads of rollouts (default: all cores)"
     )
     args = parser.parse_args()
-    compile_kernels()
+    compile_kernels(1)
+    compile_kernels(2)
     first, count = args.worlds
     plane, space = [], []
     for number in range(first, first + count):

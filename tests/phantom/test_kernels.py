@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 from numba.core import config
@@ -56,10 +57,24 @@ def test_plans_and_insertions_compile_no_further_kernel(preset, axes):
 def cache(tmp_path, monkeypatch):
     """An empty cache of its own."""
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the second process
     return tmp_path
 
 
-@pytest.mark.usefixtures("cache")
+@pytest.fixture
+def nothing_to_compile(monkeypatch):
+    """Let the kernels of model and plants be none."""
+    monkeypatch.setattr(kernels, "Simulator", lambda _scenario, threads: Compiled())  # noqa: ARG005
+    monkeypatch.setattr(kernels, "PLANTS", ())
+
+
+@pytest.fixture
+def no_second_process(monkeypatch):
+    """Start no process that compiles the exact plant."""
+    monkeypatch.setattr(kernels, "_compiling_exact_plant", nullcontext)
+
+
+@pytest.mark.usefixtures("cache", "nothing_to_compile", "no_second_process")
 def test_kernels_of_the_plane_are_not_those_of_space():
     assert not all_compiled(1)
     compile_kernels(1)
@@ -67,12 +82,14 @@ def test_kernels_of_the_plane_are_not_those_of_space():
     assert not all_compiled(2)
 
 
+@pytest.mark.usefixtures("nothing_to_compile", "no_second_process")
 def test_those_of_other_sources_are_not_these(cache, monkeypatch):
     compile_kernels(1)
     monkeypatch.setattr(kernels, "cache_folder", lambda home: str(cache / home.name))
     assert not all_compiled(1)
 
 
+@pytest.mark.usefixtures("nothing_to_compile", "no_second_process")
 def test_one_process_compiles_at_a_time(cache, monkeypatch):
     held = []
 
@@ -80,12 +97,17 @@ def test_one_process_compiles_at_a_time(cache, monkeypatch):
         held.append((threads, locked(cache)))
         return Compiled()
 
-    monkeypatch.setattr(kernels, "load_scenario", lambda _name: None)
     monkeypatch.setattr(kernels, "Simulator", simulator)
-    monkeypatch.setattr(kernels, "PLANTS", ())
     compile_kernels(2)
     assert held == [(1, True)]
     assert not locked(cache)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("nothing_to_compile")
+def test_a_second_process_compiles_the_exact_plant(cache):
+    compile_kernels(1)
+    assert list(cache.rglob("equilibrium.step-*.nbc"))
 
 
 class Compiled:

@@ -245,7 +245,8 @@ def _rollout(
     )
     for j in range(first, last):
         needle = start
-        rest[:], u[:] = rest0, u0
+        for i in range(rest.size):  # not by slices, whose check of shapes takes 2 s to compile
+            rest[i], u[i] = rest0[i], u0[i]
         for k in range(commands.shape[1]):
             needle = _advanced(model, needle, rest, u, w, commands[j, k])
             tip = needle.solution.tip

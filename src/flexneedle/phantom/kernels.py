@@ -1,8 +1,10 @@
 """Compiled kernels of the closed loop: those of the model and of the virtual phantoms, in the plane or in space."""
 
 import fcntl
+import subprocess
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from flexneedle import phantom
@@ -11,6 +13,7 @@ from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
 from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL
 
@@ -27,14 +30,31 @@ def all_compiled(axes: int) -> bool:
 def compile_kernels(axes: int) -> None:
     """Compile all kernels for scenarios with `setup.axes`, or load them from the cache, ahead of their first call.
 
-    One process at a time: compiling in many at once is slow, and has crashed. The others load what it has compiled.
+    One caller at a time: compiling in many processes at once is slow, and has crashed. The other callers load what the
+    first has compiled.
     """
     scenario, mark = load_scenario(_SCENARIOS[axes]), _mark(axes)
     with _alone(mark.with_name("lock")):
-        Simulator(scenario, threads=1).compile()
+        # The exact plant has the same kernels in the plane and in space.
+        with nullcontext() if any(map(all_compiled, _SCENARIOS)) else _compiling_exact_plant():
+            Simulator(scenario, threads=1).compile()
         for kind in PLANTS:
-            Phantom(Truth(scenario), 0.0, kind).apply(STILL, 0.0)
+            compile_plant(scenario, kind)
         mark.touch()
+
+
+def compile_plant(scenario: Scenario, kind: str) -> None:
+    """Compile the kernels of a plant, or load them from the cache."""
+    Phantom(Truth(scenario), 0.0, kind).apply(STILL, 0.0)
+
+
+@contextmanager
+def _compiling_exact_plant() -> Iterator[None]:
+    """Compile the exact plant, half of the work, in a second process; if it fails, this one compiles later."""
+    code = f"from {__name__} import compile_plant, load_scenario; compile_plant(load_scenario('phantom'), 'exact')"
+    none = subprocess.DEVNULL
+    with subprocess.Popen([sys.executable, "-c", code], stdin=none, stdout=none, stderr=none):
+        yield
 
 
 def _mark(axes: int) -> Path:
