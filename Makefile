@@ -136,7 +136,7 @@ worlds-space: setup  ## 200 random worlds in space, each with every driver, and 
 	$(BIN)/flexneedle study worlds-space --resume --out $(or $(DIR),runs/worlds-space)
 	$(BIN)/flexneedle report $(or $(DIR),runs/worlds-space)
 
-tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/lab/study/tuning (long)
+tuning: setup  ## tune each controller with 200 insertions; writes studies/tuning (long)
 	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done

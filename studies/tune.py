@@ -7,8 +7,8 @@ the space and four that cover it evenly, are tried on the same cases: the 15 tar
 phantom (exact plant, preset `phantom`). The best two after twenty cases continue to seventy: the standard
 deviation of single errors is about their mean, so more settings with fewer cases each would be ranked by chance. The
 score is the mean true error plus a quarter of its 95 % quantile (mm); an unfinished insertion counts 5 mm. Planning
-is outside the budget. The table is printed on stdout; the record is written to DIR/CONTROLLER.json (default: the
-shipped records, src/flexneedle/lab/study/tuning), with the same bytes for any number of processes.
+is outside the budget. The table is printed on stdout; the record is written to DIR/CONTROLLER.json (default:
+studies/tuning), with the same bytes for any number of processes.
 
 Each trial sets all settings of the space, independent of the shipped values, so that the result can be reproduced after
 the shipped settings have been changed to it. All other settings are the shipped ones. The weights of `adaptive-mpc` are
@@ -44,7 +44,7 @@ PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
 # Remarks on a result, by method.
 NOTES: dict[str, str] = {}
-RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/lab/study/tuning"
+RECORDS = Path(__file__).resolve().parent / "tuning"
 Settings = dict[str, float]
 
 

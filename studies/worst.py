@@ -33,8 +33,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flexneedle.errors import InputError
 from flexneedle.figures import style
-from flexneedle.lab.study.grid import Study, StudyInsertion, load_study
-from flexneedle.lab.study.plans import Plans, plan_key
+from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion, load_study
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
 from flexneedle.loop import closed_loop
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Stream
@@ -226,7 +226,7 @@ def plot_quantiles(axes: Axes, values: np.ndarray, error: np.ndarray, label: str
     axes.set_ylim(bottom=0.0)
 
 
-def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path) -> None:
+def draw_figure(study: ExpandedStudy, index: np.ndarray, error: np.ndarray, folder: Path) -> None:
     """The tail of the distribution, and the error against the phantom parameters."""
     truths = [parameters_of((one := study.insertion(int(k))).point.scenario, one.seed) for k in index]
     depth = np.array([study.insertion(int(k)).point.scenario.target.depth_mm for k in index])
@@ -265,7 +265,7 @@ def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path
         style.save(figure, folder, study.name)
 
 
-def of_folder(folder: Path, source: str | None) -> Study:
+def of_folder(folder: Path, source: str | None) -> ExpandedStudy:
     """Return the study of a folder. Raises InputError if `source` is a different study."""
     stored = json.loads((folder / STUDY_FILE).read_text(encoding="utf-8"))["study"]
     study = load_study(source or stored["name"])
@@ -275,13 +275,15 @@ def of_folder(folder: Path, source: str | None) -> Study:
 
 
 def repeat_in_variants(
-    pool: Executor, plans: Plans, worst: Sequence[StudyInsertion], samples: int
+    pool: Executor, plans: StudyPlans, worst: Sequence[StudyInsertion], samples: int
 ) -> list[list[list[Ending]]]:
     """Endings of the worst insertions in each variant with each sample (N, variants, samples)."""
     calls = [
         [
             [
-                pool.submit(carried_out, insertion, plans.plan(plan_key(insertion.point)), variant, sample)
+                pool.submit(
+                    carried_out, insertion, plans.plan(digest_plan_inputs(insertion.point)), variant, sample
+                )
                 for sample in range(1, samples + 1)
             ]
             for variant in WITHOUT
@@ -312,14 +314,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows = pq.read_table(chosen.folder / "runs.parquet").to_pydict()
     except (OSError, InputError) as error:
         parser.error(str(error))
-    plans = Plans(chosen.folder / "plans")
+    plans = StudyPlans(chosen.folder / "plans")
     done = np.array(rows["outcome"]) == "done"
     index, error = np.array(rows["index"])[done], np.array(rows["true_error_mm"], dtype=float)[done]
     print_distribution(np.array(rows["target_depth_mm"])[done], error)
     order = np.argsort(-error, kind="stable")[: chosen.worst]
     worst = [study.insertion(int(k)) for k in index[order]]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
-        own = [pool.submit(carried_out, one, plans.plan(plan_key(one.point))) for one in worst]
+        own = [pool.submit(carried_out, one, plans.plan(digest_plan_inputs(one.point))) for one in worst]
         endings = [call.result() for call in own]
         if not np.array_equal([end.error for end in endings], error[order]):
             parser.error(f"{chosen.folder}: not reproduced by this version: repeat the study")

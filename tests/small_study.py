@@ -29,7 +29,7 @@ def run(folder):
     """Run it; the folder of its 8 rows."""
     (folder / "mine.toml").write_text(STUDY)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pools, "local", _local)
+        patch.setattr(pools, "open_processes", _local)
         return run_study(folder / "mine.toml", folder / "study")
 
 

@@ -111,13 +111,9 @@ def asked(rows, **more):
     return study | more | {"axes": axes | more.get("axes", {})}
 
 
-def write_study(folder, rows, about=None, timing=True, **more):
+def write_study(folder, rows, about=None, **more):
     """Write the folder of a study, and return it. about: `study.json`; without it that of `asked(rows, **more)`."""
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns_of(rows)), folder / "runs.parquet")
-    if timing:
-        parts = {"plan_s": 0.5, "control_s": 0.4, "plant_s": 0.2, "total_s": 0.62}
-        times = [{"index": row["index"], "plan": row["plan"]} | parts for row in rows]
-        pq.write_table(pa.Table.from_pylist(times), folder / "timing.parquet")
     (folder / "study.json").write_text(json.dumps(about or {"study": asked(rows, **more)}))
     return folder

@@ -4,7 +4,6 @@ import importlib.util
 import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,11 @@ from numpy.testing import assert_allclose
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS, check_tables
-from flexneedle.lab.study.findings.reading import read_tuning
 from flexneedle.record.plain import to_text
 
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
-SHIPPED = files("flexneedle.lab.study") / "tuning"
-TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
+SHIPPED = SCRIPT.parent / "tuning"
+TUNED = sorted(item.stem for item in SHIPPED.iterdir())
 NOT_TUNED = {"open-loop", "adaptive-mpc"}  # no settings; settings chosen on random worlds
 
 
@@ -71,7 +69,7 @@ def test_records_agree_with_the_script(tune, method):
 
 
 def test_records_have_no_remarks():
-    assert {tuned.method: tuned.note for tuned in read_tuning()} == dict.fromkeys(TUNED, "")
+    assert {method: record_of(method)["note"] for method in TUNED} == dict.fromkeys(TUNED, "")
 
 
 def test_each_controller_gets_200_insertions(tune):

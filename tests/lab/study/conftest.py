@@ -61,4 +61,4 @@ def in_threads(monkeypatch):
         with ThreadPoolExecutor(workers or 1) as pool:
             yield pool
 
-    monkeypatch.setattr(pools, "local", local)
+    monkeypatch.setattr(pools, "open_processes", local)

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-from flexneedle.lab.study.journal import Journal
+from flexneedle.lab.study.journal import StudyJournal
 
 
 def main():
@@ -12,14 +12,14 @@ def main():
     from flexneedle.cli.main import main as flexneedle
 
     number, after = signal.Signals[sys.argv[1]], int(sys.argv[2])
-    add = Journal.add
+    add = StudyJournal.add
 
     def add_and_stop(journal, rows):
         add(journal, rows)
         if len(journal.rows) == after:
             os.kill(0 if number == signal.SIGINT else os.getpid(), number)
 
-    Journal.add = add_and_stop
+    StudyJournal.add = add_and_stop
     return flexneedle(sys.argv[3:])
 
 

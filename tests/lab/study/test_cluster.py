@@ -77,11 +77,11 @@ def test_a_scheduler_that_does_not_respond_creates_no_folder(quick, tmp_path, mo
 def test_only_a_scheduler_without_workers_is_reported():
     calls = []
     with scheduler() as address:
-        with pools.cluster(address, lambda: calls.append("none")):
+        with pools.open_cluster(address, lambda: calls.append("none")):
             assert calls == ["none"]
         with worker(address), distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=30)
-            with pools.cluster(address, lambda: calls.append("none")):
+            with pools.open_cluster(address, lambda: calls.append("none")):
                 assert calls == ["none"]
 
 
@@ -110,7 +110,7 @@ def test_a_valid_address_is_tried(quick, tmp_path, address, monkeypatch):
     def refuses(tried):
         raise InputError(f"tried {tried}")
 
-    monkeypatch.setattr(pools, "_client", refuses)
+    monkeypatch.setattr(pools, "_connect", refuses)
     with pytest.raises(InputError, match="^tried " + re.escape(address) + "$"):
         run_study(quick, tmp_path / "a", scheduler=address)
 

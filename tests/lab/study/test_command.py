@@ -7,8 +7,8 @@ import pytest
 from flexneedle.cli import main as cli
 from flexneedle.cli.progress import Progress
 from flexneedle.lab.commands import study as study_command
-from flexneedle.lab.study import pools, rows
-from flexneedle.lab.study.runner import Advance
+from flexneedle.lab.study import jobs, pools
+from flexneedle.lab.study.runner import StudyProgress
 
 
 def run(capsys, *argv):
@@ -54,7 +54,7 @@ def test_a_study_without_a_finished_insertion_prints_the_first_failure(capsys, q
     def broken(_scenario, _plan, seed, **_options):
         raise ZeroDivisionError(f"seed\n{seed}")
 
-    monkeypatch.setattr(rows, "insert", broken)
+    monkeypatch.setattr(jobs, "insert", broken)
     line = "flexneedle: no insertion finished; the first failure: error: ZeroDivisionError: seed 7"
     status, _, err = run(capsys, "study", quick, "--out", tmp_path / "a")
     assert (status, err.splitlines()[-1]) == (1, line)
@@ -63,13 +63,13 @@ def test_a_study_without_a_finished_insertion_prints_the_first_failure(capsys, q
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_with_a_finished_insertion_prints_no_failure(capsys, quick, tmp_path, monkeypatch):
-    insert = rows.insert
+    insert = jobs.insert
 
     def some(scenario, made, seed, **options):
         done = insert(scenario, made, seed, **options)
         return replace(done, outcome="held", reason="no sample") if seed == 7 else done
 
-    monkeypatch.setattr(rows, "insert", some)
+    monkeypatch.setattr(jobs, "insert", some)
     status, _, err = run(capsys, "study", quick, "--out", tmp_path / "a")
     assert status == 0
     assert "no insertion" not in err
@@ -86,7 +86,7 @@ def progress_of(monkeypatch, advances):
 
     show = study_command._StudyProgress(Listener())
     for plans, all_plans, done, later in advances:
-        show.advance(Advance(plans, all_plans, done, 1050, 0))
+        show.advance(StudyProgress(plans, all_plans, done, 1050, 0))
         now += later
     return [args for args in shown if args[0] == "Planning"], [
         args for args in shown if args[0] == "Inserting"
@@ -128,9 +128,9 @@ def test_a_study_with_all_plans_shows_planning_as_complete(monkeypatch):
 def test_a_cluster_without_workers_is_reported(capsys, quick, tmp_path, monkeypatch):
     def cluster(_address, on_no_workers):
         on_no_workers()
-        return pools.local(1)
+        return pools.open_processes(1)
 
-    monkeypatch.setattr(pools, "cluster", cluster)
+    monkeypatch.setattr(pools, "open_cluster", cluster)
     monkeypatch.setattr("flexneedle.lab.study.runner._CLUSTER_JOBS", 4)
     status, _, err = run(capsys, "study", quick, "--scheduler", "tcp://host:1", "--out", tmp_path / "a")
     assert status == 0

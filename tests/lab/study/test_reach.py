@@ -8,7 +8,13 @@ import pytest
 
 import flexneedle
 import synthetic
-from flexneedle.lab.study.reach import beside, reach, reachable, straight_end, to_hull
+from flexneedle.lab.study.reach import (
+    compute_reach,
+    distance_beside,
+    distance_to_hull,
+    find_reachable,
+    insert_straight,
+)
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.plants import ModelPlant
 from flexneedle.scenario.worlds import world
@@ -21,7 +27,7 @@ GUIDED = world(3, "perfect").with_values(COARSE)
 
 def end(scenario, roll=0.0, phantom="model"):
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(0).spawn(4)[0]))
-    return straight_end(truth, roll, phantom, scenario.target.depth_mm)
+    return insert_straight(truth, roll, phantom, scenario.target.depth_mm)
 
 
 @pytest.mark.parametrize("phantom", ["model", "exact"])
@@ -49,7 +55,7 @@ def test_without_a_guide_the_reach_is_the_distance_to_the_interval_between_the_e
     for side in (-1, 1):
         lateral = side * (end(FREE)[1] + beyond)
         scenario = FREE.with_values({"target.lateral_mm": lateral})
-        assert reach(scenario, 0, "model") == pytest.approx(expected, abs=1e-9)
+        assert compute_reach(scenario, 0, "model") == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_reach_is_computed_for_the_phantom_of_the_insertion(monkeypatch):
@@ -66,7 +72,7 @@ def test_the_reach_is_computed_for_the_phantom_of_the_insertion(monkeypatch):
         lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Outcome.DONE, ""),
     )
     scenario = world(15).with_values(COARSE)
-    reach(scenario, 5)
+    compute_reach(scenario, 5)
     flexneedle.insert(scenario, synthetic.make_plan("manipulation", scenario.target.position, 0), 5)
     assert drawn[0] == drawn[1] != draw(scenario, np.random.default_rng(5))
 
@@ -81,28 +87,28 @@ def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
     missing = [depth - truth.scenario.setup.max_depth for truth in truths]
     seed = int(np.argmax(missing))
     assert missing[seed] > 1.0
-    assert reach(scenario, seed, "model") >= missing[seed]
+    assert compute_reach(scenario, seed, "model") >= missing[seed]
 
 
 @pytest.mark.slow
 def test_with_a_guide_the_reach_is_the_miss_of_a_long_search():
     """At most what ends the search with the full travel of the guide, larger with a limited one."""
-    assert reach(GUIDED, 0, "model") < 0.05
+    assert compute_reach(GUIDED, 0, "model") < 0.05
     tight = {"setup.max_guide_travel_mm": 0.2, "needle.bevel.offset_mm": 0.0, "target.lateral_mm": 0.2}
     bound = GUIDED.with_values({**tight, "setup.max_guide_step_mm": 1e-3})
-    assert 0.05 < reach(bound, 0, "model") < 0.2
+    assert 0.05 < compute_reach(bound, 0, "model") < 0.2
 
 
 def test_the_reach_is_computed_for_a_users_own_plant():
     """As a factory, and as `module:NAME`, as in a study."""
-    expected = reach(FREE, 0, "model")
-    assert reach(FREE, 0, ModelPlant) == expected
-    assert reach(FREE, 0, "flexneedle.phantom.plants:ModelPlant") == expected
+    expected = compute_reach(FREE, 0, "model")
+    assert compute_reach(FREE, 0, ModelPlant) == expected
+    assert compute_reach(FREE, 0, "flexneedle.phantom.plants:ModelPlant") == expected
 
 
 def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
     monkeypatch.setattr("flexneedle.phantom.plants.ModelPlant.converged", property(lambda _: False))
-    assert math.isnan(reach(FREE, 0, "model"))
+    assert math.isnan(compute_reach(FREE, 0, "model"))
 
 
 @pytest.mark.slow
@@ -110,8 +116,8 @@ def test_a_guide_that_steering_does_not_move_does_not_improve_the_reach():
     """A target within reach of guide and bevel but not of the bevel alone."""
     low, high = sorted(end(GUIDED, roll)[1] for roll in (math.pi, 0.0))
     scenario = GUIDED.with_values({"target.lateral_mm": high + 1.0})
-    assert reach(scenario, 0, "model") < 0.1
-    assert reach(scenario, 0, "model", "steering") == pytest.approx(1.0, abs=1e-9)
+    assert compute_reach(scenario, 0, "model") < 0.1
+    assert compute_reach(scenario, 0, "model", "steering") == pytest.approx(1.0, abs=1e-9)
     assert low < high
 
 
@@ -132,13 +138,17 @@ def test_a_needle_that_rolls_to_any_angle_reaches_a_disc(direction):
     radius = end(FREE_IN_SPACE)[1]
     for beyond in (-0.5, 0.7):
         target = cmath.rect(radius + beyond, direction)
-        assert reach(aimed(FREE_IN_SPACE, target), 0, "model") == pytest.approx(max(0.0, beyond), abs=1e-3)
+        assert compute_reach(aimed(FREE_IN_SPACE, target), 0, "model") == pytest.approx(
+            max(0.0, beyond), abs=1e-3
+        )
 
 
 def test_half_turns_reach_an_interval_and_nothing_beside_it():
     radius = end(HALF_TURNS)[1]
-    assert reach(aimed(HALF_TURNS, complex(0.5 * radius, 0.8)), 0, "model") == pytest.approx(0.8, abs=1e-6)
-    corner = reach(aimed(HALF_TURNS, complex(-radius - 0.6, 0.8)), 0, "model")
+    assert compute_reach(aimed(HALF_TURNS, complex(0.5 * radius, 0.8)), 0, "model") == pytest.approx(
+        0.8, abs=1e-6
+    )
+    corner = compute_reach(aimed(HALF_TURNS, complex(-radius - 0.6, 0.8)), 0, "model")
     assert corner == pytest.approx(1.0, abs=1e-6)
 
 
@@ -149,7 +159,7 @@ def test_the_reach_is_about_the_place_where_a_displaced_needle_ends():
         off = scenario.with_values(values)
         _, y, z = end(off)
         assert abs(z) > 0.05
-        within = reach(aimed(off, 0.9 * y + 1j * z), 0, "model")
+        within = compute_reach(aimed(off, 0.9 * y + 1j * z), 0, "model")
         assert within == pytest.approx(0.0, abs=1e-3)
 
 
@@ -160,7 +170,7 @@ def test_the_distance_from_the_interval_between_two_ends(target, expected):
     for turn in (1.0, cmath.exp(0.4j), cmath.exp(-1.2j)):
         ends = [2.0 * turn, -2.0 * turn]
         for given in (ends, ends[::-1]):
-            assert to_hull(target * turn, given) == pytest.approx(expected, abs=1e-12)
+            assert distance_to_hull(target * turn, given) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -178,23 +188,25 @@ def test_the_distance_from_the_hull_of_a_square(target, expected):
     """With a point inside, and one twice, which change nothing."""
     ends = [0.0, 2.0, 2.0 + 1.0j, 1.0j, 1.0j, 0.7 + 0.6j]
     for turn in (1.0, cmath.exp(0.4j), 1j):
-        assert to_hull(target * turn, [end * turn for end in ends]) == pytest.approx(expected, abs=1e-12)
+        assert distance_to_hull(target * turn, [end * turn for end in ends]) == pytest.approx(
+            expected, abs=1e-12
+        )
 
 
 def test_an_end_without_extent_is_a_point():
-    assert to_hull(3.0 + 4.0j, [0.0, 0.0]) == 5.0
-    assert reachable([2j, 2j, 2j], all_around=True) == ([2j], 0.0)
+    assert distance_to_hull(3.0 + 4.0j, [0.0, 0.0]) == 5.0
+    assert find_reachable([2j, 2j, 2j], all_around=True) == ([2j], 0.0)
 
 
 def test_all_around_the_ends_give_the_disc_about_their_mean_with_their_mean_distance():
     ends = [1.0 + 1.0j + radius * turn for radius, turn in ((2.0, 1), (2.0, -1), (4.0, 1j), (4.0, -1j))]
-    (middle,), radius = reachable(ends, all_around=True)
+    (middle,), radius = find_reachable(ends, all_around=True)
     assert (middle, radius) == (pytest.approx(1.0 + 1.0j), pytest.approx(3.0))
-    assert reachable(ends, all_around=False) == (ends, 0.0)
+    assert find_reachable(ends, all_around=False) == (ends, 0.0)
 
 
 def test_how_far_a_target_is_beside_what_the_bevel_reaches_along_z():
-    assert [beside(z, [1.0 + 2.0j, -4.0j], 0.5) for z in (-5.0, -4.5, 0.0, 2.5, 4.0)] == [
+    assert [distance_beside(z, [1.0 + 2.0j, -4.0j], 0.5) for z in (-5.0, -4.5, 0.0, 2.5, 4.0)] == [
         0.5,
         0.0,
         0.0,
@@ -211,7 +223,7 @@ def test_a_limited_range_reaches_the_hull_of_its_arc():
         (complex(0.5 * radius, 0.3), 0.0),
         (complex(0.5 * radius - 0.8, 0.3), 0.8),
     ):
-        assert reach(aimed(limited, target), 0, "model") == pytest.approx(expected, abs=1e-3)
+        assert compute_reach(aimed(limited, target), 0, "model") == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("rig", ["one-axis", "one-axis-half-turns"])
@@ -220,14 +232,14 @@ def test_a_guide_on_one_axis_leaves_the_other_to_the_bevel(rig):
     scenario = world(3, "perfect", rig).with_values(COARSE)
     bevel = end(scenario)[1] if rig == "one-axis" else 0.0
     off = aimed(scenario, complex(0.5, -bevel - 0.9))
-    assert reach(off, 0, "model") == pytest.approx(0.9, abs=0.05)
-    assert reach(aimed(scenario, complex(0.5, -0.9 * bevel)), 0, "model") < 0.02
+    assert compute_reach(off, 0, "model") == pytest.approx(0.9, abs=0.05)
+    assert compute_reach(aimed(scenario, complex(0.5, -0.9 * bevel)), 0, "model") < 0.02
 
 
 def test_a_plant_that_does_not_converge_on_one_side_has_no_reach(monkeypatch):
     def ends(_truth, roll, *_):
         return (math.nan,) * 3 if roll == 0.0 else (30.0, 1.0, 0.0)
 
-    monkeypatch.setattr("flexneedle.lab.study.reach.straight_end", ends)
-    assert math.isnan(reach(HALF_TURNS, 0, "model"))
-    assert math.isnan(reach(FREE_IN_SPACE, 0, "model"))
+    monkeypatch.setattr("flexneedle.lab.study.reach.insert_straight", ends)
+    assert math.isnan(compute_reach(HALF_TURNS, 0, "model"))
+    assert math.isnan(compute_reach(FREE_IN_SPACE, 0, "model"))

@@ -8,10 +8,10 @@ import sys
 import pytest
 
 from flexneedle.errors import InputError
+from flexneedle.lab.study import jobs
 from flexneedle.lab.study import recompute as module
-from flexneedle.lab.study import rows
 from flexneedle.lab.study.folder import read_folder
-from flexneedle.lab.study.grid import load_study, recorded_study
+from flexneedle.lab.study.grid import load_study, restore_study
 from flexneedle.lab.study.recompute import recompute, row_folder
 from flexneedle.lab.study.runner import run_study
 from flexneedle.record.folder import versions
@@ -166,7 +166,7 @@ values = ["resolved-rate"]
 
 def test_a_world_is_the_same_also_after_one_that_is_left_out(ran, monkeypatch):
     """Without a guide, in world 15, this controller has no row."""
-    monkeypatch.setattr(rows, "reach", lambda *_: 1 / 0)
+    monkeypatch.setattr(jobs, "compute_reach", lambda *_: 1 / 0)
     folder = ran(WORLDS)
     found = journalled(folder)
     assert len(found) == 4
@@ -184,8 +184,8 @@ def test_a_recorded_study_has_the_insertions_of_the_study(source, quick, tmp_pat
     study = load_study(files.get(source, source))
     definition = json.loads(json.dumps(study.definition))
     for index in range(0, len(study), 1 + len(study) // 20):
-        assert recorded_study(definition).insertion(index) == study.insertion(index)
-    assert recorded_study(definition).definition == study.definition
+        assert restore_study(definition).insertion(index) == study.insertion(index)
+    assert restore_study(definition).definition == study.definition
 
 
 def test_a_study_that_runs_has_the_rows_that_are_finished(copied):

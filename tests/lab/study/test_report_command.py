@@ -40,7 +40,6 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
             "whole",
             "groups",
             "controllers",
-            "controllers_by_depth",
             "cases",
             "worlds",
             "predictions",

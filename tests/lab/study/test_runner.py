@@ -15,10 +15,10 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.study import pools, rows, runner
+from flexneedle.lab.study import jobs, pools, runner
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.runner import run_study
-from flexneedle.lab.study.summary import summarise
+from flexneedle.lab.study.summary import summarize_study
 from flexneedle.record.folder import versions
 
 STOPPED = Path(__file__).with_name("stopped.py")
@@ -72,7 +72,7 @@ def test_a_row_agrees_with_insert_for_its_settings(quick, uninterrupted):
         plan,
         row["seed"],
         controller=row["controller"],
-        rig=flexneedle.VirtualRig(row)["plant"],
+        rig=flexneedle.VirtualRig(row["plant"]),
     )
     assert row["true_error_mm"] == insertion.true_error_mm
     assert row["residual_mm"] == insertion.residual_mm
@@ -202,7 +202,7 @@ def test_a_resumed_study_does_not_repeat_its_plans(quick, tmp_path, monkeypatch)
     """Of two cases with the same two targets; interrupted in the first case."""
     made, study = [], tmp_path / "one-plant.toml"
     study.write_text(quick.read_text().replace('values = "all"', 'values = ["model"]'))
-    monkeypatch.setattr(runner, "make_plan", lambda point: made.append(point) or rows.make_plan(point))
+    monkeypatch.setattr(runner, "make_plan", lambda point: made.append(point) or jobs.make_plan(point))
 
     class StoppedError(Exception):
         pass
@@ -239,8 +239,8 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
             raise RunError("plan misses the target by 1.20 mm")
         return flexneedle.insert(scenario, made, seed, **options)
 
-    monkeypatch.setattr(rows, "plan", plan)
-    monkeypatch.setattr(rows, "insert", insert)
+    monkeypatch.setattr(jobs, "plan", plan)
+    monkeypatch.setattr(jobs, "insert", insert)
     reports = []
     out = run_study(quick, tmp_path / "a", on_advance=reports.append)
     table = runs(out)
@@ -250,7 +250,7 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
     assert {row["reason"] for row in table if row["seed"] < 9} == {"no plan: FloatingPointError: overflow"}
     assert all((row["true_error_mm"] is None) == (row["outcome"] != "done") for row in table)
     assert reports[-1].unfinished == 12
-    summary = summarise(out, load_study(quick))
+    summary = summarize_study(out, load_study(quick))
     assert summary["outcomes"] == {"error": 8, "done": 4, "refused": 4}
     assert summary["first_failure"] == "error: no plan: FloatingPointError: overflow"
     json.dumps(summary, allow_nan=False)
@@ -258,7 +258,7 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("in_threads")
 def test_a_worker_with_other_package_versions_is_rejected(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(rows, "versions", lambda: {**versions(), "numpy": "1.0"})
+    monkeypatch.setattr(jobs, "versions", lambda: {**versions(), "numpy": "1.0"})
     with pytest.raises(
         RunError, match=r"package versions of a worker differ from this process: .*'numpy': '1.0'"
     ):
@@ -289,7 +289,7 @@ def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, t
         yield Dying(6)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pools, "local", dying)
+        patch.setattr(pools, "open_processes", dying)
         with pytest.raises(
             RunError, match=r"workers were lost \(BrokenExecutor .*\); finished rows are kept"
         ):
@@ -403,7 +403,7 @@ def test_workers_are_at_least_one_and_local(quick, tmp_path, options, line):
 
 
 def test_the_summary_agrees_with_the_table(quick, uninterrupted):
-    summary, table = summarise(uninterrupted, load_study(quick)), runs(uninterrupted)
+    summary, table = summarize_study(uninterrupted, load_study(quick)), runs(uninterrupted)
     errors = sorted(row["true_error_mm"] for row in table)
     mean = sum(errors) / SIZE
     assert summary["complete"]
@@ -437,7 +437,7 @@ def test_the_summary_is_over_finished_insertions_and_counts_the_others(quick, un
     }
     pq.write_table(pa.Table.from_pylist(changed, schema=table.schema), tmp_path / "runs.parquet")
     shutil.copy(uninterrupted / "timing.parquet", tmp_path)
-    summary = summarise(tmp_path, load_study(quick))
+    summary = summarize_study(tmp_path, load_study(quick))
     assert (summary["insertions"], summary["outcomes"]) == (SIZE, {"done": SIZE - 1, "held": 1})
     rest = changed[1:]
     assert summary["true_error_mm"]["mean"] == pytest.approx(
@@ -457,13 +457,13 @@ def test_the_summary_has_the_coverage_of_tip_and_middle(quick, uninterrupted, tm
     rows[0]["outcome"] = "held"
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), tmp_path / "runs.parquet")
     shutil.copy(uninterrupted / "timing.parquet", tmp_path)
-    coverage = summarise(tmp_path, load_study(quick))["coverage"]
+    coverage = summarize_study(tmp_path, load_study(quick))["coverage"]
     assert coverage["tip"]["half"] == pytest.approx(12 / 15)
     assert coverage["middle"]["half"] is None
 
 
 def test_a_plan_counts_once_in_the_time(quick, uninterrupted):
-    time = summarise(uninterrupted, load_study(quick))["time"]
+    time = summarize_study(uninterrupted, load_study(quick))["time"]
     timing = pq.read_table(uninterrupted / "timing.parquet").to_pylist()
     assert time["plan_s"] == pytest.approx(timing[0]["plan_s"] + timing[-1]["plan_s"])
     total = sum(row["total_s"] for row in timing)

@@ -11,15 +11,15 @@ import pytest
 
 from flexneedle.cli import main as cli
 from flexneedle.lab.commands import study as study_command
-from flexneedle.lab.study import pools, rows
-from flexneedle.lab.study.runner import Advance
+from flexneedle.lab.study import jobs, pools
+from flexneedle.lab.study.runner import StudyProgress
 
 STUDY = """\
 name = "my study"
 title = "Two targets"
 [values]
 plan = { samples = 16, iterations = 2 }
-control = { samples = 8, iterations = 1, horizon = 2 }
+control.ce_mpc = { samples = 8, iterations = 1, horizon = 2 }
 setup.tip_to_skin_mm = 4.0
 target.lateral_mm = 0.5
 phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
@@ -41,7 +41,7 @@ def in_threads_and_tmp(tmp_path, monkeypatch):
         with ThreadPoolExecutor(workers or 1) as pool:
             yield pool
 
-    monkeypatch.setattr(pools, "local", local)
+    monkeypatch.setattr(pools, "open_processes", local)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my.toml").write_text(STUDY)
     return tmp_path
@@ -121,18 +121,18 @@ def test_bad_input_is_one_line(capsys, argv, line):
 
 
 def test_some_failures_are_counted_and_all_failures_fail(capsys, monkeypatch):
-    insert = rows.insert
+    insert = jobs.insert
 
     def some(scenario, made, seed, **options):
         if seed == 0:
             raise ZeroDivisionError
         return insert(scenario, made, seed, **options)
 
-    monkeypatch.setattr(rows, "insert", some)
+    monkeypatch.setattr(jobs, "insert", some)
     status, out, err = run(capsys, "my.toml", "--out", "some", "--json")
     assert (status, json.loads(out)["outcomes"]) == (0, {"error": 2, "done": 2})
     assert ", 2 not finished" in err
-    monkeypatch.setattr(rows, "insert", None)
+    monkeypatch.setattr(jobs, "insert", None)
     status, out, _ = run(capsys, "my.toml", "--out", "all", "--json")
     assert (status, json.loads(out)["outcomes"]) == (1, {"error": 4})
     status, out, _ = run(capsys, "my.toml", "--out", "table")
@@ -150,7 +150,7 @@ def test_the_rate_is_that_of_the_insertions_of_this_run(monkeypatch):
 
     show = study_command._StudyProgress(Listener())
     for plans, done, later in ((0, 40, 50.0), (1, 40, 8.0), (2, 41, 10.0), (2, 46, 0.0)):
-        show.advance(Advance(plans, 2, done, 100, 3))
+        show.advance(StudyProgress(plans, 2, done, 100, 3))
         now += later
     message = [note for stage, note in notes if stage == "Inserting"]
     assert message[:3] == [f"{done} of 100, 3 not finished" for done in (40, 40, 41)]
@@ -158,19 +158,19 @@ def test_the_rate_is_that_of_the_insertions_of_this_run(monkeypatch):
 
 
 def test_unconverged_periods_are_reported(capsys, monkeypatch):
-    insert = rows.insert
+    insert = jobs.insert
 
     def unconverged(*args, **options):
         done = insert(*args, **options)
         return replace(done, periods=(replace(done.periods[0], converged=False), *done.periods[1:]))
 
-    monkeypatch.setattr(rows, "insert", unconverged)
+    monkeypatch.setattr(jobs, "insert", unconverged)
     _, out, _ = run(capsys, "my.toml", "--out", "a")
     assert "4 periods did not converge: see column unconverged_periods of runs.parquet." in out
 
 
 def test_a_lost_worker_is_one_line_with_the_command_to_resume(capsys, monkeypatch):
-    monkeypatch.setattr(rows, "versions", lambda: {"flexneedle": "0"})
+    monkeypatch.setattr(jobs, "versions", lambda: {"flexneedle": "0"})
     status, out, err = run(capsys, "my.toml", "--out", "a")
     assert (status, out) == (1, "")
     assert err.splitlines()[-1].startswith(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from commands import names, run
-from flexneedle.cli import view
+from flexneedle.lab.commands import view
 from flexneedle.lab.study import pools
 from flexneedle.lab.study.runner import run_study
 from flexneedle.record.loading import load_insertion
@@ -38,7 +38,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     (folder / "mine.toml").write_text(STUDY)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pools, "local", _local)
+        patch.setattr(pools, "open_processes", _local)
         return run_study(folder / "mine.toml", folder / "study")
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from flexneedle.control.controllers import check_tables
 from flexneedle.errors import InputError
-from flexneedle.lab.study import rows
+from flexneedle.lab.study import jobs
 from flexneedle.lab.study.grid import load_study
-from flexneedle.lab.study.plans import Plans, plan_key, truth_key
-from flexneedle.lab.study.rows import Job, run_job
-from flexneedle.lab.study.runner import _reach_points
+from flexneedle.lab.study.jobs import InsertionJob, run_job
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
+from flexneedle.lab.study.runner import _find_reach_points
 from flexneedle.lab.study.summary import is_failure
 from flexneedle.lab.study.tables import write_tables
 from flexneedle.record.results import RESULT_COLUMNS
@@ -140,25 +140,25 @@ def test_the_shipped_study_has_two_hundred_worlds_not_used_for_tuning():
 
 def test_the_reach_is_computed_once_for_all_controllers_of_a_world_and_case(load):
     study = load()
-    chosen = [point for point in study.points if id(point) in _reach_points(study)]
+    chosen = [point for point in study.points if id(point) in _find_reach_points(study)]
     assert [(point.case, point.world) for point in chosen] == [
         *(("perfect", FREE), ("perfect", GUIDED), ("real", FREE), ("real", GUIDED), ("structure", GUIDED))
     ]
-    assert len({truth_key(point) for point in study.points}) == 5
-    assert len({plan_key(point) for point in study.points}) == 2
+    assert len({digest_reach_inputs(point) for point in study.points}) == 5
+    assert len({digest_plan_inputs(point) for point in study.points}) == 2
 
 
 def test_a_job_computes_the_reach_if_requested(load, monkeypatch):
     point = load().points[0]
     monkeypatch.setattr(
-        rows,
-        "reach",
+        jobs,
+        "compute_reach",
         lambda scenario, seed, _plant, strategy: (
             (point.scenario is scenario and strategy == "manipulation") * seed * 0.1
         ),
     )
     for with_reach, expected in ((True, 0.5), (False, None)):
-        (row,) = run_job(Job(point, None, "no plan", ((0, 5),), with_reach)).rows
+        (row,) = run_job(InsertionJob(point, None, "no plan", ((0, 5),), with_reach)).rows
         assert row["reach_mm"] == expected
         assert row["outcome"] == "error"
 
@@ -169,10 +169,10 @@ def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkey
     def reach(*_args):
         raise ZeroDivisionError("nowhere")
 
-    monkeypatch.setattr(rows, "reach", reach)
-    monkeypatch.setattr(rows, "insertion_at", lambda *_args, **_options: done)
-    monkeypatch.setattr(rows, "_times", lambda _insertion: {})
-    (row,) = run_job(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    monkeypatch.setattr(jobs, "compute_reach", reach)
+    monkeypatch.setattr(jobs, "insert_at", lambda *_args, **_options: done)
+    monkeypatch.setattr(jobs, "_sum_times", lambda _insertion: {})
+    (row,) = run_job(InsertionJob(load().points[0], done.plan, "", ((0, 5),), True)).rows
     assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
     assert row["reach_mm"] is None
 
@@ -185,7 +185,7 @@ def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
         index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _reach_rows(study) else None}
         for index in range(len(study) - 2)
     }
-    write_tables(tmp_path, study, found, Plans(tmp_path / "plans"))
+    write_tables(tmp_path, study, found, StudyPlans(tmp_path / "plans"))
     table = pq.read_table(tmp_path / "runs.parquet").to_pylist()
     of_truth = {
         (row["case"], row["world"]): row["reach_mm"] for row in table if row["controller"] == "open-loop"
@@ -195,7 +195,9 @@ def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
 
 
 def _reach_rows(study):
-    return [index for index in range(len(study)) if id(study.insertion(index).point) in _reach_points(study)]
+    return [
+        index for index in range(len(study)) if id(study.insertion(index).point) in _find_reach_points(study)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -216,8 +218,8 @@ def test_a_hold_is_a_failure_up_to_the_miss_at_which_a_controller_may_hold(outco
 def test_points_with_another_needle_have_another_reach(load):
     point = load().points[0]
     other = replace(point, scenario=point.scenario.with_values({"phantom.run_out_mm": 0.1}))
-    assert truth_key(other) != truth_key(point)
-    assert plan_key(other) == plan_key(point)
+    assert digest_reach_inputs(other) != digest_reach_inputs(point)
+    assert digest_plan_inputs(other) == digest_plan_inputs(point)
 
 
 IN_SPACE = f"""

@@ -25,12 +25,6 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)"
     )
-    parser.add_argument(
-        "--tuning",
-        type=Path,
-        metavar="DIR",
-        help="folder of the tuning records to show (default: the records of the package)",
-    )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
 
 
@@ -40,7 +34,7 @@ def _report(args: argparse.Namespace) -> int:
     require_extra("study", "pyarrow", "jinja2")
     from flexneedle.lab.study.report.report import write_report
 
-    report = write_report(args.study, args.out, args.tuning)
+    report = write_report(args.study, args.out)
     if args.json:
         print_json(report.values())
     else:

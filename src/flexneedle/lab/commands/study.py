@@ -15,8 +15,8 @@ from flexneedle.cli.common import compile_first, print_json
 
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
-    from flexneedle.lab.study.grid import Study
-    from flexneedle.lab.study.runner import Advance
+    from flexneedle.lab.study.grid import ExpandedStudy
+    from flexneedle.lab.study.runner import StudyProgress
 
 
 _TABLE_WIDTH = 120  # at least, so that rows are not wrapped in a file
@@ -118,7 +118,7 @@ class _StudyProgress:
         self._planning, self._inserting = _Pace(), _Pace()
         self._planned = False  # whether completed planning has been shown
 
-    def advance(self, advance: Advance) -> None:
+    def advance(self, advance: StudyProgress) -> None:
         planning, inserting = _STAGES
         if not self._planned:
             self._planned = advance.plans == advance.all_plans
@@ -159,11 +159,11 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
+def _report(study: ExpandedStudy, folder: Path, as_json: bool, seconds: float) -> int:
     from flexneedle.errors import make_printable
-    from flexneedle.lab.study.summary import summarise
+    from flexneedle.lab.study.summary import summarize_study
 
-    summary = summarise(folder, study)
+    summary = summarize_study(folder, study)
     summary["time"]["wall_s"] = seconds
     if as_json:
         print_json(summary)

@@ -12,8 +12,8 @@ from typing import Any
 
 from flexneedle.errors import InputError, describe_error, make_printable, one_line
 from flexneedle.files import RUNS, create_folder, replace_file
-from flexneedle.lab.study.grid import Study, StudyInsertion, recorded_study
-from flexneedle.lab.study.journal import Journal, read_rows
+from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion, restore_study
+from flexneedle.lab.study.journal import StudyJournal, read_rows
 from flexneedle.record.folder import STUDY_FILE, versions
 from flexneedle.record.plain import to_text
 from flexneedle.scenario.dotted import flatten
@@ -24,13 +24,13 @@ _SOURCE = "versions.source"
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """A study in its folder, finished or not. versions: those it was made with; own: digests of its own modules;
+class RecordedStudy:
+    """A study in its folder, finished or not. versions: of the packages that made it; own: digests of custom modules;
     rows: those that are finished, by index.
     """
 
     folder: Path
-    study: Study
+    study: ExpandedStudy
     versions: Mapping[str, str]
     own: Mapping[str, str]
     rows: Mapping[int, Mapping[str, Any]]
@@ -43,26 +43,26 @@ class Recorded:
             raise InputError(f"{self.folder}: row {index}: {one_line(error)}") from None
 
 
-def read_folder(path: Path) -> Recorded:
+def read_folder(path: Path) -> RecordedStudy:
     """Return the study in a folder, also while it runs.
 
-    Raises InputError if there is none, if it is damaged, or if a module of its own is missing.
+    Raises InputError if there is none, if it is damaged, or if a custom module is missing.
     """
-    stored = _stored(path)
+    stored = _read_identity(path)
     if stored["format"] != _FORMAT:
         raise InputError(f"{path}: not a study of this version of flexneedle: format must be {_FORMAT}")
     try:
-        study = recorded_study(stored["study"])
+        study = restore_study(stored["study"])
         made_by = dict(stored["versions"]), dict(stored["study"]["own"])
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path / STUDY_FILE}: damaged: {describe_error(error)}") from None
-    return Recorded(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
+    return RecordedStudy(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
 
 
 @contextmanager
-def study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
+def make_study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
     """Yield the folder `out`, or a new one in `runs/`, and whether it contains no study yet.
 
     If the block fails, folders that are new and empty are removed.
@@ -92,7 +92,7 @@ def remove_unused(path: Path) -> None:
         (path / name).unlink()
 
 
-def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Journal:
+def open_folder(path: Path, study: ExpandedStudy, resume: bool, command: str = "") -> StudyJournal:
     """Return the journal of a new study in the folder `path`, or with `resume` of the study in it.
 
     An empty or missing folder starts a new study in either case. Raises InputError if the folder contains other
@@ -102,24 +102,24 @@ def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Jo
     try:
         _check(path, study, resume)
         path.mkdir(parents=True, exist_ok=True)
-        journal = Journal(path / JOURNAL_FILE, len(study))
+        journal = StudyJournal(path / JOURNAL_FILE, len(study))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     try:
         _check(path, study, resume)  # again, now that no other process can create one here
         if not (path / STUDY_FILE).exists():
-            replace_file(path / STUDY_FILE, to_text({**_identity(study), "command": command}).encode())
+            replace_file(path / STUDY_FILE, to_text({**_identify(study), "command": command}).encode())
     except BaseException:
         journal.__exit__(None, None, None)
         raise
     return journal
 
 
-def _identity(study: Study) -> dict[str, Any]:
+def _identify(study: ExpandedStudy) -> dict[str, Any]:
     return {"format": _FORMAT, "versions": versions(), "study": study.definition}
 
 
-def _check(path: Path, study: Study, resume: bool) -> None:
+def _check(path: Path, study: ExpandedStudy, resume: bool) -> None:
     if (path / STUDY_FILE).exists():
         if not resume:
             raise InputError(
@@ -130,15 +130,15 @@ def _check(path: Path, study: Study, resume: bool) -> None:
         raise InputError(f"{path}: exists and is not an empty folder: set another with --out")
 
 
-def _check_same(path: Path, study: Study) -> None:
+def _check_same(path: Path, study: ExpandedStudy) -> None:
     """Raise InputError, with the first difference, unless the folder contains this study with these versions."""
-    key = _first_difference(_stored(path), _identity(study))
+    key = _find_difference(_read_identity(path), _identify(study))
     if key is not None:
         raise InputError(f"{path}: cannot resume: {key}")
 
 
-def _stored(path: Path) -> dict[str, Any]:
-    """What `_identity` has returned for the study in a folder."""
+def _read_identity(path: Path) -> dict[str, Any]:
+    """Return the recorded result of `_identify` for the study in a folder."""
     try:
         values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
         return {name: values[name] for name in ("format", "versions", "study")}
@@ -148,12 +148,12 @@ def _stored(path: Path) -> dict[str, Any]:
         raise InputError(f"{path / STUDY_FILE}: cannot be read: {error}") from None
 
 
-def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
+def _find_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
     there, here = flatten(stored), flatten(json.loads(json.dumps(current)))
     for key in there | here:
         if there.get(key) != here.get(key):
             name = key.removeprefix("study.")
-            before, now = (_value_text(values, key) for values in (there, here))
+            before, now = (_format_value(values, key) for values in (there, here))
             edited = (
                 "the code of flexneedle has changed since the start of the study: " if key == _SOURCE else ""
             )
@@ -161,5 +161,5 @@ def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> 
     return None
 
 
-def _value_text(values: Mapping[str, Any], key: str) -> str:
+def _format_value(values: Mapping[str, Any], key: str) -> str:
     return str(values[key]) if key in values else "not recorded"

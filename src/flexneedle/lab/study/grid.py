@@ -28,13 +28,13 @@ from flexneedle.lab.study.spec import (
     WORLD,
     WORLD_CASE,
     WORLD_RIG,
-    Axis,
+    StudyAxis,
     StudyFile,
-    base_of,
+    flatten_settings,
     is_seed,
-    of_worlds,
-    read_study,
-    settings_of,
+    load_base,
+    read_study_file,
+    with_worlds,
 )
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, find_plant
 from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, find_tracker
@@ -69,7 +69,7 @@ _FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {W
 
 
 @dataclass(frozen=True)
-class GridPoint:
+class StudyPoint:
     """A point of the grid: the settings shared by its insertions.
 
     varied: values of the axes except target and world; target_number: index of the target in the study, or number of
@@ -97,23 +97,23 @@ class StudyInsertion:
     """One insertion of a study: index of its row, grid point, number of the repeat, seed of the phantom."""
 
     index: int
-    point: GridPoint
+    point: StudyPoint
     repeat: int
     seed: int
 
 
 @dataclass(frozen=True)
-class Study:
+class ExpandedStudy:
     """An expanded study. definition: all its settings as plain values; seeds: values of an axis of seeds, else ()."""
 
     definition: Mapping[str, Any]
-    grid: "Grid"
+    grid: "StudyGrid"
     repeats: int
     first_seed: int
     seeds: tuple[int, ...]
 
     @cached_property
-    def points(self) -> tuple[GridPoint, ...]:
+    def points(self) -> tuple[StudyPoint, ...]:
         """All points in their order. Raises InputError for one that is not valid."""
         return tuple(map(self.grid.point, range(len(self.grid))))
 
@@ -147,36 +147,36 @@ class Study:
         return StudyInsertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
 
 
-def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None) -> Study:
+def load_study(source: str | Path | ExpandedStudy, worlds: tuple[int, int] | None = None) -> ExpandedStudy:
     """Return the study of a shipped name or a TOML file; a Study is returned unchanged.
 
-    worlds: first number and count, in place of those of the axis of worlds.
+    worlds: first number and count, in place of the axis of worlds.
     Raises InputError with one line for each problem: file, key, value, rule.
     """
-    if isinstance(source, Study):
+    if isinstance(source, ExpandedStudy):
         return source
-    file, home, label = read_study(source)
+    file, home, label = read_study_file(source)
     try:
-        return _expanded(file if worlds is None else of_worlds(file, *worlds), base_of(file, home))
+        return _expand(file if worlds is None else with_worlds(file, *worlds), load_base(file, home))
     except InputError as error:
         raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
 
 
-def recorded_study(definition: Mapping[str, Any]) -> Study:
+def restore_study(definition: Mapping[str, Any]) -> ExpandedStudy:
     """Return the study of a recorded `definition`; a point is made when it is needed, which may be one of thousands.
 
     Raises InputError if this version makes another number of insertions of it, or for one of its parts that is missing;
     KeyError, TypeError, ValueError or AttributeError for values that are no definition.
     """
-    study = _study(definition, Scenario.from_values(definition["scenario"]))
+    study = _make_study(definition, Scenario.from_values(definition["scenario"]))
     if len(study) != definition["insertions"]:
         rule = f"this version of flexneedle makes {len(study)} of it: its rows cannot be assigned"
         raise InputError(to_line(Problem("insertions", definition["insertions"], rule)))
     return study
 
 
-def _expanded(file: StudyFile, base: Scenario) -> Study:
-    axes = {axis.key: _axis_values(axis) for axis in file.axes}
+def _expand(file: StudyFile, base: Scenario) -> ExpandedStudy:
+    axes = {axis.key: _list_values(axis) for axis in file.axes}
     seeds = tuple(axes.pop(SEED, ()))
     repeats = len(seeds) or file.repeats
     targets = {case.name: case.targets for case in file.cases if case.targets is not None}
@@ -189,8 +189,8 @@ def _expanded(file: StudyFile, base: Scenario) -> Study:
         "title": file.title,
         "scenario": base.values(),
         "without": list(file.without),
-        "values": _DEFAULTS | settings_of(file.values),
-        "cases": {case.name: settings_of(case.values) for case in file.cases},
+        "values": _DEFAULTS | flatten_settings(file.values),
+        "cases": {case.name: flatten_settings(case.values) for case in file.cases},
         "targets": targets,
         "reach": [case.name for case in file.cases if case.reach],
         "axes": axes,
@@ -198,41 +198,41 @@ def _expanded(file: StudyFile, base: Scenario) -> Study:
         "first_seed": file.first_seed,
         "seeds": seeds,
     }
-    study = _study(settings, base)
+    study = _make_study(settings, base)
     _ = study.points  # which are checked before anything runs
     return study
 
 
-def _study(settings: Mapping[str, Any], base: Scenario) -> Study:
-    """The study of a definition, which may lack what follows from the rest of it. base: its scenario."""
+def _make_study(settings: Mapping[str, Any], base: Scenario) -> ExpandedStudy:
+    """Return the study of a definition, which may lack derived values. base: its scenario."""
     fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
-    names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
+    names = {key: _collect_values(key, fixed, cases, axes) for key in _OWN}
     own = find_own_controllers(names["controller"])
     base = check_tables(base, *own)
     _check_without(settings["without"], base)
     left_out, targets, reaching = (settings[key] for key in ("without", "targets", "reach"))
     parts = _Parts(base, dict.fromkeys(left_out), fixed, cases or {"": {}}, targets, reaching, axes, own)
-    grid, repeats = Grid(parts), settings["repeats"]
+    grid, repeats = StudyGrid(parts), settings["repeats"]
     definition = {
         **settings,
         "scenario": base.values(),
         "insertions": len(grid) * repeats,
         "own": digest_modules(name for of_key in names.values() for name in of_key),
     }
-    return Study(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
+    return ExpandedStudy(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 
 
-def _values_of(
+def _collect_values(
     key: str,
     fixed: Mapping[str, Any],
     cases: Mapping[str, Mapping[str, Any]],
     axes: Mapping[str, list[Any]],
 ) -> list[Any]:
-    """All values of a key in a study."""
+    """Return all values of a key in a study."""
     return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
 
 
-def _axis_values(axis: Axis) -> list[Any]:
+def _list_values(axis: StudyAxis) -> list[Any]:
     if axis.key in _CHOICES and axis.values == ALL:
         return list(_CHOICES[axis.key])
     if isinstance(axis.values, dict):
@@ -249,7 +249,7 @@ def _check_without(keys: Sequence[str], base: Scenario) -> None:
 
 @dataclass(frozen=True)
 class _Parts:
-    """The parts of a grid: targets: those of a case by its name; reaching: cases with a reach."""
+    """The parts of a grid: targets: of a case by its name; reaching: cases with a reach."""
 
     base: Scenario
     left_out: Mapping[str, None]
@@ -261,7 +261,7 @@ class _Parts:
     own: tuple[Controller, ...]
 
     def choices(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Each case and its values: cases vary slowest, then their targets, then the axes in order."""
+        """Yield each case and its values: cases vary slowest, then their targets, then the axes in order."""
         for case in self.cases:
             own = {TARGET: self.targets[case]} if case in self.targets else {}
             axes = {**own, **self.axes}
@@ -282,25 +282,25 @@ class _Choice:
     target_number: int
 
 
-class Grid:
+class StudyGrid:
     """The points of a study by number. Each is made when it is first asked for, and is the same from then on."""
 
     def __init__(self, parts: _Parts) -> None:
         self._parts, self._worlds = parts, cache(world)  # the same worlds for every controller
-        self._choices = tuple(_choices(parts, self._worlds))
-        self._made = dict[int, GridPoint]()
+        self._choices = tuple(_list_choices(parts, self._worlds))
+        self._made = dict[int, StudyPoint]()
 
     def __len__(self) -> int:
         return len(self._choices)
 
-    def point(self, number: int) -> GridPoint:
+    def point(self, number: int) -> StudyPoint:
         """Return a point. Raises InputError if its settings are not valid."""
         if number not in self._made:
-            self._made[number] = _point(self._parts, self._choices[number], self._worlds)
+            self._made[number] = _make_point(self._parts, self._choices[number], self._worlds)
         return self._made[number]
 
 
-def _choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choice]:
+def _list_choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choice]:
     """Yield the settings of the points; later settings override earlier ones."""
     numbers: dict[Any, int] = {}
     start = _DEFAULT_TARGET | {
@@ -309,32 +309,32 @@ def _choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[_Choi
         if key in TARGET_KEYS and key not in parts.left_out
     }
     for case, chosen in parts.choices():
-        settings = {**parts.fixed, **parts.cases[case], **settings_of(chosen)}
+        settings = {**parts.fixed, **parts.cases[case], **flatten_settings(chosen)}
         run = {key: settings.pop(key) for key in _DEFAULTS}
         number = settings.pop(WORLD, None)
         kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}
         _check_run(run | kind)
         if number is not None and _is_skipped(worlds(number), run["controller"], *kind.values()):
             continue
-        own = numbers.setdefault(_place(start | settings), len(numbers)) if number is None else number
+        own = numbers.setdefault(_target_key(start | settings), len(numbers)) if number is None else number
         yield _Choice(case, chosen, settings, run, number, kind, own)
 
 
-def _place(settings: Mapping[str, Any]) -> tuple[float | str, ...]:
-    """The target by which its number is found; one that is not valid is refused with its scenario."""
+def _target_key(settings: Mapping[str, Any]) -> tuple[float | str, ...]:
+    """Return the target as a key; an invalid one is refused with its scenario."""
     values = (settings[key] for key in TARGET_KEYS)
     return tuple(value if isinstance(value, int | float) else repr(value) for value in values)
 
 
-def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> GridPoint:
+def _make_point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> StudyPoint:
     case, chosen, kind = choice.case, choice.chosen, choice.kind
     named = {"case": case, **chosen} if case else chosen
     at = make_printable(", ".join(f"{key} = {value}" for key, value in named.items()))
     start = parts.base if choice.world is None else worlds(choice.world, *kind.values())
-    scenario = _varied(start, {**parts.left_out, **choice.settings}, parts.own, at)
+    scenario = _vary(start, {**parts.left_out, **choice.settings}, parts.own, at)
     _check_guide(choice.run, scenario, at)
     of_world: dict[str, Any] = {} if choice.world is None else {WORLD: choice.world, **kind}
-    return GridPoint(
+    return StudyPoint(
         scenario,
         case,
         **choice.run,
@@ -346,7 +346,7 @@ def _point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario]) -> G
 
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
-    """Whether a world has another guide than the rig, or none that this case or the controller needs."""
+    """Return whether a world has another guide than the rig, or none that this case or the controller needs."""
     return not has_rig(scenario, world_rig) or (
         not scenario.setup.has_guide
         and (world_case == STRUCTURE or find_controller(controller)[1].needs_guide)
@@ -357,10 +357,10 @@ def _check_guide(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
     try:
         check_guide(find_controller(run["controller"])[1], scenario.setup, run["strategy"])
     except InputError as error:
-        raise InputError(f"{error}{_suffix(at)}") from None
+        raise InputError(f"{error}{_format_place(at)}") from None
 
 
-def _suffix(at: str) -> str:
+def _format_place(at: str) -> str:
     return f" (at {at})" if at else ""
 
 
@@ -376,10 +376,12 @@ def _check_run(run: Mapping[str, Any]) -> None:
         raise InputError(to_line(Problem("plan_seed", run["plan_seed"], rule)))
 
 
-def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Controller, ...], at: str) -> Scenario:
+def _vary(base: Scenario, settings: Mapping[str, Any], own: tuple[Controller, ...], at: str) -> Scenario:
     try:
         return check_tables(base.with_values(settings), *own)
     except ScenarioError as error:
         further = (_FURTHER_KEYS if "unknown key" in problem else "" for problem in error.problems)
-        lines = (problem + more + _suffix(at) for problem, more in zip(error.problems, further, strict=True))
+        lines = (
+            problem + more + _format_place(at) for problem, more in zip(error.problems, further, strict=True)
+        )
         raise InputError("\n".join(lines)) from None

@@ -11,17 +11,17 @@ from typing import Any, Self
 
 from flexneedle.errors import InputError
 from flexneedle.interrupts import uninterrupted
-from flexneedle.lab.study.rows import TIMES
+from flexneedle.lab.study.jobs import TIMES
 from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.scenario.problems import Problem, to_line
 
 _KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
 _READ = ("true_error_mm", "outcome", "reason")
-"""Columns that whoever reads rows needs; those of another version may lack others."""
+"""Columns that every reader of rows needs; rows of another version may lack others."""
 _LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # in a column
 
 
-class Journal:
+class StudyJournal:
     """An open journal, locked against other processes; `rows`: finished rows by index.
 
     Numbers keep all digits. An incomplete last line is dropped; its row is repeated. size: number of rows of the
@@ -66,8 +66,8 @@ class Journal:
     def _read(self) -> None:
         self._file.seek(0)
         data = self._file.read()
-        self.rows = _rows_of(data, self._path, self._size, tuple(RESULT_COLUMNS))
-        self._file.truncate(_whole(data))
+        self.rows = _parse_rows(data, self._path, self._size, tuple(RESULT_COLUMNS))
+        self._file.truncate(_complete_length(data))
 
 
 def read_rows(path: Path, size: int) -> dict[int, dict[str, Any]]:
@@ -79,50 +79,50 @@ def read_rows(path: Path, size: int) -> dict[int, dict[str, Any]]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    return _rows_of(data, path, size, _READ)
+    return _parse_rows(data, path, size, _READ)
 
 
-def _rows_of(data: bytes, path: Path, size: int, needed: Sequence[str]) -> dict[int, dict[str, Any]]:
-    """The rows of the complete lines of a journal."""
+def _parse_rows(data: bytes, path: Path, size: int, needed: Sequence[str]) -> dict[int, dict[str, Any]]:
+    """Return the rows of the complete lines of a journal."""
     rows = {}
-    for number, line in enumerate(data[: _whole(data)].splitlines(), 1):
-        row = _parsed(line)
-        fault = _fault(row, size, needed)
+    for number, line in enumerate(data[: _complete_length(data)].splitlines(), 1):
+        row = _parse_line(line)
+        fault = _find_fault(row, size, needed)
         if fault is not None:
             raise InputError(f"{path}: damaged at line {number}: {fault}")
         rows[row["index"]] = row
     return rows
 
 
-def _whole(data: bytes) -> int:
-    """Length of the complete lines."""
+def _complete_length(data: bytes) -> int:
+    """Return the length of the complete lines."""
     return data.rfind(b"\n") + 1
 
 
-def _parsed(line: bytes) -> Any:
+def _parse_line(line: bytes) -> Any:
     try:
         return json.loads(line)
     except (ValueError, RecursionError):
         return None
 
 
-def _fault(row: Any, size: int, needed: Sequence[str]) -> str | None:
+def _find_fault(row: Any, size: int, needed: Sequence[str]) -> str | None:
     """Return why a value is not a row with the needed columns of a study of this size, or None for a valid row."""
     if not isinstance(row, dict):
         return "not a row in JSON"
     index = row.get("index")
-    if not (isinstance(index, int) and _fits(index, int) and 0 <= index < size):
+    if not (isinstance(index, int) and _has_kind(index, int) and 0 <= index < size):
         return to_line(Problem("index", index, f"must be a whole number from 0 to {size - 1}"))
     missing = next((name for name in needed if name not in row), None)
     if missing is not None:
         return f"{missing}: missing"
     known = ((name, kind) for name, kind in _KINDS.items() if name in row)
-    wrong = next((name for name, kind in known if not _fits(row[name], kind)), None)
+    wrong = next((name for name, kind in known if not _has_kind(row[name], kind)), None)
     return None if wrong is None else to_line(Problem(wrong, row[wrong], "wrong type, or too large"))
 
 
-def _fits(value: Any, kind: type) -> bool:
-    """Whether a value fits a column of this kind; numbers may be None."""
+def _has_kind(value: Any, kind: type) -> bool:
+    """Return whether a value fits a column of this kind; numbers may be None."""
     if kind is str:
         return isinstance(value, str)
     if value is None:

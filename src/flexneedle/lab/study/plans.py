@@ -7,30 +7,30 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.lab.study.grid import GridPoint
-from flexneedle.lab.study.rows import PlanResult
+from flexneedle.lab.study.grid import StudyPoint
+from flexneedle.lab.study.jobs import PlanResult
 from flexneedle.planning.origin import PLANNER_INPUTS
 from flexneedle.record.plain import plan_from_values, to_text
 from flexneedle.types import Plan
 
 
-def plan_key(point: GridPoint) -> str:
+def digest_plan_inputs(point: StudyPoint) -> str:
     """Return the key of a point's plan: a digest of all planner inputs."""
     return _digest(point, (), point.strategy, point.plan_seed)
 
 
-def truth_key(point: GridPoint) -> str:
+def digest_reach_inputs(point: StudyPoint) -> str:
     """Return a digest of all inputs of the reach of a point's phantoms, except the seed."""
     return _digest(point, ("phantom",), point.plant, point.strategy)
 
 
-def _digest(point: GridPoint, sections: tuple[str, ...], *settings: object) -> str:
+def _digest(point: StudyPoint, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
     inputs = [{name: values[name] for name in (*PLANNER_INPUTS, *sections)}, *settings]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class Plans:
+class StudyPlans:
     """Plans by key, in memory and in a folder. Points without a plan (`refusals`) are planned again on resume.
 
     Raises InputError if the path exists and is not a folder.
@@ -67,11 +67,11 @@ class Plans:
 
     def _find(self, key: str) -> tuple[Plan, float] | None:
         if key not in self._made and self._path(key).exists():
-            self._made[key] = _read(self._path(key))
+            self._made[key] = _read_plan(self._path(key))
         return self._made.get(key)
 
 
-def _read(path: Path) -> tuple[Plan, float]:
+def _read_plan(path: Path) -> tuple[Plan, float]:
     try:
         values: Any = json.loads(path.read_text(encoding="utf-8"))
         return plan_from_values(values["plan"]), float(values["seconds"])

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, make_printable
-from flexneedle.lab.study.worker import set_up
+from flexneedle.lab.study.worker import set_up_worker
 from flexneedle.scenario.problems import Problem, to_line
 
 _CONNECT_S = 20
@@ -19,23 +19,23 @@ _LAST_PORT = 65535
 _ADDRESS = re.compile(r"(tcp|tls|ws|wss)://(\[[0-9A-Fa-f:.]+\]|[^\s/:@?#\[\]]+):(?P<port>[0-9]{1,5})")
 
 
-def usable_cores() -> int:
+def count_cores() -> int:
     """Return the number of cores available to this process, or of the machine if unknown."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def local(workers: int | None = None) -> Iterator[Executor]:
+def open_processes(workers: int | None = None) -> Iterator[Executor]:
     """Yield a pool of worker processes (default: one per usable core)."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers or usable_cores(), context, set_up) as pool:
-        with _without_ctrl_c():
+    with ProcessPoolExecutor(workers or count_cores(), context, set_up_worker) as pool:
+        with _defer_ctrl_c():
             pool.submit(int)  # starts the processes
         yield pool
 
 
 @contextmanager
-def _without_ctrl_c() -> Iterator[None]:
+def _defer_ctrl_c() -> Iterator[None]:
     """Defer Ctrl-C, also in the processes that start in the meantime, until they are set up."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -53,21 +53,21 @@ def check_address(address: str) -> None:
 
 
 @contextmanager
-def cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
+def open_cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
     """Yield the workers of the Dask scheduler at `address` (`tcp://host:8786`) as an executor.
 
     Tasks are submitted as impure, so that equal tasks are all executed. `on_no_workers` is called if there are no
-    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `cluster` is not
+    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `open_cluster` is not
     installed, or if no scheduler responds.
     """
     check_address(address)
-    with _client(address) as client:
+    with _connect(address) as client:
         if not client.nthreads():
             on_no_workers()
         yield client.get_executor(pure=False)
 
 
-def _client(address: str) -> Any:
+def _connect(address: str) -> Any:
     require_extra("cluster", "distributed")
     from distributed import Client, Security
 

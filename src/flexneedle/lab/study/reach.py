@@ -24,7 +24,7 @@ _DIRECTIONS = 6
 """Constant directions of the bevel, all around; on an arc one more, with both of its ends."""
 
 
-def reach(
+def compute_reach(
     scenario: Scenario,
     seed: int,
     phantom: str | PlantFactory = DEFAULT_PLANT,
@@ -44,21 +44,21 @@ def reach(
     base_moves = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
     axes = setup.axes if base_moves else guide_axes(setup, strategy)
     if axes == setup.axes:
-        return _best_miss(truth)
-    ends = [straight_end(truth, roll, find_plant(phantom)[1], depth) for roll in _rolls(setup)]
+        return _find_best_miss(truth)
+    ends = [insert_straight(truth, roll, find_plant(phantom)[1], depth) for roll in _list_rolls(setup)]
     if any(math.isnan(x) for x, *_ in ends):
         return math.nan
     _, *lateral = scenario.target.position
     all_around = not setup.half_turns and setup.max_rotation >= math.pi
-    places, radius = reachable([complex(y, z) for _, y, z in ends], all_around=all_around)
+    places, radius = find_reachable([complex(y, z) for _, y, z in ends], all_around=all_around)
     if axes == 1:
-        return math.hypot(_best_miss(truth, on_axis=True), beside(lateral[1], places, radius))
+        return math.hypot(_find_best_miss(truth, on_axis=True), distance_beside(lateral[1], places, radius))
     short = max(depth - x for x, *_ in ends)
-    return math.hypot(short, max(0.0, to_hull(complex(*lateral), places) - radius))
+    return math.hypot(short, max(0.0, distance_to_hull(complex(*lateral), places) - radius))
 
 
-def _best_miss(truth: Truth, *, on_axis: bool = False) -> float:
-    """Miss (mm) of the best plan on the true model; on_axis: with the target's z on the needle's axis."""
+def _find_best_miss(truth: Truth, *, on_axis: bool = False) -> float:
+    """Return the miss (mm) of the best plan on the true model; on_axis: with the target's z on the needle's axis."""
     scenario, target = truth.scenario, truth.scenario.target
     z = scenario.entry.lateral(target.depth_mm).imag if on_axis else target.lateral_z_mm
     aimed, missed = scenario.with_values(_ONLY_THE_MISS | {"target.lateral_z_mm": z}), math.inf
@@ -70,8 +70,8 @@ def _best_miss(truth: Truth, *, on_axis: bool = False) -> float:
     return missed
 
 
-def _rolls(setup: Setup) -> list[float]:
-    """Constant angles (rad) of the needle: both of half turns, all around, or along the range of the rotation."""
+def _list_rolls(setup: Setup) -> list[float]:
+    """Return constant angles (rad) of the needle: two half turns, all around, or along its range."""
     if setup.half_turns:
         return [math.pi, 0.0]
     if setup.max_rotation >= math.pi:
@@ -79,8 +79,8 @@ def _rolls(setup: Setup) -> list[float]:
     return [setup.max_rotation * (2.0 * k / _DIRECTIONS - 1.0) for k in range(_DIRECTIONS + 1)]
 
 
-def reachable(ends: Sequence[complex], *, all_around: bool) -> tuple[list[complex], float]:
-    """What the needle reaches, as points y + iz and a distance (mm) from their convex hull.
+def find_reachable(ends: Sequence[complex], *, all_around: bool) -> tuple[list[complex], float]:
+    """Return the reachable set: points y + iz and a distance (mm) from their convex hull.
 
     The ends themselves, or, where their directions are all around, their mean, and their mean distance from it.
     """
@@ -90,29 +90,31 @@ def reachable(ends: Sequence[complex], *, all_around: bool) -> tuple[list[comple
     return [middle], sum(abs(end - middle) for end in ends) / len(ends)
 
 
-def to_hull(target: complex, ends: Sequence[complex]) -> float:
+def distance_to_hull(target: complex, ends: Sequence[complex]) -> float:
     """Return the distance (mm) of a target y + iz from the convex hull of the ends."""
     sides = [(a, b - a) for a in ends for b in ends if a != b]
     ways = [
         side * turn / abs(side) for _, side in sides for turn in (1.0, 1.0j)
     ]  # both signs, by both orders
-    if sides and all(_along(target, way) <= max(_along(end, way) for end in ends) for way in ways):
+    if sides and all(_project(target, way) <= max(_project(end, way) for end in ends) for way in ways):
         return 0.0
-    nearest = [a + side * min(1.0, max(0.0, _along(target - a, side) / abs(side) ** 2)) for a, side in sides]
+    nearest = [
+        a + side * min(1.0, max(0.0, _project(target - a, side) / abs(side) ** 2)) for a, side in sides
+    ]
     return min(abs(target - place) for place in (*nearest, *ends))
 
 
-def _along(place: complex, way: complex) -> float:
+def _project(place: complex, way: complex) -> float:
     return (place * way.conjugate()).real
 
 
-def beside(z: float, places: Sequence[complex], radius: float) -> float:
+def distance_beside(z: float, places: Sequence[complex], radius: float) -> float:
     """Return how far (mm) a target's z is from the range of z of points with a radius about each."""
     low, high = min(place.imag for place in places) - radius, max(place.imag for place in places) + radius
     return max(0.0, low - z, z - high)
 
 
-def straight_end(truth: Truth, roll: float, phantom: str | PlantFactory, depth: float) -> Point:
+def insert_straight(truth: Truth, roll: float, phantom: str | PlantFactory, depth: float) -> Point:
     """Return the tip x, y, z in mm of a plant inserted to a depth, or to full stroke, without moving base or bevel.
 
     NaN if the plant does not converge.

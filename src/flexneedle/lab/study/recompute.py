@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.lab.study.folder import PLANS_FOLDER, Recorded, read_folder
-from flexneedle.lab.study.plans import Plans, plan_key
-from flexneedle.lab.study.rows import insertion_at
+from flexneedle.lab.study.folder import PLANS_FOLDER, RecordedStudy, read_folder
+from flexneedle.lab.study.jobs import insert_at
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
 from flexneedle.loop.events import Event, PeriodEnded
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain
@@ -22,7 +22,7 @@ _ERROR, _ROWS_FOLDER = "true_error_mm", "rows"
 
 
 @dataclass(frozen=True, eq=False)
-class Recomputed:
+class RecomputedRow:
     """The insertion of a row, computed again.
 
     note: "" if the versions of the study give the recorded row to the last digit; else what differs, in one line.
@@ -34,19 +34,19 @@ class Recomputed:
 
 def recompute(
     folder: Path, index: int, on_share: Callable[[float], object] = lambda _share: None
-) -> Recomputed:
+) -> RecomputedRow:
     """Compute a row of the study in a folder again, also while the study runs.
 
     on_share: called after each control period with the share of the depth that the tip has reached, 0 to 1.
 
-    Raises InputError if the folder has no study, is damaged, or lacks a module of its own, and for a row that is none
+    Raises InputError if the folder has no study, is damaged, or lacks a custom module, and for a row that is none
     of the study, is not finished, or has no insertion; RunError if the insertion is refused, which the row was not.
     """
     recorded = read_folder(folder)
-    row, made_by = _row(recorded, index), _made_by(recorded)
+    row, made_by = _find_row(recorded, index), _describe_version(recorded)
     one = recorded.insertion(index)
-    scenario, key = one.point.scenario, plan_key(one.point)
-    plan = Plans(folder / PLANS_FOLDER).plan(key)
+    scenario, key = one.point.scenario, digest_plan_inputs(one.point)
+    plan = StudyPlans(folder / PLANS_FOLDER).plan(key)
     if plan is None:
         why = f"; the study was made by {made_by}" if made_by else ""
         raise InputError(f"{folder}: row {index}: its plan {PLANS_FOLDER}/{key}.json is missing{why}")
@@ -58,8 +58,8 @@ def recompute(
         reached = (event.period.estimate.x - start) / (scenario.target.depth_mm - start)
         on_share(min(max(reached, 0.0), 1.0))
 
-    insertion = insertion_at(one.point, plan, one.seed, listeners=(share_reached,))
-    return Recomputed(insertion, _note(made_by, _difference(insertion, row)))
+    insertion = insert_at(one.point, plan, one.seed, listeners=(share_reached,))
+    return RecomputedRow(insertion, _make_note(made_by, _find_difference(insertion, row)))
 
 
 def row_folder(study: Path, index: int) -> Path:
@@ -67,8 +67,8 @@ def row_folder(study: Path, index: int) -> Path:
     return study / _ROWS_FOLDER / f"row-{index:06d}"
 
 
-def _row(recorded: Recorded, index: int) -> Mapping[str, Any]:
-    """The recorded row. Raises InputError if it has no insertion."""
+def _find_row(recorded: RecordedStudy, index: int) -> Mapping[str, Any]:
+    """Return the recorded row. Raises InputError if it has no insertion."""
     folder, count, rows = recorded.folder, len(recorded.study), recorded.rows
     if not 0 <= index < count:
         raise InputError(f"{folder}: row = {index}: must be from 0 to {count - 1}")
@@ -80,8 +80,8 @@ def _row(recorded: Recorded, index: int) -> Mapping[str, Any]:
     return row
 
 
-def _made_by(recorded: Recorded) -> str:
-    """What the study was made by, if not by the present code and versions; else ""."""
+def _describe_version(recorded: RecordedStudy) -> str:
+    """Return "other code" or "other versions (…)" if the study was made by them, else ""."""
     stored, present = ({**recorded.versions}, versions())
     changed = {name for name in stored | present if stored.get(name) != present.get(name)}
     if changed & _OURS or recorded.own != recorded.study.definition["own"]:
@@ -89,24 +89,24 @@ def _made_by(recorded: Recorded) -> str:
     return f"other versions ({', '.join(sorted(changed))})" if changed else ""
 
 
-def _difference(insertion: Insertion, row: Mapping[str, Any]) -> str:
-    """The first difference from the recorded row, or "". The reason, which may have that of the reach, may differ."""
+def _find_difference(insertion: Insertion, row: Mapping[str, Any]) -> str:
+    """Return the first difference from the recorded row, or ""; the reason, which may include the reach, may differ."""
     again = plain(insertion_row(insertion))
     for name in ("outcome", _ERROR, *again):
         if name != "reason" and name in row and again[name] != row[name]:
             unit = " mm" if name == _ERROR else ""
-            new, old = _texts(again[name], row[name])
+            new, old = _format_values(again[name], row[name])
             return f"{'error' if name == _ERROR else name} {new}{unit}, recorded {old}{unit}"
     return ""
 
 
-def _texts(*values: Any) -> tuple[str, ...]:
-    """Values as text, numbers with three digits where these differ."""
+def _format_values(*values: Any) -> tuple[str, ...]:
+    """Return values as text, numbers with three digits where these differ."""
     short = tuple(f"{value:.3f}" if isinstance(value, float) else str(value) for value in values)
     return short if len(set(short)) == len(short) else tuple(map(str, values))
 
 
-def _note(made_by: str, difference: str) -> str:
+def _make_note(made_by: str, difference: str) -> str:
     if made_by:
         return f"recomputed with {made_by} than the study's: {difference or 'the same result'}"
     return difference and f"recomputed with the study's code, and not the same: {difference}"

@@ -13,20 +13,20 @@ from typing import Any
 from flexneedle.arguments import check_path, check_whole, require_extra
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.study import pools
-from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder, remove_unused, study_folder
-from flexneedle.lab.study.grid import GridPoint, Study, load_study
-from flexneedle.lab.study.journal import Journal
-from flexneedle.lab.study.plans import Plans, plan_key, truth_key
-from flexneedle.lab.study.rows import Job, JobResult, PlanResult, make_plan, run_job
+from flexneedle.lab.study.folder import PLANS_FOLDER, make_study_folder, open_folder, remove_unused
+from flexneedle.lab.study.grid import ExpandedStudy, StudyPoint, load_study
+from flexneedle.lab.study.jobs import InsertionJob, JobRows, PlanResult, make_plan, run_job
+from flexneedle.lab.study.journal import StudyJournal
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.record.folder import versions
 
-_Pending = dict[str, list[tuple[GridPoint, tuple[tuple[int, int], ...]]]]
+_Pending = dict[str, list[tuple[StudyPoint, tuple[tuple[int, int], ...]]]]
 _CLUSTER_JOBS = 1000  # at most: each job carries its plan, about 100 kB in the memory of the scheduler
 
 
 @dataclass(frozen=True)
-class Advance:
+class StudyProgress:
     """Progress of a study: completed and total plans and insertions; insertions that did not finish."""
 
     plans: int
@@ -37,13 +37,13 @@ class Advance:
 
 
 def run_study(
-    source: str | Path | Study,
+    source: str | Path | ExpandedStudy,
     out: str | Path | None = None,
     *,
     workers: int | None = None,
     scheduler: str | None = None,
     resume: bool = False,
-    on_advance: Callable[[Advance], None] | None = None,
+    on_advance: Callable[[StudyProgress], None] | None = None,
     on_no_workers: Callable[[], None] = lambda: None,
     command: str = "",
 ) -> Path:
@@ -63,7 +63,7 @@ def run_study(
     require_extra("study", "pyarrow")
     from flexneedle.lab.study.tables import write_tables
 
-    if not isinstance(source, Study):
+    if not isinstance(source, ExpandedStudy):
         check_path("source", source)
     study = load_study(source)
     if workers is not None and scheduler is not None:
@@ -75,8 +75,8 @@ def run_study(
     # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
     # script.
     with (
-        _pool(workers, scheduler, on_no_workers) as pool,
-        study_folder(given, study.name) as (folder, is_new),
+        _open_pool(workers, scheduler, on_no_workers) as pool,
+        make_study_folder(given, study.name) as (folder, is_new),
         open_folder(folder, study, resume, command) as journal,
     ):
         engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
@@ -93,23 +93,29 @@ def run_study(
     return folder
 
 
-def _pool(
+def _open_pool(
     workers: int | None, scheduler: str | None, on_no_workers: Callable[[], None]
 ) -> AbstractContextManager[Executor]:
-    return pools.local(workers) if scheduler is None else pools.cluster(scheduler, on_no_workers)
+    return (
+        pools.open_processes(workers) if scheduler is None else pools.open_cluster(scheduler, on_no_workers)
+    )
 
 
 class _Engine:
     """Submits jobs and writes all results; the only writer of the study."""
 
     def __init__(
-        self, study: Study, folder: Path, journal: Journal, on_advance: Callable[[Advance], None]
+        self,
+        study: ExpandedStudy,
+        folder: Path,
+        journal: StudyJournal,
+        on_advance: Callable[[StudyProgress], None],
     ) -> None:
-        self.plans = Plans(folder / PLANS_FOLDER)
+        self.plans = StudyPlans(folder / PLANS_FOLDER)
         self._study, self._journal, self._on_advance = study, journal, on_advance
         self._versions = versions()
-        self._pending = _pending(study, journal.rows)
-        self._reach_points = _reach_points(study)
+        self._pending = _find_pending(study, journal.rows)
+        self._reach_points = _find_reach_points(study)
         self._all_plans = len(self._pending)
         self._unfinished = sum(map(_is_unfinished, journal.rows.values()))
 
@@ -120,7 +126,7 @@ class _Engine:
         try:
             for key, points in self._pending.items():
                 if self.plans.plan(key) is None:
-                    calls.submit(make_plan, points[0][0], partial(self._planned, calls, chunk, key))
+                    calls.submit(make_plan, points[0][0], partial(self._keep_plan, calls, chunk, key))
                 else:
                     self._submit(calls, chunk, key)
             calls.finish()
@@ -128,7 +134,7 @@ class _Engine:
             calls.abandon()
             raise
 
-    def _planned(self, calls: "_PendingCalls", chunk: int, key: str, planned: PlanResult) -> None:
+    def _keep_plan(self, calls: "_PendingCalls", chunk: int, key: str, planned: PlanResult) -> None:
         self.plans.keep(key, planned)
         self._submit(calls, chunk, key)
         self._report_progress()
@@ -138,10 +144,10 @@ class _Engine:
         for point, insertions in self._pending[key]:
             for first in range(0, len(insertions), chunk):
                 chosen = insertions[first : first + chunk]
-                job = Job(point, made, refusal, chosen, id(point) in self._reach_points)
-                calls.submit(run_job, job, self._keep)
+                job = InsertionJob(point, made, refusal, chosen, id(point) in self._reach_points)
+                calls.submit(run_job, job, self._keep_rows)
 
-    def _keep(self, done: JobResult) -> None:
+    def _keep_rows(self, done: JobRows) -> None:
         if done.versions != self._versions:
             raise RunError(
                 f"package versions of a worker differ from this process: {done.versions}, {self._versions}"
@@ -155,10 +161,10 @@ class _Engine:
             self.plans.plan(key) is None and key not in self.plans.refusals for key in self._pending
         )
         made, rows = self._all_plans - missing, len(self._journal.rows)
-        self._on_advance(Advance(made, self._all_plans, rows, len(self._study), self._unfinished))
+        self._on_advance(StudyProgress(made, self._all_plans, rows, len(self._study), self._unfinished))
 
 
-def _pending(study: Study, done: Container[int]) -> _Pending:
+def _find_pending(study: ExpandedStudy, done: Container[int]) -> _Pending:
     """Return the missing insertions by plan: points, each with (index, seed) of its insertions."""
     pending: _Pending = {}
     for number, point in enumerate(study.points):
@@ -166,16 +172,16 @@ def _pending(study: Study, done: Container[int]) -> _Pending:
         indices = [index for index in range(first, first + study.repeats) if index not in done]
         if indices:
             insertions = tuple((index, study.insertion(index).seed) for index in indices)
-            pending.setdefault(plan_key(point), []).append((point, insertions))
+            pending.setdefault(digest_plan_inputs(point), []).append((point, insertions))
     return pending
 
 
-def _reach_points(study: Study) -> set[int]:
+def _find_reach_points(study: ExpandedStudy) -> set[int]:
     """Return the points, by id, whose insertions also compute the reach: the first with each truth."""
     first: dict[str, int] = {}
     for point in study.points:
         if point.with_reach:
-            first.setdefault(truth_key(point), id(point))
+            first.setdefault(digest_reach_inputs(point), id(point))
     return set(first.values())
 
 
@@ -196,7 +202,7 @@ class _PendingCalls:
         """Submit `function(argument)`; `then` is called with its result. Ignored after `abandon`."""
         if self._abandoned:
             return
-        with _worker_loss_reported():
+        with _report_worker_loss():
             future = self._executor.submit(function, argument)
         self._open[future] = then
         future.add_done_callback(self._done.put)
@@ -205,7 +211,7 @@ class _PendingCalls:
         """Wait for all calls, including those submitted in the meantime."""
         while self._open:
             future = self._done.get()
-            with _worker_loss_reported():
+            with _report_worker_loss():
                 result = future.result()
             self._open.pop(future)(result)
 
@@ -220,7 +226,7 @@ class _PendingCalls:
 
 
 @contextmanager
-def _worker_loss_reported() -> Iterator[None]:
+def _report_worker_loss() -> Iterator[None]:
     """Convert exceptions to RunError: jobs catch errors of an insertion, so others come from a lost worker."""
     try:
         yield

@@ -31,17 +31,17 @@ _LARGEST = {SEED: LARGEST_SEED, WORLD: LARGEST_WORLD}
 
 
 def is_seed(value: Any) -> bool:
-    """Whether a value is an integer from 0 to `LARGEST_SEED`."""
+    """Return whether a value is an integer from 0 to `LARGEST_SEED`."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_SEED
 
 
-def _seed(value: int) -> int:
+def _check_seed(value: int) -> int:
     if not is_seed(value):
         raise ValueError(f"must be from 0 to {LARGEST_SEED}")
     return value
 
 
-class Axis(Section):
+class StudyAxis(Section):
     """One `[[axes]]`: a key and its values; axes are combined in all ways."""
 
     key: str
@@ -52,12 +52,12 @@ class Axis(Section):
     or worlds."""
 
     @model_validator(mode="after")
-    def _check_values(self) -> "Axis":
-        refuse(_value_problems(self.key, self.values))
+    def _check_values(self) -> "StudyAxis":
+        refuse(_check_axis_values(self.key, self.values))
         return self
 
 
-class Case(Section):
+class StudyCase(Section):
     """One `[[cases]]`: a named set of values."""
 
     name: Title
@@ -70,16 +70,16 @@ class Case(Section):
     """Whether `reach_mm` is computed in this case, too, as in worlds."""
 
     @model_validator(mode="after")
-    def _check_values(self) -> "Case":
-        refuse(_settings_problems(self.values))
+    def _check_values(self) -> "StudyCase":
+        refuse(_check_settings(self.values))
         if self.targets is not None:
-            refuse(_value_problems(TARGET, self.targets, "targets"))
-            refuse(_target_twice(self.values))
+            refuse(_check_axis_values(TARGET, self.targets, "targets"))
+            refuse(_check_target_once(self.values))
         return self
 
 
 class StudyFile(Section):
-    """Contents of a study file, before names are looked up and the grid is expanded."""
+    """Contents of a study file, before names are resolved and the grid is expanded."""
 
     name: Title
     """Name, used in the name of the folder."""
@@ -91,28 +91,28 @@ class StudyFile(Section):
     """Keys of the base to remove, for example diameters if a gauge is set."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key for the whole study."""
-    axes: Annotated[tuple[Axis, ...], Field(strict=False)] = ()
-    cases: Annotated[tuple[Case, ...], Field(strict=False)] = ()
+    axes: Annotated[tuple[StudyAxis, ...], Field(strict=False)] = ()
+    cases: Annotated[tuple[StudyCase, ...], Field(strict=False)] = ()
     repeats: int = count(1, least=1, most=_MAX_VALUES)
     """Insertions at each point of the grid, each with its own seed."""
-    first_seed: Annotated[int, AfterValidator(_seed)] = 0
+    first_seed: Annotated[int, AfterValidator(_check_seed)] = 0
     """Seed of the first insertion."""
 
     @model_validator(mode="after")
     def _check_together(self) -> "StudyFile":
         refuse(
             (
-                *_settings_problems(self.values),
-                *_case_problems(self),
-                *_key_problems(self),
-                *_seed_problems(self),
-                *_world_problems(self),
+                *_check_settings(self.values),
+                *_check_cases(self),
+                *_check_keys(self),
+                *_check_seeds(self),
+                *_check_worlds(self),
             )
         )
         return self
 
 
-def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
+def read_study_file(source: str | Path) -> tuple[StudyFile, Path, str]:
     """Return the study of a shipped name or a TOML file, the folder of the file, and its label in messages.
 
     Raises FileError with one line for each problem: file, key, value, rule.
@@ -121,12 +121,12 @@ def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
     return STUDIES.load(source, StudyFile), Path() if shipped else Path(source).parent, label(source)
 
 
-def base_of(file: StudyFile, home: Path) -> Scenario:
+def load_base(file: StudyFile, home: Path) -> Scenario:
     """Return the base scenario of a study; home: folder of the study file. Raises ScenarioError."""
     return load_scenario(file.scenario if file.scenario in PRESETS.names() else home / file.scenario)
 
 
-def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
+def with_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
     """Return the study with other worlds. Raises InputError if it has no axis of worlds, or for invalid numbers."""
     if all(axis.key != WORLD for axis in file.axes):
         raise InputError("no axis of worlds: --worlds needs one")
@@ -134,11 +134,11 @@ def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
         rule = f"must be the first number, 0 to {LARGEST_WORLD}, and a count, 1 to {_MAX_VALUES}"
         raise InputError(f"worlds = {first}, {count}: {rule}")
     values = {"from": first, "count": count}
-    axes = (Axis(key=WORLD, values=values) if axis.key == WORLD else axis for axis in file.axes)
+    axes = (StudyAxis(key=WORLD, values=values) if axis.key == WORLD else axis for axis in file.axes)
     return file.model_copy(update={"axes": tuple(axes)})
 
 
-def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
+def flatten_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by dotted key; a target [depth, y] or [depth, y, z] becomes the three keys of the scenario."""
     flat = flatten(values)
     if TARGET in flat:
@@ -147,41 +147,41 @@ def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _keys_of(key: str) -> tuple[str, ...]:
+def _list_keys(key: str) -> tuple[str, ...]:
     """Return the scenario keys of an axis."""
     return TARGET_KEYS if key == TARGET else (key,)
 
 
-def _value_problems(key: str, values: Any, name: str = "values") -> Iterator[Problem]:
+def _check_axis_values(key: str, values: Any, name: str = "values") -> Iterator[Problem]:
     if key in NAMED and values == ALL:
         return
     if key in _LARGEST and isinstance(values, dict):
-        yield from _range_problems(values, _LARGEST[key])
+        yield from _check_range(values, _LARGEST[key])
     elif not isinstance(values, list) or not values:
         yield Problem(name, values, "must be a list of at least one value")
-    elif (twice := _twice(values)) is not None:
+    elif (twice := _find_duplicate(values)) is not None:
         yield Problem(name, values, f"contains {twice!r} twice")
     elif key == TARGET:
-        yield from (problem for value in values for problem in _target_problems(name, value))
+        yield from (problem for value in values for problem in _check_target(name, value))
     elif key in _LARGEST and not all(is_seed(value) and value <= _LARGEST[key] for value in values):
         yield Problem("values", values, f"must be whole numbers from 0 to {_LARGEST[key]}")
 
 
-def _twice(values: list[Any]) -> Any:
+def _find_duplicate(values: list[Any]) -> Any:
     """Return a duplicate value of a list, or None; equal numbers are duplicates, also 25 and 25.0."""
-    times = Counter(map(_comparable, values))
-    return next((value for value in values if times[_comparable(value)] > 1), None)
+    times = Counter(map(_make_comparable, values))
+    return next((value for value in values if times[_make_comparable(value)] > 1), None)
 
 
-def _comparable(value: Any) -> Hashable:
+def _make_comparable(value: Any) -> Hashable:
     if isinstance(value, list):
-        return tuple(map(_comparable, value))
+        return tuple(map(_make_comparable, value))
     if isinstance(value, dict):
-        return frozenset((key, _comparable(item)) for key, item in value.items())
+        return frozenset((key, _make_comparable(item)) for key, item in value.items())
     return (bool, value) if isinstance(value, bool) else value  # True is not equal to 1 here
 
 
-def _range_problems(values: dict[str, Any], largest: int) -> Iterator[Problem]:
+def _check_range(values: dict[str, Any], largest: int) -> Iterator[Problem]:
     fine = set(values) == {"from", "count"} and all(map(is_seed, values.values()))
     if not fine or not 1 <= values["count"] <= _MAX_VALUES or values["from"] > largest:
         rule = (
@@ -191,22 +191,22 @@ def _range_problems(values: dict[str, Any], largest: int) -> Iterator[Problem]:
         yield Problem("values", values, rule)
 
 
-def _target_problems(key: str, value: Any) -> Iterator[Problem]:
+def _check_target(key: str, value: Any) -> Iterator[Problem]:
     if not isinstance(value, list) or len(value) not in (2, 3):
         yield Problem(key, value, "must be two or three numbers, [depth, y] or [depth, y, z] in mm")
 
 
-def _target_twice(values: Mapping[str, Any]) -> Iterator[Problem]:
-    """Targets of a case that its values set, too."""
-    for key in settings_of(values):
+def _check_target_once(values: Mapping[str, Any]) -> Iterator[Problem]:
+    """Yield the targets of a case that its values set, too."""
+    for key in flatten_settings(values):
         if key in TARGET_KEYS:
             yield Problem(f"values.{key}", None, "also set by targets")
 
 
-def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
+def _check_settings(values: Mapping[str, Any]) -> Iterator[Problem]:
     flat = flatten(values)
     if TARGET in flat:
-        yield from _target_problems(f"values.{TARGET}", flat[TARGET])
+        yield from _check_target(f"values.{TARGET}", flat[TARGET])
     if SEED in flat:
         rule = "not allowed here: set seeds with first_seed and repeats, or with an axis"
         yield Problem(f"values.{SEED}", flat[SEED], rule)
@@ -214,34 +214,34 @@ def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
         yield Problem(f"values.{WORLD}", flat[WORLD], "not allowed here: set worlds with an axis")
 
 
-def _case_problems(study: StudyFile) -> Iterator[Problem]:
+def _check_cases(study: StudyFile) -> Iterator[Problem]:
     for name, times in Counter(case.name for case in study.cases).items():
         if times > 1:
             yield Problem("cases", name, "names must be unique")
 
 
-def _key_problems(study: StudyFile) -> Iterator[Problem]:
-    """Keys set by two axes, or by an axis and a case."""
-    axes = Counter(key for axis in study.axes for key in _keys_of(axis.key))
+def _check_keys(study: StudyFile) -> Iterator[Problem]:
+    """Yield the keys set by two axes, or by an axis and a case."""
+    axes = Counter(key for axis in study.axes for key in _list_keys(axis.key))
     for key, times in axes.items():
         if times > 1:
             yield Problem("axes", key, "set by two axes")
     for number, case in enumerate(study.cases):
-        for key in settings_of(case.values):
+        for key in flatten_settings(case.values):
             if key in axes:
                 yield Problem(f"cases.{number}.values", key, "also set by an axis")
         if case.targets is not None and axes.keys() & {*TARGET_KEYS, WORLD}:
             yield Problem(f"cases.{number}.targets", None, "also set by an axis")
 
 
-def _seed_problems(study: StudyFile) -> Iterator[Problem]:
+def _check_seeds(study: StudyFile) -> Iterator[Problem]:
     if any(axis.key == SEED for axis in study.axes):
         for key in sorted({"repeats", "first_seed"} & study.model_fields_set):
             yield Problem(key, getattr(study, key), "remove it: an axis sets the seeds")
 
 
-def _world_problems(study: StudyFile) -> Iterator[Problem]:
-    """An axis of worlds sets the scenarios; only worlds have cases."""
+def _check_worlds(study: StudyFile) -> Iterator[Problem]:
+    """Yield keys that conflict with an axis of worlds, or need one."""
     axes = {axis.key for axis in study.axes}
     if WORLD in axes:
         for key in sorted({"scenario", "without"} & study.model_fields_set):

@@ -9,19 +9,18 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from flexneedle.lab.study.coverage import columns_of, covered
-from flexneedle.lab.study.grid import Study
+from flexneedle.lab.study.findings.predictions import compute_coverage, list_deviation_columns
+from flexneedle.lab.study.findings.worlds import MISS_LIMIT, is_failure
+from flexneedle.lab.study.grid import ExpandedStudy
 from flexneedle.lab.study.tables import RUNS_FILE, TIMING_FILE
 from flexneedle.record.plain import plain
 from flexneedle.record.results import DEPTH_FRACTIONS, PREDICTED_PARTS
 
 _ENERGY, _PLANNED_ENERGY = "strain_energy_mj", "planned_strain_energy_mj"
-_WITHIN_REACH_MM = 1.0
-_LIMIT = "control.miss_limit_mm"
 _Row = Mapping[str, Any]
 
 
-def summarise(folder: Path, study: Study) -> dict[str, Any]:
+def summarize_study(folder: Path, study: ExpandedStudy) -> dict[str, Any]:
     """Return outcomes, errors (mm), bevel flips, energy (mJ), periods and times (s) of a study folder as plain values.
 
     Statistics are over finished insertions with a known value, as in the report; unconverged periods are counted
@@ -39,8 +38,8 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
         "unconverged_periods",
         "reach_mm",
         "reason",
-        _LIMIT,
-        *(name for part in PREDICTED_PARTS for axes in columns_of(part) for name in axes),
+        MISS_LIMIT,
+        *(name for part in PREDICTED_PARTS for axes in list_deviation_columns(part) for name in axes),
     ]
     rows = pq.read_table(folder / RUNS_FILE, columns=columns).to_pylist()
     result: dict[str, Any] = plain(
@@ -49,87 +48,76 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
             "title": study.title,
             "folder": str(folder),
             "complete": len(rows) == len(study),
-            "first_failure": next((_failure_text(row) for row in rows if row["outcome"] != "done"), None),
-            **_statistics(rows),
+            "first_failure": next((_format_failure(row) for row in rows if row["outcome"] != "done"), None),
+            **_summarize_rows(rows),
             "groups": [
-                {"settings": dict(settings), **_statistics(members)}
-                for settings, members in _groups(rows, study).items()
+                {"settings": dict(settings), **_summarize_rows(members)}
+                for settings, members in _group_rows(rows, study).items()
             ],
-            "time": _times(folder),
+            "time": _sum_times(folder),
         }
     )
     return result
 
 
-def is_failure(row: _Row) -> bool:
-    """Whether an insertion did not finish although its reach is unknown or at most 1 mm.
-
-    For a held insertion the limit is at least `control.miss_limit_mm`, the miss at which a controller may hold.
-    """
-    reach, limit = row["reach_mm"], _WITHIN_REACH_MM
-    if row["outcome"] == "held":
-        limit = max(limit, row.get(_LIMIT) or 0.0)
-    return row["outcome"] != "done" and (reach is None or reach <= limit)
-
-
-def _failure_text(row: _Row) -> str:
+def _format_failure(row: _Row) -> str:
     return f"{row['outcome']}: {row['reason']}" if row["reason"] else str(row["outcome"])
 
 
-def _groups(rows: Sequence[_Row], study: Study) -> dict[tuple[tuple[str, Any], ...], list[_Row]]:
+def _group_rows(rows: Sequence[_Row], study: ExpandedStudy) -> dict[tuple[tuple[str, Any], ...], list[_Row]]:
     groups: dict[tuple[tuple[str, Any], ...], list[_Row]] = {}
     for row in rows:
         point = study.insertion(row["index"]).point
         settings = ({"case": point.case} if point.case else {}) | dict(point.varied)
         if settings:
-            groups.setdefault(tuple((key, _hashable(value)) for key, value in settings.items()), []).append(
-                row
-            )
+            groups.setdefault(
+                tuple((key, _make_hashable(value)) for key, value in settings.items()), []
+            ).append(row)
     return groups
 
 
-def _hashable(value: Any) -> Any:
-    return tuple(map(_hashable, value)) if isinstance(value, list) else value
+def _make_hashable(value: Any) -> Any:
+    return tuple(map(_make_hashable, value)) if isinstance(value, list) else value
 
 
-def _statistics(members: Sequence[_Row]) -> dict[str, Any]:
+def _summarize_rows(members: Sequence[_Row]) -> dict[str, Any]:
     rows = [row for row in members if row["outcome"] == "done"]
     return {
         "insertions": len(members),
         "failures": sum(map(is_failure, members)),
         "outcomes": dict(Counter(row["outcome"] for row in members).most_common()),
-        "true_error_mm": _spread([row["true_error_mm"] for row in rows]),
-        "residual_mm": _spread([row["residual_mm"] for row in rows]),
-        "flips": _mean(rows, "flips"),
-        "planned_flips": _mean(rows, "planned_flips"),
-        "strain_energy_mj": _mean(rows, _ENERGY),
-        "planned_strain_energy_mj": _mean(rows, _PLANNED_ENERGY),
-        "energy_ratio": _mean(rows, _ENERGY) / _mean(rows, _PLANNED_ENERGY),
-        "period_ratio": _spread([_ratio(row["periods"], row["planned_periods"]) for row in rows]),
+        "true_error_mm": _summarize_values([row["true_error_mm"] for row in rows]),
+        "residual_mm": _summarize_values([row["residual_mm"] for row in rows]),
+        "flips": _average(rows, "flips"),
+        "planned_flips": _average(rows, "planned_flips"),
+        "strain_energy_mj": _average(rows, _ENERGY),
+        "planned_strain_energy_mj": _average(rows, _PLANNED_ENERGY),
+        "energy_ratio": _average(rows, _ENERGY) / _average(rows, _PLANNED_ENERGY),
+        "period_ratio": _summarize_values([_divide(row["periods"], row["planned_periods"]) for row in rows]),
         "unconverged_periods": sum(row["unconverged_periods"] or 0 for row in members),
         "coverage": {
-            part: dict(zip(DEPTH_FRACTIONS, covered(_deviations(rows, part)), strict=True))
+            part: dict(zip(DEPTH_FRACTIONS, compute_coverage(_read_deviations(rows, part)), strict=True))
             for part in PREDICTED_PARTS
         },
     }
 
 
-def _deviations(rows: Sequence[_Row], part: str) -> NDArray[np.float64]:
-    """The deviations (3, 2, n) of tip or middle from the predictions, NaN where unknown."""
-    values = [[[row[name] for row in rows] for name in axes] for axes in columns_of(part)]
+def _read_deviations(rows: Sequence[_Row], part: str) -> NDArray[np.float64]:
+    """Return the deviations (3, 2, n) of tip or middle from the predictions, NaN where unknown."""
+    values = [[[row[name] for row in rows] for name in axes] for axes in list_deviation_columns(part)]
     return np.array(values, dtype=float).reshape(len(values), len(values[0]), len(rows))
 
 
-def _mean(rows: Sequence[_Row], name: str) -> float:
+def _average(rows: Sequence[_Row], name: str) -> float:
     values = [row[name] for row in rows if row[name] is not None]
     return float(np.mean(values)) if values else float("nan")
 
 
-def _ratio(value: float | None, planned: float | None) -> float | None:
+def _divide(value: float | None, planned: float | None) -> float | None:
     return value / planned if value is not None and planned else None
 
 
-def _spread(values: Sequence[float | None]) -> dict[str, Any]:
+def _summarize_values(values: Sequence[float | None]) -> dict[str, Any]:
     known = np.array([value for value in values if value is not None])
     if not known.size:
         return dict.fromkeys(("mean", "sd", "median", "p95", "max"))
@@ -142,8 +130,8 @@ def _spread(values: Sequence[float | None]) -> dict[str, Any]:
     }
 
 
-def _times(folder: Path) -> dict[str, float]:
-    """Times (s) of planning, control, plant and the rest, summed over all workers; a plan counts once."""
+def _sum_times(folder: Path) -> dict[str, float]:
+    """Return the times (s) of planning, control, plant and the rest, summed over all workers; a plan counts once."""
     rows = pq.read_table(folder / TIMING_FILE).to_pylist()
     plans = {row["plan"]: row["plan_s"] or 0.0 for row in rows}
     parts = {name: sum(row[f"{name}_s"] or 0.0 for row in rows) for name in ("control", "plant", "total")}

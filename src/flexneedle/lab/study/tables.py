@@ -8,9 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flexneedle.files import replace_file
-from flexneedle.lab.study.grid import Study, StudyInsertion
-from flexneedle.lab.study.plans import Plans, plan_key, truth_key
-from flexneedle.lab.study.rows import TIMES
+from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion
+from flexneedle.lab.study.jobs import TIMES
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
 from flexneedle.record.folder import versions
 from flexneedle.record.results import RESULT_COLUMNS
 
@@ -37,28 +37,30 @@ _CONDITIONS: dict[str, tuple[type, Callable[[StudyInsertion, str], Any]]] = {
 _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 
 
-def write_tables(folder: Path, study: Study, rows: Mapping[int, Mapping[str, Any]], plans: Plans) -> None:
+def write_tables(
+    folder: Path, study: ExpandedStudy, rows: Mapping[int, Mapping[str, Any]], plans: StudyPlans
+) -> None:
     """Write `runs.parquet` and `timing.parquet` for the finished rows (by index).
 
     The bytes of `runs.parquet` depend only on study and versions, not on the assignment of rows to workers.
     """
     insertions = [study.insertion(index) for index in sorted(rows)]
-    keys = {id(point): plan_key(point) for point in study.points}
+    keys = {id(point): digest_plan_inputs(point) for point in study.points}
     plan_keys = [keys[id(insertion.point)] for insertion in insertions]
-    results = _with_reach(insertions, [rows[insertion.index] for insertion in insertions])
-    _write(folder / RUNS_FILE, _runs(study, insertions, plan_keys, results))
+    results = _add_reach(insertions, [rows[insertion.index] for insertion in insertions])
+    _write(folder / RUNS_FILE, _make_runs(study, insertions, plan_keys, results))
     seconds = {key: plans.seconds(key) for key in set(plan_keys)}
     timing = [
         {**row, "plan": key, "plan_s": seconds[key]} for row, key in zip(results, plan_keys, strict=True)
     ]
-    _write(folder / TIMING_FILE, pa.table(_columns(timing, _TIMING)))
+    _write(folder / TIMING_FILE, pa.table(_make_columns(timing, _TIMING)))
 
 
-def _with_reach(
+def _add_reach(
     insertions: Sequence[StudyInsertion], results: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:
     """Return the results, each with the reach that was computed for the same truth."""
-    digests = {id(i.point): truth_key(i.point) if i.point.with_reach else "" for i in insertions}
+    digests = {id(i.point): digest_reach_inputs(i.point) if i.point.with_reach else "" for i in insertions}
     keys = [(digests[id(insertion.point)], insertion.seed) for insertion in insertions]
     known = {
         key: row["reach_mm"] for key, row in zip(keys, results, strict=True) if row["reach_mm"] is not None
@@ -66,39 +68,43 @@ def _with_reach(
     return [{**row, "reach_mm": known.get(key)} for key, row in zip(keys, results, strict=True)]
 
 
-def _runs(
-    study: Study,
+def _make_runs(
+    study: ExpandedStudy,
     insertions: Sequence[StudyInsertion],
     plan_keys: Sequence[str],
     results: Sequence[Mapping[str, Any]],
 ) -> pa.Table:
     flats = {id(point): point.scenario.flat() for point in study.points}
     settings = [flats[id(insertion.point)] for insertion in insertions]
-    conditions = [_conditions(insertion, key) for insertion, key in zip(insertions, plan_keys, strict=True)]
+    conditions = [
+        _list_conditions(insertion, key) for insertion, key in zip(insertions, plan_keys, strict=True)
+    ]
     version_columns = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
     cases = [{"index": insertion.index, "case": insertion.point.case} for insertion in insertions]
     return pa.table(
-        _columns(cases, {"index": int, "case": str})
-        | _columns(settings, _kinds(list(flats.values())))
-        | _columns(conditions, {name: kind for name, (kind, _) in _CONDITIONS.items()})
-        | _columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
+        _make_columns(cases, {"index": int, "case": str})
+        | _make_columns(settings, _find_kinds(list(flats.values())))
+        | _make_columns(conditions, {name: kind for name, (kind, _) in _CONDITIONS.items()})
+        | _make_columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
         | {name: pa.array(values, pa.string()) for name, values in version_columns.items()}
     )
 
 
-def _conditions(insertion: StudyInsertion, key: str) -> dict[str, Any]:
+def _list_conditions(insertion: StudyInsertion, key: str) -> dict[str, Any]:
     return {name: value(insertion, key) for name, (_, value) in _CONDITIONS.items()}
 
 
-def _columns(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, Any]) -> dict[str, pa.Array]:
-    return {name: pa.array([row.get(name) for row in rows], _type(kind)) for name, kind in kinds.items()}
+def _make_columns(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, Any]) -> dict[str, pa.Array]:
+    return {
+        name: pa.array([row.get(name) for row in rows], _choose_type(kind)) for name, kind in kinds.items()
+    }
 
 
-def _type(kind: Any) -> pa.DataType:
+def _choose_type(kind: Any) -> pa.DataType:
     return pa.list_(pa.float64()) if kind is list else _TYPES[kind]
 
 
-def _kinds(flats: Sequence[Mapping[str, Any]]) -> dict[str, type]:
+def _find_kinds(flats: Sequence[Mapping[str, Any]]) -> dict[str, type]:
     """Return the type of each scenario value, in the order of the schema; values that no scenario has are omitted."""
     return {name: type(value) for flat in flats for name, value in flat.items()}
 

@@ -215,7 +215,7 @@ def _check_label(table: Table, name: str, label: str | None) -> None:
 
 
 def _leave_one_out(pairs: PointPairs) -> Floats:
-    """Residual of each fiducial (mm) with a registration from all others; NaN if those are too few or collinear."""
+    """Return the residual of each fiducial (mm) with a registration from the others, NaN if there is none."""
     errors = np.full(len(pairs.names), np.nan)
     for k in range(len(errors)):
         others = np.arange(len(errors)) != k

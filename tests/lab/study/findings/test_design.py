@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexneedle.lab.study.findings.design import column_label, design_of
+from flexneedle.lab.study.findings.design import find_design, label_column
 from flexneedle.lab.study.findings.reading import read_study_folder
 from flexneedle.scenario.files import load_scenario
 from study_rows import BASE, OURS, make_rows, write_study
@@ -19,7 +19,7 @@ def design(tmp_path):
 
     def read(rows, **asked):
         study = read_study_folder(write_study(tmp_path / "study", rows, **asked))
-        return design_of(study.rows, study.definition)
+        return find_design(study.rows, study.definition)
 
     return read
 
@@ -174,7 +174,7 @@ def test_names_that_differ_in_more_than_a_number_are_cases(in_cases, names):
     ],
 )
 def test_labels_have_units(key, label):
-    assert column_label(key) == label
+    assert label_column(key) == label
 
 
 def environment(name):

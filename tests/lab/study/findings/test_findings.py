@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from flexneedle.lab.study.findings.design import design_of
-from flexneedle.lab.study.findings.reading import read_study_folder
-from flexneedle.lab.study.findings.summary import (
-    case_differences,
-    controller_differences,
-    endings,
-    groups_of,
-    worst,
+from flexneedle.lab.study.findings.design import find_design
+from flexneedle.lab.study.findings.groups import (
+    compare_cases,
+    compare_controllers,
+    count_endings,
+    find_worst,
+    group_rows,
 )
+from flexneedle.lab.study.findings.reading import read_study_folder
 from study_rows import BASE, OURS, make_rows, unfinished, write_study
 
 TARGETS = ((25.0, 0.0), (40.0, 5.0))
@@ -27,7 +27,7 @@ def read(tmp_path):
 
 
 def designed(study):
-    return design_of(study.rows, study.definition)
+    return find_design(study.rows, study.definition)
 
 
 def doubled(*names):
@@ -49,7 +49,7 @@ def test_the_statistics_of_a_group_agree_with_hand_values(read):
         }
     rows[0]["periods"], rows[1]["unconverged_periods"] = 75, 3
     found = read(rows)
-    (group,) = groups_of(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, designed(found).factors)
     value = {name: estimate.value for name, estimate in group.estimates.items()}
     assert (group.name, group.count, group.finished, group.known, group.missed) == (OURS, 5, 5, 5, 1)
     assert (group.unconverged, group.largest_mm, group.largest_period_ratio) == (1, 2.0, 1.5)
@@ -69,7 +69,7 @@ def test_unfinished_insertions_are_counted_and_not_averaged(read):
     rows.append(unfinished({**rows[0], "index": 4, "seed": 99, "repeat": 4}, "error", "ValueError: x"))
     rows[3]["unconverged_periods"] = 7
     found = read(rows)
-    (group,) = groups_of(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, designed(found).factors)
     assert (group.count, group.finished, group.missed, group.unconverged) == (5, 3, 0, 1)
     assert group.estimates["mean_mm"].value == pytest.approx(0.2)
     assert group.largest_mm == 0.3
@@ -80,7 +80,7 @@ def test_a_finished_insertion_with_unknown_error_is_counted(read):
     rows[0]["true_error_mm"] = None
     rows[1]["true_error_mm"] = float("nan")
     found = read(rows)
-    (group,) = groups_of(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, designed(found).factors)
     assert (group.finished, group.known) == (3, 1)
 
 
@@ -88,7 +88,7 @@ def test_groups_are_every_level_of_every_factor(read):
     axes = {"contact.spacing_mm": [1.0, 0.5]}
     rows = make_rows((OURS, "open-loop"), axes=axes, targets=TARGETS, repeats=2)
     found = read(rows, axes=axes)
-    groups = groups_of(found.rows, designed(found).factors)
+    groups = group_rows(found.rows, designed(found).factors)
     assert [group.levels for group in groups] == [
         {"controller": name, "contact.spacing_mm": spacing}
         for name in (OURS, "open-loop")
@@ -99,7 +99,7 @@ def test_groups_are_every_level_of_every_factor(read):
 
 def compared(rows, read, **more):
     found = read(rows, **more)
-    return controller_differences(found.rows, designed(found))
+    return compare_controllers(found.rows, designed(found))
 
 
 def test_controllers_are_compared_pair_by_pair(read):
@@ -160,7 +160,7 @@ def test_cases_are_compared_with_the_base_for_each_controller(read):
         more = {"as shipped": 0.0, "run_out_mm doubled": 0.02, "initial_bend_mm doubled": -0.01}[row["case"]]
         row["true_error_mm"] += more * (3 if row["controller"] == "open-loop" else 1)
     found = read(rows)
-    differences = case_differences(found.rows, designed(found))
+    differences = compare_cases(found.rows, designed(found))
     assert [(d.controller, d.name, d.pairs, d.verdict) for d in differences] == [
         (controller, case, 30, verdict)
         for controller in (OURS, "open-loop")
@@ -176,7 +176,7 @@ def test_endings_that_differ_only_in_numbers_are_grouped(read):
         rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1 s)")
     rows[5] = unfinished(rows[5], "error", "ValueError: x")
     rows[8]["reason"] = "missed the target by 1.20 mm"
-    found = endings(read(rows).rows)
+    found = count_endings(read(rows).rows)
     assert [(kind.outcome, kind.count, kind.first, kind.reason) for kind in found] == [
         ("held", 3, 1, "held for 1.03 s (limit 1 s)"),
         ("error", 1, 5, "ValueError: x"),
@@ -189,7 +189,7 @@ def test_the_worst_are_the_largest_errors_finished_or_not(read):
     for row, error in zip(rows, (0.1, 0.5, 0.3, None, 0.5, 0.2), strict=True):
         row["true_error_mm"] = error
     rows[4] = unfinished(rows[4])
-    assert worst(read(rows).rows, 4) == [1, 4, 2, 5]
+    assert find_worst(read(rows).rows, 4) == [1, 4, 2, 5]
 
 
 @settings(max_examples=25)
@@ -205,7 +205,7 @@ def test_no_insertion_is_dropped_for_any_outcomes(tmp_path_factory, data):
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
     found = read_study_folder(write_study(tmp_path_factory.mktemp("study"), rows))
-    groups = groups_of(found.rows, designed(found).factors)
+    groups = group_rows(found.rows, designed(found).factors)
     assert sum(group.count for group in groups) == 8
     assert sum(group.finished for group in groups) == outcomes.count("done")
-    assert sum(kind.count for kind in endings(found.rows)) == 8 - outcomes.count("done")
+    assert sum(kind.count for kind in count_endings(found.rows)) == 8 - outcomes.count("done")

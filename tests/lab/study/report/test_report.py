@@ -1,19 +1,17 @@
 """Reports of a study folder: a self-contained page, its figures and its text."""
 
 import base64
-import json
 import math
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.study.report.page import image as data_url
+from flexneedle.lab.study.report.page import embed_figure as data_url
 from flexneedle.lab.study.report.report import write_report
 from flexneedle.scenario.files import load_scenario
 from report_page import Page, save_nothing
@@ -40,8 +38,8 @@ ABOUT = {
 def drawn_on(tmp_path):
     """Return a function from rows to a report and its page."""
 
-    def write(rows, about=None, tuning=None, **options):
-        report = write_report(write_study(tmp_path / "study", rows, about, **options), tuning=tuning)
+    def write(rows, about=None, **options):
+        report = write_report(write_study(tmp_path / "study", rows, about, **options))
         return report, Page(report.page)
 
     return write
@@ -106,17 +104,10 @@ def test_each_cell_of_a_table_has_its_heading_as_label(report_on):
     rows = make_rows((*BOTH, "ce-mpc"), cases, targets=TARGETS, repeats=4)
     rows[0] = unfinished(rows[0])
     tables = report_on(rows)[1].tables
-    assert len(tables) == 10
+    assert len(tables) == 7
     for table in tables.values():
         assert len(table.labels) > 0
         assert all(labels == table.headings for labels in table.labels)
-
-
-def test_a_label_is_the_heading_whatever_its_text(report_on, rows):
-    """The table of differences by depth has the names of the controllers as headings."""
-    tables = report_on([row | {"controller": EVIL} for row in rows[12:]] + rows[:12])[1].tables
-    (found,) = (table for caption, table in tables.items() if caption.startswith("By target depth"))
-    assert found.labels == [["target", EVIL]] * 3
 
 
 def rules(page):
@@ -169,18 +160,18 @@ def test_a_large_figure_is_embedded_as_png(plain, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({}, ["targeting", "errors-by-depth", "energy"]),
-        ({"controllers": BOTH}, ["targeting", "errors", "errors-by-depth", "controllers", "energy"]),
+        ({}, ["targeting", "errors-by-depth"]),
+        ({"controllers": BOTH}, ["targeting", "errors-by-depth", "controllers"]),
         (
             {"axes": {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}},
-            ["targeting", "errors-by-depth", "error-along-1", "error-along-2", "energy"],
+            ["targeting", "errors-by-depth", "error-along-1", "error-along-2"],
         ),
         (
             {"cases": {"base": {}, "a": {"phantom.run_out_mm": 1.0}, "b": {"phantom.initial_bend_mm": 1.0}}},
-            ["targeting", "errors-by-depth", "cases", "energy"],
+            ["targeting", "errors-by-depth", "cases"],
         ),
-        ({"targets": TARGETS[:1]}, ["targeting", "errors-by-depth", "energy"]),
-        ({"targets": TARGETS[:1], "controllers": BOTH}, ["targeting", "errors", "controllers", "energy"]),
+        ({"targets": TARGETS[:1]}, ["targeting", "errors-by-depth"]),
+        ({"targets": TARGETS[:1], "controllers": BOTH}, ["targeting", "errors-by-depth", "controllers"]),
     ],
 )
 def test_figures_are_those_that_the_rows_support(sketched_on, options, expected):
@@ -199,7 +190,7 @@ def test_cases_of_one_controller_have_separate_panels(sketched_on):
     for row in rows:
         row["true_error_mm"] = 0.7 if row["case"] == "bent" else 0.2
     drawn = {one.name: one for one in sketched_on(rows)[0].figures}
-    for name in ("targeting", "errors-by-depth", "energy"):
+    for name in ("targeting", "errors-by-depth"):
         base, bent = drawn[name].alt.split("bent: ")
         assert "base: " in base
         assert "0.2" in base
@@ -211,7 +202,7 @@ def test_the_caption_names_the_pooled_factors(sketched_on):
     axes = {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}
     rows = make_rows(axes=axes, targets=TARGETS, repeats=3)
     drawn = {one.name: one for one in sketched_on(rows, axes=axes)[0].figures}
-    for name in ("errors-by-depth", "energy"):
+    for name in ("errors-by-depth",):
         assert "contact.spacing_mm" not in drawn[name].caption
         assert "pooled over needle gauge" in drawn[name].caption
 
@@ -262,23 +253,6 @@ def test_the_headline_compares_the_default_with_the_others(report_on):
     )
 
 
-def test_differences_are_given_at_each_depth(report_on):
-    rows = make_rows(BOTH, targets=TARGETS, repeats=10)
-    for row in rows:
-        deep = row["target_depth_mm"] == 45.0
-        row["true_error_mm"] = (0.3 if row["controller"] == OURS else 0.1 if deep else 0.6) + 1e-4 * row[
-            "seed"
-        ]
-    report, page = report_on(rows)
-    found = report.values()["controllers_by_depth"]
-    assert {depth: one["mean_mm"]["value"] for depth, (one,) in found.items()} == pytest.approx(
-        {"25": -0.3, "40": -0.3, "45": 0.2}
-    )
-    assert [one["verdict"] for (one,) in found.values()] == ["better", "better", "worse"]
-    assert "45 mm deep" in page.text
-    assert "+0.200" in page.text
-
-
 def test_effort_is_reported_relative_to_the_plan(report_on):
     rows = make_rows(targets=TARGETS, repeats=4)
     for row in rows:
@@ -295,12 +269,6 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
     assert report.values()["groups"][0]["unconverged_periods"] == 7
 
 
-def test_small_energies_are_not_rounded_to_zero(sketched_on):
-    rows = [row | {"strain_energy_mj": 0.0042} for row in make_rows(targets=TARGETS, repeats=2)]
-    report, _ = sketched_on(rows)
-    assert "medians 0.0042 mJ" in {drawn.name: drawn for drawn in report.figures}["energy"].alt
-
-
 def test_command_versions_and_definitions_are_there(report_on, rows):
     _, page = report_on(rows, ABOUT)
     for text in (
@@ -313,42 +281,9 @@ def test_command_versions_and_definitions_are_there(report_on, rows):
         assert text in page.text
 
 
-def test_tuning_is_shown_beside_the_settings_of_the_study(report_on, rows, tmp_path):
-    for method, gain, score in (("open-loop", 0.3, 0.2), (OURS, 0.5, 0.1), ("no-one", 0.1, 0.3)):
-        record = {"method": method, "chosen": {"control.load_gain": gain}, "budget_insertions": 200}
-        record |= {"phantom_seeds": [5000, 5049], "trials": [{"score_mm": score}]}
-        record |= {"note": "seeds 1 to 9 before" if method == OURS else ""}
-        (tmp_path / f"{method}.json").write_text(json.dumps(record))
-    text = report_on(rows, tuning=tmp_path)[1].text
-    gain = BASE["control.load_gain"]
-    assert gain == 0.3
-    assert "open-loop 200 5000 to 5049 – 0.200 control.load_gain = 0.3 used" in text
-    ours = f"{OURS} 200 5000 to 5049 seeds 1 to 9 before 0.100 control.load_gain = 0.5"
-    assert f"{ours} different: control.load_gain" in text
-    assert "no-one" not in text
-
-
-def test_the_shipped_tuning_is_shown_in_any_folder(report_on, rows, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = report_on([row | {"controller": "ce-mpc"} for row in rows])[1].text
-    shown = text.split("Settings chosen by tuning")[1]
-    assert "ce-mpc 200 5000 to 5069 – " in shown
-    assert " used " in shown
-    assert "resolved-rate" not in shown
-
-
 def test_columns_of_any_kind_are_shown_as_settings(report_on, rows):
     page = report_on([row | {"mine.own": {"a": 1}, "mine.raw": b"x"} for row in rows])[1]
     assert "mine.own {'a': 1}" in page.text
-
-
-@pytest.mark.parametrize("content", ["{", "{}", '{"method": "a"}'])
-def test_damaged_tuning_records_are_rejected(report_on, rows, tmp_path, content):
-    with pytest.raises(InputError, match="contains no tuning records"):
-        report_on(rows, tuning=tmp_path)
-    (tmp_path / "a.json").write_text(content)
-    with pytest.raises(InputError, match=r"a\.json: "):
-        report_on(rows, tuning=tmp_path)
 
 
 def test_unfinished_insertions_are_counted_and_listed(report_on, rows):
@@ -440,27 +375,6 @@ def in_space(rows, off=1.0):
     ]
 
 
-def test_a_study_in_space_shows_its_tips_in_the_view_along_the_axis(sketched_on, rows):
-    report, _ = sketched_on(in_space(rows))
-    assert [drawn.name for drawn in report.figures][:2] == ["targeting", "targeting-across"]
-    assert "view along the axis" in report.figures[1].caption
-
-
-def test_the_view_along_the_axis_has_the_distances_from_the_targets(drawn_on, rows, monkeypatch):
-    shown = []
-    monkeypatch.setattr("flexneedle.lab.study.report.figures.save", save_nothing)
-    monkeypatch.setattr(
-        "flexneedle.lab.study.report.figures.targeting_figure", lambda panels: shown.append(panels)
-    )
-    rows = in_space(rows)
-    drawn_on(rows)
-    _, across = shown
-    tips = np.concatenate([panel.content.tips for panel in across])
-    expected = [(row["tip_y_mm"] - row["target_lateral_mm"], row["true_error_mm"]) for row in rows]
-    np.testing.assert_allclose(sorted(tips.tolist()), sorted(expected), atol=1e-12)
-    assert all((panel.content.targets == 0.0).all() for panel in across)
-
-
 def test_targets_in_space_have_three_numbers_in_page_and_command(report_on, rows):
     report, page = report_on(in_space(rows))
     depth, lateral = (
@@ -515,17 +429,16 @@ def test_a_controller_that_predicts_shapes_alone_warns_of_nothing(report_on):
     assert np.isnan(found.in_vain)
 
 
-def test_studies_of_before_have_no_coverage_and_no_view_along_the_axis(sketched_on, rows):
-    """Their tables have neither a second axis nor deviations."""
+def test_tables_without_predictions_have_no_coverage(report_on, rows):
+    """Nor have they a second axis."""
     young = ("setup.axes", "setup.guide_axes", "setup.rotation", "entry.")
     rows = [
         {name: value for name, value in row.items() if "_z_" not in name and not name.startswith(young)}
         for row in rows
     ]
     assert not any(name.endswith("_sds") for name in rows[0])
-    report, _ = sketched_on(rows)
+    report, _ = report_on(rows)
     assert report.findings.predictions == []
-    assert "targeting-across" not in {drawn.name for drawn in report.figures}
 
 
 def test_other_scenarios_are_written_for_the_commands(report_on):
@@ -568,7 +481,7 @@ def test_text_from_data_is_escaped(drawn_on, rows):
 
 def test_two_reports_of_the_same_rows_differ_at_most_in_the_run(tmp_path, plain, rows):
     about = ABOUT | {"command": "flexneedle study mine --out elsewhere"}
-    again = write_report(write_study(tmp_path / "study", rows, about, timing=False), tmp_path / "elsewhere")
+    again = write_report(write_study(tmp_path / "study", rows, about), tmp_path / "elsewhere")
     pages = [report.page for report in (plain[0], again)]
     assert pages[0].read_text() != pages[1].read_text()
     run = re.compile(r'<section id="run">.*?</section>', re.DOTALL)
@@ -583,24 +496,6 @@ def test_two_reports_of_the_same_rows_differ_at_most_in_the_run(tmp_path, plain,
 def test_rows_in_another_order_are_the_same_study(report_on, rows):
     first = report_on(rows)[0].values()["groups"]
     assert report_on(rows[::-1])[0].values()["groups"] == first
-
-
-def test_time_is_divided_and_a_plan_counts_once(report_on, rows, tmp_path):
-    folder = write_study(tmp_path / "timed", rows)
-    times = [
-        {"index": k, "plan": f"{k % 2}", "plan_s": 3.0, "control_s": 0.5, "plant_s": 0.25, "total_s": 1.0}
-        for k in range(len(rows))
-    ]
-    pq.write_table(pa.Table.from_pylist(times), folder / "timing.parquet")
-    text = Page(write_report(folder).page).text
-    for line in (
-        "plan 6.0 20 % 3000",
-        "control 12.0 40 % 500",
-        "plant 6.0 20 % 250",
-        "other 6.0 20 % 250",
-    ):
-        assert line in text
-    assert "No times recorded." in report_on(rows, timing=False)[1].text
 
 
 def test_a_report_is_written_to_the_given_folder(tmp_path, rows, report_on):

@@ -11,7 +11,7 @@ from flexneedle.lab.page.protocol import StudyRow, StudyRowsMessage
 from flexneedle.lab.page.worker.recordings import read_run, report_recording, save_complete
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.lab.study.folder import read_folder
-from flexneedle.lab.study.grid import GridPoint
+from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.recompute import WITHOUT, recompute
 from flexneedle.types import Insertion
 
@@ -85,7 +85,7 @@ def _worst(found: Mapping[int, Mapping[str, Any]]) -> list[int]:
     return sorted(found, key=lambda index: (-error(index), index))
 
 
-def _row_of(index: int, point: GridPoint, row: Mapping[str, Any]) -> StudyRow:
+def _row_of(index: int, point: StudyPoint, row: Mapping[str, Any]) -> StudyRow:
     varied = (
         f"{key} {value}" if "." in key else str(value)
         for key, value in point.varied.items()

@@ -27,7 +27,7 @@ class DifferenceRow:
     high: float
 
 
-def difference_figure(shown: Sequence[Panel[Sequence[DifferenceRow]]], label: str) -> Figure:
+def draw_differences(shown: Sequence[Panel[Sequence[DifferenceRow]]], label: str) -> Figure:
     """Return the figure: one panel each, with rows in the same order, on a common scale with `label`."""
     most = max(len(panel.content) for panel in shown)
     with styled():
@@ -72,9 +72,9 @@ def _write(ax: Axes, level: int, text: str) -> None:
 def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
     known = [v for row in rows for v in (row.mean, row.low, row.high) if not isnan(v)] or [0.0]
     low, high = min(0.0, *known), max(0.0, *known)
-    even = _even(rows)
+    even = _find_linear_range(rows)
     if max(high, -low) > _WIDE * even:
-        _over_decades(ax, low, high, even, ticks)
+        _scale_decades(ax, low, high, even, ticks)
     else:
         pad = 0.06 * (high - low) or 0.05
         ax.set_xlim(low - pad, high + pad)
@@ -82,7 +82,7 @@ def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
     ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
 
 
-def _even(rows: Sequence[DifferenceRow]) -> float:
+def _find_linear_range(rows: Sequence[DifferenceRow]) -> float:
     """Return the range of the linear scale around zero: largest interval that contains zero, or else nearest end."""
     known = [(abs(row.low), abs(row.high), row.low <= 0.0 <= row.high) for row in rows if not isnan(row.low)]
     holding = [max(low, high) for low, high, holds in known if holds]
@@ -90,7 +90,7 @@ def _even(rows: Sequence[DifferenceRow]) -> float:
     return max(holding) if holding else min(nearest, default=inf)
 
 
-def _over_decades(ax: Axes, low: float, high: float, even: float, most: int) -> None:
+def _scale_decades(ax: Axes, low: float, high: float, even: float, most: int) -> None:
     """Make the scale linear within ±`even` around zero, and logarithmic beyond."""
     ax.set_xscale("symlog", linthresh=even)
     ax.set_xlim(min(1.3 * low, -1.3 * even), max(1.3 * high, 1.3 * even))

@@ -20,13 +20,13 @@ from flexneedle.figures.layout import (
     ticks_of,
 )
 from flexneedle.figures.style import INK, QUIET, styled
-from flexneedle.lab.study.figures.samples import LEAST, Sample
+from flexneedle.lab.study.figures.samples import LEAST, ErrorSample
 
 _GOLDEN = 0.6180339887
 _HIGH = 0.28  # half height of the scatter of a row
 
 
-def error_figure(shown: Sequence[Panel[Sequence[Sample]]], label: str) -> Figure:
+def draw_errors(shown: Sequence[Panel[Sequence[ErrorSample]]], label: str) -> Figure:
     """Return the figure: one panel each, one row per sample; label: factor of the rows."""
     single, most = len(shown) == 1, max(len(panel.content) for panel in shown)
     with styled():
@@ -41,7 +41,7 @@ def error_figure(shown: Sequence[Panel[Sequence[Sample]]], label: str) -> Figure
     return figure
 
 
-def _draw_rows(ax: Axes, rows: Sequence[Sample]) -> None:
+def _draw_rows(ax: Axes, rows: Sequence[ErrorSample]) -> None:
     """Draw rows from the top down."""
     ax.set_ylim(len(rows) - 0.45, -0.6)
     ax.set_yticks(range(len(rows)), [short(row.name, 24) for row in rows])
@@ -52,7 +52,7 @@ def _draw_rows(ax: Axes, rows: Sequence[Sample]) -> None:
             _draw_row(ax, level, row)
 
 
-def _draw_row(ax: Axes, level: int, row: Sample) -> None:
+def _draw_row(ax: Axes, level: int, row: ErrorSample) -> None:
     errors = row.drawn
     spread = level + _HIGH * (2.0 * ((np.arange(len(errors)) * _GOLDEN) % 1.0) - 1.0)
     dots = scattered(len(errors), 0.5)
@@ -67,7 +67,7 @@ def _draw_row(ax: Axes, level: int, row: Sample) -> None:
     ax.plot([most, most], [level - _HIGH, level + _HIGH], linewidth=1.6, label="95 %", **thick)
 
 
-def _count(ax: Axes, rows: Sequence[Sample]) -> None:
+def _count(ax: Axes, rows: Sequence[ErrorSample]) -> None:
     """Write the number of insertions to the right of each row."""
     for level, row in enumerate(rows):
         text = f"n = {row.count}" + (f"\n{row.missing} not finished" if row.missing else "")

@@ -10,7 +10,7 @@ LEAST = 1e-3  # mm; smaller errors are drawn at this value
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class ErrorSample:
     """True errors (k,) (mm) of the finished insertions; count: all insertions."""
 
     name: str

@@ -9,10 +9,10 @@ from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import FAINT, LIMIT, Panel, decades, legend, limit_line, panels, ticks_of
 from flexneedle.figures.style import styled
-from flexneedle.lab.study.figures.samples import Sample
+from flexneedle.lab.study.figures.samples import ErrorSample
 
 
-def share_figure(shown: Sequence[Panel[Sequence[Sample]]]) -> Figure:
+def draw_shares(shown: Sequence[Panel[Sequence[ErrorSample]]]) -> Figure:
     """Return the figure: one panel each; a line ends below 100 % by the share of unfinished insertions."""
     samples = [sample for panel in shown for sample in panel.content]
     colors = {sample.name: sample.look.color for sample in samples}
@@ -26,7 +26,7 @@ def share_figure(shown: Sequence[Panel[Sequence[Sample]]]) -> Figure:
     return figure
 
 
-def _draw(ax: Axes, samples: Sequence[Sample]) -> None:
+def _draw(ax: Axes, samples: Sequence[ErrorSample]) -> None:
     ax.set_ylim(0.0, 102.0)
     ax.grid(axis="y", color=FAINT, linewidth=0.4)
     limit_line(ax, vertical=True)

@@ -12,16 +12,16 @@ from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import FAINT, OVERLAID, Floats, Panel, decades, legend, panels, short
 from flexneedle.figures.style import BAD, INK, styled
-from flexneedle.lab.study.figures.samples import Sample
+from flexneedle.lab.study.figures.samples import ErrorSample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
 _GAP = 6.0  # pixels between names of levels
 _WIDE = 20.0  # ratio of the largest to the smallest median or mean above which the scale is logarithmic
-Sweep = Panel[Sequence[Sample]]
+Sweep = Panel[Sequence[ErrorSample]]
 """A controller with the samples at the m levels."""
 
 
-def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
+def draw_sweep(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
     """Return the figure along an axis with levels at `places` (m,); few controllers share one panel."""
     overlaid = len(sweeps) <= OVERLAID
     shown = [Panel("", "", INK, ())] if overlaid else list(sweeps)
@@ -30,14 +30,16 @@ def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
         for k, ax in enumerate(axes):
             for other in () if overlaid else sweeps:
                 line: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1}
-                ax.plot(places, _each(other, np.median), label="medians of other controllers", **line)
+                ax.plot(
+                    places, _apply_to_levels(other, np.median), label="medians of other controllers", **line
+                )
             for sweep in sweeps if overlaid else sweeps[k : k + 1]:
                 _draw(ax, sweep, places)
             _scale(ax, sweeps)
             _name_levels(ax, places, [row.name for row in sweeps[0].content])
         if overlaid:
             _count_unfinished(axes[0], sweeps, places)
-        legend(figure, _handles(), [_named(sweep) for sweep in sweeps] if overlaid else ())
+        legend(figure, _handles(), [_name_sweep(sweep) for sweep in sweeps] if overlaid else ())
         figure.draw_without_rendering()
         for ax in axes:
             _thin_names(ax)
@@ -46,23 +48,23 @@ def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
 
 def _draw(ax: Axes, sweep: Sweep, places: Floats) -> None:
     color, marker = sweep.color, sweep.content[0].look.marker
-    low, high = _each(sweep, _FIRST), _each(sweep, _THIRD)
+    low, high = _apply_to_levels(sweep, _FIRST), _apply_to_levels(sweep, _THIRD)
     ax.fill_between(
         places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2, label="interquartile range"
     )
-    middle, average = _each(sweep, np.median), _each(sweep, np.mean)
+    middle, average = _apply_to_levels(sweep, np.median), _apply_to_levels(sweep, np.mean)
     ax.plot(places, middle, color=color, marker=marker, markersize=5, zorder=4, label="median")
     ax.plot(places, average, color=color, linestyle=(0, (4, 2)), linewidth=1.2, zorder=3, label="mean")
 
 
-def _each(sweep: Sweep, statistic: Callable[[Floats], object]) -> Floats:
+def _apply_to_levels(sweep: Sweep, statistic: Callable[[Floats], object]) -> Floats:
     samples = (row.errors for row in sweep.content)
     return np.array([statistic(errors) if len(errors) else np.nan for errors in samples], dtype=float)
 
 
 def _scale(ax: Axes, sweeps: Sequence[Sweep]) -> None:
-    shown = [_each(sweep, statistic) for sweep in sweeps for statistic in (np.median, np.mean)]
-    band = [_each(sweep, statistic) for sweep in sweeps for statistic in (_FIRST, _THIRD)]
+    shown = [_apply_to_levels(sweep, statistic) for sweep in sweeps for statistic in (np.median, np.mean)]
+    band = [_apply_to_levels(sweep, statistic) for sweep in sweeps for statistic in (_FIRST, _THIRD)]
     values = np.concatenate(shown)
     values = values[values > 0.0]
     if len(values) and values.max() > _WIDE * values.min():
@@ -100,7 +102,7 @@ def _count_unfinished(ax: Axes, sweeps: Sequence[Sweep], places: Floats) -> None
             ax.annotate(str(count), (place, 1), (0, 3), ax.get_xaxis_transform(), ha="center", **look)
 
 
-def _named(sweep: Sweep) -> Line2D:
+def _name_sweep(sweep: Sweep) -> Line2D:
     look = sweep.content[0].look
     return Line2D([], [], color=look.color, marker=look.marker, markersize=5, label=short(sweep.title, 30))
 

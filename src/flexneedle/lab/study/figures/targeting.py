@@ -19,7 +19,6 @@ from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
 
 MAP = ("depth (mm)", "lateral (mm)")
 BEYOND = ("depth beyond the target (mm)", "lateral (mm)")
-ACROSS = ("y beyond the target (mm)", "z beyond the target (mm)")
 _MOST_TARGETS = 40  # above this, all targets are drawn at the origin
 _MARGIN, _FAR = 2.0, 6.0  # smallest and largest margin (mm) around the targets
 _CIRCLE, _TIP, _CROSS = (
@@ -30,10 +29,10 @@ _CIRCLE, _TIP, _CROSS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Tips:
+class TipPositions:
     """Targets and true tips (n, 2) of n insertions, mm, NaN where unknown; done (n,): whether they finished.
 
-    labels: of both axes, MAP or ACROSS.
+    labels: of both axes.
     """
 
     targets: Floats
@@ -42,20 +41,19 @@ class Tips:
     labels: tuple[str, str] = MAP
 
     @property
-    def on_one(self) -> "Tips":
+    def on_one(self) -> "TipPositions":
         """The tips relative to their targets, all targets at the origin."""
-        labels = BEYOND if self.labels == MAP else self.labels
         tips = self.tips - self.targets
-        return replace(self, targets=np.zeros_like(self.targets), tips=tips, labels=labels)
+        return replace(self, targets=np.zeros_like(self.targets), tips=tips, labels=BEYOND)
 
 
-def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
+def draw_targeting(shown: Sequence[Panel[TipPositions]]) -> Figure:
     """Return the figure: one panel each, on the same scale; a single panel has a magnified view beside it."""
     targets = np.unique(np.concatenate([panel.content.targets for panel in shown]), axis=0)
     if len(targets) > _MOST_TARGETS:
         shown = [replace(panel, content=panel.content.on_one) for panel in shown]
         targets = np.zeros((1, 2))
-    low, high = _window(targets, [panel.content.tips for panel in shown])
+    low, high = _find_window(targets, [panel.content.tips for panel in shown])
     ratio = float(high[1] - low[1]) / float(high[0] - low[0])
     with styled():
         if len(shown) == 1:
@@ -69,16 +67,16 @@ def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
     return figure
 
 
-def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
+def _find_window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
     """Return the corners (2,) of the view: all targets, and the tips within the largest margin."""
-    ends = _known(np.concatenate([targets, *tips]))
+    ends = _drop_unknown(np.concatenate([targets, *tips]))
     low, high = targets.min(axis=0), targets.max(axis=0)
     below = np.clip(low - ends.min(axis=0) + 0.5, _MARGIN, _FAR)
     above = np.clip(ends.max(axis=0) - high + 0.5, _MARGIN, _FAR)
     return low - below, high + above
 
 
-def _with_close_up(panel: Panel[Tips], ratio: float) -> tuple[Figure, list[Axes]]:
+def _with_close_up(panel: Panel[TipPositions], ratio: float) -> tuple[Figure, list[Axes]]:
     """Return a figure with an empty map and, beside it, the tips relative to their targets."""
     height = ratio * (WIDTH - 1.2) / (1.0 + ratio) + 0.8
     figure, (ax, close) = sheet(height, columns=2, widths=(1.0, ratio))
@@ -89,8 +87,8 @@ def _with_close_up(panel: Panel[Tips], ratio: float) -> tuple[Figure, list[Axes]
     return figure, [ax]
 
 
-def _draw_close_up(ax: Axes, tips: Tips, color: str) -> None:
-    known = _known(tips.tips[tips.done])
+def _draw_close_up(ax: Axes, tips: TipPositions, color: str) -> None:
+    known = _drop_unknown(tips.tips[tips.done])
     farthest = float(np.hypot(*known.T).max()) if len(known) else 1.0
     half = min(max(1.15 * farthest, 0.02), _FAR)
     sizes = [float(f"{digit}e{k}") for k in range(-3, 2) for digit in (1, 2, 5)]
@@ -105,7 +103,7 @@ def _draw_close_up(ax: Axes, tips: Tips, color: str) -> None:
     ax.set_xlabel(tips.labels[0])
 
 
-def _draw_map(ax: Axes, panel: Panel[Tips], low: Floats, high: Floats) -> None:
+def _draw_map(ax: Axes, panel: Panel[TipPositions], low: Floats, high: Floats) -> None:
     targets = np.unique(panel.content.targets, axis=0)
     circles = PatchCollection([Circle((x, y), 1.0) for x, y in targets.tolist()], zorder=2, label=_CIRCLE)
     circles.set(facecolor="none", edgecolor=TARGET, linewidth=1.0)
@@ -116,7 +114,7 @@ def _draw_map(ax: Axes, panel: Panel[Tips], low: Floats, high: Floats) -> None:
         axis.set_major_locator(MultipleLocator(5.0 if last - first > 10.0 else 1.0))
 
 
-def _draw_tips(ax: Axes, tips: Tips, color: str, low: Floats, high: Floats) -> None:
+def _draw_tips(ax: Axes, tips: TipPositions, color: str, low: Floats, high: Floats) -> None:
     """Draw the tips inside a window to scale, and write the number of those outside."""
     style = scattered(len(tips.tips))
     ax.scatter(*tips.tips[tips.done].T, color=color, zorder=3, label=_TIP, **style)
@@ -127,7 +125,7 @@ def _draw_tips(ax: Axes, tips: Tips, color: str, low: Floats, high: Floats) -> N
     ax.set_aspect("equal")
     for side in ("top", "right"):
         ax.spines[side].set(visible=True, color=QUIET)
-    known = _known(tips.tips)
+    known = _drop_unknown(tips.tips)
     outside = int(((known < low) | (known > high)).any(axis=1).sum())
     if outside:
         text = f"{outside} tip{'s' if outside > 1 else ''} outside"
@@ -136,7 +134,7 @@ def _draw_tips(ax: Axes, tips: Tips, color: str, low: Floats, high: Floats) -> N
         ax.text(0.99, 0.98, text, color=BAD, fontsize=8, path_effects=[halo], **placed)
 
 
-def _known(points: Floats) -> Floats:
+def _drop_unknown(points: Floats) -> Floats:
     return points[~np.isnan(points).any(axis=1)]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.lab.study.findings.reading import StudyDefinition
-from flexneedle.lab.study.findings.rows import Codes, Floats, Rows
+from flexneedle.lab.study.findings.rows import Codes, Floats, InsertionRows
 from flexneedle.scenario.sections.needle import GAUGES
 
 _SAMPLED = frozenset({"controller", "seed", "plan_seed", "world"})
@@ -46,7 +46,7 @@ class Factor:
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
+class StudyDesign:
     """The factors of a study. `cases` varies only if the cases are not points of an axis."""
 
     controller: Factor
@@ -65,32 +65,34 @@ class Design:
         return tuple(factor for factor in self.factors if factor not in compared)
 
 
-def design_of(rows: Rows, definition: StudyDefinition) -> Design:
+def find_design(rows: InsertionRows, definition: StudyDefinition) -> StudyDesign:
     """Return the factors of a study with the levels in its rows.
 
     The first levels are the default controller and the base case, which is the first case without settings.
     """
     base = [name for name, settings in definition.cases.items() if not settings][:1]
-    cases = _factor("case", rows.text("case"), first=base)
+    cases = _make_factor("case", rows.text("case"), first=base)
     keys = [key for key in definition.axes if key not in _SAMPLED and not key.startswith("target")]
-    axes = [_factor(key, _column(rows, key)) for key in keys]
-    case_axis = _case_axis(cases, definition.cases)
+    axes = [_make_factor(key, _read_column(rows, key)) for key in keys]
+    case_axis = _find_case_axis(cases, definition.cases)
     if case_axis is not None:
-        axes, cases = [case_axis, *axes], _factor("case", [""] * len(rows))
-    return Design(
-        _factor("controller", rows.text("controller"), first=controllers_in_order()),
+        axes, cases = [case_axis, *axes], _make_factor("case", [""] * len(rows))
+    return StudyDesign(
+        _make_factor("controller", rows.text("controller"), first=list_controllers()),
         cases,
         tuple(axis for axis in axes if axis.varies),
-        _factor("guide", [""] * len(rows) if "world_rig" in keys else _guides(rows), first=["with a guide"]),
+        _make_factor(
+            "guide", [""] * len(rows) if "world_rig" in keys else _read_guides(rows), first=["with a guide"]
+        ),
     )
 
 
-def controllers_in_order() -> list[str]:
+def list_controllers() -> list[str]:
     """Return the controllers, the default first."""
     return sorted(CONTROLLERS, key=lambda name: name != DEFAULT)
 
 
-def column_label(key: str) -> str:
+def label_column(key: str) -> str:
     """Return a key as words, unit in brackets."""
     *sections, last = key.split(".")
     unit = next((end for end in sorted(_UNITS, key=len, reverse=True) if last.endswith("_" + end)), "")
@@ -99,7 +101,7 @@ def column_label(key: str) -> str:
     return _LABELS.get(key) or (f"{label} ({_UNITS[unit]})" if unit else label)
 
 
-def _column(rows: Rows, key: str) -> list[Any]:
+def _read_column(rows: InsertionRows, key: str) -> list[Any]:
     """Return the values (n,) of an axis: its column; for a table its name, or else all its values."""
     below = [name for name in rows.names if name.startswith(f"{key}.")]
     if f"{key}.name" in below:
@@ -107,7 +109,7 @@ def _column(rows: Rows, key: str) -> list[Any]:
     return list(zip(*map(rows.values, below), strict=True)) if below else rows.values(key)
 
 
-def _guides(rows: Rows) -> list[str]:
+def _read_guides(rows: InsertionRows) -> list[str]:
     """Return "with a guide" or "no guide" for each world (n,); "" in other studies."""
     guides = np.isnan(rows.number("setup.guide_to_skin_mm"))
     of_worlds = not np.isnan(rows.number("world")).all()
@@ -116,14 +118,14 @@ def _guides(rows: Rows) -> list[str]:
     )
 
 
-def _factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Factor:
+def _make_factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Factor:
     """Return the factor of values (n,): numbers ascending, gauges by size, otherwise `first`, then as they appear."""
-    levels, label = list(dict.fromkeys(values)), column_label(key)
+    levels, label = list(dict.fromkeys(values)), label_column(key)
     numeric = all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels)
     first = [*first, *GAUGES]
     ordered = sorted(levels) if numeric else sorted(levels, key=lambda k: _rank(k, first))
     number = {level: k for k, level in enumerate(ordered)}
-    names = tuple(map(_name, ordered))
+    names = tuple(map(_name_level, ordered))
     words, _, unit = label.rstrip(")").partition(" (")
     titles = tuple(f"{words} = {name} {unit}".rstrip() for name in names) if numeric else names
     positions = np.array(ordered if numeric else range(len(ordered)), dtype=float)
@@ -136,15 +138,15 @@ def _rank(level: Any, first: Sequence[Any]) -> int:
     return first.index(level) if level in first else len(first)
 
 
-def _name(level: Any) -> str:
+def _name_level(level: Any) -> str:
     if isinstance(level, tuple):
-        return " to ".join(map(_name, level))
+        return " to ".join(map(_name_level, level))
     if isinstance(level, float):
         return f"{level:.6g}"
     return "none" if level is None else str(level)
 
 
-def _case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Factor | None:
+def _find_case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Factor | None:
     """Return the cases as an axis if their names differ only in a number, else None."""
     found = [match for match in map(_NUMBERED.fullmatch, cases.names) if match]
     around = {(match[1], match[3]) for match in found}
@@ -154,8 +156,8 @@ def _case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Fact
     own = [settings.get(name, {}) for name in cases.names]
     key = next((key for key in own[0] if [case.get(key) for case in own] == numbers), "case")
     words, unit = (part.strip(" =_-:×") for part in around.pop())
-    label = column_label(key) if key != "case" else f"{words} ({unit})" if unit else words or key
-    axis = _factor(key, [numbers[code] for code in cases.codes])
+    label = label_column(key) if key != "case" else f"{words} ({unit})" if unit else words or key
+    axis = _make_factor(key, [numbers[code] for code in cases.codes])
     order = np.argsort(numbers, kind="stable").tolist()
     titles = tuple(cases.names[k] for k in order)
     return replace(axis, label=label, titles=titles, covaried=tuple(name for name in own[0] if name != key))

@@ -5,23 +5,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexneedle.lab.study.findings.design import Design, design_of
-from flexneedle.lab.study.findings.predictions import Predictions, predictions_of
-from flexneedle.lab.study.findings.reading import StudyRecord
-from flexneedle.lab.study.findings.statistics import CONFIDENCE, RESAMPLES, SEED
-from flexneedle.lab.study.findings.summary import (
+from flexneedle.lab.study.findings.design import StudyDesign, find_design
+from flexneedle.lab.study.findings.groups import (
     DONE,
     Difference,
     Ending,
-    Group,
-    case_differences,
-    controller_differences,
-    differences_by_depth,
-    endings,
-    groups_of,
-    worst,
+    SettingGroup,
+    compare_cases,
+    compare_controllers,
+    count_endings,
+    find_worst,
+    group_rows,
 )
-from flexneedle.lab.study.findings.worlds import WorldGroup, has_worlds, world_groups
+from flexneedle.lab.study.findings.predictions import Predictions, assess_predictions
+from flexneedle.lab.study.findings.reading import StudyTables
+from flexneedle.lab.study.findings.statistics import CONFIDENCE, RESAMPLES, SEED
+from flexneedle.lab.study.findings.worlds import WorldGroup, group_worlds, has_worlds
 
 _MOST_KINDS = 20  # of endings in the list
 
@@ -31,17 +30,16 @@ class Findings:
     """Findings of a study.
 
     outcomes: insertions by outcome, "done" first; whole: one group per controller over all its insertions; groups:
-    one per combination of settings; worst: rows with the largest errors, in worlds those of the first controller;
+    one per combination of settings; worst: rows with the largest errors, in worlds only of the first controller;
     worlds: empty in other studies; predictions: of controllers that predict the miss.
     """
 
-    study: StudyRecord
-    design: Design
+    study: StudyTables
+    design: StudyDesign
     outcomes: Mapping[str, int]
-    whole: Sequence[Group]
-    groups: Sequence[Group]
+    whole: Sequence[SettingGroup]
+    groups: Sequence[SettingGroup]
     against: Sequence[Difference]
-    against_by_depth: Mapping[str, Sequence[Difference]]
     cases: Sequence[Difference]
     endings: Sequence[Ending]
     worst: Sequence[int]
@@ -87,9 +85,6 @@ class Findings:
             "whole": list(map(asdict, self.whole)),
             "groups": list(map(asdict, self.groups)),
             "controllers": list(map(asdict, self.against)),
-            "controllers_by_depth": {
-                depth: list(map(asdict, found)) for depth, found in self.against_by_depth.items()
-            },
             "cases": list(map(asdict, self.cases)),
             "worlds": list(map(asdict, self.worlds)),
             "predictions": list(map(asdict, self.predictions)),
@@ -97,23 +92,22 @@ class Findings:
         }
 
 
-def findings_of(study: StudyRecord) -> Findings:
+def compute_findings(study: StudyTables) -> Findings:
     """Return the findings of a study."""
     rows = study.rows
-    design = design_of(rows, study.definition)
-    groups = groups_of(rows, design.factors)
+    design = find_design(rows, study.definition)
+    groups = group_rows(rows, design.factors)
     controllers_only = len(design.factors) == 1
     return Findings(
         study,
         design,
         {DONE: 0} | Counter(rows.text("outcome")),
-        groups if controllers_only else groups_of(rows, [design.controller]),
+        groups if controllers_only else group_rows(rows, [design.controller]),
         groups,
-        controller_differences(rows, design),
-        differences_by_depth(rows, design) if design.controller.varies else {},
-        case_differences(rows, design),
-        endings(rows)[:_MOST_KINDS],
-        worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
-        world_groups(rows, design),
-        predictions_of(rows, design),
+        compare_controllers(rows, design),
+        compare_cases(rows, design),
+        count_endings(rows)[:_MOST_KINDS],
+        find_worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
+        group_worlds(rows, design),
+        assess_predictions(rows, design),
     )

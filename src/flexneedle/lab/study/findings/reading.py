@@ -2,10 +2,8 @@
 
 import json
 from dataclasses import dataclass
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,14 +11,12 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from flexneedle.errors import InputError
-from flexneedle.lab.study.findings.rows import Rows
-from flexneedle.lab.study.tables import RUNS_FILE, TIMING_FILE
+from flexneedle.lab.study.findings.rows import InsertionRows
+from flexneedle.lab.study.tables import RUNS_FILE
 from flexneedle.record.folder import STUDY_FILE
 from flexneedle.scenario.problems import describe
 
-_SHIPPED = files("flexneedle.lab.study") / "tuning"
 _STRICT = ConfigDict(strict=True, frozen=True)
-Record = TypeVar("Record", bound=BaseModel)
 
 
 class StudyDefinition(BaseModel):
@@ -43,13 +39,12 @@ class StudyJson(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class StudyRecord:
-    """A study folder: `study.json`, the rows ordered by index, and wall-clock times if available."""
+class StudyTables:
+    """A study folder: `study.json`, and the rows ordered by index."""
 
     folder: Path
     header: StudyJson
-    rows: Rows
-    timing: Rows | None
+    rows: InsertionRows
 
     @property
     def definition(self) -> StudyDefinition:
@@ -70,29 +65,7 @@ class RequiredColumns(BaseModel):
     outcome: str
 
 
-class Trial(BaseModel):
-    """Settings tried in tuning, with their score."""
-
-    model_config = _STRICT
-    score_mm: float
-
-
-class Tuning(BaseModel):
-    """Tuning record of a controller: chosen settings and all trials, the best first.
-
-    budget_insertions: over all trials; phantom_seeds: first and last; note: remark on the tuning.
-    """
-
-    model_config = _STRICT
-    method: str
-    chosen: dict[str, Any]
-    budget_insertions: int
-    phantom_seeds: list[int] = Field(min_length=2, max_length=2)
-    note: str = ""
-    trials: list[Trial] = Field(min_length=1)
-
-
-def read_study_folder(folder: Path) -> StudyRecord:
+def read_study_folder(folder: Path) -> StudyTables:
     """Return the contents of a study folder. Raises InputError, in one line, if they are incomplete or damaged."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: give the folder of a `flexneedle study`")
@@ -101,37 +74,22 @@ def read_study_folder(folder: Path) -> StudyRecord:
     if not (folder / RUNS_FILE).exists():
         hint = "the study was killed or is still running; --resume completes it and writes its tables"
         raise InputError(f"{folder}: {hint}: there is no {RUNS_FILE}")
-    rows, timing = _checked(folder / RUNS_FILE), folder / TIMING_FILE
-    header = _read(StudyJson, folder / STUDY_FILE, "damaged")
-    return StudyRecord(folder, header, rows, _read_table(timing) if timing.exists() else None)
+    return StudyTables(folder, _read_header(folder / STUDY_FILE), _read_rows(folder / RUNS_FILE))
 
 
-def read_tuning(folder: Path | None = None) -> list[Tuning]:
-    """Return the tuning records of a folder, one JSON file each (default: those of the package).
-
-    Raises InputError if there is none, or if a file is not a record.
-    """
-    source: Traversable = _SHIPPED if folder is None else folder
-    found = [item for item in source.iterdir() if item.name.endswith(".json")] if source.is_dir() else []
-    if not found:
-        raise InputError(f"{source}: contains no tuning records: there is no .json file")
-    return [_read(Tuning, item, "not a tuning record") for item in sorted(found, key=lambda item: item.name)]
-
-
-def _read(model: type[Record], path: Traversable, problem: str) -> Record:
-    """Return the contents of a JSON file as a model. Raises InputError, with the problem, if they do not fit."""
+def _read_header(path: Path) -> StudyJson:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
             raise ValueError("must contain one JSON object")
-        return model.model_validate(values)
+        return StudyJson.model_validate(values)
     except ValidationError as error:
-        raise InputError(f"{path}: {problem}: {describe(error, model)[0]}") from None
+        raise InputError(f"{path}: damaged: {describe(error, StudyJson)[0]}") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {problem}: {error}") from None
+        raise InputError(f"{path}: damaged: {error}") from None
 
 
-def _checked(path: Path) -> Rows:
+def _read_rows(path: Path) -> InsertionRows:
     rows = _read_table(path)
     missing = [name for name in RequiredColumns.model_fields if name not in rows.names]
     if missing:
@@ -147,12 +105,12 @@ def _checked(path: Path) -> Rows:
     index, times = np.unique(rows.number("index"), return_counts=True)
     if times.max() > 1:
         raise InputError(f"{path}: damaged: index {index[times.argmax()]:.0f} occurs more than once")
-    return Rows(rows.table.sort_by("index"))
+    return InsertionRows(rows.table.sort_by("index"))
 
 
-def _read_table(path: Path) -> Rows:
+def _read_table(path: Path) -> InsertionRows:
     try:
-        return Rows(pq.read_table(path))
+        return InsertionRows(pq.read_table(path))
     except (pa.ArrowException, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: damaged, or not a Parquet file: {first}") from None

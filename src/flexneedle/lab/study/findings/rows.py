@@ -17,7 +17,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class InsertionRows:
     """n insertions. The values of a missing column are unknown."""
 
     table: pa.Table
@@ -41,11 +41,11 @@ class Rows:
         """Return a column as numbers, text, or tuples of them; None where unknown."""
         if name not in self.names:
             return [None] * len(self)
-        return [_plain(value) for value in self.table.column(name).to_pylist()]
+        return [_to_plain(value) for value in self.table.column(name).to_pylist()]
 
     def value(self, name: str, row: int) -> Any:
         """Return one value of a column, as in `values`."""
-        return _plain(self.table.column(name)[row].as_py()) if name in self.names else None
+        return _to_plain(self.table.column(name)[row].as_py()) if name in self.names else None
 
     def target(self, row: int) -> tuple[float, ...]:
         """Return the target of a row in mm, without z in the plane."""
@@ -62,9 +62,9 @@ class Rows:
         return np.array([known.setdefault(value, len(known)) for value in self.values(name)], dtype=np.int64)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(map(_plain, value))
+        return tuple(map(_to_plain, value))
     if value is None or value != value:
         return None
     return value if isinstance(value, int | float | str) else str(value)

@@ -34,7 +34,7 @@ class IntervalEstimate:
 
 def mean(values: Floats) -> Statistic:
     """Return the mean of values (n,), ignoring NaN."""
-    known, filled = _known(values)
+    known, filled = _split_known(values)
 
     def statistic(counts: Counts) -> Floats:
         return _divide((counts * filled).sum(axis=1), (counts * known).sum(axis=1))
@@ -44,7 +44,7 @@ def mean(values: Floats) -> Statistic:
 
 def sd(values: Floats) -> Statistic:
     """Return the standard deviation of values (n,) with n − 1 in the denominator, ignoring NaN."""
-    known, filled = _known(values)
+    known, filled = _split_known(values)
 
     def statistic(counts: Counts) -> Floats:
         n = (counts * known).sum(axis=1)
@@ -78,7 +78,7 @@ def ratio(over: Floats, under: Floats) -> Statistic:
     return lambda counts: _divide(one(counts), other(counts))
 
 
-def estimates(
+def estimate_all(
     statistics: Mapping[str, Statistic],
     clusters: NDArray[np.int64],
     resamples: int = RESAMPLES,
@@ -94,15 +94,16 @@ def estimates(
     if len(np.unique(clusters)) < LEAST_CLUSTERS:
         return {name: IntervalEstimate(value) for name, value in values.items()}
     drawn: dict[str, list[Floats]] = {name: [] for name in statistics}
-    for counts in _samples(clusters, resamples, np.random.default_rng(seed)):
+    for counts in _draw_samples(clusters, resamples, np.random.default_rng(seed)):
         for name, statistic in statistics.items():
             drawn[name].append(statistic(counts))
     return {
-        name: IntervalEstimate(values[name], *_ends(np.concatenate(found))) for name, found in drawn.items()
+        name: IntervalEstimate(values[name], *_find_ends(np.concatenate(found)))
+        for name, found in drawn.items()
     }
 
 
-def beyond_largest(count: int, confidence: float = CONFIDENCE) -> float:
+def bound_share_beyond(count: int, confidence: float = CONFIDENCE) -> float:
     """Return an upper bound on the share of all insertions beyond the largest of `count` independent ones.
 
     It holds with this confidence: 1 − (1 − confidence)^(1/count) (Wilks 1941). NaN for a count of 0.
@@ -110,7 +111,7 @@ def beyond_largest(count: int, confidence: float = CONFIDENCE) -> float:
     return 1.0 - (1.0 - confidence) ** (1.0 / count) if count else nan
 
 
-def _samples(clusters: Counts, resamples: int, rng: np.random.Generator) -> Iterator[Counts]:
+def _draw_samples(clusters: Counts, resamples: int, rng: np.random.Generator) -> Iterator[Counts]:
     """Yield the multiplicity of each row in each sample, (b, n), for `resamples` samples in total."""
     number = int(clusters.max()) + 1
     most = max(1, _CHUNK // max(number, len(clusters)))
@@ -120,7 +121,7 @@ def _samples(clusters: Counts, resamples: int, rng: np.random.Generator) -> Iter
         yield np.bincount(chosen.ravel(), minlength=size * number).reshape(size, number)[:, clusters]
 
 
-def _ends(values: Floats) -> tuple[float, float]:
+def _find_ends(values: Floats) -> tuple[float, float]:
     values = values[~np.isnan(values)]
     if len(values) == 0:
         return nan, nan
@@ -129,7 +130,7 @@ def _ends(values: Floats) -> tuple[float, float]:
     return low, high
 
 
-def _known(values: Floats) -> tuple[Counts, Floats]:
+def _split_known(values: Floats) -> tuple[Counts, Floats]:
     known = ~np.isnan(values)
     return known.astype(np.int64), np.where(known, values, 0.0)
 

@@ -1,19 +1,28 @@
 """Groups of a study of random worlds: errors relative to open loop and to the reach (docs/worlds.md)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import nan
+from typing import Any
 
 import numpy as np
 
-from flexneedle.lab.study.findings.design import Design
-from flexneedle.lab.study.findings.rows import Codes, Flags, Floats, Rows
-from flexneedle.lab.study.findings.summary import HIT_MM, finished, members_of, pair_keys, quotient
-from flexneedle.lab.study.summary import is_failure
+from flexneedle.lab.study.findings.design import StudyDesign
+from flexneedle.lab.study.findings.groups import (
+    HIT_MM,
+    divide_positive,
+    find_finished,
+    number_pairs,
+    split_rows,
+)
+from flexneedle.lab.study.findings.rows import Codes, Flags, Floats, InsertionRows
 
 _OPEN_LOOP = "open-loop"
 LEAST_MM, TWICE = 0.1, 2.0  # limit of a small error: max(LEAST_MM, TWICE * error of open loop)
 WORSE_MM = 0.2  # than open loop
 BEYOND_REACH_MM = 0.5
+MISS_LIMIT = "control.miss_limit_mm"
+_WITHIN_REACH_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,22 +52,24 @@ class WorldGroup:
     energy_ratio: float
 
 
-def has_worlds(rows: Rows) -> bool:
-    """Whether the study is a study of worlds."""
+def has_worlds(rows: InsertionRows) -> bool:
+    """Return whether the study is a study of worlds."""
     return not np.isnan(rows.number("world")).all()
 
 
-def world_groups(rows: Rows, design: Design) -> list[WorldGroup]:
+def group_worlds(rows: InsertionRows, design: StudyDesign) -> list[WorldGroup]:
     """Return the groups of a study of worlds in the order of its factors; none for another study."""
     if not has_worlds(rows):
         return []
-    error = np.where(finished(rows), rows.number("true_error_mm"), nan)
-    columns = np.stack([error, _open_loop(rows, design, error), rows.number("reach_mm"), _energy_ratio(rows)])
-    failed = failures(rows)
-    return [_group(levels, columns[:, own], failed[own]) for levels, own in members_of(design.factors)]
+    error = np.where(find_finished(rows), rows.number("true_error_mm"), nan)
+    columns = np.stack(
+        [error, _find_open_loop(rows, design, error), rows.number("reach_mm"), _divide_energies(rows)]
+    )
+    failed = find_failures(rows)
+    return [_make_group(levels, columns[:, own], failed[own]) for levels, own in split_rows(design.factors)]
 
 
-def _group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup:
+def _make_group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup:
     """Return the group of columns (4, n): error, error of open loop, reach, energy ratio."""
     error, open_loop, reach, energy = columns[:, ~np.isnan(columns[0])]
     share = (0.5, 0.95, 0.99, 1.0)
@@ -69,44 +80,55 @@ def _group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup
         len(error),
         int(failed.sum()),
         median,
-        mean_of(error),
+        average(error),
         p95,
         p99,
         largest,
-        mean_of(error > HIT_MM),
-        _within(error, np.maximum(LEAST_MM, TWICE * open_loop)),
-        _within(error, open_loop + WORSE_MM),
-        _within(error, reach + BEYOND_REACH_MM),
-        float(np.exp(mean_of(np.log(energy[energy > 0.0])))),
+        average(error > HIT_MM),
+        _share_within(error, np.maximum(LEAST_MM, TWICE * open_loop)),
+        _share_within(error, open_loop + WORSE_MM),
+        _share_within(error, reach + BEYOND_REACH_MM),
+        float(np.exp(average(np.log(energy[energy > 0.0])))),
     )
 
 
-def mean_of(values: Floats | Flags) -> float:
+def average(values: Floats | Flags) -> float:
     """Return the mean, NaN if there are no values."""
     return float(np.mean(values)) if len(values) else nan
 
 
-def _within(error: Floats, limit: Floats) -> float:
-    """Share of errors within their limit, among those with a known limit."""
+def _share_within(error: Floats, limit: Floats) -> float:
+    """Return the share of errors within their limit, among those with a known limit."""
     known = ~np.isnan(limit)
-    return mean_of(error[known] <= limit[known])
+    return average(error[known] <= limit[known])
 
 
-def _open_loop(rows: Rows, design: Design, error: Floats) -> Floats:
-    """Error (n,) of the open loop in the same world, case and phantom."""
-    keys: Codes = pair_keys(rows, design.besides(design.controller))
+def _find_open_loop(rows: InsertionRows, design: StudyDesign, error: Floats) -> Floats:
+    """Return the error (n,) of the open loop in the same world, case and phantom."""
+    keys: Codes = number_pairs(rows, design.besides(design.controller))
     is_open = np.array([name == _OPEN_LOOP for name in rows.text("controller")], dtype=bool)
     of_key = np.full(int(keys.max(initial=0)) + 1, nan)
     of_key[keys[is_open]] = error[is_open]
     return np.asarray(of_key[keys])
 
 
-def failures(rows: Rows) -> Flags:
+def is_failure(row: Mapping[str, Any]) -> bool:
+    """Return whether an insertion did not finish although its reach is unknown or at most 1 mm.
+
+    For a held insertion the limit is at least `control.miss_limit_mm`, the miss at which a controller may hold.
+    """
+    reach, limit = row["reach_mm"], _WITHIN_REACH_MM
+    if row["outcome"] == "held":
+        limit = max(limit, row.get(MISS_LIMIT) or 0.0)
+    return row["outcome"] != "done" and (reach is None or reach <= limit)
+
+
+def find_failures(rows: InsertionRows) -> Flags:
     """Return which rows (n,) are failures, see `is_failure`."""
-    names = ("outcome", "reach_mm", "control.miss_limit_mm")
+    names = ("outcome", "reach_mm", MISS_LIMIT)
     found = zip(*map(rows.values, names), strict=True)
     return np.array([is_failure(dict(zip(names, row, strict=True))) for row in found], dtype=bool)
 
 
-def _energy_ratio(rows: Rows) -> Floats:
-    return quotient(rows.number("strain_energy_mj"), rows.number("planned_strain_energy_mj"))
+def _divide_energies(rows: InsertionRows) -> Floats:
+    return divide_positive(rows.number("strain_energy_mj"), rows.number("planned_strain_energy_mj"))

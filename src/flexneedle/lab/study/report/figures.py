@@ -12,25 +12,24 @@ from matplotlib.figure import Figure
 
 from flexneedle.figures.layout import MOST_PANELS, Floats, Look, Panel, look
 from flexneedle.figures.style import INK, save
-from flexneedle.lab.study.figures.comparison import DifferenceRow, difference_figure
-from flexneedle.lab.study.figures.distributions import error_figure
-from flexneedle.lab.study.figures.energy import energy_figure
-from flexneedle.lab.study.figures.samples import Sample
-from flexneedle.lab.study.figures.shares import share_figure
-from flexneedle.lab.study.figures.sweeps import sweep_figure
-from flexneedle.lab.study.figures.targeting import ACROSS, Tips, targeting_figure
-from flexneedle.lab.study.findings.design import Factor, controllers_in_order
+from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
+from flexneedle.lab.study.figures.distributions import draw_errors
+from flexneedle.lab.study.figures.samples import ErrorSample
+from flexneedle.lab.study.figures.shares import draw_shares
+from flexneedle.lab.study.figures.sweeps import draw_sweep
+from flexneedle.lab.study.figures.targeting import TipPositions, draw_targeting
+from flexneedle.lab.study.findings.design import Factor, list_controllers
 from flexneedle.lab.study.findings.findings import Findings
-from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Flags, Rows
-from flexneedle.lab.study.findings.summary import Difference, depths, finished
-from flexneedle.lab.study.findings.worlds import failures
+from flexneedle.lab.study.findings.groups import Difference, find_finished, group_depths
+from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Flags
+from flexneedle.lab.study.findings.worlds import find_failures
 
 _MOST_LEVELS = 40  # of an axis in a figure
 _LOGARITHMIC = "Errors are on a logarithmic scale."
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ReportFigure:
     """A figure on disk with title and caption; alt: caption with the notes of the panels."""
 
     name: str
@@ -62,11 +61,10 @@ class _Facts:
     error: Floats
     done: Flags
     known: Flags
-    energy: Floats
 
     @property
     def controllers(self) -> list[tuple[str, Flags, Look]]:
-        """Name, rows (n,) and look of each controller."""
+        """Name, rows (n,), color and marker of each controller."""
         factor = self.found.design.controller
         own = [factor.codes == k for k in range(len(factor.names))]
         return list(zip(factor.names, own, self.looks, strict=True))
@@ -81,11 +79,11 @@ class _Facts:
     def pooled(self, *shown: Factor) -> str:
         """Return as text the factors, besides controller and those shown, whose levels are pooled."""
         labels = [factor.label for factor in self.found.design.besides(self.found.design.controller, *shown)]
-        return f", pooled over {_listed(labels)}" if labels else ""
+        return f", pooled over {_list(labels)}" if labels else ""
 
-    def sample(self, name: str, own: Flags, look: Look) -> Sample:
+    def sample(self, name: str, own: Flags, look: Look) -> ErrorSample:
         """Return the errors of some of the rows (n,)."""
-        return Sample(name, look, self.error[own & self.known], int(own.sum()))
+        return ErrorSample(name, look, self.error[own & self.known], int(own.sum()))
 
     def panels(self, content: Callable[[Flags, Look], Any]) -> list[Panel[Any]]:
         """Return a panel of `content` for each level of `panel_factor`."""
@@ -110,83 +108,68 @@ class _Facts:
         return f"{missing} not finished" if missing else ""
 
 
-def draw_figures(found: Findings, folder: Path) -> list[Drawn]:
+def draw_figures(found: Findings, folder: Path) -> list[ReportFigure]:
     """Draw all applicable figures to a folder, PNG and SVG each, and return them in reading order."""
     drawn = []
-    for entry in _table(_facts(found)):
+    for entry in _list_entries(_collect_facts(found)):
         if entry.applies:
             shown = entry.panels()
             png, svg = save(entry.draw(shown), folder, entry.name)
             notes = "; ".join(f"{panel.title}: {panel.note}" for panel in shown if panel.note)
             alt = f"{entry.title}. {entry.caption} {notes}".strip()
-            drawn.append(Drawn(entry.name, entry.title, entry.caption, alt, png, svg))
+            drawn.append(ReportFigure(entry.name, entry.title, entry.caption, alt, png, svg))
     return drawn
 
 
-def _facts(found: Findings) -> _Facts:
+def _collect_facts(found: Findings) -> _Facts:
     rows, names = found.study.rows, found.design.controller.names
-    order = [*controllers_in_order(), *sorted(set(names) - set(controllers_in_order()))]
-    error, done = rows.number("true_error_mm"), finished(rows)
+    order = [*list_controllers(), *sorted(set(names) - set(list_controllers()))]
+    error, done = rows.number("true_error_mm"), find_finished(rows)
     looks = [look(order.index(name)) for name in names]
-    return _Facts(found, looks, error, done, done & ~np.isnan(error), rows.number("strain_energy_mj"))
+    return _Facts(found, looks, error, done, done & ~np.isnan(error))
 
 
-def _table(f: _Facts) -> list[_Entry]:
+def _list_entries(f: _Facts) -> list[_Entry]:
     """Return all figures in reading order."""
     found, any_known, ours = f.found, bool(f.known.any()), f.found.design.controller.names[0]
     rows = found.study.rows
-    dots, depth = f"Every finished insertion is a dot{f.pooled(f.panel_factor)}.", depths(rows)
+    depth = group_depths(rows)
     return [
         _Entry(
             "shares", "True error in worlds", bool(found.worlds) and any_known,
             "Cumulative share of insertions by true error. A line that ends below 100 % lacks the failures. "
             f"{_LOGARITHMIC}",
-            partial(_shares, f), share_figure,
+            partial(_shares, f), draw_shares,
         ),
         _Entry(
             "targeting", "Final tip positions", not found.worlds and not np.isnan(rows.number("tip_x_mm")).all(),
             "True tips of all insertions, and targets with circles of 1 mm radius, to scale.",
-            partial(_tips, f), targeting_figure,
-        ),
-        _Entry(
-            "targeting-across", "Final tip positions along the axis", _in_space(rows),
-            "True tips of all insertions in the view along the axis, y and z relative to the target, with a circle of "
-            "1 mm radius, to scale.",
-            partial(_tips_across, f), targeting_figure,
-        ),
-        _Entry(
-            "errors", "True error by controller", any_known and found.design.controller.varies,
-            f"Every finished insertion is a dot{f.pooled()}. {_LOGARITHMIC}",
-            partial(_by_controller, f), partial(error_figure, label=""),
+            partial(_tips, f), draw_targeting,
         ),
         _Entry(
             "errors-by-depth", "True error by target depth",
-            any_known and (depth.varies or not found.design.controller.varies), f"{dots} {_LOGARITHMIC}",
-            partial(_by_depth, f, depth), partial(error_figure, label=depth.label),
+            any_known, f"Every finished insertion is a dot{f.pooled(f.panel_factor)}. {_LOGARITHMIC}",
+            partial(_by_depth, f, depth), partial(draw_errors, label=depth.label),
         ),
-        *(_along(f, axis, number) for number, axis in enumerate(found.design.axes, 1)),
+        *(_make_axis_entry(f, axis, number) for number, axis in enumerate(found.design.axes, 1)),
         _Entry(
-            "controllers", f"{ours} against the other controllers", _some(found.against),
+            "controllers", f"{ours} against the other controllers", _has_means(found.against),
             f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets. "
             "If the differences vary widely in size, the scale is linear around zero and logarithmic beyond.",
-            partial(_against, f), partial(difference_figure, label="difference of the true error (mm)"),
+            partial(_against, f), partial(draw_differences, label="difference of the true error (mm)"),
         ),
         _Entry(
-            "cases", f"Cases against the base case, {found.design.cases.names[0]}", _some(found.cases),
+            "cases", f"Cases against the base case, {found.design.cases.names[0]}", _has_means(found.cases),
             "Mean paired difference of the true error: the case minus the base case, on the same phantoms and targets; "
             "largest first.",
-            partial(_cases, f), partial(difference_figure, label="increase of the true error (mm)"),
-        ),
-        _Entry(
-            "energy", "Tissue energy against true error", bool((f.known & (f.energy > 0)).any()),
-            f"{dots} Both scales are logarithmic.", partial(_energy, f), energy_figure,
+            partial(_cases, f), partial(draw_differences, label="increase of the true error (mm)"),
         ),
     ]  # fmt: skip
 
 
-def _along(f: _Facts, axis: Factor, number: int) -> _Entry:
+def _make_axis_entry(f: _Facts, axis: Factor, number: int) -> _Entry:
     """Return the figure of the true error along an axis."""
-    covaried = f" Also varied along the axis: {_listed(axis.covaried)}." if axis.covaried else ""
+    covaried = f" Also varied along the axis: {_list(axis.covaried)}." if axis.covaried else ""
 
     def panels() -> list[Panel[Any]]:
         levels = [(name, axis.codes == k) for k, name in enumerate(axis.names)]
@@ -207,13 +190,13 @@ def _along(f: _Facts, axis: Factor, number: int) -> _Entry:
         bool(f.known.any()) and len(axis.names) <= _MOST_LEVELS,
         f"Median, interquartile range (25 to 75 %) and mean of the finished insertions{f.pooled(axis)}.{covaried}",
         panels,
-        partial(sweep_figure, label=axis.label, places=axis.positions),
+        partial(draw_sweep, label=axis.label, places=axis.positions),
     )
 
 
 def _shares(f: _Facts) -> list[Panel[Any]]:
     rows, cases = f.found.study.rows, f.found.design.cases
-    counted, world = f.done | failures(rows), rows.number("world")
+    counted, world = f.done | find_failures(rows), rows.number("world")
     panels = []
     for level, title in enumerate(cases.names[:MOST_PANELS]):
         own = (cases.codes == level) & counted
@@ -226,30 +209,12 @@ def _shares(f: _Facts) -> list[Panel[Any]]:
 
 
 def _tips(f: _Facts) -> list[Panel[Any]]:
-    targets, tips = _places(f.found.study.rows, slice(2))
-    return f.panels(lambda own, _: Tips(targets[own], tips[own], f.done[own]))
-
-
-def _tips_across(f: _Facts) -> list[Panel[Any]]:
-    targets, tips = _places(f.found.study.rows, slice(1, 3))
-    off = tips - targets
-    return f.panels(lambda own, _: Tips(np.zeros_like(off[own]), off[own], f.done[own], ACROSS))
-
-
-def _places(rows: Rows, columns: slice) -> tuple[Floats, Floats]:
-    """Columns x, y, z of the targets and true tips (n, k), mm."""
-    names = TARGET_COLUMNS[columns], ("tip_x_mm", "tip_y_mm", "tip_z_mm")[columns]
-    targets, tips = (np.stack(list(map(rows.number, of)), axis=1) for of in names)
-    return targets, tips
-
-
-def _in_space(rows: Rows) -> bool:
-    """Whether there are tips of needles with two lateral axes."""
-    return bool(((rows.number("setup.axes") == 2) & ~np.isnan(rows.number("tip_z_mm"))).any())
-
-
-def _by_controller(f: _Facts) -> list[Panel[Any]]:
-    return [Panel("", "", INK, [f.sample(*controller) for controller in f.controllers])]
+    rows = f.found.study.rows
+    targets, tips = (
+        np.stack([rows.number(name) for name in names], axis=1)
+        for names in (TARGET_COLUMNS[:2], ("tip_x_mm", "tip_y_mm"))
+    )
+    return f.panels(lambda own, _: TipPositions(targets[own], tips[own], f.done[own]))
 
 
 def _by_depth(f: _Facts, depth: Factor) -> list[Panel[Any]]:
@@ -262,7 +227,7 @@ def _by_depth(f: _Facts, depth: Factor) -> list[Panel[Any]]:
 
 def _against(f: _Facts) -> list[Panel[Any]]:
     names = f.found.design.controller.names
-    rows = [_row(d.against, f.looks[names.index(d.against)], d) for d in f.found.against]
+    rows = [_make_row(d.against, f.looks[names.index(d.against)], d) for d in f.found.against]
     return [
         Panel(
             f"{names[0]} minus each other controller", "left of zero: smaller errors", f.looks[0].color, rows
@@ -277,34 +242,18 @@ def _cases(f: _Facts) -> list[Panel[Any]]:
     panels = []
     for name, own, mark in f.controllers[:MOST_PANELS]:
         of_case = {d.name: d for d in differences if d.controller == name}
-        rows = [_row(case, mark, of_case[case]) for case in order]
+        rows = [_make_row(case, mark, of_case[case]) for case in order]
         panels.append(Panel(name, f"base case: {f.note(own & (cases.codes == 0))}", mark.color, rows))
     return panels
 
 
-def _energy(f: _Facts) -> list[Panel[Any]]:
-    chosen = f.known & (f.energy > 0)
-    points = np.stack([f.energy, f.error], axis=1)
-    return [
-        Panel(panel.title, _medians(panel.content), panel.color, panel.content)
-        for panel in f.panels(lambda own, _: points[own & chosen])
-    ]
-
-
-def _medians(points: Floats) -> str:
-    if len(points) == 0:
-        return ""
-    energy, error = np.median(points, axis=0).tolist()
-    return f"medians {energy:.2g} mJ, {error:.3f} mm"
-
-
-def _row(name: str, look: Look, found: Difference) -> DifferenceRow:
+def _make_row(name: str, look: Look, found: Difference) -> DifferenceRow:
     return DifferenceRow(name, look, found.mean_mm.value, found.mean_mm.low, found.mean_mm.high)
 
 
-def _some(differences: Sequence[Difference]) -> bool:
+def _has_means(differences: Sequence[Difference]) -> bool:
     return any(not isnan(found.mean_mm.value) for found in differences)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))

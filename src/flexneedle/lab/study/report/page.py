@@ -10,13 +10,11 @@ from itertools import cycle
 from math import isnan
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.lab.study.findings import predictions, statistics, summary, worlds
+from flexneedle.lab.study.findings import groups, predictions, statistics, worlds
 from flexneedle.lab.study.findings.findings import Findings
-from flexneedle.lab.study.findings.reading import Tuning
-from flexneedle.lab.study.findings.rows import Rows
+from flexneedle.lab.study.findings.rows import InsertionRows
 from flexneedle.lab.study.findings.statistics import IntervalEstimate
-from flexneedle.lab.study.findings.times import division
-from flexneedle.lab.study.report.figures import Drawn
+from flexneedle.lab.study.report.figures import ReportFigure
 from flexneedle.record.folder import STUDY_FILE
 
 if TYPE_CHECKING:
@@ -29,31 +27,27 @@ _HEADING = re.compile(r'<th scope="col"[^>]*>(.*?)</th>')
 _CELL = re.compile(r"<t[dh]\b")
 
 
-def page_text(
-    findings: Findings, figures: Sequence[Drawn], commands: Mapping[int, str], tuning: Sequence[Tuning] = ()
-) -> str:
-    """Return the page as HTML. commands: command of each listed row; tuning: tuning records of the controllers."""
+def render_page(findings: Findings, figures: Sequence[ReportFigure], commands: Mapping[int, str]) -> str:
+    """Return the page as HTML. commands: command of each listed row."""
     from markupsafe import Markup
 
     study = findings.study
-    return _template().render(
+    return _compile_template().render(
         style=Markup((_TEMPLATES / "report.css").read_text(encoding="utf-8")),
         found=findings,
         rows=study.rows,
         factors=findings.design.factors,
         figures=figures,
         commands=commands,
-        tuning=[tuned for tuned in tuning if tuned.method in findings.design.controller.names],
-        versions=package_versions(study.rows),
-        settings=settings(study.rows),
-        parts=None if study.timing is None else division(study.timing),
+        versions=list_versions(study.rows),
+        settings=list_settings(study.rows),
         written=datetime.fromtimestamp((study.folder / STUDY_FILE).stat().st_mtime, UTC),
-        limits=vars(worlds) | vars(summary) | vars(predictions) | vars(statistics),
+        limits=vars(worlds) | vars(groups) | vars(predictions) | vars(statistics),
     )
 
 
 @cache
-def _template() -> "Template":
+def _compile_template() -> "Template":
     """Return the compiled template with its filters and functions."""
     from jinja2 import Environment, StrictUndefined
 
@@ -61,63 +55,57 @@ def _template() -> "Template":
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {
-        "number": number_text,
-        "signed": signed_text,
-        "interval": interval_text,
-        "value": value_text,
-        "labelled": labelled,
+        "number": format_number,
+        "signed": format_signed,
+        "interval": format_interval,
+        "value": format_value,
+        "labelled": label_cells,
     }
-    environment.globals |= {"tuning_status": tuning_status, "image": image}
+    environment.globals["image"] = embed_figure
     return environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
 
 
-def number_text(value: float, digits: int = 3, unit: str = "") -> str:
+def format_number(value: float, digits: int = 3, unit: str = "") -> str:
     """Return a number as text, "–" if unknown."""
     return "–" if isnan(value) else f"{value:.{digits}f}{unit}"
 
 
-def signed_text(value: float) -> str:
+def format_signed(value: float) -> str:
     """Return a number with its sign as text."""
     return "–" if isnan(value) else f"{value:+.3f}".replace("-", "−")
 
 
-def interval_text(estimate: IntervalEstimate, digits: int = 3, unit: str = "") -> str:
+def format_interval(estimate: IntervalEstimate, digits: int = 3, unit: str = "") -> str:
     """Return the ends of an interval as text."""
     if isnan(estimate.low):
         return "no interval"
     return f"{estimate.low:.{digits}f} to {estimate.high:.{digits}f}{unit}".replace("-", "−")
 
 
-def value_text(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a value of a row or a setting as text."""
     if isinstance(value, list | tuple):
         return ", ".join(f"{item:.10g}" if isinstance(item, float) else str(item) for item in value)
     return "–" if value is None else f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def package_versions(rows: Rows) -> dict[str, str]:
+def list_versions(rows: InsertionRows) -> dict[str, str]:
     """Return the versions of the packages by name, without the digest of the source."""
     names = [name for name in rows.names if name.startswith("version_") and name != "version_source"]
     return {name.removeprefix("version_"): ", ".join(sorted(set(rows.text(name)))) for name in names}
 
 
-def settings(rows: Rows) -> dict[str, str]:
+def list_settings(rows: InsertionRows) -> dict[str, str]:
     """Return the settings of the scenario as text: the value, or the number of values."""
     levels = {name: list(dict.fromkeys(rows.values(name))) for name in rows.names if "." in name}
     return {
-        name: value_text(found[0]) if len(found) == 1 else f"varies: {len(found)} values"
+        name: format_value(found[0]) if len(found) == 1 else f"varies: {len(found)} values"
         for name, found in levels.items()
         if found != [None]
     }
 
 
-def tuning_status(rows: Rows, tuned: Tuning) -> str:
-    """Return as text whether a study uses the settings chosen by tuning."""
-    other = [key for key, chosen in tuned.chosen.items() if set(rows.values(key)) != {chosen}]
-    return "used" if not other else f"different: {', '.join(other)}"
-
-
-def labelled(table: str) -> "Markup":
+def label_cells(table: str) -> "Markup":
     """Return head and body of a table with the heading of its column as `data-label` of each cell of the body.
 
     On a narrow screen, where a row is a card, the label is beside the value.
@@ -129,7 +117,7 @@ def labelled(table: str) -> "Markup":
     return Markup(head + end + _CELL.sub(lambda cell: f'{cell[0]} data-label="{next(headings)}"', body))
 
 
-def image(drawn: Drawn) -> str:
+def embed_figure(drawn: ReportFigure) -> str:
     """Return a figure as a data URL."""
     large = drawn.svg.stat().st_size > _LARGEST_SVG
     path, kind = (drawn.png, "image/png") if large else (drawn.svg, "image/svg+xml")

@@ -7,21 +7,21 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.lab.study.findings.findings import Findings, findings_of
-from flexneedle.lab.study.findings.reading import read_study_folder, read_tuning
-from flexneedle.lab.study.report.figures import Drawn, draw_figures
-from flexneedle.lab.study.report.page import page_text
-from flexneedle.lab.study.report.reproduce import commands
+from flexneedle.lab.study.findings.findings import Findings, compute_findings
+from flexneedle.lab.study.findings.reading import read_study_folder
+from flexneedle.lab.study.report.figures import ReportFigure, draw_figures
+from flexneedle.lab.study.report.page import render_page
+from flexneedle.lab.study.report.reproduce import write_commands
 
 REPORT_FILE = "report.html"
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class StudyReport:
     """A written report: the page, its figures, the findings, and the commands that reproduce the listed rows."""
 
     page: Path
-    figures: Sequence[Drawn]
+    figures: Sequence[ReportFigure]
     findings: Findings
     commands: Mapping[int, str]
 
@@ -41,24 +41,21 @@ class Report:
         }
 
 
-def write_report(folder: Path, out: Path | None = None, tuning: Path | None = None) -> Report:
+def write_report(folder: Path, out: Path | None = None) -> StudyReport:
     """Write the report on the study in `folder` to `out` (default: `report` inside it), and return it.
 
-    tuning: folder of tuning records (`studies/tune.py`) to show with the settings of the study (default: those of the
-    package). The same rows give identical files, except for the section on the run in the page: command, date and
-    times. Raises InputError if the folder contains no study, is damaged, or has no insertion yet; if `tuning` contains
-    no records; or if `out` cannot be written.
+    The same rows give identical files, except for the section on the run in the page: command and date. Raises
+    InputError if the folder contains no study, is damaged, or has no insertion yet, or if `out` cannot be written.
     """
-    tuned = read_tuning(tuning)
-    findings = findings_of(read_study_folder(folder))
+    findings = compute_findings(read_study_folder(folder))
     target = folder / "report" if out is None else out
     try:
         target.mkdir(parents=True, exist_ok=True)
         listed = [*findings.worst, *(ending.first for ending in findings.endings)]
-        found_commands = commands(findings.study.rows, listed, target)
+        found_commands = write_commands(findings.study.rows, listed, target)
         figures = draw_figures(findings, target)
         page = target / REPORT_FILE
-        replace_file(page, page_text(findings, figures, found_commands, tuned).encode())
+        replace_file(page, render_page(findings, figures, found_commands).encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror}") from None
-    return Report(page, figures, findings, found_commands)
+    return StudyReport(page, figures, findings, found_commands)

@@ -71,7 +71,7 @@ def _levels(found: IndicatorSummary | IndicatorSamples) -> list[str]:
 
 
 def _fit_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
-    """Rows with the paper's values where sensor and environments are those of the paper."""
+    """Yield the rows of the fits, with the paper's values for its sensor and environments."""
     as_in_paper = published.paper_sensor(found.sensor) == REFERENCE
     as_in_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
     fits = published.FITS

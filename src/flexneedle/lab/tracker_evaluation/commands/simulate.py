@@ -35,7 +35,7 @@ def add_parser(commands: Commands) -> None:
         "--field-seed",
         type=seed,
         metavar="N",
-        help="seed of the field errors (default: that of the environment)",
+        help="seed of the field errors (default: as in the environment)",
     )
     counts = (
         ("points", 2, 100, 5, "grid points per edge"),

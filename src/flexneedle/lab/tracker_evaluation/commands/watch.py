@@ -52,7 +52,7 @@ def add_parser(commands: Commands) -> None:
         type=int,
         choices=range(7),
         metavar="N",
-        help="number of reference sensors needed to judge the field (default: those of the tracker, at most 3)",
+        help="number of reference sensors needed to judge the field (default: all of the tracker, at most 3)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame and line")
 
@@ -140,7 +140,7 @@ def _line(snapshot: Snapshot) -> str:
 
 
 def _cells(frame: Frame) -> Iterator[str]:
-    """Position and indicator of the tip (without a tip: of the first sensor), and the indicators of all others."""
+    """Yield position and indicator of the tip (without a tip: of the first sensor), and the other indicators."""
     from flexneedle.phantom.tracking.table import TIP
 
     first = TIP if TIP in frame.readings else next(iter(frame.readings), "")

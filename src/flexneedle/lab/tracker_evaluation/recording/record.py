@@ -23,7 +23,7 @@ from flexneedle.ports import Clock, Tracker
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
 EXTRA = ("time_s", "frame_number", "repeat")
-"""Columns in addition to those of a table of measurements. Times continue over interruptions."""
+"""Further columns than in a table of measurements. Times continue over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
 _FIRST_LINE = ",".join(_HEADER).encode() + b"\n"
 _PAUSE_S = 0.01

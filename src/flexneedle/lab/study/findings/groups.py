@@ -8,12 +8,12 @@ from math import isnan, nan
 
 import numpy as np
 
-from flexneedle.lab.study.findings.design import Design, Factor
-from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Codes, Flags, Floats, Rows
+from flexneedle.lab.study.findings.design import Factor, StudyDesign
+from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Codes, Flags, Floats, InsertionRows
 from flexneedle.lab.study.findings.statistics import (
     IntervalEstimate,
-    beyond_largest,
-    estimates,
+    bound_share_beyond,
+    estimate_all,
     mean,
     quantile,
     ratio,
@@ -27,7 +27,7 @@ _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
-class Group:
+class SettingGroup:
     """Insertions with the same levels of the factors.
 
     name: levels in one line; levels: name of the level by factor; count, finished: insertions; known: finished
@@ -80,21 +80,21 @@ class Ending:
     reason: str
 
 
-def finished(rows: Rows) -> Flags:
+def find_finished(rows: InsertionRows) -> Flags:
     """Return which rows (n,) finished."""
     return np.array([outcome == DONE for outcome in rows.text("outcome")], dtype=bool)
 
 
-def groups_of(rows: Rows, factors: Sequence[Factor]) -> list[Group]:
+def group_rows(rows: InsertionRows, factors: Sequence[Factor]) -> list[SettingGroup]:
     """Return a group for each combination of levels that occurs, in the order of the factors."""
-    done, title = finished(rows), {f.key: dict(zip(f.names, f.titles, strict=True)) for f in factors}
+    done, title = find_finished(rows), {f.key: dict(zip(f.names, f.titles, strict=True)) for f in factors}
     return [
-        _group(rows, members, done, ", ".join(title[key][name] for key, name in levels.items()), levels)
-        for levels, members in members_of(factors)
+        _make_group(rows, members, done, ", ".join(title[key][name] for key, name in levels.items()), levels)
+        for levels, members in split_rows(factors)
     ]
 
 
-def members_of(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Codes]]:
+def split_rows(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Codes]]:
     """Yield each combination of levels, by key of the factor, with its rows, in the order of the factors."""
     combined = np.stack([factor.codes for factor in factors], axis=1)
     levels, codes = np.unique(combined, axis=0, return_inverse=True)
@@ -103,14 +103,16 @@ def members_of(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Code
         yield names, np.flatnonzero(codes.ravel() == number)
 
 
-def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str, str]) -> Group:
+def _make_group(
+    rows: InsertionRows, members: Codes, done: Flags, name: str, levels: dict[str, str]
+) -> SettingGroup:
     ended = members[done[members]]
     error = rows.number("true_error_mm")[ended]
     known = error[~np.isnan(error)]
     seeds = rows.codes("seed")[ended]
     unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
-    ratios = quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
-    return Group(
+    ratios = divide_positive(rows.number("periods")[ended], rows.number("planned_periods")[ended])
+    return SettingGroup(
         name=name,
         levels=levels,
         count=len(members),
@@ -120,14 +122,14 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
         unconverged=int((unconverged > 0).sum()),
         unconverged_periods=int(unconverged.sum()),
         seeds=len(np.unique(seeds)),
-        largest_mm=_largest(known),
-        largest_period_ratio=_largest(ratios[~np.isnan(ratios)]),
-        beyond_largest=beyond_largest(len(known)),
-        estimates=_estimates(rows, ended, seeds),
+        largest_mm=_find_largest(known),
+        largest_period_ratio=_find_largest(ratios[~np.isnan(ratios)]),
+        beyond_largest=bound_share_beyond(len(known)),
+        estimates=_estimate_group(rows, ended, seeds),
     )
 
 
-def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, IntervalEstimate]:
+def _estimate_group(rows: InsertionRows, ended: Codes, seeds: Codes) -> dict[str, IntervalEstimate]:
     def column(name: str) -> Floats:
         return rows.number(name)[ended]
 
@@ -146,36 +148,24 @@ def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, IntervalEsti
         "energy_ratio": ratio(energy, planned_energy),
         "period_ratio": ratio(column("periods"), column("planned_periods")),
     }
-    return estimates(statistics, _dense(seeds))
+    return estimate_all(statistics, _renumber(seeds))
 
 
-def controller_differences(rows: Rows, design: Design, among: Flags | None = None) -> list[Difference]:
-    """Return the first controller minus each other one, in insertions with the same seed, target and settings.
-
-    among (n,): rows to compare (default: all).
-    """
-    chosen = np.ones(len(rows), dtype=bool) if among is None else among
-    keys, controller = pair_keys(rows, design.besides(design.controller)), design.controller
-    ours, *others = (chosen & (controller.codes == k) for k in range(len(controller.names)))
+def compare_controllers(rows: InsertionRows, design: StudyDesign) -> list[Difference]:
+    """Return the first controller minus each other one, in insertions with the same seed, target and settings."""
+    keys, controller = number_pairs(rows, design.besides(design.controller)), design.controller
+    ours, *others = (controller.codes == k for k in range(len(controller.names)))
     return [
-        _difference(rows, keys, (ours, theirs), (controller.names[0], name, ""))
+        _compare_sides(rows, keys, (ours, theirs), (controller.names[0], name, ""))
         for theirs, name in zip(others, controller.names[1:], strict=True)
     ]
 
 
-def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
-    """Return `controller_differences` at each target depth, by the name of the depth."""
-    depth = depths(rows)
-    return {
-        name: controller_differences(rows, design, depth.codes == k) for k, name in enumerate(depth.names)
-    }
-
-
-def case_differences(rows: Rows, design: Design) -> list[Difference]:
+def compare_cases(rows: InsertionRows, design: StudyDesign) -> list[Difference]:
     """Return each case minus the base case, the first, for each controller."""
-    keys, cases = pair_keys(rows, design.besides(design.cases)), design.cases
+    keys, cases = number_pairs(rows, design.besides(design.cases)), design.cases
     return [
-        _difference(rows, keys, ((cases.codes == case) & own, (cases.codes == 0) & own), names)
+        _compare_sides(rows, keys, ((cases.codes == case) & own, (cases.codes == 0) & own), names)
         for number, name in enumerate(design.controller.names)
         for own in (design.controller.codes == number,)
         for case in range(1, len(cases.names))
@@ -183,7 +173,7 @@ def case_differences(rows: Rows, design: Design) -> list[Difference]:
     ]
 
 
-def depths(rows: Rows) -> Factor:
+def group_depths(rows: InsertionRows) -> Factor:
     """Return the target depth as a factor; many depths are grouped into bands."""
     depth = rows.number("target_depth_mm")
     levels, codes = np.unique(depth, return_inverse=True)
@@ -196,7 +186,7 @@ def depths(rows: Rows) -> Factor:
     return Factor("depth", "target depth (mm)", tuple(names), tuple(names), positions, codes)
 
 
-def endings(rows: Rows) -> list[Ending]:
+def count_endings(rows: InsertionRows) -> list[Ending]:
     """Return the endings of insertions that did not finish, or finished with a remark, the most frequent first.
 
     Reasons that differ only in numbers are grouped.
@@ -210,7 +200,7 @@ def endings(rows: Rows) -> list[Ending]:
     return sorted(kinds, key=lambda kind: (kind.outcome == DONE, -kind.count))
 
 
-def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]:
+def find_worst(rows: InsertionRows, number: int = 10, among: Flags | None = None) -> list[int]:
     """Return the rows with the largest true error minus reach, finished or not, the largest first.
 
     An unknown reach counts as 0; among (n,): rows to consider (default: all).
@@ -221,21 +211,21 @@ def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]
     return [int(row) for row in order[:number] if not isnan(excess[row])]
 
 
-def _difference(
-    rows: Rows, keys: Codes, sides: tuple[Flags, Flags], names: tuple[str, str, str]
+def _compare_sides(
+    rows: InsertionRows, keys: Codes, sides: tuple[Flags, Flags], names: tuple[str, str, str]
 ) -> Difference:
-    error, done = rows.number("true_error_mm"), finished(rows)
-    one, other = (_by_key(keys, np.flatnonzero(side)) for side in sides)
+    error, done = rows.number("true_error_mm"), find_finished(rows)
+    one, other = (_index_by_key(keys, np.flatnonzero(side)) for side in sides)
     both = np.array([(one[key], other[key]) for key in one if key in other], dtype=np.int64).reshape(-1, 2)
     known = (done & ~np.isnan(error))[both].all(axis=1)
     pairs = both[known]
     difference = error[pairs[:, 0]] - error[pairs[:, 1]]
-    found = estimates({"mean": mean(difference)}, _dense(rows.codes("seed")[pairs[:, 0]]))["mean"]
+    found = estimate_all({"mean": mean(difference)}, _renumber(rows.codes("seed")[pairs[:, 0]]))["mean"]
     name, against, controller = names
-    return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _verdict(found))
+    return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _judge(found))
 
 
-def _verdict(difference: IntervalEstimate) -> str | None:
+def _judge(difference: IntervalEstimate) -> str | None:
     if isnan(difference.low):
         return None
     if difference.high < 0.0:
@@ -243,14 +233,14 @@ def _verdict(difference: IntervalEstimate) -> str | None:
     return "worse" if difference.low > 0.0 else "not separable"
 
 
-def pair_keys(rows: Rows, factors: Sequence[Factor]) -> Codes:
+def number_pairs(rows: InsertionRows, factors: Sequence[Factor]) -> Codes:
     """Return an integer key (n,) for each row, equal for rows with the same seed, target, repeat and factors."""
     names = ("seed", "plan_seed", *TARGET_COLUMNS, "repeat")
     columns = np.stack([*map(rows.codes, names), *(factor.codes for factor in factors)], axis=1)
     return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
 
 
-def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
+def _index_by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
     """Return rows by key and occurrence of the key, so that no row is paired twice."""
     occurrences: dict[int, count[int]] = {}
     return {
@@ -259,15 +249,15 @@ def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
     }
 
 
-def _dense(codes: Codes) -> Codes:
+def _renumber(codes: Codes) -> Codes:
     return np.unique(codes, return_inverse=True)[1].astype(np.int64)
 
 
-def quotient(over: Floats, under: Floats) -> Floats:
+def divide_positive(over: Floats, under: Floats) -> Floats:
     """Return `over / under` (n,), NaN where `under` is not positive or unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(under > 0, over / under, nan)
 
 
-def _largest(values: Floats) -> float:
+def _find_largest(values: Floats) -> float:
     return float(values.max()) if len(values) else nan

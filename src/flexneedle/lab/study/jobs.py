@@ -8,8 +8,8 @@ from functools import cache
 from typing import Any
 
 from flexneedle.errors import RunError, ScenarioWarning
-from flexneedle.lab.study.grid import GridPoint
-from flexneedle.lab.study.reach import reach
+from flexneedle.lab.study.grid import StudyPoint
+from flexneedle.lab.study.reach import compute_reach
 from flexneedle.loop.events import Listener
 from flexneedle.loop.insert import insert
 from flexneedle.loop.virtual import VirtualRig
@@ -25,13 +25,13 @@ TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class InsertionJob:
     """Insertions of one point: (index, seed) of each; refusal: reason for a missing plan.
 
     with_reach: whether to compute their reach; needed for one of all points with the same truth.
     """
 
-    point: GridPoint
+    point: StudyPoint
     plan: Plan | None
     refusal: str
     insertions: tuple[tuple[int, int], ...]
@@ -48,30 +48,30 @@ class PlanResult:
 
 
 @dataclass(frozen=True)
-class JobResult:
+class JobRows:
     """Rows of a job, each with index, results and times, and the package versions of the worker."""
 
     rows: list[dict[str, Any]]
     versions: dict[str, str]
 
 
-def make_plan(point: GridPoint) -> PlanResult:
+def make_plan(point: StudyPoint) -> PlanResult:
     """Plan for a point, on one thread."""
     _compile_once(point.scenario.setup.axes)
     try:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
     except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
-        return PlanResult(refusal=f"no plan: {_error_text(error)}")
+        return PlanResult(refusal=f"no plan: {_format_error(error)}")
     return PlanResult(plan_values(made), made.seconds)
 
 
-def run_job(job: Job) -> JobResult:
+def run_job(job: InsertionJob) -> JobRows:
     """Run the insertions of a job, on one thread."""
     _compile_once(job.point.scenario.setup.axes)
-    return JobResult([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
+    return JobRows([{"index": index, **_make_row(job, seed)} for index, seed in job.insertions], versions())
 
 
-def _row(job: Job, seed: int) -> dict[str, Any]:
+def _make_row(job: InsertionJob, seed: int) -> dict[str, Any]:
     begun = time.perf_counter()
     results: dict[str, Any] = dict.fromkeys(RESULT_COLUMNS)
     results |= {"warning": "", "outcome": "error", "reason": job.refusal}
@@ -79,32 +79,32 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
     if job.plan is not None:
         results |= plan_row(job.plan)
         try:
-            insertion = insertion_at(job.point, job.plan, seed, threads=1)
+            insertion = insert_at(job.point, job.plan, seed, threads=1)
         except RunError as error:
             results |= {"outcome": "refused", "reason": str(error)}
         except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
-            results["reason"] = _error_text(error)
+            results["reason"] = _format_error(error)
         else:
             results |= insertion_row(insertion)
-            times = _times(insertion)
+            times = _sum_times(insertion)
     times["total_s"] = time.perf_counter() - begun
     if job.with_reach:
-        results["reach_mm"], failed = _reach(job.point, seed)
+        results["reach_mm"], failed = _try_reach(job.point, seed)
         results["reason"] = "; ".join(filter(None, (results["reason"], failed)))
     values: dict[str, Any] = plain(results | times)
     return values
 
 
-def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
-    """The reach (mm), or the reason why it is unknown; the outcome of the insertion is not affected."""
+def _try_reach(point: StudyPoint, seed: int) -> tuple[float | None, str]:
+    """Return the reach (mm), or the reason why it is unknown; the outcome of the insertion is not affected."""
     try:
-        return reach(point.scenario, seed, point.plant, point.strategy), ""
+        return compute_reach(point.scenario, seed, point.plant, point.strategy), ""
     except Exception as error:  # noqa: BLE001  recorded in the row
-        return None, f"no reach: {_error_text(error)}"
+        return None, f"no reach: {_format_error(error)}"
 
 
-def insertion_at(
-    point: GridPoint,
+def insert_at(
+    point: StudyPoint,
     made: Plan,
     seed: int,
     *,
@@ -126,7 +126,7 @@ def insertion_at(
         )
 
 
-def _times(insertion: Insertion) -> dict[str, float]:
+def _sum_times(insertion: Insertion) -> dict[str, float]:
     periods = insertion.periods
     return {
         "control_s": sum(period.durations["decide"] + period.durations["observe"] for period in periods),
@@ -134,7 +134,7 @@ def _times(insertion: Insertion) -> dict[str, float]:
     }
 
 
-def _error_text(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 

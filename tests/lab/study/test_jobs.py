@@ -9,11 +9,11 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError
-from flexneedle.lab.study import rows
+from flexneedle.lab.study import jobs
 from flexneedle.lab.study.grid import load_study
-from flexneedle.lab.study.journal import Journal
-from flexneedle.lab.study.plans import Plans, plan_key
-from flexneedle.lab.study.rows import Job, make_plan, run_job
+from flexneedle.lab.study.jobs import InsertionJob, make_plan, run_job
+from flexneedle.lab.study.journal import StudyJournal
+from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
 from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.types import DG_Y, ROLL, Verdict, VerdictKind
 
@@ -42,7 +42,7 @@ def test_a_row_has_the_results_of_the_insertion(point, plan):
         rig=flexneedle.VirtualRig(point.plant),
         threads=1,
     )
-    row = only_row(Job(point, plan, "", ((3, 11),)))
+    row = only_row(InsertionJob(point, plan, "", ((3, 11),)))
     last = insertion.periods[-1]
     applied = np.array([period.applied for period in insertion.periods])
     assert row["index"] == 3
@@ -66,8 +66,8 @@ def test_unconverged_periods_are_counted(point, plan, monkeypatch):
         spoilt = [replace(period, converged=period.index not in (2, 5)) for period in insertion.periods]
         return replace(insertion, periods=tuple(spoilt), outcome="failed", reason="did not converge")
 
-    monkeypatch.setattr(rows, "insert", insert)
-    row = only_row(Job(point, plan, "", ((0, 11),)))
+    monkeypatch.setattr(jobs, "insert", insert)
+    row = only_row(InsertionJob(point, plan, "", ((0, 11),)))
     assert (row["unconverged_periods"], row["outcome"], row["reason"]) == (2, "failed", "did not converge")
     assert row["true_error_mm"] is not None
 
@@ -75,7 +75,7 @@ def test_unconverged_periods_are_counted(point, plan, monkeypatch):
 def test_a_plan_that_misses_is_refused_in_a_row_without_results(point, plan):
     tips = plan.tips + np.array([0.0, 1.5, 0.0, 0.0, 0.0])
     point = replace(point, controller="open-loop")
-    row = only_row(Job(point, replace(plan, tips=tips, limit="some limit"), "", ((0, 11),)))
+    row = only_row(InsertionJob(point, replace(plan, tips=tips, limit="some limit"), "", ((0, 11),)))
     assert row["outcome"] == "refused"
     assert row["reason"].startswith("plan misses the target by 1.")
     assert row["true_error_mm"] is row["periods"] is row["flips"] is None
@@ -88,8 +88,8 @@ def test_an_error_in_one_insertion_is_recorded_and_the_others_continue(point, pl
             raise ZeroDivisionError("no\nwhere to go")
         return flexneedle.insert(scenario, made, seed, **options)
 
-    monkeypatch.setattr(rows, "insert", insert)
-    broken, fine = run_job(Job(point, plan, "", ((0, 11), (1, 12)))).rows
+    monkeypatch.setattr(jobs, "insert", insert)
+    broken, fine = run_job(InsertionJob(point, plan, "", ((0, 11), (1, 12)))).rows
     assert (broken["outcome"], broken["reason"]) == ("error", "ZeroDivisionError: no where to go")
     assert broken["true_error_mm"] is None
     assert broken["planned_periods"] == len(plan.controls)
@@ -100,9 +100,9 @@ def test_a_planner_failure_is_recorded_in_each_row(point, monkeypatch):
     def fail(*_args, **_options):
         raise FloatingPointError("overflow")
 
-    monkeypatch.setattr(rows, "plan", fail)
+    monkeypatch.setattr(jobs, "plan", fail)
     refusal = make_plan(point).refusal
-    row = only_row(Job(point, None, refusal, ((0, 11),)))
+    row = only_row(InsertionJob(point, None, refusal, ((0, 11),)))
     assert (row["outcome"], row["reason"]) == ("error", "no plan: FloatingPointError: overflow")
     assert row["planned_periods"] is None
 
@@ -115,8 +115,8 @@ def test_nan_is_null(point, plan, monkeypatch):
             periods=tuple(replace(p, verdict=Verdict(VerdictKind.MISSING)) for p in insertion.periods),
         )
 
-    monkeypatch.setattr(rows, "insert", insert)
-    row = only_row(Job(point, plan, "", ((0, 11),)))
+    monkeypatch.setattr(jobs, "insert", insert)
+    row = only_row(InsertionJob(point, plan, "", ((0, 11),)))
     assert row["residual_mm"] is None
     assert row["true_error_mm"] is not None
 
@@ -137,18 +137,18 @@ def test_nan_is_null(point, plan, monkeypatch):
 )
 def test_points_with_the_same_planner_inputs_share_a_plan(point, key, same):
     other = replace(point, scenario=point.scenario.with_values({key: 9}), controller="x", plant="y", case="z")
-    assert (plan_key(other) == plan_key(point)) is same
+    assert (digest_plan_inputs(other) == digest_plan_inputs(point)) is same
 
 
 def test_strategy_and_plan_seed_have_separate_plans(point):
     others = [replace(point, strategy="steering"), replace(point, plan_seed=1)]
-    assert len({plan_key(one) for one in (point, *others)}) == 3
+    assert len({digest_plan_inputs(one) for one in (point, *others)}) == 3
 
 
 def test_a_plan_is_read_from_disk_unchanged(point, tmp_path):
     planned = make_plan(point)
-    Plans(tmp_path).keep("a", planned)
-    kept = Plans(tmp_path)
+    StudyPlans(tmp_path).keep("a", planned)
+    kept = StudyPlans(tmp_path)
     made = flexneedle.plan(point.scenario)
     for name in ("controls", "tips", "shapes", "strain_energy", "guide"):
         np.testing.assert_array_equal(getattr(kept.plan("a"), name), getattr(made, name))
@@ -159,19 +159,19 @@ def test_a_plan_is_read_from_disk_unchanged(point, tmp_path):
 def test_a_damaged_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").write_text('{"seconds": 1}')
     with pytest.raises(InputError, match=r"a\.json: damaged: KeyError 'plan': remove it to plan again"):
-        Plans(tmp_path).plan("a")
+        StudyPlans(tmp_path).plan("a")
 
 
 def test_a_folder_in_place_of_a_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").mkdir()
     with pytest.raises(InputError, match=r"a\.json: cannot be read: Is a directory: remove it to plan again"):
-        Plans(tmp_path).plan("a")
+        StudyPlans(tmp_path).plan("a")
 
 
 def test_a_file_in_place_of_the_plans_folder_is_an_error_before_planning(tmp_path):
     (tmp_path / "plans").touch()
     with pytest.raises(InputError, match=r"plans: not a folder, needed for the plans: move it away"):
-        Plans(tmp_path / "plans")
+        StudyPlans(tmp_path / "plans")
 
 
 UNKNOWN = dict.fromkeys(RESULT_COLUMNS) | {"warning": "", "outcome": "held", "reason": ""}
@@ -182,20 +182,20 @@ ROWS = [
 
 
 def test_rows_are_read_from_the_journal_with_all_digits(tmp_path):
-    with Journal(tmp_path / "j", 5) as journal:
+    with StudyJournal(tmp_path / "j", 5) as journal:
         journal.add(ROWS)
-    with Journal(tmp_path / "j", 5) as journal:
+    with StudyJournal(tmp_path / "j", 5) as journal:
         assert [json.dumps(journal.rows[row["index"]]) for row in ROWS] == [json.dumps(row) for row in ROWS]
 
 
 @pytest.mark.parametrize("kept", [1, 20, -1])
 def test_an_incomplete_last_line_is_dropped_and_the_journal_continues(tmp_path, kept):
     path = tmp_path / "j"
-    with Journal(path, 5) as journal:
+    with StudyJournal(path, 5) as journal:
         journal.add(ROWS)
     first, second = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + second[:kept])
-    with Journal(path, 5) as journal:
+    with StudyJournal(path, 5) as journal:
         assert list(journal.rows) == [4]
         journal.add([ROWS[1]])
     assert path.read_bytes() == first + second
@@ -236,16 +236,16 @@ def test_a_damaged_journal_is_rejected_with_the_line_and_not_modified(tmp_path, 
     path.write_text(f"{line()}\n{text}\n{line(index=3)}\n")
     before = path.read_bytes()
     with pytest.raises(InputError) as caught:
-        Journal(path, 5)
+        StudyJournal(path, 5)
     assert str(caught.value) == f"{path}: damaged at line 2: {message}"
     assert path.read_bytes() == before
 
 
 def test_only_one_process_writes_a_journal(tmp_path):
     with (
-        Journal(tmp_path / "j", 5),
+        StudyJournal(tmp_path / "j", 5),
         pytest.raises(InputError, match="another process is writing to this study"),
     ):
-        Journal(tmp_path / "j", 5)
-    with Journal(tmp_path / "j", 5) as again:
+        StudyJournal(tmp_path / "j", 5)
+    with StudyJournal(tmp_path / "j", 5) as again:
         assert again.rows == {}
