@@ -25,8 +25,9 @@ _SOURCE = "versions.source"
 
 @dataclass(frozen=True, eq=False)
 class RecordedStudy:
-    """A study in its folder, finished or not. versions: of the packages that made it; own: digests of custom modules;
-    rows: those that are finished, by index.
+    """A study in its folder, finished or not.
+
+    versions: of the packages that made it; own: digests of custom modules; rows: finished rows by index.
     """
 
     folder: Path
