@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRow, StudyRowsMessage
@@ -31,66 +30,6 @@ def files(visit, server):
     return opened
 
 
-def test_a_preset_and_a_random_world_are_begun(files, server):
-    page = files()
-    page.select_option("#files-preset", "phantom")
-    page.click("[aria-label='Begin with the preset']")
-    page.fill("[aria-label='Number of a random world']", "7")
-    page.click("text=Random world")
-    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "world:7"]
-
-
-def test_a_file_is_loaded(files, server):
-    page = files()
-    payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
-    page.set_input_files(f"{FILES} input[type=file]", payload)
-    page.wait_for_selector("text=you are in control")
-    assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
-
-
-ASKS = {
-    "preset": "To begin with phantom drops the changes that were made here.",
-    "world": "To begin with world:7 drops the changes",
-    "file": "To load my.toml drops the changes",
-}
-
-
-@pytest.mark.parametrize("opened", [True, False])
-@pytest.mark.parametrize("way", ASKS)
-def test_it_asks_before_changes_are_lost(files, server, way, opened):
-    page = files()
-    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
-    until(page, "flexneedle.store.get('session').changed.length")
-    if way == "preset":
-        page.select_option("#files-preset", "phantom")
-        page.click("[aria-label='Begin with the preset']")
-    elif way == "world":
-        page.fill("[aria-label='Number of a random world']", "7")
-        page.click("text=Random world")
-    else:
-        payload = {"name": "my.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
-        page.set_input_files(f"{FILES} input[type=file]", payload)
-    page.wait_for_selector(f"{FILES} >> text={ASKS[way]}")
-    assert not server.asked("preset")
-    assert not server.asked("load")
-    status = page.locator(f"{FILES} [role=status]", has_text="drops the changes")
-    if opened:
-        status.get_by_role("button", name="Load" if way == "file" else "Begin", exact=True).click()
-        server.wait_for("load" if way == "file" else "preset")
-    else:
-        status.get_by_role("button", name="Keep this scenario").click()
-    until(page, f"!document.querySelector('{FILES}').textContent.includes('drops the changes')")
-    assert opened or not (server.asked("preset") or server.asked("load"))
-
-
-def test_a_file_that_is_too_large_is_not_sent(files, server):
-    page = files()
-    payload = {"name": "large.toml", "mimeType": "application/toml", "buffer": b"x" * 200_001}
-    page.set_input_files(f"{FILES} input[type=file]", payload)
-    page.wait_for_selector("text=must have at most 200000")
-    assert not server.asked("load")
-
-
 DROPPED = """(element, text) => {
   const dataTransfer = new DataTransfer();
   dataTransfer.items.add(new File([text], "dropped.toml"));
@@ -100,24 +39,66 @@ DROPPED = """(element, text) => {
 """Drop a file on an element; whether the page takes it, as otherwise the browser opens it in the place of the page."""
 
 
-def test_a_file_that_is_dropped_on_the_panel_is_loaded(files, server):
+def payload(name, data):
+    return {"name": name, "mimeType": "application/toml", "buffer": data}
+
+
+def test_a_scenario_is_begun_from_preset_world_and_file_and_saved(files, server, tmp_path):
     page = files()
+    page.select_option("#files-preset", "phantom")
+    page.click("[aria-label='Begin with the preset']")
+    page.fill("[aria-label='Number of a random world']", "7")
+    page.click("text=Random world")
+    assert [each["name"] for each in server.wait_for("preset", 2)] == ["phantom", "world:7"]
+    page.set_input_files(f"{FILES} input[type=file]", payload("my ü.toml", TEXT.encode()))
+    assert server.wait_for("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
+    page.set_input_files(f"{FILES} input[type=file]", payload("large.toml", b"x" * 200_001))
+    page.wait_for_selector("text=must have at most 200000")
     assert page.eval_on_selector(f"{FILES} .runs", DROPPED, TEXT) == [True, True]
-    assert server.wait_for("load") == [{"type": "load", "name": "dropped.toml", "text": TEXT}]
+    loaded = server.wait_for("load", 2)
+    assert loaded[1:] == [{"type": "load", "name": "dropped.toml", "text": TEXT}]
+    with page.expect_download() as download:
+        page.click("text=Save the scenario")
+    assert download.value.suggested_filename == "scenario.toml"
+    download.value.save_as(tmp_path / "saved.toml")
+    assert (tmp_path / "saved.toml").read_text() == TEXT
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
-def test_it_fits_its_width(files, server, pictures, size, scheme):
-    page = files(width=size[0], height=size[1], scheme=scheme)
-    server.send(insertion("done", of="first", name="mine"), rows(0, 3, "first"))
-    page.click("summary:has-text('Download')")
-    assert too_wide(page) == []
-    pictures(page.locator(FILES), f"files-{size[0]}-{scheme}")
-
-
-def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
+def test_it_asks_before_changes_are_lost(files, server):
+    """For each way to begin another scenario; once the scenario is kept, and once it is not."""
     page = files()
+    server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
+    until(page, "flexneedle.store.get('session').changed.length")
+
+    def begin(way):
+        if way == "preset":
+            page.select_option("#files-preset", "phantom")
+            page.click("[aria-label='Begin with the preset']")
+        elif way == "world":
+            page.fill("[aria-label='Number of a random world']", "7")
+            page.click("text=Random world")
+        else:
+            page.set_input_files(f"{FILES} input[type=file]", payload("my.toml", TEXT.encode()))
+
+    for way, words in (
+        ("preset", "To begin with phantom"),
+        ("world", "To begin with world:7"),
+        ("file", "To load my.toml"),
+    ):
+        kind, name = ("load", "Load") if way == "file" else ("preset", "Begin")
+        asked = len(server.asked(kind))
+        for button in ("Keep this scenario", name):
+            begin(way)
+            page.wait_for_selector(f"{FILES} >> text={words} drops the changes")
+            assert len(server.asked(kind)) == asked
+            status = page.locator(f"{FILES} [role=status]", has_text="drops the changes")
+            status.get_by_role("button", name=button, exact=True).click()
+            until(page, f"!document.querySelector('{FILES}').textContent.includes('drops the changes')")
+        server.wait_for(kind, asked + 1)
+
+
+def test_a_run_is_opened_compared_closed_and_downloaded(files, server, visit):
+    page, held = files(), []
     page.click("[aria-label='Open first']")
     page.click("[aria-label='Compare with first']")
     page.click("summary:has-text('Download')")
@@ -130,10 +111,13 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
         {"type": "open", "name": "first", "second": True},
         {"type": "open", "name": None, "second": False},
     ]
+    page.focus("[aria-label='CSV of first']")
+    first = {"name": "first", "kind": "insertion", "summary": "changed", "made": 1.7e9}
+    server.send(RunsMessage(runs=[MANY, first]))
+    page.wait_for_selector("text=changed")
+    assert page.locator(".run strong").all_inner_texts() == ["many", "first"]
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
 
-
-def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
-    page, held = files(), []
     page.route("**/runs/first/*", lambda route, _request: held.append(route))
 
     def requested():
@@ -141,7 +125,6 @@ def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
             page.wait_for_timeout(20)
         return held.pop()
 
-    page.click("summary:has-text('Download')")
     page.click("[aria-label='CSV of first']")
     page.wait_for_selector("text=CSV of first is being made…")
     requested().fulfill(status=404, body="the run has no trace\n")
@@ -153,23 +136,37 @@ def test_a_download_reports_that_it_is_made_and_why_it_is_refused(files, visit):
         requested().fulfill(body=b"PK")
     assert download.value.suggested_filename == "first-run.zip"
     page.wait_for_selector("text=is being made…", state="detached")
+    page.unroute("**/runs/first/*")
     assert len(visit.errors) == 1  # the browser's own line of the refusal
     visit.errors.clear()
-
-
-def test_news_of_runs_leave_open_what_is_open_and_the_focus(files, server):
-    page = files()
-    page.click("summary:has-text('Download')")
-    page.focus("[aria-label='CSV of first']")
-    first = {"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}
-    server.send(RunsMessage(runs=[MANY, first | {"summary": "changed"}]))
-    page.wait_for_selector("text=changed")
-    names = page.locator(".run strong").all_inner_texts()
-    assert names == ["many", "first"]
-    assert page.is_visible("[aria-label='CSV of first']")
-    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
     server.send(RunsMessage(runs=[MANY]))
     page.wait_for_selector("text=changed", state="detached")
+
+
+def test_the_insertion_and_the_shown_row_are_saved_as_runs(files, server):
+    page = files()
+    assert not page.is_visible("[aria-label='Name of the run to save']")
+    server.send(insertion("done"))
+    page.fill("[aria-label='Name of the run to save']", "../x")
+    page.click("text=Save the insertion")
+    page.wait_for_selector("text=The name must begin with a letter or digit")
+    page.fill("[aria-label='Name of the run to save']", "my run")
+    page.click("text=Save the insertion")
+    server.wait_for("save")
+    server.send(
+        insertion("done", of="first", name="mine"),
+        insertion("done", of="second", name="many, row 17", row=17),
+    )
+    page.wait_for_selector("text=Compared with: many, row 17")
+    assert page.locator("text=Save as a run").count() == 1
+    name = page.locator("[aria-label='Name to save many row 17 as']")
+    assert name.input_value() == "many row 17"
+    name.fill("worst")
+    page.click("text=Save as a run")
+    assert server.wait_for("save", 2) == [
+        {"type": "save", "name": "my run", "of": "live"},
+        {"type": "save", "name": "worst", "of": "second"},
+    ]
 
 
 MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
@@ -196,13 +193,10 @@ def listing(request):
     return [StudyRowsMessage(name=request["name"], index=index, rows=found, **about)]
 
 
-@pytest.mark.parametrize(
-    ("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light"), (390, "dark")]
-)
-def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures, width, scheme):
+def test_rows_of_a_study_are_listed_computed_opened_and_compared(files, server):
     server.news[-1] = RunsMessage(runs=[MANY])
     server.answers["study"] = listing
-    page = files(width=width, scheme=scheme)
+    page = files()
     assert not page.is_visible("text=Worst first")
     page.click("[aria-label='Rows of many']")
     page.wait_for_selector("text=many: Many targets, 149 of 150 rows")
@@ -212,7 +206,6 @@ def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures,
     assert entries[2].split("\n") == refused
     assert entries[3] == "3 of 149 finished rows: choose the first row for others"
     assert page.locator("[aria-label='Open row 9']").count() == 0
-    pictures(page.locator(FILES), f"study-{width}-{scheme}")
     page.click("[aria-label='Open row 17']")
     page.click("[aria-label='Compare with row 3']")
     page.fill("[aria-label='First row']", "120")
@@ -229,74 +222,12 @@ def test_rows_of_a_study_are_listed_opened_and_compared(files, server, pictures,
         {"type": "study", "name": "many", "index": 120},
         {"type": "study", "name": "many", "index": None},
     ]
-    assert too_wide(page) == []
-
-
-def test_a_study_without_finished_rows_is_named_so(files, server):
-    server.news[-1] = RunsMessage(runs=[MANY])
-    about = {"title": "Many", "insertions": 150, "finished": 0}
-    server.answers["study"] = lambda _: [StudyRowsMessage(name="many", index=None, rows=[], **about)]
-    page = files()
-    page.click("[aria-label='Rows of many']")
-    page.wait_for_selector("text=No row is finished yet")
-
-
-def test_a_row_that_is_computed_has_progress_and_is_cancelled(files, server):
-    page = files()
     server.send(JobMessage(job=7, kind="row", state="running", share=0.4, text="many, row 17"))
     page.wait_for_selector("text=Computing again: many, row 17")
     page.click("[aria-label='Cancel: Computing again']")
     assert server.wait_for("cancel") == [{"type": "cancel", "job": 7}]
-
-
-def test_an_insertion_that_has_ended_is_saved(files, server):
-    page = files()
-    assert not page.is_visible("[aria-label='Name of the run to save']")
-    server.send(insertion("done"))
-    page.fill("[aria-label='Name of the run to save']", "../x")
-    page.click("text=Save the insertion")
-    page.wait_for_selector("text=The name must begin with a letter or digit")
-    page.fill("[aria-label='Name of the run to save']", "my run")
-    page.click("text=Save the insertion")
-    assert server.wait_for("save") == [{"type": "save", "name": "my run", "of": "live"}]
-
-
-def test_a_row_that_is_shown_is_saved_as_a_run(files, server):
-    page = files()
-    server.send(
-        insertion("done", of="first", name="mine"),
-        insertion("done", of="second", name="many, row 17", row=17),
-    )
-    page.wait_for_selector("text=Compared with: many, row 17")
-    assert page.locator("text=Save as a run").count() == 1
-    name = page.locator("[aria-label='Name to save many row 17 as']")
-    assert name.input_value() == "many row 17"
-    name.fill("worst")
-    page.click("text=Save as a run")
-    until(page, "!document.querySelector('.opened form input').value")
-    assert server.asked("save") == [{"type": "save", "name": "worst", "of": "second"}]
-
-
-def test_the_scenario_is_saved(files, tmp_path):
-    page = files()
-    with page.expect_download() as download:
-        page.click("text=Save the scenario")
-    assert download.value.suggested_filename == "scenario.toml"
-    download.value.save_as(tmp_path / "saved.toml")
-    assert (tmp_path / "saved.toml").read_text() == TEXT
-
-
-def test_a_picture_of_the_scene_is_saved(files, tmp_path):
-    page = files(draws=True)
-    page.wait_for_selector("[data-panel=space] .legend li")
-    with page.expect_download() as download:
-        page.click("text=Picture")
-    assert download.value.suggested_filename == "flexneedle.png"
-    download.value.save_as(tmp_path / "made.png")
-    picture = imread(tmp_path / "made.png")
-    shape = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
-    assert list(picture.shape[:2]) == shape
-    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+    server.send(StudyRowsMessage(name="many", title="Many", insertions=150, finished=0, index=None, rows=[]))
+    page.wait_for_selector("text=No row is finished yet")
 
 
 PAINTED = """async () => {
@@ -335,7 +266,7 @@ async ([width, height, frames]) => {{
 """
 
 
-@pytest.mark.parametrize("size", [(1, 1), (37, 20), (120, 90)])
+@pytest.mark.parametrize("size", [(37, 20), (120, 90)])
 def test_a_gif_has_the_pixels_of_its_frames(files, size):
     """Also where the codes of a frame need 12 bits and begin anew, and end at any of their lengths."""
     page = files()
@@ -348,8 +279,17 @@ def test_a_gif_has_the_pixels_of_its_frames(files, size):
     assert np.max(np.abs(shown.reshape(frames.shape).astype(int) - frames)) <= 26
 
 
-def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
+def test_pictures_of_the_scene_and_of_an_insertion_are_saved(files, server, tmp_path):
     page = files(draws=True)
+    page.wait_for_selector("[data-panel=space] .legend li")
+    with page.expect_download() as download:
+        page.click("text=Picture")
+    assert download.value.suggested_filename == "flexneedle.png"
+    download.value.save_as(tmp_path / "made.png")
+    picture = imread(tmp_path / "made.png")
+    size = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
+    assert list(picture.shape[:2]) == size
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
     page.click("text=GIF")
     page.wait_for_selector("text=A GIF needs an insertion")
     server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))

@@ -1,4 +1,4 @@
-"""static/frames.js and page/frames.py read the same bytes in the same way."""
+"""static/frames.js and page/shape_frames.py read the same bytes in the same way."""
 
 import re
 from pathlib import Path
@@ -11,10 +11,10 @@ from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame,
 
 TEXT = (Path(flexneedle.lab.page.__file__).parent / "static/frames.js").read_text()
 READ = """async (frames) => {
-  const { unpack_frame } = await import("/static/frames.js");
+  const { unpacked } = await import("/static/frames.js");
   return frames.map((bytes) => {
     try {
-      const frame = unpack_frame(new Uint8Array(bytes).buffer);
+      const frame = unpacked(new Uint8Array(bytes).buffer);
       return { ...frame, values: [...frame.values] };
     } catch (error) {
       return error.message;

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from browser_blends import BLENDS, arrived
-from browser_layout import too_wide
 from fake_page import until
 from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
@@ -47,19 +46,6 @@ def table(page):
     return {row.locator("th").inner_text(): row.locator("td").all_inner_texts() for row in rows}
 
 
-def test_work_is_started_and_cancelled(plans, server):
-    page = plans()
-    for work in ("plan", "compare", "reach"):
-        page.click(f"{PLANS} [data-work={work}]")
-    assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
-    server.send(JobMessage(job=4, kind="compare", state="running", share=0.25))
-    page.click(f"{PLANS} button:has-text('Cancel')")
-    assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
-    server.send(JobMessage(job=4, kind="compare", state="cancelled"))
-    page.wait_for_selector(f"{PLANS} progress", state="hidden")
-    assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
-
-
 COST = """async ([tone, shares]) => {
   const { color } = await import("/static/theme.js");
   const wanted = color(tone).match(/[0-9]+/g).slice(0, 3).map(Number);
@@ -85,9 +71,18 @@ def share_of(cost):
     return (np.log10(cost) - low) / (high - low)
 
 
-def test_cost_falls_with_each_iteration(plans, server):
+def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, server):
     """The lowest line is the best cost so far, on an axis that is logarithmic; the others are above it."""
     page = plans()
+    for work in ("plan", "compare", "reach"):
+        page.click(f"{PLANS} [data-work={work}]")
+    assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
+    server.send(JobMessage(job=4, kind="compare", state="running", share=0.25))
+    page.click(f"{PLANS} button:has-text('Cancel')")
+    assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
+    server.send(JobMessage(job=4, kind="compare", state="cancelled"))
+    page.wait_for_selector(f"{PLANS} progress", state="hidden")
+    assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
     for number in range(4):
         server.send(iteration(number), samples(number))
         until(page, f"flexneedle.store.get('iteration manipulation')?.iteration === {number}")
@@ -105,6 +100,9 @@ def test_cost_falls_with_each_iteration(plans, server):
     highest = max(max(column) for column in columns[4:])  # of dots, near the first iteration
     np.testing.assert_allclose(lowest, [share_of(cost) for cost in iteration(3).best], atol=3.0 / height)
     assert highest == pytest.approx(share_of(iteration(3).median[0]), abs=4.0 / height)
+    server.send(people(2, steering=2))
+    until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
+    assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
 
 
 def test_strategies_are_side_by_side_with_their_terms(plans):
@@ -197,22 +195,6 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
     server.send(plan("steering"))
     page.wait_for_selector(f"{PLANS} >> text=Steering: ends 0.001 mm off.")
     assert page.evaluate("window.changes") > 0
-
-
-def test_nothing_is_started_while_another_steers(plans):
-    page = plans([*opening(), people(2, steering=2)])
-    until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
-    assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 1000), (390, 844)])
-def test_it_is_drawn_at_each_size(plans, pictures, size, scheme):
-    page = plans(planned(), width=size[0], height=size[1], scheme=scheme)
-    page.evaluate("document.querySelector('.panel.plans').scrollIntoView()")
-    page.wait_for_timeout(300)
-    assert too_wide(page) == []
-    pictures(page, f"plans-{size[0]}-{scheme}")
 
 
 SAMPLED = """async () => {

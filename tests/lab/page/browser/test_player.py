@@ -1,11 +1,8 @@
 """The player: which insertion and period all views show; plots follow it, and choose it."""
 
-import json
-
 import numpy as np
 import pytest
 
-from browser_layout import too_wide
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
@@ -53,61 +50,43 @@ def see_plots(page):
     page.locator(f"{PLOTS} figure").last.scroll_into_view_if_needed()  # others have grown above them
 
 
-def test_scrubbing_shows_a_period(player):
+def test_a_run_is_scrubbed_and_played(player, server):
     page = player()
     page.focus(SCRUB)
     page.keyboard.press("Home")
     until(page, f"{PERIOD} === 0")
-    page.keyboard.press("ArrowRight")
-    until(page, f"{PERIOD} === 1")
-    assert not page.evaluate(PLAYING)
-    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 2 of 50']")
-    for key, period in ((".", 2), (",", 1), ("End", 49)):
+    for key, period in (("ArrowRight", 1), (".", 2), (",", 1), ("End", 49)):
         page.keyboard.press(key)
         until(page, f"{PERIOD} === {period}")
+    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
     page.click("text=Latest period")
     until(page, f"{PERIOD} === undefined")
-
-
-def test_it_plays_at_a_speed_and_ends_at_the_end(player):
-    page = player()
-    page.focus(SCRUB)
-    for _ in range(3):
-        page.keyboard.press(">")
-    page.wait_for_selector(f"{PLAYER} >> text=10×")
-    start = page.evaluate("performance.now()")
-    page.keyboard.press(" ")
-    until(page, f"{PERIOD} === 49 && !flexneedle.store.get('view playing')")
-    seconds = (page.evaluate("performance.now()") - start) / 1000
-    assert seconds >= 49 * 0.2 / 10 - 0.05
-
-
-def test_it_is_made_slower_and_faster(player):
-    page = player()
     speed = page.locator(f"{PLAYER} .tools .number").first
-    for text, factor in (("Slower", "0.5×"), ("Slower", "0.25×"), ("Faster", "0.5×")):
+    for text, factor in (("Slower", "0.5×"), ("Slower", "0.25×"), ("Faster", "0.5×"), ("Faster", "1×")):
         page.click(f"{PLAYER} >> text={text}")
         speed.locator(f"text={factor}").wait_for()
     assert not page.evaluate(PLAYING)
-
-
-def test_playing_pauses(player):
-    page = player()
     page.click(f"{PLAYER} >> text=Play")
     until(page, f"{PERIOD} > 0")
     page.click(f"{PLAYER} >> text=Pause")
     at = page.evaluate(PERIOD)
     page.wait_for_timeout(500)
     assert page.evaluate(PERIOD) == at
-
-
-def test_what_is_shown_is_chosen(player):
-    page = player([*inserting(10), *recorded()])
-    for text, of in (("Target and plan", "scene"), ("Recorded run", "first"), ("Insertion", "live")):
-        page.click(f"{PLAYER} [role=group] button:has-text('{text}')")
-        until(page, f"flexneedle.store.get('view of') === '{of}'")
-        shows(page, of)
-        assert page.locator(f"{PLAYER} [data-of][aria-pressed=true]").count() == 1
+    page.focus(SCRUB)
+    page.keyboard.press("Home")
+    for _ in range(3):
+        page.keyboard.press(">")
+    page.wait_for_selector(f"{PLAYER} >> text=10×")
+    start = page.evaluate("performance.now()")
+    page.keyboard.press(" ")
+    until(page, f"{PERIOD} === 49 && !{PLAYING}")
+    assert (page.evaluate("performance.now()") - start) / 1000 >= 49 * 0.2 / 10 - 0.05
+    page.evaluate("flexneedle.store.set('view speed', 0)")
+    page.click(f"{PLAYER} >> text=Play")
+    until(page, PLAYING)
+    server.send(insertion("running"), rows(0, 3))  # which ends playing
+    until(page, f"!{PLAYING} && {PERIOD} === undefined")
+    shows(page, "live")
 
 
 def choose(page, text, period=None):
@@ -116,8 +95,12 @@ def choose(page, text, period=None):
         page.evaluate(f"flexneedle.store.set('view period', {period})")
 
 
-def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
-    page = player()
+def test_the_newest_insertion_or_run_is_shown_unless_another_is_chosen(player, server):
+    page = player([*inserting(10), *recorded()])
+    for text, of in (("Target and plan", "scene"), ("Recorded run", "first"), ("Insertion", "live")):
+        choose(page, text)
+        shows(page, of)
+        assert page.locator(f"{PLAYER} [data-of][aria-pressed=true]").count() == 1
     choose(page, "Recorded run", 20)
     server.send(insertion("planning", periods=0), insertion("running"), rows(0, 3))
     shows(page, "live")
@@ -125,31 +108,18 @@ def test_an_insertion_that_begins_is_shown_at_its_newest(player, server):
     choose(page, "Target and plan")
     server.send(insertion("done", periods=3), insertion("planning", periods=0))
     shows(page, "live")
-    server.send(insertion("running"), rows(0, 4))
-    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 4 of 4']")
-    server.send(insertion("done", periods=4))
+    server.send(insertion("running", periods=30), rows(0, 30), insertion("done", periods=30))
     page.wait_for_selector("[data-panel=insertion] button:visible:text-is('Insert')")
     shows(page, "live")  # and not the run that was opened before
-    assert page.evaluate(PERIOD) is None
-
-
-@pytest.mark.parametrize("name", ["phantom3d", "other"])
-def test_a_run_that_is_opened_is_shown_at_its_end_also_the_same_again(player, server, name):
-    page = player()
-    choose(page, "Recorded run", 20)
-    choose(page, "Target and plan")
-    server.send(*recorded(name=name))
-    shows(page, "first")
-    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
-    assert page.evaluate(PERIOD) is None
-
-
-def test_a_run_that_is_compared_or_closed_changes_the_period_only_where_it_is_shown(player, server):
-    page = player([*opening(), insertion("done", periods=30), rows(0, 30), *recorded()])
+    for name in ("phantom3d", "other"):  # the same again, and another
+        choose(page, "Target and plan")
+        server.send(*recorded(name=name))
+        shows(page, "first")
+        page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
+        assert page.evaluate(PERIOD) is None
     choose(page, "Recorded run", 20)
     server.send(*recorded("second"))
     until(page, "flexneedle.store.get('insertion second')")
-    assert page.evaluate(PERIOD) == 20
     server.send(ClosedMessage(of="second"))
     until(page, "!flexneedle.store.get('insertion second')")
     assert page.evaluate(PERIOD) == 20
@@ -158,7 +128,7 @@ def test_a_run_that_is_compared_or_closed_changes_the_period_only_where_it_is_sh
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 30 of 30']")
 
 
-def test_after_a_lost_connection_the_same_is_shown(player, server):
+def test_after_a_lost_connection_the_same_is_shown_unless_an_insertion_has_begun(player, server):
     page = player([*inserting(10), *recorded()])
     choose(page, "Recorded run", 3)
     page.evaluate("() => { window.before = flexneedle.store.get('rows first'); }")
@@ -167,12 +137,8 @@ def test_after_a_lost_connection_the_same_is_shown(player, server):
     page.wait_for_selector("text=Connected")
     shows(page, "first")
     assert page.evaluate(PERIOD) == 3
-
-
-def test_what_begins_while_the_connection_is_lost_is_shown(player, server):
-    page = player([*opening(), insertion("done"), rows(0, 70)])
     choose(page, "Target and plan")
-    server.news = [*opening(), insertion("running", periods=3), rows(0, 3)]
+    server.news = [*opening(), insertion("running", periods=3).model_copy(update={"seed": 9}), rows(0, 3)]
     server.drop()
     shows(page, "live")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 3 of 3']")
@@ -184,46 +150,39 @@ def plotted(page, title):
     return page.get_attribute(f"{PLOTS} [aria-label^='{title}']", "aria-label")
 
 
-def test_a_colour_of_the_plots_has_one_meaning(player):
-    """The guide's is that of the guide in the views, not those of the strategies."""
-    page = player()
-    see_plots(page)
-    guide = page.locator(f"{PLOTS} figure", has_text="Guide").locator(".swatch")
-    assert [each.get_attribute("style") for each in guide.all()] == ["color: var(--guide);"] * 2
-
-
-def test_plots_follow_the_player(player):
+def test_plots_follow_the_player_and_choose_its_period(player, server):
     page = player()
     see_plots(page)
     page.evaluate("flexneedle.store.set('view period', 20)")
     page.wait_for_selector(f"{PLOTS} [aria-label^='Roll (°) at 4.0 s']")
     assert plotted(page, "Roll") == "Roll (°) at 4.0 s: roll 60.000"
     assert plotted(page, "Guide") == "Guide (mm) at 4.0 s: y 0.400, z 0.200"
-
-
-def test_the_error_is_that_of_the_true_tip_and_on_a_rig_of_the_estimated_one(player, server):
-    page = player()
+    guide = page.locator(f"{PLOTS} figure", has_text="Guide").locator(".swatch")
+    assert [each.get_attribute("style") for each in guide.all()] == ["color: var(--guide);"] * 2
+    page.evaluate("flexneedle.store.set('view speed', 0)")
+    page.evaluate("flexneedle.store.set('view period', 0)")
+    page.click(f"{PLAYER} >> text=Play")
+    until(page, PLAYING)
+    click_in_the_middle(page)
+    until(page, f"!{PLAYING}")
+    assert abs(page.evaluate(PERIOD) - 25) <= 2
+    page.click("text=Latest period")
     see_plots(page)
-    figure = page.locator(f"{PLOTS} figure").first
-    error = f"{row(49).error_mm:.3f}"
+    figure, error = page.locator(f"{PLOTS} figure").first, f"{row(49).error_mm:.3f}"
     title = "Error from the planned path (mm)"
     page.wait_for_selector(f"{PLOTS} [aria-label='{title} at 9.8 s: true tip {error}']")
     assert figure.locator(".legend").inner_text() == "true tip"
-    server.send(
-        insertion("done", of="first", name="rig", periods=50), of_rows("first", lambda _: {"true": None})
-    )
+    unknown = of_rows("first", lambda _: {"true": None, "indicator": None})
+    server.send(insertion("done", of="first", name="rig", periods=50), unknown)
     page.wait_for_selector(f"{PLOTS} [aria-label='{title} at 9.8 s: estimated tip {error}']")
     assert figure.locator(".legend").inner_text() == "estimated tip"
-
-
-def test_a_tracker_without_an_indicator_is_named_so(player, server):
-    page = player()
-    see_plots(page)
-    figure = page.locator(f"{PLOTS} figure").last
-    page.wait_for_selector(f"{PLOTS} [aria-label^='Tracker']")
-    assert figure.locator(".legend").inner_text() == ""
-    server.send(of_rows("first", lambda _: {"indicator": None}))
-    figure.locator("text=This tracker has no indicator.").wait_for()
+    page.locator(f"{PLOTS} figure").last.locator("text=This tracker has no indicator.").wait_for()
+    ranges = page.evaluate("""async () => {
+      const { rangeOf } = await import("/static/plots/plot.js");
+      return [[0, 0], [-90, -90], [null, null], [0, 10]].map((each) => rangeOf(null, ...each));
+    }""")
+    assert ranges[:3] == [[-1, 1], [-135, -45], [None, None]]  # a constant line is in the middle
+    assert ranges[3][0] <= 0 < 10 < ranges[3][1]
 
 
 def test_times_of_a_rig_count_from_its_first_period(player):
@@ -246,61 +205,6 @@ def click_in_the_middle(page):
     box = plot.bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2 - 3, box["y"] + 20)
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
-
-
-def test_a_click_on_a_plot_shows_its_period(player):
-    page = player()
-    see_plots(page)
-    click_in_the_middle(page)
-    until(page, f"Math.abs({PERIOD} - 25) <= 2")
-    assert not page.evaluate(PLAYING)
-
-
-def test_a_period_that_is_chosen_while_it_plays_ends_playing(player):
-    page = player()
-    see_plots(page)
-    page.evaluate("flexneedle.store.set('view speed', 0)")
-    page.click(f"{PLAYER} >> text=Play")
-    until(page, f"{PLAYING} && {PERIOD} === 0")
-    click_in_the_middle(page)
-    until(page, f"!{PLAYING}")
-    assert abs(page.evaluate(PERIOD) - 25) <= 2
-
-
-def test_a_new_insertion_ends_playing(player, server):
-    page = player()
-    page.evaluate("flexneedle.store.set('view speed', 0)")
-    page.click(f"{PLAYER} >> text=Play")
-    until(page, PLAYING)
-    server.send(insertion("running"), rows(0, 3))
-    until(page, f"!{PLAYING} && {PERIOD} === undefined")
-    shows(page, "live")
-    assert page.locator(f"{PLAYER} >> text=Play").count() == 1
-
-
-def test_two_runs_are_plotted_beside_each_other(player, server, pictures):
-    page = player()
-    see_plots(page)
-    assert not page.locator(f"{PLOTS} >> text=roll, second").count()
-    shifted = [row(k).model_copy(update={"roll_deg": 90.0, "time": 0.2 * k + 0.05}) for k in range(30)]
-    server.send(
-        insertion("done", of="second", periods=30), rows(0, 1, "second").model_copy(update={"rows": shifted})
-    )
-    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
-    pictures(page, "plots-compared")
-
-
-def test_a_second_run_begins_where_the_first_does(player, server):
-    page = player()
-    later = [row(k).model_copy(update={"time": 0.2 * k + 60.0}) for k in range(50)]
-    server.send(
-        insertion("done", of="second", periods=50), rows(0, 1, "second").model_copy(update={"rows": later})
-    )
-    see_plots(page)
-    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
-    click_in_the_middle(page)
-    until(page, f"Math.abs({PERIOD} - 25) <= 2")
-    assert not page.evaluate(PLAYING)
 
 
 def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
@@ -326,17 +230,6 @@ def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
     until(page, "flexneedle.store.get('insertion second').periods === 40")
     assert page.evaluate("flexneedle.store.get('view of')") is None
     assert page.evaluate(shown)
-
-
-def test_without_an_insertion_a_second_run_is_beside_the_scene(visit, server):
-    """Also where the scene was chosen: there is nothing else to choose."""
-    server.news = [*opening(), insertion("done", of="second", periods=10), rows(0, 10, "second")]
-    page = visit(ready="[data-panel=section] canvas")
-    shown = """async () => (await import("/static/shown.js")).shownSecond(flexneedle.store)?.row.index"""
-    until(page, "flexneedle.store.get('rows second')?.length === 10")
-    for of in (None, "scene"):
-        page.evaluate(f"flexneedle.store.set('view of', {json.dumps(of)} ?? undefined)")
-        assert page.evaluate(shown) == 9
 
 
 def test_another_run_of_the_same_length_takes_the_place_of_the_last(player):
@@ -426,23 +319,3 @@ def test_a_period_without_a_shape_shows_none(player):
     until(page, "flexneedle.store.track('predicted', 'first', 4)")
     read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
     assert page.evaluate(read) == [2, None, 4, None]
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
-def test_it_fits_its_width(player, pictures, size, scheme):
-    page = player(inserting(), width=size[0], height=size[1], scheme=scheme)
-    see_plots(page)
-    page.wait_for_timeout(200)
-    assert too_wide(page) == []
-    pictures(page, f"plots-{size[0]}-{scheme}")
-
-
-def test_a_line_without_a_change_is_in_the_middle_of_its_plot(player):
-    page = player()
-    ranges = page.evaluate("""async () => {
-      const { rangeOf } = await import("/static/plots/plot.js");
-      return [[0, 0], [-90, -90], [null, null], [0, 10]].map((each) => rangeOf(null, ...each));
-    }""")
-    assert ranges[:3] == [[-1, 1], [-135, -45], [None, None]]
-    assert ranges[3][0] <= 0 < 10 < ranges[3][1]

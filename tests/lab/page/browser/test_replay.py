@@ -69,7 +69,7 @@ def pictures_at(page, period):
     return found
 
 
-def test_it_begins_at_the_end_of_the_run_with_what_happened_in_words(replay):
+def test_a_run_is_read_played_and_scrubbed(replay):
     page = replay()
     assert page.title() == "mine – flexneedle"
     assert page.get_attribute(SCRUB, "aria-valuetext").startswith(f"period {PERIODS} of {PERIODS}")
@@ -78,22 +78,19 @@ def test_it_begins_at_the_end_of_the_run_with_what_happened_in_words(replay):
     assert page.locator("[data-panel=player] [role=group]").is_hidden()
     assert page.locator("main .panel").count() == 6
     assert page.locator("main .panel:visible").count() == 6
-
-
-def test_scrubbing_by_keys_shows_another_period_in_all_views(replay):
-    page = replay(draws=True)
-    last = pictures_at(page, PERIODS - 1)
+    page.locator(SECTION).scroll_into_view_if_needed()
+    at(page, 3)
+    assert page.locator(".handle").count() == 0
     page.focus(SCRUB)
+    for _ in range(4):
+        page.keyboard.press(">")
     page.keyboard.press("Home")
     until(page, "flexneedle.store.get('view period') === 0")
-    for before, after in zip(last, pictures_at(page, 0), strict=True):
-        assert before != after
-    for before, after in zip(last, pictures_at(page, PERIODS - 1), strict=True):
-        assert before == after
-
-
-def test_plots_follow_and_choose_the_period(replay):
-    page = replay()
+    page.keyboard.press(" ")
+    until(page, f"flexneedle.store.get('view period') === {PERIODS - 1}")
+    until(page, "!flexneedle.store.get('view playing')")
+    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period {PERIODS} of {PERIODS}']")
+    assert page.input_value(SCRUB) == str(PERIODS - 1)
     page.locator(PLOTS).scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
     at(page, 20)
@@ -108,25 +105,16 @@ def test_plots_follow_and_choose_the_period(replay):
     until(page, f"Math.abs(flexneedle.store.get('view period') - {PERIODS // 2}) <= 3")
 
 
-def test_it_plays(replay):
-    page = replay()
+def test_scrubbing_by_keys_shows_another_period_in_all_views(replay):
+    page = replay(draws=True)
+    last = pictures_at(page, PERIODS - 1)
     page.focus(SCRUB)
-    for _ in range(4):
-        page.keyboard.press(">")
     page.keyboard.press("Home")
     until(page, "flexneedle.store.get('view period') === 0")
-    page.keyboard.press(" ")
-    until(page, f"flexneedle.store.get('view period') === {PERIODS - 1}")
-    until(page, "!flexneedle.store.get('view playing')")
-    page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period {PERIODS} of {PERIODS}']")
-    assert page.input_value(SCRUB) == str(PERIODS - 1)
-
-
-def test_nothing_can_be_moved_or_asked_for(replay):
-    page = replay()
-    page.locator(SECTION).scroll_into_view_if_needed()
-    at(page, 3)
-    assert page.locator(".handle").count() == 0
+    for before, after in zip(last, pictures_at(page, 0), strict=True):
+        assert before != after
+    for before, after in zip(last, pictures_at(page, PERIODS - 1), strict=True):
+        assert before == after
 
 
 def test_two_runs_are_beside_each_other(replay, pictures):
@@ -141,24 +129,20 @@ def test_two_runs_are_beside_each_other(replay, pictures):
     pictures(page, "replay-compared")
 
 
-def test_names_and_reasons_are_text(replay):
-    page = replay(record(name=HOSTILE, summary=HOSTILE))
+def test_names_are_text_in_a_browser_without_storage_and_webgl(replay):
+    page = replay(
+        record(name=HOSTILE, summary=HOSTILE),
+        before=NO_STORAGE + NO_WEBGL,
+        ready="[data-panel=section] .legend li",
+    )
+    page.wait_for_selector("text=This browser has no WebGL")
     assert page.inner_text(WORDS).count(HOSTILE) == 2
     assert page.evaluate("window.hit") is None
-
-
-def test_a_browser_that_keeps_nothing_shows_it_in_both_themes(replay):
-    page = replay(before=NO_STORAGE)
     ground = "getComputedStyle(document.body).backgroundColor"
     light = page.evaluate(ground)
     page.click("#theme")
     assert page.evaluate(ground) != light
     assert page.inner_text("#theme") == "Light"
-
-
-def test_without_webgl_the_other_views_show_it(replay):
-    page = replay(before=NO_WEBGL, ready="[data-panel=section] .legend li")
-    page.wait_for_selector("text=This browser has no WebGL")
     at(page, 3)
     assert page.get_attribute(SCRUB, "aria-valuetext").startswith("period 4 of")
 

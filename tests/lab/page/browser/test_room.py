@@ -27,7 +27,7 @@ OBJECTS = f"""async () => {{
 }}"""
 LISTEN = f"""async () => {{
   {VIEW}
-  const {{ add }} = view.labels;
+  const add = (window.addLabel ??= view.labels.add);
   window.labels = [];
   view.labels.add = (...given) => {{
     window.labels.push(given.slice(0, 3));
@@ -62,8 +62,10 @@ def labels(page):
     return places
 
 
-def test_layers_are_boxes_to_scale_the_stiffer_the_denser_and_the_first_begins_with_the_skin(space):
-    objects = space(opening()).evaluate(OBJECTS)
+def test_layers_and_grid_are_to_scale_and_labelled(space, server):
+    """The stiffer a layer, the denser; lines each 5 mm on floor and back wall; without a guide none is named."""
+    page = space(opening())
+    objects = page.evaluate(OBJECTS)
     layers = [each for each in objects if each["type"] == "Mesh BoxGeometry"]
     _, right, half = BOX
     for layer, (top, bottom) in zip(layers, [(0.0, 20.0), (20.0, right)], strict=True):
@@ -75,10 +77,7 @@ def test_layers_are_boxes_to_scale_the_stiffer_the_denser_and_the_first_begins_w
     assert [(each["at"], each["tone"]) for each in surfaces] == [(0.0, "--skin")] * 2 + [
         (20.0, "--tissue")
     ] * 2
-
-
-def test_the_grid_has_lines_each_5_mm_on_floor_and_back(space):
-    grids = [each for each in space(opening()).evaluate(OBJECTS) if each["tone"] == "--grid"]
+    grids = [each for each in objects if each["tone"] == "--grid"]
     assert len(grids) == 1
     lines = np.reshape(grids[0]["corners"], (-1, 2, 3))
     left, right, half = BOX
@@ -92,10 +91,7 @@ def test_the_grid_has_lines_each_5_mm_on_floor_and_back(space):
     np.testing.assert_array_equal(depths, np.arange(left, right + 5.0, 5.0))
     assert np.count_nonzero(~along) == 2 * len(depths)
     assert np.count_nonzero(along) == 2 * len(np.arange(-half, half + 5.0, 5.0))
-
-
-def test_labels_name_layers_skin_guide_and_lengths(space):
-    places = labels(space(opening()))
+    places = labels(page)
     half = BOX[2]
     assert places.pop("skin") == [(0.0, half, half)]
     assert places.pop("superficial") == [(10.0, half, -half)]
@@ -107,10 +103,6 @@ def test_labels_name_layers_skin_guide_and_lengths(space):
         assert depths[depth] == [(depth, -half, 1.15 * half)]
     assert {place[1:] for place in depths[half]} == {(half, -half), (-half, half)}
     assert set(depths) == {-40.0, -20.0, 0.0, 20.0, 40.0, -half, half}
-
-
-def test_without_a_guide_none_is_named_or_drawn(space, server):
-    page = space(opening())
     guide = f"async () => {{ {VIEW} return view.shapes.guide.visible; }}"
     assert page.evaluate(guide)
     server.send(scene().model_copy(update={"guide": None}))

@@ -63,59 +63,39 @@ def edited(page, server):
     return server.asked("edit")[-1]["values"]
 
 
-def test_the_legend_names_what_is_drawn(views):
-    page = views([*planned(), REACH])
-    names = page.locator(f"{SECTION} .legend li").all_inner_texts()
-    assert set(names) == {
-        "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
-        "needle", "target, 1 mm",
-    }  # fmt: skip
-
-
-def test_a_finger_scrolls_over_a_drawing_and_drags_its_handles(views):
-    page = views()
-    action = "(element) => getComputedStyle(element).touchAction"
-    for panel in (SECTION, AXIAL):
-        assert page.eval_on_selector(f"{panel} canvas", action) == "auto"
-        assert page.eval_on_selector(f"{panel} .stage", action) == "auto"
-        assert page.eval_on_selector(f"{panel} .handle", action) == "none"
-    assert page.eval_on_selector("[data-panel=space] canvas", action) == "none"
-
-
 def legends(page):
     """Names in the legends of section, view along the axis, and view in space."""
     panels = (SECTION, AXIAL, "[data-panel=space]")
     return [set(page.locator(f"{panel} .legend li").all_inner_texts()) for panel in panels]
 
 
-def test_during_an_insertion_all_views_name_the_true_and_the_measured_tip(views, server):
-    page = views(inserting())
+def test_legends_of_all_views_name_the_drawn_parts(views, server):
+    """The needle at the target is a line; with a band it is an area."""
+    page = views([*planned(), REACH])
     until(page, "document.querySelector('[data-panel=space] .legend li')")
+    assert legends(page)[0] == {
+        "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
+        "needle", "target, 1 mm",
+    }  # fmt: skip
+
+    def check_swatch(text, form, style="color: var(--predicted);"):
+        for panel in (SECTION, AXIAL, "[data-panel=space]"):
+            swatch = page.locator(f"{panel} .legend li", has_text=text).locator(".swatch")
+            assert swatch.get_attribute("class") == f"swatch {form}"
+            assert swatch.get_attribute("style") == style
+
+    check_swatch("needle at the target, planned", "line")
+    server.send(*inserting())
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
+    check_swatch("predicted needle at the target ± 2 sd", "area")
+    check_swatch("measured tip", "cross", "color: var(--measured);")
     both = {"true path of the tip", "measured tip"}
     assert [both & names for names in legends(page)] == [both] * 3
     blind = [row(k).model_copy(update={"measured": None, "true": None}) for k in range(3)]
-    server.send(
-        insertion("planning", periods=0), insertion(rig="Bench"), RowsMessage(of="live", first=0, rows=blind)
-    )
+    missing = RowsMessage(of="live", first=0, rows=blind)
+    server.send(insertion("planning", periods=0), insertion(rig="Bench"), missing)
     until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
     assert [both & names for names in legends(page)] == [set()] * 3
-
-
-@pytest.mark.parametrize(
-    ("state", "text", "form"),
-    [
-        (planned, "needle at the target, planned", "line"),
-        (inserting, "predicted needle at the target ± 2 sd", "area"),
-    ],
-)
-def test_all_legends_show_the_needle_at_the_target_alike(views, state, text, form):
-    """As a line; as an area where it has a band."""
-    page = views(state())
-    until(page, "document.querySelector('[data-panel=space] .legend li')")
-    for panel in (SECTION, AXIAL, "[data-panel=space]"):
-        swatch = page.locator(f"{panel} .legend li", has_text=text).locator(".swatch")
-        assert swatch.get_attribute("class") == f"swatch {form}"
-        assert swatch.get_attribute("style") == "color: var(--predicted);"
 
 
 def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
@@ -141,14 +121,6 @@ def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
     assert legends(page) == [wanted] * 3
 
 
-def test_a_plan_of_an_earlier_state_stays_where_there_is_no_estimate(views):
-    page = views([*opening(), plan(), *plan_frames(), session(2), scene(2)])
-    until(page, "document.querySelector('[data-panel=space] .legend li')")
-    assert legends(page) == [{"planned path", "needle", "target, 1 mm"}] * 3
-    stale = "(await import('/static/planned.js')).plannedPaths(flexneedle.store, 'scene').chosen.stale"
-    assert page.evaluate(f"async () => {stale}")
-
-
 DRAWN = """async ([stretch, right]) => {
   const { drawSection } = await import("/static/flat/section.js");
   const { layersIn } = await import("/static/flat/layers.js");
@@ -170,34 +142,29 @@ DRAWN = """async ([stretch, right]) => {
 }"""
 
 
-@pytest.mark.parametrize(
-    ("stretch", "times", "label"),
-    [(1, 1.0, ""), (3, 3.0, ", lateral ×3"), (5, 3.81, ", lateral ×3.8")],  # as much as there is room for
-)
-def test_a_stretched_axis_is_named_and_the_target_is_1_mm_in_it(views, stretch, times, label):
-    drawn = views().evaluate(DRAWN, [stretch, 50])
-    assert drawn["radii"] == drawn["scales"]
-    assert drawn["scales"][1] / drawn["scales"][0] == pytest.approx(times, rel=0.01)
-    assert f"from the axis (mm){label}" in drawn["texts"]
-
-
-@pytest.mark.parametrize(("right", "last"), [(60, "40"), (70, "60")])
-def test_a_number_at_the_edge_has_room_or_is_left_out(views, right, last):
-    """Numbers of the axis are each 20 mm; the edge is at `right`."""
-    words = views().evaluate(DRAWN, [1, right])["words"]
-    numbers = [each for each in words if each["text"].isdecimal() and each["y"] > 290]
-    assert numbers[-1]["text"] == last
-    assert all(each["x"] + 3 * len(each["text"]) <= 400 for each in numbers)
-
-
-def test_names_of_thin_layers_are_below_each_other(views):
-    names, top = ["skin", "fascia", "fat", "muscle wall", "organ"], 0.0
-    layers = []
+def test_the_section_is_to_scale_and_its_labels_have_room(views, server):
+    """A stretched axis is named, and the target is 1 mm in it; names of thin layers are below each other."""
+    page = views()
+    for stretch, times, label in ((1, 1.0, ""), (3, 3.0, ", lateral ×3"), (5, 3.81, ", lateral ×3.8")):
+        drawn = page.evaluate(DRAWN, [stretch, 50])
+        assert drawn["radii"] == drawn["scales"]
+        assert drawn["scales"][1] / drawn["scales"][0] == pytest.approx(times, rel=0.01)
+        assert f"from the axis (mm){label}" in drawn["texts"]
+    for right, last in (
+        (60, "40"),
+        (70, "60"),
+    ):  # numbers each 20 mm; one at the edge has room or is left out
+        words = page.evaluate(DRAWN, [1, right])["words"]
+        numbers = [each for each in words if each["text"].isdecimal() and each["y"] > 290]
+        assert numbers[-1]["text"] == last
+        assert all(each["x"] + 3 * len(each["text"]) <= 400 for each in numbers)
+    names, top, layers = ["skin", "fascia", "fat", "muscle wall", "organ"], 0.0, []
     for name, thickness in zip(names, [1.0, 2.0, 1.0, 20.0, None], strict=True):
         bottom = None if thickness is None else top + thickness
         layers.append({"name": name, "top_mm": top, "bottom_mm": bottom, "shear_modulus_kpa": 5.0})
         top = bottom
-    page = views([*opening(), scene().model_copy(update={"layers": layers})])
+    server.send(scene().model_copy(update={"layers": layers}))
+    until(page, "flexneedle.store.get('scene').layers.length === 5")
     words = [each for each in page.evaluate(DRAWN, [1, 50])["words"] if each["text"] in names]
     assert [each["text"] for each in words] == names
     assert len({each["y"] for each in words[:3]}) == 3
@@ -207,7 +174,7 @@ def test_names_of_thin_layers_are_below_each_other(views):
             assert abs(one["x"] - other["x"]) >= 3 * (len(one["text"]) + len(other["text"]))
 
 
-def test_arrow_keys_move_the_target_in_its_plane(views, server):
+def test_keys_move_target_and_guide_in_the_planes_of_the_views(views, server):
     page = views()
     handle(page, "target").focus()
     page.keyboard.press("ArrowRight")
@@ -221,50 +188,52 @@ def test_arrow_keys_move_the_target_in_its_plane(views, server):
         atol=0.006,
     )
     page.wait_for_selector(f"{SECTION} [data-handle=target][aria-label*='depth 40.50 mm']")
+    lateral = values["target.lateral_z_mm"]
+    handle(page, "target", AXIAL).focus()
+    page.keyboard.press("ArrowRight")
+    assert edited(page, server)["target.lateral_z_mm"] == pytest.approx(lateral + 0.5)
+    handle(page, "guide").focus()
+    page.keyboard.press("ArrowLeft")
+    assert edited(page, server) == {"setup.guide_to_skin_mm": 41.5}
+    drag(page, handle(page, "guide"), 400)  # it stays before the skin
+    assert edited(page, server) == {"setup.guide_to_skin_mm": 1}
 
 
-def test_the_pointer_moves_the_target(views, server):
+def test_the_pointer_moves_the_target_in_each_plane(views, server):
     page = views()
-    page.click(f"{SECTION} >> text=x–y")
-    drag(page, handle(page, "target"), 20, 10)
+    action = "(element) => getComputedStyle(element).touchAction"
+    for panel in (SECTION, AXIAL):  # a finger scrolls over a drawing and drags its handles
+        assert page.eval_on_selector(f"{panel} canvas", action) == "auto"
+        assert page.eval_on_selector(f"{panel} .handle", action) == "none"
+    across = {"x–y": "target.lateral_mm", "x–z": "target.lateral_z_mm"}
+    before = {"target.depth_mm": TARGET[0], "target.lateral_mm": TARGET[1], "target.lateral_z_mm": TARGET[2]}
+    for plane, key in across.items():
+        page.click(f"{SECTION} >> text={plane}")
+        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        drag(page, handle(page, "target"), 20, 10)
+        values = edited(page, server)
+        right, up = (values[each] - before[each] for each in ("target.depth_mm", key))
+        assert right == pytest.approx(2 * up, abs=0.03)
+        assert right > 1.0
+        (other,) = set(across.values()) - {key}
+        assert values[other] == before[other]
+        before = values
+    drag(page, handle(page, "target", AXIAL), 20, 10)
     values = edited(page, server)
-    right, up = values["target.depth_mm"] - TARGET[0], values["target.lateral_mm"] - TARGET[1]
+    right, up = (values[each] - before[each] for each in ("target.lateral_z_mm", "target.lateral_mm"))
     assert right == pytest.approx(2 * up, abs=0.03)
-    assert right > 1.0
-    assert values["target.lateral_z_mm"] == TARGET[2]
-    server.wait_for("rest")
-    assert [each["type"] for each in server.requests][-2:] == ["edit", "rest"]  # it was let go
+    assert right > 0.5
+    assert values["target.depth_mm"] == before["target.depth_mm"]
+    server.wait_for("rest", 3)
+    assert [each["type"] for each in server.requests][-2:] == ["edit", "rest"]  # it was released
     edits = len(server.asked("edit"))
     handle(page, "target").click()  # and not moved
     page.evaluate("flexneedle.link.edit({'target.depth_mm': 35})")
     server.wait_for("edit", edits + 1)
-    assert len(server.asked("rest")) == 1
+    assert len(server.asked("rest")) == 3
 
 
-def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(views, server):
-    page = views([*planned(), REACH])
-    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
-    for panel in (SECTION, AXIAL):
-        drag(page, handle(page, "target", panel), 20, 10)
-        edited(page, server)
-    assert page.evaluate("flexneedle.store.get('session').revision") > REACH.revision
-    assert all("reach" in names for names in legends(page))
-    server.send(session(90), scene(90))
-    until(page, "flexneedle.store.get('session').revision === 90")
-    shown = "[...document.querySelectorAll('[data-panel] .legend')].some((one) => one.textContent.includes('reach'))"
-    until(page, f"!{shown}")
-
-
-def test_the_guide_is_moved_along_the_axis_and_stays_before_the_skin(views, server):
-    page = views()
-    handle(page, "guide").focus()
-    page.keyboard.press("ArrowLeft")
-    assert edited(page, server) == {"setup.guide_to_skin_mm": 41.5}
-    drag(page, handle(page, "guide"), 400)
-    assert edited(page, server) == {"setup.guide_to_skin_mm": 1}
-
-
-def test_a_boundary_is_moved_and_those_below_it_stay(views, server):
+def test_boundaries_are_moved_and_those_below_stay(views, server):
     three = scene().model_copy(
         update={
             "layers": [
@@ -281,37 +250,24 @@ def test_a_boundary_is_moved_and_those_below_it_stay(views, server):
     handle(page, "boundary-1").focus()
     page.keyboard.press("ArrowRight")
     assert edited(page, server) == {"tissue.1.thickness_mm": 18.5}
-
-
-def test_the_pointer_moves_a_boundary(views, server):
-    page = views()
-    drag(page, handle(page, "boundary-0"), 30)
+    drag(page, handle(page, "boundary-1"), 30)
     values = edited(page, server)
-    assert values.keys() == {"tissue.0.thickness_mm"}
-    assert 21.0 < values["tissue.0.thickness_mm"] < TARGET[0]
+    assert values.keys() == {"tissue.1.thickness_mm"}
+    assert 19.0 < values["tissue.1.thickness_mm"] < TARGET[0]
 
 
-def test_in_the_plane_of_x_and_z_the_target_is_moved_along_z(views, server):
-    page = views()
-    page.click(f"{SECTION} >> text=x–z")
-    assert page.get_attribute(f"{SECTION} [data-plane='x–z']", "aria-pressed") == "true"
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    drag(page, handle(page, "target"), 20, 10)
-    values = edited(page, server)
-    right, up = values["target.depth_mm"] - TARGET[0], values["target.lateral_z_mm"] - TARGET[2]
-    assert right == pytest.approx(2 * up, abs=0.03)
-    assert right > 1.0
-    assert values["target.lateral_mm"] == TARGET[1]
-
-
-def test_the_pointer_moves_the_target_along_the_axis_view(views, server):
-    page = views()
-    drag(page, handle(page, "target", AXIAL), 20, 10)
-    values = edited(page, server)
-    right, up = values["target.lateral_z_mm"] - TARGET[2], values["target.lateral_mm"] - TARGET[1]
-    assert right == pytest.approx(2 * up, abs=0.03)
-    assert right > 0.5
-    assert values["target.depth_mm"] == TARGET[0]
+def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(views, server):
+    page = views([*planned(), REACH])
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
+    for panel in (SECTION, AXIAL):
+        drag(page, handle(page, "target", panel), 20, 10)
+        edited(page, server)
+    assert page.evaluate("flexneedle.store.get('session').revision") > REACH.revision
+    assert all("reach" in names for names in legends(page))
+    server.send(session(90), scene(90))
+    until(page, "flexneedle.store.get('session').revision === 90")
+    shown = "[...document.querySelectorAll('[data-panel] .legend')].some((one) => one.textContent.includes('reach'))"
+    until(page, f"!{shown}")
 
 
 OF_TONE = """async (tone) => {
@@ -345,57 +301,10 @@ def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
     assert page.evaluate(OF_TONE, "--measured") == [0, 0]
 
 
-PAINTS = """{
-  const pen = CanvasRenderingContext2D.prototype;
-  window.painted = { fill: new Set(), stroke: new Set() };
-  for (const [how, style] of [["fill", "fillStyle"], ["stroke", "strokeStyle"]]) {
-    const paint = pen[how];
-    pen[how] = function (...values) {
-      painted[how].add(`${this[style]} ${this.canvas.closest("[data-panel]").dataset.panel}`);
-      return paint.apply(this, values);
-    };
-  }
-}"""
-"""Keeps in which tones each panel has filled and drawn lines."""
-PAINTED = """async ([tone, panel]) => {
-  const { color } = await import("/static/theme.js");
-  const pen = document.createElement("canvas").getContext("2d");
-  pen.fillStyle = color(tone);
-  return Object.values(painted).map((tones) => tones.has(`${pen.fillStyle} ${panel}`));
-}"""
-
-
-def test_a_measured_tip_is_a_cross_in_all_views_and_their_legends(views):
-    """Along the axis the tips and ends of needles are discs."""
-    page = views(inserting(), before=PAINTS)
-    assert page.evaluate(PAINTED, ["--measured", "section"]) == [False, True]
-    assert page.evaluate(PAINTED, ["--measured", "axial"]) == [False, True]
-    assert page.evaluate(PAINTED, ["--needle", "axial"]) == [True, False]
-    until(page, "document.querySelector('[data-panel=space] .legend .cross')")
-    for panel in (SECTION, AXIAL, "[data-panel=space]"):
-        named = page.locator(f"{panel} .legend li", has_text="measured tip")
-        assert named.locator(".swatch.cross").count() == 1
-
-
-def test_the_target_is_moved_along_the_axis_view(views, server):
-    page = views()
-    handle(page, "target", AXIAL).focus()
-    page.keyboard.press("ArrowUp")
-    values = edited(page, server)
-    assert values == {"target.depth_mm": 40, "target.lateral_mm": 5.5, "target.lateral_z_mm": 3}
-    page.keyboard.press("ArrowRight")
-    assert edited(page, server)["target.lateral_z_mm"] == 3.5
-
-
-@pytest.mark.parametrize("news", [[people(2, steering=2)], [insertion("running", periods=0)]])
-def test_nothing_is_moved_where_another_steers_or_an_insertion_runs(views, news):
-    page = views([*opening(), *news])
+def test_nothing_is_moved_during_an_insertion_and_the_way_back_is_shown_after_it(views, server):
+    page = views([*inserting(10)])
     until(page, "!document.querySelector('.handle')")
     assert page.locator(f"{SECTION} .legend li").count() > 0  # it is drawn
-
-
-def test_after_an_insertion_the_way_back_to_the_target_is_shown(views, server):
-    page = views([*inserting(10)])
     note = page.locator(f"{SECTION} >> text=This is an insertion")
     assert not note.is_visible()  # while it runs
     server.send(insertion("done", periods=11))

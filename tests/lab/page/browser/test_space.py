@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS
+from browser_blends import BLENDS, arrived
 from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
@@ -131,24 +131,13 @@ def test_each_part_of_the_scene_is_drawn_at_each_size(space, pictures, state, si
     assert [each for each in counts if each[1] < LEAST] == []
 
 
-def test_the_legend_names_what_is_drawn(space):
-    assert legend(space()) == ["needle", "target, 1 mm"]
-    found = legend(space([*planned(), REACH]))
-    assert found[1:] == [
-        "needle at the target, planned", "path by manipulation", "path by steering", "32 sampled paths", "reach",
-        "target, 1 mm",
-    ]  # fmt: skip
-    found = legend(space(inserting()))
-    assert found[:4] == [
-        "needle",
-        "true needle",
-        "predicted needle at the target ± 2 sd",
-        "stretch of the tissue, 1 to 1.35",
-    ]
-
-
-def test_lengths_are_to_scale(space):
+def test_lengths_are_to_scale_and_shapes_follow_the_period(space, server):
     page = space()
+    position = on_view(page, "return [...view.shapes.group.children[0].geometry.attributes.position.array]")
+    ring = np.reshape(position, (-1, 10, 3))[1]  # ring 0 closes the end
+    start = needle(-28.5)[0]
+    np.testing.assert_allclose(ring.mean(axis=0), start, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(ring - start, axis=1), 0.41, atol=1e-4)
     page.click("text=x–y")
     pixels = on_view(
         page,
@@ -164,23 +153,49 @@ def test_lengths_are_to_scale(space):
     )
     assert pixels[0] > 20.0
     assert pixels[0] == pytest.approx(pixels[1], rel=1e-3)
-
-
-def test_the_needle_is_a_tube_of_its_radius_along_its_points(space):
-    page = space()
-    position = on_view(page, "return [...view.shapes.group.children[0].geometry.attributes.position.array]")
-    ring = np.reshape(position, (-1, 10, 3))[1]  # ring 0 closes the end
-    start = needle(-28.5)[0]
-    np.testing.assert_allclose(ring.mean(axis=0), start, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(ring - start, axis=1), 0.41, atol=1e-4)
-
-
-def test_scrubbing_shows_the_shapes_of_a_period(space):
-    page = space(inserting(50))
+    server.send(*inserting(50))
+    until(page, "flexneedle.store.get('rows live')?.length === 51")
     page.evaluate("flexneedle.store.set('view period', 20)")
     settled(page)
     tip = on_view(page, "return view.shapes.bevel.position.toArray()")
     np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
+
+
+def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, server):
+    page = space()
+    assert "software" in page.inner_text(f"{SPACE} [role=note]")
+    assert legend(page) == ["needle", "target, 1 mm"]
+    version = "return view.shapes.group.children[0].geometry.attributes.position.version"
+    settled(page)
+    before = on_view(page, version)
+    server.send(people(clients=2))
+    page.wait_for_selector("text=2 people")
+    settled(page)
+    assert on_view(page, version) == before
+    server.send(*planned(), REACH)
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
+    assert legend(page)[1:] == [
+        "needle at the target, planned", "path by manipulation", "path by steering", "32 sampled paths", "reach",
+        "target, 1 mm",
+    ]  # fmt: skip
+    server.send(*inserting(10))
+    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('true needle')")
+    assert legend(page)[:3] == ["needle", "true needle", "predicted needle at the target ± 2 sd"]
+    settled(page)
+    page.wait_for_timeout(200)
+    count = "return view.renderer.info.render.frame"
+    before = on_view(page, count)
+    page.wait_for_timeout(400)
+    assert on_view(page, count) == before
+    server.send(rows(11, 1), *period_frames(11))
+    until(page, "flexneedle.store.get('rows live')?.length === 12")
+    settled(page)
+    assert before < on_view(page, count) <= before + 4
+    color = "return view.shapes.group.children[0].material.color.getHex()"
+    before = on_view(page, color)
+    page.click("#theme")
+    settled(page)
+    assert on_view(page, color) != before
 
 
 BEVEL = """
@@ -189,20 +204,19 @@ return head.position.clone().applyQuaternion(view.shapes.bevel.quaternion).norma
 """
 
 
-@pytest.mark.parametrize(
-    ("news", "direction"),
-    [
+def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, server):
+    page = space(opening())
+    for news, direction in (
         ([], (0.0, 1.0, 0.0)),
-        ([plan(roll_deg=90.0)], (0.0, 0.0, 1.0)),
-        ([plan(roll_deg=90.0), session(2)], (0.0, 1.0, 0.0)),
         ([estimate(roll_deg=180.0)], (0.0, -1.0, 0.0)),
-        ([plan(roll_deg=90.0), *inserting(20)], (0.0, np.cos(np.radians(60.0)), np.sin(np.radians(60.0)))),
-    ],
-)
-def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, news, direction):
-    page = space([*opening(), *news])
-    settled(page)
-    np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
+        ([plan(roll_deg=90.0)], (0.0, 0.0, 1.0)),
+        ([session(2)], (0.0, 1.0, 0.0)),  # the plan is outdated
+        (inserting(20)[-100:], (0.0, np.cos(np.radians(60.0)), np.sin(np.radians(60.0)))),
+    ):
+        server.send(*news)
+        arrived(page)
+        settled(page)
+        np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
 
 
 TUBE = """
@@ -220,36 +234,16 @@ def tube(page, order, points):
     return [np.reshape(part, (-1, SIDES, 3))[1 : points + 1] for part in parts]  # ring 0 closes the end
 
 
-def test_the_predicted_needle_is_as_wide_as_it_is_uncertain(space):
-    """Two standard deviations around the needle's radius, at each of its points."""
-    page = space(inserting(20))
+def test_the_predicted_needle_shows_its_uncertainty_and_the_channel_its_stretch(space):
+    """Two standard deviations around the needle's radius; the darker, the more stretched."""
+    page = space(inserting(60))
     settled(page)
     rings, _ = tube(page, PREDICTED, NODES)
-    sd = 0.2 + 1.2 * np.linspace(0.0, 1.0, NODES) * (1 - 20 / PERIODS)
+    sd = 0.2 + 1.2 * np.linspace(0.0, 1.0, NODES) * (1 - 60 / PERIODS)
     middle = rings.mean(axis=1, keepdims=True)
     radius = np.linalg.norm(rings - middle, axis=2)
     np.testing.assert_allclose(radius, np.tile(0.41 + 2.0 * sd, (SIDES, 1)).T, atol=1e-3)
     np.testing.assert_allclose(middle[:, 0], needle(TARGET[0], sway=0.1), atol=1e-3)
-
-
-IN_ITS_TONE = """
-const { paint } = await import("/static/space/room.js");
-const tone = paint("--predicted").getHex();
-return view.shapes.group.children.filter((each) => each.visible && each.material?.color.getHex() === tone).length;
-"""
-
-
-@pytest.mark.parametrize(("state", "tubes"), [(planned, 1), (inserting, 2)])
-def test_the_needle_at_the_target_is_drawn_in_the_tone_of_its_legend(space, state, tubes):
-    """During an insertion with its band."""
-    page = space(state())
-    settled(page)
-    assert on_view(page, IN_ITS_TONE) == tubes
-
-
-def test_the_cut_channel_is_the_darker_the_more_it_is_stretched(space):
-    page = space(inserting(60))
-    settled(page)
     _, colors = tube(page, CHANNEL, 24)
     cut = np.linspace(0.0, -28.5 + 68.5 * 61 / PERIODS, 24)
     stretch = np.sin(np.pi * cut / (TARGET[0] + 5.0))
@@ -282,41 +276,7 @@ def test_sampled_paths_narrow_with_each_iteration(space, server):
     assert np.all(np.diff(spreads) < 0.0)
 
 
-def test_it_draws_only_when_something_has_changed(space, server):
-    page = space(inserting(10))
-    settled(page)
-    page.wait_for_timeout(200)
-    count = "return view.renderer.info.render.frame"
-    before = on_view(page, count)
-    page.wait_for_timeout(400)
-    assert on_view(page, count) == before
-    server.send(rows(11, 1), *period_frames(11))
-    until(page, "flexneedle.store.get('rows live')?.length === 12")
-    settled(page)
-    assert before < on_view(page, count) <= before + 4
-
-
-def test_a_shape_is_drawn_once(space, server):
-    page = space()
-    version = "return view.shapes.group.children[0].geometry.attributes.position.version"
-    settled(page)
-    before = on_view(page, version)
-    server.send(people(clients=2))
-    page.wait_for_selector("text=2 people")
-    settled(page)
-    assert on_view(page, version) == before
-
-
-def test_the_switch_repaints_the_scene(space):
-    page = space()
-    color = "return view.shapes.group.children[0].material.color.getHex()"
-    before = on_view(page, color)
-    page.click("#theme")
-    settled(page)
-    assert on_view(page, color) != before
-
-
-def test_keys_turn_zoom_and_reset(space):
+def test_keys_pointer_and_wheel_move_the_camera_and_nothing_else(space, server):
     page = space()
     place = "return view.camera.camera.position.toArray()"
     start = on_view(page, place)
@@ -328,10 +288,6 @@ def test_keys_turn_zoom_and_reset(space):
     assert len({tuple(np.round(each, 3)) for each in places}) == len(places)
     page.keyboard.press("0")
     np.testing.assert_allclose(on_view(page, place), start, atol=1e-6)
-
-
-def test_the_pointer_turns_the_view_and_the_scene_stays(space, server):
-    page = space()
     before = on_view(page, "return view.camera.camera.position.toArray()")
     box = page.locator(CANVAS).bounding_box()
     page.mouse.move(box["x"] + 60, box["y"] + 40)
@@ -343,12 +299,7 @@ def test_the_pointer_turns_the_view_and_the_scene_stays(space, server):
         > 5.0
     )
     assert not server.asked("edit")
-
-
-def test_the_wheel_zooms(space):
-    page = space()
     distance = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
-    box = page.locator(CANVAS).bounding_box()
     page.mouse.move(box["x"] + 60, box["y"] + 40)
     distances = [on_view(page, distance)]
     for turn in (-200, 400):
@@ -407,26 +358,20 @@ def test_the_strip_of_the_reach_is_shown_while_the_target_is_in_its_plane(space,
     assert page.locator(f"{SPACE} .legend li", has_text="reach").locator(".swatch.area").count() == strip
 
 
-def test_in_the_plane_the_target_has_no_third_coordinate(space, server):
+def test_in_the_plane_the_target_keeps_its_plane_and_rests_while_another_is_in_control(space, server):
     page = space([*opening(), scene(axes=1)])
     until(page, "flexneedle.store.get('scene').axes === 1")
     drag_target(page, 20)
     until(page, "!flexneedle.store.get('draft')")
     assert set(server.asked("edit")[0]["values"]) == {"target.depth_mm", "target.lateral_mm"}
-
-
-@pytest.mark.parametrize("news", [[people(2, steering=2)], [insertion("running", periods=0)]])
-def test_the_target_stays_where_another_steers_or_an_insertion_runs(space, server, news):
-    page = space([*opening(), *news])
-    settled(page)
-    drag_target(page, 20)
-    page.wait_for_timeout(100)
-    assert not server.asked("edit")
-    assert on_view(page, "return view.target.ball.position.toArray()") == list(TARGET)
-
-
-def test_software_rendering_is_noticed(space):
-    assert "software" in space().inner_text(f"{SPACE} [role=note]")
+    for news in ([people(2, steering=2)], [people(1, steering=1), insertion("running", periods=0)]):
+        server.send(*news)
+        arrived(page)
+        edits, place = len(server.asked("edit")), on_view(page, "return view.target.ball.position.toArray()")
+        drag_target(page, 20)
+        page.wait_for_timeout(100)
+        assert len(server.asked("edit")) == edits
+        assert on_view(page, "return view.target.ball.position.toArray()") == place
 
 
 def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):

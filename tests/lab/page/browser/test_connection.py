@@ -1,0 +1,165 @@
+"""Connection, control, refusals, work in the status bar, and recovery after a lost connection."""
+
+from typing import get_args
+
+import pytest
+
+from fake_page import until
+from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage
+from flexneedle.lab.page.shape_frames import FrameSource
+from recorded_page import insertion, people, period_frames, planned, rows, session
+
+pytestmark = pytest.mark.page
+
+STATUS = "[data-panel=status]"
+FOCUSED = "document.activeElement.textContent"
+
+
+def test_control_is_taken_shared_and_released(visit, server):
+    page = visit()
+    page.wait_for_selector("text=Connected")
+    assert "Two-layer tissue phantom in space · seed 0" in page.inner_text("#title")
+    assert "1 person connected, nobody is in control" in page.inner_text(STATUS)
+    page.click("text=Take control")
+    page.wait_for_selector("text=you are in control")
+    assert page.evaluate(FOCUSED) == "Release control"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=nobody is in control")
+    assert page.evaluate(FOCUSED) == "Take control"
+    assert server.asked("steer") == [{"type": "steer", "take": True}, {"type": "steer", "take": False}]
+    server.send(people(2))
+    page.wait_for_selector("text=2 people connected, you are person 1, nobody is in control")
+    server.answers["steer"] = RefusedMessage(what="steer", reason="Person 2 is in control: ask for it first.")
+    page.click("text=Take control")
+    page.wait_for_selector("[role=alert] >> text=Person 2 is in control")
+    page.click("[role=alert] >> text=Close")
+    page.wait_for_selector("text=Person 2 is in control", state="detached")
+    server.send(people(3, steering=2))
+    page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
+
+
+def test_edits_take_control_are_merged_and_a_refusal_ends_with_the_next_accepted_value(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody is in control")
+    seconds = page.evaluate(
+        """async () => {
+          const start = performance.now();
+          for (let depth = 0; depth < 100; depth++) {
+            flexneedle.link.edit({ "target.depth_mm": 30 + depth / 10 });
+            await new Promise((resolve) => setTimeout(resolve, 5));
+          }
+          return (performance.now() - start) / 1000;
+        }"""
+    )
+    page.wait_for_selector("text=you are in control")
+    until(page, "flexneedle.store.get('scene').target[0] === 39.9 && !flexneedle.store.get('draft')")
+    edits = server.asked("edit")
+    assert 2 <= len(edits) <= 20 * seconds + 2
+    assert edits[-1]["values"] == {"target.depth_mm": 39.9}
+    problems = {"target.depth_mm": "must be above 0"}
+    server.answers["edit"] = RefusedMessage(what="edit", reason="depth: must be above 0", problems=problems)
+    page.evaluate("flexneedle.link.edit({'target.depth_mm': -1})")
+    page.wait_for_selector("[role=alert] >> text=must be above 0")
+    del server.answers["edit"]
+    page.evaluate("flexneedle.link.edit({'target.depth_mm': 30})")
+    page.wait_for_selector("[role=alert] >> text=must be above 0", state="detached")
+
+
+def test_work_is_shown_cancelled_and_an_insertion_stopped_from_the_status_bar(visit, server):
+    server.news = [*server.news, JobMessage(job=4, kind="reach", state="failed", text="the worker has ended")]
+    page = visit()
+    page.wait_for_selector("text=Reach: the worker has ended")
+    server.send(
+        JobMessage(job=5, kind="reach", state="running"), JobMessage(job=5, kind="reach", state="done")
+    )
+    page.wait_for_selector("text=the worker has ended", state="detached")
+    server.send(JobMessage(job=1, kind="needle", state="waiting", text="the computation starts"))
+    page.wait_for_selector(f"{STATUS} >> text=Needle: the computation starts")
+    assert page.get_attribute(f"{STATUS} progress", "value") is None  # without a share
+    page.evaluate("() => { const now = performance.now(); performance.now = () => now + 75_000; }")
+    page.wait_for_selector(f"{STATUS} >> text=/the computation starts \\(7\\d s\\)/")
+    server.send(JobMessage(job=1, kind="needle", state="done"))
+    server.send(JobMessage(job=7, kind="plan", state="running", share=0.25, text="iteration 5 of 20"))
+    page.wait_for_selector("text=Plan: iteration 5 of 20")
+    assert page.eval_on_selector(f"{STATUS} progress", "bar => bar.value") == 0.25
+    page.click("[aria-label='Cancel: Plan']")
+    server.send(JobMessage(job=7, kind="plan", state="cancelled"))
+    page.wait_for_selector("text=Plan: iteration", state="detached")
+    assert server.wait_for("cancel") == [{"type": "cancel", "job": 7}]
+    kinds = get_args(JobMessage.model_fields["kind"].annotation)
+    server.send(*(JobMessage(job=number, kind=kind, state="running") for number, kind in enumerate(kinds, 8)))
+    page.wait_for_selector(f"{STATUS} .job >> nth={len(kinds) - 1}")
+    assert "undefined" not in page.inner_html(STATUS)
+    cancels = page.locator(f"{STATUS} .job button:visible").evaluate_all(
+        "all => all.map((one) => one.ariaLabel)"
+    )
+    assert len(cancels) == len(kinds) - 2  # an insertion is stopped, and a run is saved completely
+    for number, state in enumerate(("waiting", "planning", "ready", "running", "paused", "holding"), 1):
+        server.send(insertion(state, rig="Bench"))
+        page.click(f"{STATUS} >> text=Stop the insertion")
+        assert server.wait_for("stop", number)[-1] == {"type": "stop"}
+    server.send(insertion("interrupted", rig="Bench"))
+    page.wait_for_selector(f"{STATUS} >> text=Stop the insertion", state="hidden")
+
+
+FASTER = "const every = setInterval; window.setInterval = (call, ms) => every(call, ms / 10);"
+
+
+def test_after_a_restart_a_dead_line_and_a_lost_connection_the_state_is_recovered(visit, server):
+    page = visit(before=FASTER)
+    page.wait_for_selector("text=nobody is in control")
+    server.send(session(5, seed=7))
+    page.wait_for_selector("text=seed 7")
+    server.drop()
+    page.wait_for_selector("text=The server was restarted")
+    page.wait_for_selector("text=seed 0")
+    assert page.evaluate("flexneedle.store.get('refusals').length") == 1
+    server.wait_for("ping", 3)  # while all is quiet
+    server.news = [*planned()[:1], people(clients=3), session(revision=9, seed=4)]
+    server.cut()
+    page.wait_for_selector("text=3 people connected")
+    page.wait_for_selector("#title:has-text('seed 4')")
+    known = page.evaluate("['connection', 'connection reason'].map((key) => flexneedle.store.get(key))")
+    assert known == ["open", "the server is silent"]
+    assert page.evaluate("['scene', 'plan steering'].map((key) => flexneedle.store.get(key))") == [None, None]
+    page.evaluate("() => { window.WebSocket = class { close() {} }; }")  # no other attempt succeeds
+    server.drop("64 pages are connected, which is the limit")
+    page.wait_for_selector("text=No connection; trying again… (64 pages are connected, which is the limit)")
+    assert page.get_attribute(f"{STATUS} .connection", "data-state") == "lost"
+
+
+def test_outdated_state_is_dropped_missing_rows_are_requested_and_a_broken_panel_is_isolated(visit, server):
+    server.answers["rows_from"] = lambda request: [rows(request["index"], 10)]
+    page = visit()
+    page.wait_for_selector("text=nobody is in control")
+    server.send(*planned())
+    until(page, "flexneedle.store.get('shape needle scene') && flexneedle.store.get('plan steering')")
+    kept = "['shape needle scene', 'plan steering', 'scene'].map((key) => Boolean(flexneedle.store.get(key)))"
+    for revision, name, expected in ((9, "phantom3d", True), (10, "another", False)):
+        server.send(session(revision=revision, name=name))
+        until(page, f"flexneedle.store.get('session').revision === {revision}")
+        assert page.evaluate(kept) == [expected, expected, True]
+    for of, source in (("live", FrameSource.LIVE), ("first", FrameSource.FIRST)):
+        server.send(insertion("done", of=of), rows(0, 3, of), *period_frames(2, source))
+    until(page, "flexneedle.store.track('needle', 'first') && flexneedle.store.track('needle', 'live')")
+    server.send(insertion("planning", periods=0), ClosedMessage(of="first"))
+    until(
+        page,
+        "!flexneedle.store.get('insertion first') && flexneedle.store.get('insertion live').periods === 0",
+    )
+    left = "['live', 'first'].map((of) => [flexneedle.store.get(`rows ${of}`), flexneedle.store.track('needle', of)])"
+    assert page.evaluate(left) == [[None, None], [None, None]]
+    server.send(rows(0, 3))
+    server.send(rows(8, 2))
+    until(page, "flexneedle.store.get('rows live')?.length === 13")
+    assert server.asked("rows_from") == [{"type": "rows_from", "index": 3}]
+    page.evaluate(
+        """() => {
+          flexneedle.store.subscribe(["session"], () => { throw new Error("one panel"); });
+          flexneedle.store.subscribe(["session"], () => { window.after = flexneedle.store.get("session"); });
+        }"""
+    )
+    server.send(session(11, name="another", seed=8))
+    until(page, "window.after?.seed === 8")
+    assert set(visit.errors) == {"one panel"}
+    visit.errors.clear()
