@@ -138,10 +138,6 @@ class Rclpy:
             count_publishers=lambda _topic: self.publishers,
             destroy_node=lambda: None,
         )
-        executor = SimpleNamespace(
-            MultiThreadedExecutor=lambda: SimpleNamespace(add_node=lambda _node: None, spin=self.spin),
-            ExternalShutdownException=type("ExternalShutdownException", (Exception,), {}),
-        )
         parts = {
             "rclpy": {
                 "init": lambda **_: None,
@@ -149,11 +145,13 @@ class Rclpy:
                 "try_shutdown": lambda: None,
             },
             "rclpy.callback_groups": {"ReentrantCallbackGroup": object},
-            "rclpy.executors": vars(executor),
-            "rclpy.qos": {
-                "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1),
-                "QoSProfile": lambda **given: given,
+            "rclpy.executors": {
+                "MultiThreadedExecutor": lambda: SimpleNamespace(
+                    add_node=lambda _node: None, spin=lambda: until(lambda: not self.spinning)
+                ),
+                "ExternalShutdownException": type("ExternalShutdownException", (Exception,), {}),
             },
+            "rclpy.qos": {"DurabilityPolicy": MagicMock(), "QoSProfile": lambda **given: given},
             "std_msgs": {},
             "std_msgs.msg": {"Bool": SimpleNamespace, "String": SimpleNamespace},
             "std_srvs": {},
@@ -164,15 +162,29 @@ class Rclpy:
             vars(module).update(values)
             monkeypatch.setitem(sys.modules, name, module)
 
-    def spin(self):
-        until(lambda: not self.spinning)
+    def report(self, state):
+        """Report a state of the rig."""
+        self.state[1](SimpleNamespace(data=state))
 
     def call(self, name):
-        return self.services[name](None, SimpleNamespace())
+        """Call a service; return whether it succeeds, and its text."""
+        answered = self.services[f"~/{name}"](None, SimpleNamespace())
+        return answered.success, answered.message
+
+    def call_while(self, name, meanwhile):
+        """Call a service, and do something until it answers."""
+        answers = []
+        caller = Thread(target=lambda: answers.append(self.call(name)))
+        caller.start()
+        meanwhile(answers)
+        caller.join()
+        return answers[0]
 
 
 @pytest.fixture
-def running(operator, monkeypatch):
+def running(request, operator, monkeypatch):
+    answer_s = getattr(request, "param", 20.0)  # the default is for an idle machine
+    monkeypatch.setitem(operator.DEFAULTS, "answer_s", answer_s)
     rclpy = Rclpy(monkeypatch)
     thread = Thread(target=operator.main)
     thread.start()
@@ -182,60 +194,42 @@ def running(operator, monkeypatch):
     thread.join()
 
 
-def test_a_stop_is_repeated_until_the_rig_reports_it(running):
-    topic, report = running.state
-    assert topic == "/flexneedle/state"
-    report(SimpleNamespace(data="inserting"))
-    answers = []
-    caller = Thread(target=lambda: answers.append(running.call("~/stop")))
-    caller.start()
-    until(lambda: len(running.sent) >= 3)
-    report(SimpleNamespace(data="stopped"))
-    caller.join()
+@pytest.mark.parametrize("before", ["inserting", "idle"])
+def test_a_stop_is_repeated_until_the_rig_reports_it(running, before):
+    """An idle rig, too: what it last reported may be older than the stop, and an arm may be on its way."""
+
+    def stop(_answers):
+        until(lambda: len(running.sent) >= 3)
+        running.report(before)  # once a second
+        running.report("stopped")
+
+    assert running.state[0] == "/flexneedle/state"
+    running.report(before)
+    assert running.call_while("stop", stop) == (True, "the rig reports 'stopped'")
     assert set(running.sent) == {("/flexneedle/stop", True)}
-    assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
 
 
-def test_an_idle_rig_is_asked_until_it_reports_the_stop(running):
-    """What it last reported may be older than the stop, and an arm may be on its way."""
-    report = running.state[1]
-    report(SimpleNamespace(data="idle"))
-    answers = []
-    caller = Thread(target=lambda: answers.append(running.call("~/stop")))
-    caller.start()
-    until(lambda: len(running.sent) >= 3)
-    report(SimpleNamespace(data="idle"))  # once a second
-    report(SimpleNamespace(data="stopped"))
-    caller.join()
-    assert (answers[0].success, answers[0].message) == (True, "the rig reports 'stopped'")
+@pytest.mark.parametrize(("name", "state", "sent"), [("stop", "stopped", 3), ("arm", "armed", 1)])
+def test_a_state_that_was_reported_before_the_call_is_no_answer(running, name, state, sent):
+    """It may be the state of a rig that has ended, while another one begins."""
+
+    def report_again(answers):
+        until(lambda: len(running.sent) >= sent)
+        assert answers == []
+        running.report(state)
+
+    running.report(state)
+    assert running.call_while(name, report_again)[0]
 
 
-@pytest.mark.parametrize(("name", "state"), [("stop", "stopped"), ("arm", "armed")])
-def test_a_state_that_was_reported_before_the_call_is_no_answer(running, name, state):
-    """It may be that of a rig that has ended, while another one begins."""
-    report, answers = running.state[1], []
-    report(SimpleNamespace(data=state))
-    caller = Thread(target=lambda: answers.append(running.call(f"~/{name}")))
-    caller.start()
-    until(lambda: len(running.sent) >= (3 if name == "stop" else 1))
-    assert answers == []
-    report(SimpleNamespace(data=state))
-    caller.join()
-    assert answers[0].success
-
-
-def test_a_stop_that_an_idle_rig_does_not_report_fails(running):
-    running.state[1](SimpleNamespace(data="idle"))
-    answered = running.call("~/stop")
-    assert (answered.success, answered.message) == (False, "not done within 2 s: the rig reports 'idle'")
-
-
-def test_an_arm_is_asked_for_once_and_may_fail(running):
-    running.state[1](SimpleNamespace(data="idle"))
-    answered = running.call("~/arm")
+@pytest.mark.parametrize("running", [0.2], indirect=True)
+def test_what_an_idle_rig_does_not_report_fails_and_an_arm_is_sent_once(running):
+    running.report("idle")
+    failed = (False, "not done within 0.2 s: the rig reports 'idle'")
+    assert running.call("arm") == failed
     assert running.sent == [("/flexneedle/arm", True)]
-    assert not answered.success
-    assert answered.message == "not done within 2 s: the rig reports 'idle'"
+    assert running.call("stop") == failed
+    assert ("/flexneedle/stop", True) in running.sent
 
 
 @pytest.mark.parametrize(
@@ -247,23 +241,25 @@ def test_an_arm_is_asked_for_once_and_may_fail(running):
         ("inserting", ("armed", "inserting"), True),
     ],
 )
-def test_an_arm_is_done_also_where_the_rig_has_gone_on(running, before, after, done):
-    running.state[1](SimpleNamespace(data=before))
-    answers = []
-    caller = Thread(target=lambda: answers.append(running.call("~/arm")))
-    caller.start()
-    until(lambda: running.sent)
-    for state in after:
-        running.state[1](SimpleNamespace(data=state))
-    caller.join()
-    assert answers[0].success is done
+def test_an_arm_is_done_also_where_the_rig_inserts_already(operator, before, after, done):
+    states = operator.States()
+    states.report(before)
+    published = []
+
+    def publish():
+        published.append(1)
+        for state in after:
+            states.report(state)
+
+    given = {"repeat": False, "missing": ""}
+    assert operator.carry_out(publish, states, operator.ARMED, 0.2, **given)[0] is done
+    assert len(published) == 1
 
 
 def test_without_a_rig_a_service_fails_and_a_stop_is_sent_all_the_same(running):
     running.publishers = 0
-    running.state[1](SimpleNamespace(data="stopped"))  # of a rig that has ended
-    answered = running.call("~/stop")
-    assert (answered.success, answered.message) == (False, "no rig publishes /flexneedle/state")
+    running.report("stopped")  # of a rig that has ended
+    assert running.call("stop") == (False, "no rig publishes /flexneedle/state")
     assert running.sent == [("/flexneedle/stop", True)]
-    assert not running.call("~/arm").success
+    assert not running.call("arm")[0]
     assert len(running.sent) == 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import flexneedle
+from flexneedle.devices import open_rig
 from ros_rig import START_MM, quick_scenario
 from ros_topics_rig import rig_of_page
 
@@ -31,7 +32,7 @@ def test_the_rig_of_the_page_inserts_a_needle(tmp_path):
     path.write_text(rig_of_page())
     scenario = flexneedle.load_scenario(quick_scenario(tmp_path))
     with topics_rig():
-        done = flexneedle.insert(scenario, flexneedle.plan(scenario, seed=0), 0, rig=path)
+        done = flexneedle.insert(scenario, flexneedle.plan(scenario, seed=0), 0, rig=open_rig(path))
     assert done.outcome == "done"
     assert done.reached
     assert done.periods[-1].estimate.x == pytest.approx(done.target[0], abs=0.3)

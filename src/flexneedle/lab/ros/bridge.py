@@ -45,8 +45,8 @@ def load_checked_profile(settings: RosSettings) -> TopicProfile:
 class Bridge(Gate):
     """The connection of one insertion to ROS, from before its planning to after its end. Use it as a context manager.
 
-    Pass it to the insertion as a listener and as a gate. A thread polls the node and forwards a stop to the supervisor
-    at once; without a rig, a stop ends the insertion at its next event.
+    Pass it to the insertion as a listener and as its gate. A thread polls the node and forwards a stop to the
+    supervisor at once; without a rig, a stop ends the insertion at its next event.
 
     Args:
         settings: Section `ros` of a rig file.
