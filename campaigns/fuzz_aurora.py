@@ -29,9 +29,9 @@ from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.registration import Rigid
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
-from flexneedle.lab.rig.devices.aurora.incoming import Incoming
+from flexneedle.lab.rig.devices.aurora.incoming import LinkReceiver
 from flexneedle.lab.rig.devices.aurora.messages import parse
-from flexneedle.lab.rig.devices.aurora.readings import NAMES, readings, sensor_name
+from flexneedle.lab.rig.devices.aurora.readings import NAMES, make_readings, sensor_name
 from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
@@ -78,7 +78,7 @@ def random_sensor(random: Random) -> tuple[int, int, int, tuple[float, ...]]:
 def checked_reading(
     sensor: tuple[int, int, int, tuple[float, ...]],
     number: int,
-    read: Callable[..., dict[str, SensorReading]] = readings,
+    read: Callable[..., dict[str, SensorReading]] = make_readings,
 ) -> SensorReading:
     """Return the reading of a sensor. read: the conversion. Raises Failure."""
     kind, bits, frame, _ = sensor
@@ -123,7 +123,7 @@ class Feeding:
     errors: int = 0
 
     def __post_init__(self) -> None:
-        self.incoming = Incoming(NAMES, -1000.0, lambda: self.time)
+        self.incoming = LinkReceiver(NAMES, -1000.0, lambda: self.time)
 
 
 def link_inputs(random: Random) -> Iterator[str]:
@@ -201,11 +201,11 @@ def fed(feeding: Feeding, line: bytes, random: Random) -> None:
     try:
         incoming.take(parse(line))
         if random.random() < 0.01:  # the link ends
-            incoming.begin()
+            incoming.begin_link()
             feeding.device_number = 0
     except ValueError as error:
-        incoming.crashed(f"the link failed: {error}")
-        incoming.begin()
+        incoming.record_crash(f"the link failed: {error}")
+        incoming.begin_link()
         feeding.device_number, feeding.errors = 0, feeding.errors + 1
         if incoming.status == VISIBLE:
             raise Failure(f"{line!r} is not reported") from error

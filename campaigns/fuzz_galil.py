@@ -27,8 +27,8 @@ from flexneedle.errors import DriverError
 from flexneedle.lab.emulators.galil.controller import ControllerState, advance_controller, reply
 from flexneedle.lab.emulators.galil.motor_axis import MotorAxis
 from flexneedle.lab.rig.devices.galil.motors import GalilMotors, factory
-from flexneedle.lab.rig.devices.galil.replies import GarbledError, numbers, parse, text
-from flexneedle.lab.rig.devices.galil.states import report
+from flexneedle.lab.rig.devices.galil.replies import GarbledError, parse_numbers, parse_replies, parse_text
+from flexneedle.lab.rig.devices.galil.states import make_report
 from flexneedle.ports import MotorState
 from fuzzing import Failure, Part, main, mutated
 
@@ -58,17 +58,17 @@ def parser_inputs(random: Random) -> Iterator[str]:
         received = mutated(random, random.choice(REPLIES), BYTES)
         count = random.randint(1, 5)
         with suppress(GarbledError):
-            found = parse(received, count)
+            found = parse_replies(received, count)
             if found is not None:
                 rebuilt = "".join(each.data + "?:"[each.accepted] for each in found).encode()
                 if rebuilt != received or len(found) != count:
                     raise Failure(f"{received!r} as {count} replies: {found}")
-                values = [value for each in found for value in numbers(each.data, random.randint(1, 3))]
+                values = [value for each in found for value in parse_numbers(each.data, random.randint(1, 3))]
                 if not all(abs(value) < 1e10 for value in values):
                     raise Failure(f"{received!r}: {values}")
-                report(*(values * 4)[:4])
+                make_report(*(values * 4)[:4])
         with suppress(GarbledError):
-            text(received.decode("latin-1"))
+            parse_text(received.decode("latin-1"))
         yield ""
 
 

@@ -23,7 +23,7 @@ from random import Random
 from time import process_time
 
 from flexneedle.errors import RigError
-from flexneedle.lab.rig.devices.galil.settings import checked as galil_settings
+from flexneedle.lab.rig.devices.galil.settings import check_galil_settings as galil_settings
 from flexneedle.lab.rig.devices.trackers import AuroraSettings, ReplaySettings
 from flexneedle.lab.rig.rig_file import RigFile, check_settings, load_rig
 from flexneedle.lab.ros.motors import RosDriverSettings

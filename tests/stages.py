@@ -261,7 +261,7 @@ class Bench:
 
     def armed(self, deepest=50.0):
         """The same, armed."""
-        self.core.request(protocol.ArmRequest(deepest))
+        self.core.request(protocol.ArmCommand(deepest))
         return self
 
     def position(self, name):

@@ -58,7 +58,7 @@ def test_every_rig_carries_out_steps_and_rolls_with_no_more_than_the_queue(rigs,
         guides = [name for name, _ in file.axes.items() if name.startswith("guide")]
         for number, roll in enumerate((0.0, math.pi, 0.0, -math.pi), 1):
             travel = {"insertion": 1.0, **dict.fromkeys(guides, 0.1 * (-1) ** number)}
-            bench.core.request(protocol.StepRequest(number, roll, travel, rig.scenario.setup.step_time))
+            bench.core.request(protocol.StepCommand(number, roll, travel, rig.scenario.setup.step_time))
             assert bench.until(number).why == "", rig.number
         most = max(report.axes["insertion"].queued for report in bench.reports)
         assert most <= 0.51

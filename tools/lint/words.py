@@ -32,6 +32,7 @@ CHECKED = (
     "src/flexneedle/lab/emulators",
     "src/flexneedle/lab/page",
     "src/flexneedle/lab/process.py",
+    "src/flexneedle/lab/rig",
     "src/flexneedle/lab/study",
     "src/flexneedle/lab/tables",
     "src/flexneedle/lab/tracker_evaluation",

@@ -18,7 +18,7 @@ from flexneedle.lab.emulators.faults import (
 )
 from flexneedle.lab.emulators.motion import sensor_pose
 from flexneedle.lab.emulators.server import EmulatorSession, execute
-from flexneedle.lab.rig.devices.aurora.readings import reading
+from flexneedle.lab.rig.devices.aurora.readings import make_reading
 
 
 def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
@@ -163,7 +163,7 @@ def test_values_that_are_not_numbers_are_reported_and_rejected_by_the_adapter(ki
         text = read(tracking("nan@1"), 11.0)[1].decode()
         assert text.startswith("010A" + 4 * "   nan" + 3 * "    nan" + "   nan")
         found = (0.0,) * 8  # as ndicapi reads what are no digits
-    assert reading(0, 0x31, found).status == "bad transform"
+    assert make_reading(0, 0x31, found).status == "bad transform"
 
 
 def test_a_fault_of_another_sensor_does_not_change_the_tip():

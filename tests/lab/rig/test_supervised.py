@@ -22,7 +22,7 @@ from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.lab.rig.supervised import AxisColumns, SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
-from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepRequest, TickReport
+from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepCommand, TickReport
 from flexneedle.loop.closed_loop import _carry_out
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
@@ -58,7 +58,7 @@ def test_a_turn_of_the_base_is_an_axis_that_no_rig_has():
     assert travel == {"insertion": 1.0, "base_theta": 0.003, "base_psi": -0.002}
     for axis in ("base_theta", "base_psi"):
         bench = Bench().armed()
-        bench.core.request(StepRequest(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
+        bench.core.request(StepCommand(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
         assert bench.sent[-1].why.startswith(f"the rig has no axis {axis}; axes: insertion, ")
 
 

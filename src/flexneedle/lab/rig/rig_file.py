@@ -79,8 +79,7 @@ class LoopSettings(Section):
         return 1e-3 * (min(ticks, _LONGEST_QUEUE_MS) if self.queue_ms is None else self.queue_ms)
 
     def queue_of(self, axis: Axis, speed: float) -> float:
-        """Return the largest distance (mm or rad) of an axis from its target, in a motion with this speed (mm/s or
-        rad/s).
+        """Return the largest distance (mm or rad) of an axis from its target, at this speed (mm/s or rad/s).
 
         It is at least two tolerances: a motor may rest within one, and shall move on.
         """

@@ -55,8 +55,10 @@ _GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
 
 @dataclass(frozen=True)
 class AxisColumns:
-    """Conversion between columns of a control and travel of the rig's axes. slope: dy/dx + i dz/dx of the base's
-    axis."""
+    """Conversion between columns of a control and travel of the rig's axes.
+
+    slope: dy/dx + i dz/dx of the axis on which the base moves.
+    """
 
     slope: complex
 
@@ -75,8 +77,10 @@ class AxisColumns:
         return {name: way for name, way in travel.items() if abs(way) > 1e-12}
 
     def to_control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
-        """Return the control that travelled axes have carried out, with the roll and the spin (rad) of their
-        rotation."""
+        """Return the control that travelled axes have carried out.
+
+        roll, spin: parts of the rotation (rad).
+        """
         row = np.zeros(len(STILL))
         row[DB_X] = travelled.get("insertion", 0.0) / axis_stretch(self.slope)
         row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
@@ -223,7 +227,7 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
-    """The scenario with the registration of the rig file, if that has one."""
+    """Return the scenario with the registration of the rig file, if it has one."""
     if rig.registration is None:
         return scenario
     return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
@@ -257,7 +261,7 @@ class SupervisedRig:
             raise RigError(*problems)
 
     def results(self) -> dict[str, Any]:
-        """Summary of the ticks."""
+        """Return the summary of the ticks."""
         return {"ticks": self.ticks.summarize()}
 
     @contextmanager

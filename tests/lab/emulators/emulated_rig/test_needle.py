@@ -8,7 +8,7 @@ import pytest
 from flexneedle.geometry.quaternion import along, to_matrix
 from flexneedle.geometry.registration import Rigid
 from flexneedle.lab.emulators.emulated_rig.axes import NAMES
-from flexneedle.lab.emulators.emulated_rig.needle import RESOLUTION_MM, DrivenNeedle, TipSensor
+from flexneedle.lab.emulators.emulated_rig.needle import RESOLUTION_MM, DrivenNeedle, PhantomSensor
 from flexneedle.loop.virtual import Seeds
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom
@@ -123,7 +123,7 @@ def test_the_guide_moves_the_needle_in_two_axes():
 def test_a_sensor_is_behind_the_tip_in_the_trackers_frame():
     """Mapped back, and advanced along its axis, it is the tip with the bias."""
     registered = Rigid(to_matrix(np.array([0.4, -0.2, 0.8, 0.4])), np.array([220.0, 5.0, -7.0]))
-    sensor = TipSensor(registered.inverse(), offset=9.0, bias=(0.1, -0.2, 0.3))
+    sensor = PhantomSensor(registered.inverse(), offset=9.0, bias=(0.1, -0.2, 0.3))
     tip = np.array([31.0, 2.0, -1.0, 0.06, -0.03])
     x, y, z, *axis = sensor.at(tip)
     turn = tuple(along(np.array(axis)).tolist())

@@ -15,7 +15,7 @@ import pytest
 from flexneedle.cli.main import build_parser
 from flexneedle.lab.emulators.aurora import FAULTS
 from flexneedle.lab.emulators.faults import parse_fault
-from flexneedle.lab.rig.devices.aurora.readings import reading
+from flexneedle.lab.rig.devices.aurora.readings import make_reading
 
 PAGE = (Path(__file__).parents[4] / "docs" / "tracking" / "aurora.md").read_text()
 COMMANDS = [
@@ -74,8 +74,8 @@ def test_its_table_has_every_fault():
 def test_its_table_has_every_status():
     pose = (1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.02)
     cases = [(kind, 1 << bit | 1) for kind in (0, 1, 2) for bit in range(16)] + [(0, 0)]
-    statuses = {reading(kind, bits, pose).status for kind, bits in cases}
-    statuses |= {"stale", reading(0, 1, (0.0,) * 8).status}
+    statuses = {make_reading(kind, bits, pose).status for kind, bits in cases}
+    statuses |= {"stale", make_reading(0, 1, (0.0,) * 8).status}
     assert [status for status in sorted(statuses) if f"`{status}`" not in PAGE] == []
 
 

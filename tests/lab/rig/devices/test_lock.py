@@ -12,7 +12,7 @@ from bench_rig import Motors
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices import lock
 from flexneedle.lab.rig.devices.galil.motors import factory
-from flexneedle.lab.rig.devices.lock import held, lock_file, this_program
+from flexneedle.lab.rig.devices.lock import describe_program, hold_motors, lock_file
 from flexneedle.lab.rig.devices.opening import address_of
 from flexneedle.lab.rig.rig_file import DeviceSection
 from galil_peer import peer
@@ -22,7 +22,7 @@ import sys
 from pathlib import Path
 from flexneedle.lab.rig.devices import lock
 lock.FOLDER = Path(sys.argv[1])
-with lock.held("10.0.0.1:23", lock.this_program()):
+with lock.hold_motors("10.0.0.1:23", lock.describe_program()):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -35,18 +35,18 @@ def folder(tmp_path, monkeypatch):
 
 
 def refusal(address):
-    with pytest.raises(DriverError) as caught, held(address, "another"):
+    with pytest.raises(DriverError) as caught, hold_motors(address, "another"):
         pass
     return str(caught.value)
 
 
 def test_motors_that_are_held_are_refused_with_their_holder_in_one_line():
-    with held("10.0.0.1:23", "pid 7 (flexneedle insert\nphantom)"):
+    with hold_motors("10.0.0.1:23", "pid 7 (flexneedle insert\nphantom)"):
         line = refusal("10.0.0.1:23")
         assert line == r"10.0.0.1:23: in use by pid 7 (flexneedle insert\nphantom): end it first"
-        with held("10.0.0.1:24", "another"):
+        with hold_motors("10.0.0.1:24", "another"):
             pass
-    with held("10.0.0.1:23", "pid 8"):  # a shorter text than that before
+    with hold_motors("10.0.0.1:23", "pid 8"):  # a shorter text than that before
         assert refusal("10.0.0.1:23") == "10.0.0.1:23: in use by pid 8: end it first"
 
 
@@ -60,14 +60,14 @@ def test_a_program_that_is_killed_holds_nothing(folder):
         other.send_signal(signal.SIGKILL)
         other.communicate()
     assert lock_file("10.0.0.1:23").read_text().startswith(f"pid {other.pid} ")
-    with held("10.0.0.1:23", this_program()):
-        assert lock_file("10.0.0.1:23").read_text() == this_program()
+    with hold_motors("10.0.0.1:23", describe_program()):
+        assert lock_file("10.0.0.1:23").read_text() == describe_program()
 
 
 def test_the_file_is_for_all_users_whatever_the_umask_is():
     before = os.umask(0o077)
     try:
-        with held("10.0.0.1:23", "one"):
+        with hold_motors("10.0.0.1:23", "one"):
             pass
     finally:
         os.umask(before)
@@ -76,7 +76,7 @@ def test_the_file_is_for_all_users_whatever_the_umask_is():
 
 def test_the_file_of_another_user_is_opened_without_making_one(monkeypatch):
     """Linux refuses O_CREAT on another user's file in /tmp (fs.protected_regular), also if it may be written."""
-    with held("10.0.0.1:23", "one"):
+    with hold_motors("10.0.0.1:23", "one"):
         pass
     kept = os.open
 
@@ -86,7 +86,7 @@ def test_the_file_of_another_user_is_opened_without_making_one(monkeypatch):
         return kept(path, flags, *more)
 
     monkeypatch.setattr(os, "open", protected)
-    with held("10.0.0.1:23", "two"):
+    with hold_motors("10.0.0.1:23", "two"):
         assert lock_file("10.0.0.1:23").read_text() == "two"
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from bench_rig import Clock
 from flexneedle.errors import InputError, RigError
-from flexneedle.lab.rig.devices.trackers import aurora, frames_of_run, replay
+from flexneedle.lab.rig.devices.trackers import aurora, read_run_frames, replay
 from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n5.0,1,tip,1,2,3\n6.0,2,tip,1,2,3\n"
@@ -73,7 +73,7 @@ def read_run(monkeypatch, *samples):
     checked = [CheckedMeasurement(sample, "ok") for sample in samples]
     periods = [SimpleNamespace(readings=checked[:1]), SimpleNamespace(readings=checked[1:])]
     monkeypatch.setattr("flexneedle.record.reader.read_trace", lambda _: SimpleNamespace(periods=periods))
-    return frames_of_run(Path("run"))
+    return read_run_frames(Path("run"))
 
 
 def test_a_run_returns_each_frame_of_its_tracker_once(monkeypatch):

@@ -468,10 +468,10 @@ def test_the_setup_has_limits_errors_and_disabled_switches_of_the_controller():
 @settings(max_examples=200)
 @given(st.dictionaries(st.sampled_from("ABCDEFGH"), st.integers(-(2**31) + 1, 2**31 - 1), min_size=1))
 def test_every_position_is_sent_to_its_axis_in_lines_that_fit(positions):
-    from flexneedle.lab.rig.devices.galil.motors import _in_lines
+    from flexneedle.lab.rig.devices.galil.motors import _split_assignment
 
     found = {}
-    for command in _in_lines("PA", positions):
+    for command in _split_assignment("PA", positions):
         assert len(command) <= 80
         for letter, text in zip("ABCDEFGH", command.removeprefix("PA ").split(","), strict=False):
             found |= {letter: int(text)} if text else {}

@@ -12,10 +12,10 @@ from flexneedle.lab.rig.devices.galil.replies import (
     LONGEST_LINE,
     GarbledError,
     Reply,
-    lines,
-    numbers,
-    parse,
-    text,
+    parse_numbers,
+    parse_replies,
+    parse_text,
+    split_lines,
 )
 
 TRANSCRIPTS = {
@@ -27,15 +27,15 @@ EXCHANGES = [(name, exchange) for name, found in TRANSCRIPTS.items() for exchang
 
 @pytest.mark.parametrize(("name", "exchange"), EXCHANGES)
 def test_the_makers_examples_are_read(name, exchange):
-    (found,) = parse(exchange["reply"].encode(), 1)
+    (found,) = parse_replies(exchange["reply"].encode(), 1)
     assert found.accepted == (exchange["reply"] != "?")
     if "text" in exchange:
-        assert text(found.data) == exchange["text"]
+        assert parse_text(found.data) == exchange["text"]
     elif exchange.get("numbers"):
-        assert numbers(found.data, len(exchange["numbers"])) == tuple(exchange["numbers"])
+        assert parse_numbers(found.data, len(exchange["numbers"])) == tuple(exchange["numbers"])
     elif name == "hexadecimal":
         with pytest.raises(GarbledError, match="numbers"):
-            numbers(found.data, 4)
+            parse_numbers(found.data, 4)
     else:
         assert found.data == ""
 
@@ -51,7 +51,7 @@ def test_the_emulated_controller_answers_like_the_makers_examples(name):
 
 
 def test_replies_are_one_for_each_command():
-    assert parse(b" 1, 2\r\n: 3\r\n:?:", 4) == (
+    assert parse_replies(b" 1, 2\r\n: 3\r\n:?:", 4) == (
         Reply(True, " 1, 2\r\n"),
         Reply(True, " 3\r\n"),
         Reply(False),
@@ -61,7 +61,7 @@ def test_replies_are_one_for_each_command():
 
 @pytest.mark.parametrize("received", [b"", b" 1", b" 1\r\n", b":", b" 1\r\n: 2\r\n"])
 def test_replies_that_are_not_complete_are_waited_for(received):
-    assert parse(received, 2) is None
+    assert parse_replies(received, 2) is None
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_replies_that_are_not_complete_are_waited_for(received):
 )
 def test_what_is_no_reply_to_two_commands_is_refused(received):
     with pytest.raises(GarbledError):
-        parse(received, 2)
+        parse_replies(received, 2)
 
 
 @pytest.mark.parametrize(
@@ -80,30 +80,30 @@ def test_what_is_no_reply_to_two_commands_is_refused(received):
 )  # fmt: skip
 def test_what_is_not_one_number_is_refused(data):
     with pytest.raises(GarbledError):
-        numbers(data, 1)
+        parse_numbers(data, 1)
 
 
 @pytest.mark.parametrize("data", ["", "\r\n", "a\r\nb\r\n", "abc"])
 def test_what_is_not_a_line_of_text_is_refused(data):
     with pytest.raises(GarbledError):
-        text(data)
+        parse_text(data)
 
 
 def test_commands_are_distributed_over_lines_in_their_order():
     commands = tuple(f"PA{'ABCD'[k % 4]}={'1' * (5 * k + 1)}" for k in range(12))
-    found = lines(commands)
+    found = split_lines(commands)
     assert tuple(command for line in found for command in line) == commands
     assert all(len(";".join(line)) <= LONGEST_LINE for line in found)
-    assert len(lines(("TPABCD", "RPABCD", "TSABCD", "SCABCD"))) == 1
+    assert len(split_lines(("TPABCD", "RPABCD", "TSABCD", "SCABCD"))) == 1
     with pytest.raises(ValueError, match="longer than 80"):
-        lines(("X" * 81,))
+        split_lines(("X" * 81,))
 
 
 @settings(max_examples=500)
 @given(st.binary(max_size=40), st.integers(1, 5))
 def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
     try:
-        found = parse(received, count)
+        found = parse_replies(received, count)
     except GarbledError:
         return
     assert found is None or len(found) == count
@@ -116,6 +116,6 @@ def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
 def test_a_reply_arrives_in_any_pieces(values, data):
     whole = f" {', '.join(map(str, values))}\r\n:".encode()
     at = data.draw(st.integers(0, len(whole) - 1))
-    assert parse(whole[:at], 1) is None
-    (found,) = parse(whole, 1)
-    assert numbers(found.data, len(values)) == tuple(values)
+    assert parse_replies(whole[:at], 1) is None
+    (found,) = parse_replies(whole, 1)
+    assert parse_numbers(found.data, len(values)) == tuple(values)

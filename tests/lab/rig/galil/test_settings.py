@@ -8,13 +8,13 @@ import pytest
 
 from flexneedle.errors import RigError
 from flexneedle.lab.rig.devices.galil.motors import factory
-from flexneedle.lab.rig.devices.galil.settings import checked
+from flexneedle.lab.rig.devices.galil.settings import check_galil_settings
 
 GOOD = {"address": "192.168.1.10"}
 
 
 def test_defaults():
-    found = checked(GOOD, ["A", "B"])
+    found = check_galil_settings(GOOD, ["A", "B"])
     assert (found.host, found.port, found.mode, found.reply_timeout_ms) == (
         "192.168.1.10",
         23,
@@ -28,7 +28,7 @@ def test_defaults():
     [("galil.lab:2323", "galil.lab", 2323), ("[fe80::1%eth0]:23", "fe80::1%eth0", 23), ("[::1]", "::1", 23)],
 )
 def test_an_address_has_a_host_and_perhaps_a_port(address, host, port):
-    found = checked({"address": address}, ["A"])
+    found = check_galil_settings({"address": address}, ["A"])
     assert (found.host, found.port) == (host, port)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.lab.rig.devices.galil.replies import GarbledError
-from flexneedle.lab.rig.devices.galil.states import Channel, report, seen
+from flexneedle.lab.rig.devices.galil.states import ChannelState, make_report, take_report
 
 REST, MOVING, OFF = 0b0000_1111, 0b1000_1111, 0b0010_1111
 RUNS, ARRIVED, FORWARD, STOPPED, ABORTED, ON_ERROR = 0, 1, 2, 4, 7, 8
@@ -15,19 +15,19 @@ def states(channel, *reports):
     """The states after reports of (commanded position, switches, stop code)."""
     found = []
     for commanded, switches, code in reports:
-        channel, state = seen(channel, report(commanded, commanded, switches, code))
+        channel, state = take_report(channel, make_report(commanded, commanded, switches, code))
         found.append(state)
     return found
 
 
 def after(channel, *reports):
     for commanded, switches, code in reports:
-        channel, _ = seen(channel, report(commanded, commanded, switches, code))
+        channel, _ = take_report(channel, make_report(commanded, commanded, switches, code))
     return channel
 
 
 def tracking(target, *reports):
-    return after(Channel(), *(reports or [(0, REST, ARRIVED)])).follows(target, tracking=True)
+    return after(ChannelState(), *(reports or [(0, REST, ARRIVED)])).with_target(target, tracking=True)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def tracking(target, *reports):
 )
 def test_bits_of_the_switches(switches, on, reverse, forward, moving):
     """Limit bits are 1 while the switch is inactive."""
-    (state,) = states(Channel(), (5, switches, ARRIVED))
+    (state,) = states(ChannelState(), (5, switches, ARRIVED))
     assert (state.on, state.reverse_limit, state.forward_limit, state.moving) == (
         on,
         reverse,
@@ -69,13 +69,13 @@ def test_an_axis_that_passes_its_target_is_in_motion():
 
 
 def test_in_a_move_the_controller_reports_the_end():
-    channel = Channel().follows(100, tracking=False)
+    channel = ChannelState().with_target(100, tracking=False)
     assert [s.moving for s in states(channel, (100, MOVING, RUNS), (100, MOVING, RUNS))] == [True, True]
     assert states(channel, (100, REST, ARRIVED))[0].moving is False
 
 
 def test_a_target_that_waits_is_motion():
-    (state,) = states(Channel(target=5, waiting=True), (0, REST, ARRIVED))
+    (state,) = states(ChannelState(target=5, waiting=True), (0, REST, ARRIVED))
     assert state.moving
 
 
@@ -99,7 +99,7 @@ def test_a_stop_of_the_controller_is_reported_until_something_is_commanded(code,
     assert words in stopped.stopped
     assert later.stopped == stopped.stopped
     channel = after(tracking(100), (20, MOVING, RUNS), (31, REST, code))
-    for commanded in (channel.rests(), channel.follows(0, tracking=True)):
+    for commanded in (channel.without_target(), channel.with_target(0, tracking=True)):
         assert states(commanded, (31, REST, code))[0].stopped == ""
 
 
@@ -120,14 +120,14 @@ def test_an_earlier_stop_is_not_one_of_the_new_motion(code):
 
 
 def test_the_drivers_own_stop_is_none_of_the_controller():
-    channel = after(tracking(100), (20, MOVING, RUNS)).rests(STOPPED).follows(50, tracking=True)
+    channel = after(tracking(100), (20, MOVING, RUNS)).without_target(STOPPED).with_target(50, tracking=True)
     early, running, foreign = states(channel, (30, MOVING, STOPPED), (35, MOVING, RUNS), (40, REST, STOPPED))
     assert (early.stopped, running.stopped) == ("", "")
     assert "not the driver's" in foreign.stopped
 
 
 def test_at_rest_without_a_command_no_stop_is_reported():
-    assert states(Channel(), (0, REST, FORWARD))[0].stopped == ""
+    assert states(ChannelState(), (0, REST, FORWARD))[0].stopped == ""
 
 
 @pytest.mark.parametrize(
@@ -136,13 +136,13 @@ def test_at_rest_without_a_command_no_stop_is_reported():
 )  # fmt: skip
 def test_values_that_an_axis_cannot_have_are_refused(values):
     with pytest.raises(GarbledError):
-        report(*values)
+        make_report(*values)
 
 
 def test_a_target_that_waits_is_given_up_where_the_controller_stops_the_axis():
     """It rests then: who searches a limit switch waits for that. Another stop of its own is as good."""
     channel = replace(
-        after(Channel(), (0, REST, ARRIVED)).follows(100, tracking=False), target=200, waiting=True
+        after(ChannelState(), (0, REST, ARRIVED)).with_target(100, tracking=False), target=200, waiting=True
     )
     moved, at_switch = (50, MOVING, RUNS), (60, 0b0000_1011, 3)
     assert [state.moving for state in states(channel, moved, at_switch, at_switch)] == [True, False, False]

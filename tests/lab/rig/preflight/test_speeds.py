@@ -15,7 +15,7 @@ def slow(speed, acceleration):
 def test_an_axis_keeps_the_speed_that_it_can_brake_from_within_the_queue(speed, acceleration):
     rig = slow(speed, acceleration)
     bench = Bench(rig).armed()
-    bench.core.request(protocol.MoveRequest(1, "insertion", 30.0, speed))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 30.0, speed))
     times = []
     for place in (12.0, 18.0):
         while bench.position("insertion") < place:
@@ -29,7 +29,7 @@ def test_an_axis_keeps_the_speed_that_it_can_brake_from_within_the_queue(speed, 
 def test_a_step_takes_the_time_that_its_acceleration_needs(acceleration):
     rig = slow(10.0, acceleration)
     bench = Bench(rig).armed()
-    bench.core.request(protocol.StepRequest(1, 0.0, {"insertion": 1.0}, 0.2))
+    bench.core.request(protocol.StepCommand(1, 0.0, {"insertion": 1.0}, 0.2))
     assert bench.until(1).why == ""
     taken = bench.clock.now()
     assert step_time(rig.axes.insertion, rig.loop, 1.0, 0.2) == pytest.approx(taken, rel=0.1, abs=2 * TICK_S)

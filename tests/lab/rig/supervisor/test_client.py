@@ -49,27 +49,27 @@ class Scripted:
     def _serve(self):
         self._line.receive_first()
         self._report(0, rests=True)
-        while not isinstance(request := self._take(), protocol.CloseRequest):
+        while not isinstance(request := self._take(), protocol.CloseCommand):
             self._answer(request)
         self._line.send(protocol.SupervisorEnded())
         self._line.close()
 
     def _answer(self, request):
         match request:
-            case protocol.StopRequest():
+            case protocol.StopCommand():
                 self._report(self._requests - 1, rests=True)  # an earlier one, that was under way
                 self._next = [(self._requests, rests) for rests in (False, False, True)]
             case protocol.Heartbeat() if self._next:
                 requests, rests = self._next.pop(0)
                 self._report(requests, rests=rests)
-            case protocol.ResetRequest() if self._next:
+            case protocol.ResetCommand() if self._next:
                 self._line.send(
                     protocol.RequestRefused(0, "motors have not come to rest yet", SupervisorState.STOPPED)
                 )
                 self._report(self._requests, rests=False)
                 # As the supervisor's own, its number of requests never falls, also if a late client sends heartbeats.
                 self._next = [(self._requests, rests) for _, rests in self._next]
-            case protocol.ResetRequest():
+            case protocol.ResetCommand():
                 self._line.send(protocol.TickReport(0.0, SupervisorState.IDLE, requests=self._requests))
 
 

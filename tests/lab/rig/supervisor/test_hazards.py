@@ -14,7 +14,7 @@ AHEAD = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 
 
 def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
-    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, duration, expected)
+    return protocol.StepCommand(number, roll, travel or {"insertion": 1.0}, duration, expected)
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def bench():
 
 @pytest.mark.parametrize("stall", [0.1, 0.3, 0.45])
 def test_after_late_ticks_no_more_than_the_queue_is_commanded(bench, stall):
-    bench.core.request(protocol.MoveRequest(1, "insertion", 30.0, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 30.0, 5.0))
     bench.tick(20)
     bench.clock.wait(stall)
     bench.core.request(protocol.Heartbeat())
@@ -41,7 +41,7 @@ def test_after_late_ticks_no_more_than_the_queue_is_commanded(bench, stall):
 
 
 def test_after_a_long_time_without_ticks_a_motion_is_not_taken_up_again(bench):
-    bench.core.request(protocol.MoveRequest(1, "insertion", 30.0, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 30.0, 5.0))
     bench.tick(20)
     bench.clock.wait(0.6)
     bench.core.tick()
@@ -91,13 +91,13 @@ def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything
     assert bench.core.state is SupervisorState.FAULT
     bench.stage.lost = True
     bench.tick(4)
-    bench.core.request(protocol.ResetRequest())
+    bench.core.request(protocol.ResetCommand())
     assert isinstance(bench.sent[-1], protocol.RequestRefused)
     assert not bench.reports[-1].at_rest
     bench.stage.lost = False
     bench.tick(20)
     assert ("reconnect",) in bench.stage.calls
-    bench.core.request(protocol.ResetRequest())
+    bench.core.request(protocol.ResetCommand())
     assert bench.core.state is SupervisorState.IDLE
 
 
@@ -111,7 +111,7 @@ def test_a_driver_that_leaves_a_motor_out_is_a_fault(bench):
 
 @pytest.mark.parametrize("how", ["stop", "fault"])
 def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
-    bench.core.request(protocol.StopRequest("the test"))
+    bench.core.request(protocol.StopCommand("the test"))
     if how == "fault":
         bench.stage.motors["A"].stopped = "abort"
     bench.tick(10)
@@ -125,10 +125,10 @@ def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
 
 
 def test_a_second_stop_is_sent_too(bench):
-    bench.core.request(protocol.StopRequest("one"))
+    bench.core.request(protocol.StopCommand("one"))
     bench.tick(10)
     before = bench.stage.calls.count(("stop",))
-    bench.core.request(protocol.StopRequest("two"))
+    bench.core.request(protocol.StopCommand("two"))
     assert bench.stage.calls.count(("stop",)) == before + 1
     assert bench.core.why == "one"
 
@@ -138,7 +138,7 @@ def test_a_stop_without_effect_is_a_fault_and_is_reported(bench):
     bench.tick(3)
     bench.stage.deaf = True
     bench.stage.motors["A"].target = 90_000.0
-    bench.core.request(protocol.StopRequest("the test"))
+    bench.core.request(protocol.StopCommand("the test"))
     done = bench.until(1, most=60)
     assert (done.state, done.why) == (SupervisorState.FAULT, "the test")
     assert bench.core.why == "the motors do not stop"
@@ -151,19 +151,19 @@ def test_motors_that_do_not_stop_are_a_fault_also_if_the_stop_is_repeated(bench,
     bench.stage.deaf = True
     bench.stage.motors["A"].target = 90_000.0
     for _ in range(60 // every):
-        bench.core.request(protocol.StopRequest("the test"))
+        bench.core.request(protocol.StopCommand("the test"))
         bench.tick(every)
     assert (bench.core.state, bench.core.why) == (SupervisorState.FAULT, "the motors do not stop")
 
 
 def test_a_later_stop_has_its_own_time(bench):
-    bench.core.request(protocol.StopRequest("one"))
+    bench.core.request(protocol.StopCommand("one"))
     bench.tick(100)
-    bench.core.request(protocol.ResetRequest())
+    bench.core.request(protocol.ResetCommand())
     bench.armed()
     bench.core.request(step(expected=AHEAD, duration=2.0))
     bench.tick(3)
-    bench.core.request(protocol.StopRequest("two"))
+    bench.core.request(protocol.StopCommand("two"))
     bench.tick(20)
     assert (bench.core.state, bench.core.why) == (SupervisorState.STOPPED, "two")
 
@@ -177,7 +177,7 @@ def test_a_position_that_is_no_number_is_a_fault(bench):
 
 def test_a_motor_beyond_its_range_is_a_fault():
     bench = Bench().armed(deepest=1e6)
-    bench.core.request(protocol.MoveRequest(1, "insertion", 110.0, 10.0))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 110.0, 10.0))
     bench.tick(100)
     bench.stage.motors["A"].commanded = bench.stage.motors["A"].position = 110_250.0
     bench.tick()
@@ -280,14 +280,14 @@ def test_times_of_readings_are_those_of_the_motors_and_not_of_a_slow_tracker():
 
 
 def test_a_jog_is_no_faster_than_asked(bench):
-    bench.core.request(protocol.MoveRequest(1, "guide_y", 1.0, 2.0))
+    bench.core.request(protocol.MoveCommand(1, "guide_y", 1.0, 2.0))
     speeds = [call[2] for call in bench.stage.calls if call[0] == "set_speed"]
     assert speeds == pytest.approx([2.0 * 500.0])
 
 
 def test_a_speed_that_is_refused_has_the_unit_of_the_file(bench):
     for axis, speed in (("rotation", 4.0 * math.pi), ("guide_y", 12.5)):
-        bench.core.request(protocol.MoveRequest(1, axis, 1.0, speed))
+        bench.core.request(protocol.MoveCommand(1, axis, 1.0, speed))
         expected = {
             "rotation": "speed of rotation = 720 deg/s: must be above 0, at most 360 deg/s",
             "guide_y": "speed of guide_y = 12.5 mm/s: must be above 0, at most 10 mm/s",
@@ -305,22 +305,22 @@ def test_an_axis_beyond_its_range_is_armed_for_the_operator_alone_and_may_only_b
     if tracked:
         assert "guide_y = -16.000 mm: must be within -15.000 mm and 15.000 mm" in bench.sent[-1].why
         return
-    bench.core.request(protocol.MoveRequest(1, "guide_y", -16.5, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "guide_y", -16.5, 5.0))
     assert bench.sent[-1].why.startswith("guide_y = -16.500 mm: must be within")
-    bench.core.request(protocol.MoveRequest(2, "guide_y", -15.5, 5.0))
+    bench.core.request(protocol.MoveCommand(2, "guide_y", -15.5, 5.0))
     assert bench.until(2).why == ""
-    bench.core.request(protocol.MoveRequest(3, "guide_y", 0.0, 5.0))
+    bench.core.request(protocol.MoveCommand(3, "guide_y", 0.0, 5.0))
     assert bench.until(3).why == ""
 
 
 def test_a_jog_may_not_go_deeper_than_the_insertion_may():
     bench = Bench().armed(deepest=20.0)
-    bench.core.request(protocol.MoveRequest(1, "insertion", 20.1, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 20.1, 5.0))
     assert "as far as this insertion may go" in bench.sent[-1].why
 
 
 def test_after_homing_the_rig_is_not_armed(bench):
-    bench.core.request(protocol.HomeRequest(1, "rotation"))
+    bench.core.request(protocol.HomeCommand(1, "rotation"))
     bench.until(1)
     bench.core.request(step(2))
     assert bench.sent[-1].why.startswith("step: refused while idle")
@@ -328,7 +328,7 @@ def test_after_homing_the_rig_is_not_armed(bench):
 
 def test_a_home_that_cannot_be_defined_is_a_fault(bench):
     bench.stage.define = lambda *_: bench.stage._called("define") or setattr(bench.stage, "lost", True)
-    bench.core.request(protocol.HomeRequest(1, "rotation"))
+    bench.core.request(protocol.HomeCommand(1, "rotation"))
     done = bench.until(1)
     assert done.state is SupervisorState.FAULT
     assert done.why == "no reply within 100 ms"

@@ -20,7 +20,7 @@ def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(hom
     bench = Bench(rig_file(guide_y=keys)).armed()
     motor = bench.stage.motors["C"]
     motor.low, motor.high = -9000.0, 7000.0  # counts, 500 a mm
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.core.state is SupervisorState.HOMING
     done = bench.until(1, most=20_000)
     assert (done.why, done.state) == ("", SupervisorState.IDLE)
@@ -28,7 +28,7 @@ def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(hom
     assert switch == pytest.approx(direction * 500.0 * 15.5 * to_home, abs=1e-6)
     assert bench.position("guide_y") == pytest.approx((15.0 - 0.6) * to_home, abs=2e-3)
     bench.armed()
-    bench.core.request(protocol.MoveRequest(2, "guide_y", 0.0, 5.0))
+    bench.core.request(protocol.MoveCommand(2, "guide_y", 0.0, 5.0))
     assert bench.until(2).why == ""
 
 
@@ -40,7 +40,7 @@ def test_an_axis_that_slows_down_at_its_switch_is_called_home_where_it_rests(sec
     bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})).armed()
     motor = bench.stage.motors["C"]
     motor.coasts, motor.high = seconds, 500.0 * (2.0 + speed * TICK_S * phase)
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert (done.why, done.state) == ("", SupervisorState.IDLE)
     (defined,) = [call for call in bench.stage.calls if call[0] == "define"]
@@ -54,7 +54,7 @@ def test_a_home_is_where_the_servo_rests_not_where_its_profile_has_ended(lag):
     bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5, "speed_mm_s": 40.0})).armed()
     motor = bench.stage.motors["C"]
     motor.coasts, motor.lag, motor.high = 0.01, lag, 1000.0
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert (done.why, done.state) == ("", SupervisorState.IDLE)
     bench.tick(20)
@@ -67,7 +67,7 @@ def test_ticks_one_right_after_the_other_do_not_show_that_a_servo_rests(late):
     bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5, "speed_mm_s": 40.0})).armed()
     motor = bench.stage.motors["C"]
     motor.coasts, motor.lag, motor.high = 0.01, 0.02, 1000.0
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     for _ in range(10_000):
         if bench.core.state is not SupervisorState.HOMING:
             break
@@ -92,7 +92,7 @@ def test_a_home_is_set_once_the_servo_rests_off_the_switch(monkeypatch):
         define(*arguments)
 
     monkeypatch.setattr(bench.stage, "define", late)
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.until(1, most=20_000).why == ""
     bench.tick(20)
     assert bench.position("guide_y") == pytest.approx(-14.4, abs=2e-3)
@@ -102,7 +102,7 @@ def test_an_axis_that_never_rests_at_its_switch_is_a_fault():
     bench = Bench(rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})).armed()
     motor = bench.stage.motors["C"]
     motor.coasts, motor.high = 1e3, 1000.0
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert done.state is SupervisorState.FAULT
     assert motor.position < 1000.0 + 500.0 * 33.0
@@ -118,7 +118,7 @@ def test_a_search_moves_as_it_is_announced():
     )
     bench = Bench(rig).armed()
     bench.stage.motors["C"].high = 7000.0  # counts, 500 a mm
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.until(1, most=20_000).why == ""
     assert [call[2] for call in bench.stage.calls if call[0] == "set_speed"] == pytest.approx([500.0, 500.0])
     at = [report.axes["guide_y"].position for report in bench.reports]
@@ -128,7 +128,7 @@ def test_a_search_moves_as_it_is_announced():
 
 def test_an_axis_is_at_home_where_it_is():
     bench = Bench(rig_file(rotation={"home_deg": 90.0})).armed()
-    bench.core.request(protocol.HomeRequest(1, "rotation"))
+    bench.core.request(protocol.HomeCommand(1, "rotation"))
     assert bench.until(1).why == ""
     assert bench.position("rotation") == pytest.approx(math.pi / 2)
 
@@ -138,7 +138,7 @@ def called_home_while_following(lag):
     bench = Bench(rig_file(guide_y={"home_mm": 3.0})).armed()
     motor = bench.stage.motors["C"]
     motor.lag, motor.commanded, motor.target = lag, 15.0, 15.0  # counts, 500 a mm
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     return bench
 
 
@@ -165,7 +165,7 @@ def test_an_axis_that_never_rests_is_not_at_home_where_it_is():
     bench = Bench(rig_file(guide_y={"home_mm": 3.0})).armed()
     motor = bench.stage.motors["C"]
     motor.lag = 1e6
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     for tick in range(40):  # 4 counts to and fro, 0.008 mm
         motor.position = 4.0 * ((tick + 1) % 2)
         bench.tick()
@@ -176,7 +176,7 @@ def test_an_axis_that_never_rests_is_not_at_home_where_it_is():
 
 def test_without_a_switch_the_axis_has_no_home():
     bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0})).armed()
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert done.why == "guide_y: no limit switch within its range"
     assert not [call for call in bench.stage.calls if call[0] == "define"]
@@ -204,7 +204,7 @@ def test_from_its_switch_an_axis_moves_away_before_it_searches_it(creeps):
     if creeps:
         motor.position -= 5.0
         bench.tick()
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.until(1).why == ""
     assert bench.position("guide_y") == pytest.approx(HOME_MM - BACK_OFF_MM, abs=2e-3)
     assert motor.low == pytest.approx(-500.0 * HOME_MM, abs=1e-6)
@@ -230,7 +230,7 @@ def test_a_switch_that_stays_active_is_no_home(at):
         return found
 
     bench.stage.read = stuck
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert done.why == (
         "guide_y: the reverse-limit switch is still active 0.600 mm away from it: it is stuck, or needs more room: "
@@ -245,15 +245,15 @@ def test_a_switch_that_stays_active_is_no_home(at):
 def test_a_search_that_is_stopped_sets_no_home_and_the_next_one_does(ticks, leg):
     """In each of its legs: off the switch, towards it, and off it again."""
     bench, motor = guide()
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     bench.tick(ticks)
     assert [call[0] for call in bench.stage.calls].count("set_speed") == leg
-    bench.core.request(protocol.StopRequest("the keyboard"))
+    bench.core.request(protocol.StopCommand("the keyboard"))
     done = bench.until(1)
     assert (done.state, done.why) == (SupervisorState.STOPPED, "the keyboard")
     assert "define" not in [call[0] for call in bench.stage.calls]
-    bench.core.request(protocol.ResetRequest())
-    bench.armed().core.request(protocol.HomeRequest(2, "guide_y"))
+    bench.core.request(protocol.ResetCommand())
+    bench.armed().core.request(protocol.HomeCommand(2, "guide_y"))
     assert bench.until(2, most=20_000).why == ""
     assert motor.low == pytest.approx(-500.0 * HOME_MM, abs=1e-6)
 
@@ -268,7 +268,7 @@ def test_a_position_that_is_no_number_at_the_switch_is_no_home():
         return found | {"C": replace(found["C"], position=math.nan)} if at_switch else found
 
     bench.stage.read = reported
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert done.state is SupervisorState.FAULT
     assert done.why.startswith("guide_y: the motor controller reports position nan")
@@ -283,7 +283,7 @@ def test_a_switch_far_beyond_a_short_range_is_found_from_anywhere(home, start):
     motor.position = motor.commanded = motor.target = -500.0 * start
     motor.low = -500.0 * home
     bench.tick()
-    bench.armed().core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.armed().core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.until(1, most=20_000).why == ""
     assert bench.position("guide_y") == pytest.approx(2.0 - 0.08, abs=2e-3)
     assert motor.low == pytest.approx(-500.0 * home, abs=1e-6)
@@ -291,20 +291,20 @@ def test_a_switch_far_beyond_a_short_range_is_found_from_anywhere(home, start):
 
 def test_with_both_switches_active_nothing_is_searched():
     bench, _ = guide(high=-500.0 * SWITCH_MM)
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.sent[-1].why == "guide_y: both limit switches are active: check their wiring and polarity"
     assert bench.core.state is SupervisorState.ARMED
 
 
 def test_an_absolute_encoder_is_not_homed():
     bench = Bench(rig_file(guide_y={"home": "absolute"})).armed()
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     assert bench.sent[0].why == "guide_y: has an absolute encoder, and no home to search"
 
 
 def test_a_stall_while_homing_is_a_fault():
     bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0})).armed()
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     bench.tick(5)
     bench.stage.motors["C"].fault = "stall"
     begun = bench.clock.now()
@@ -328,7 +328,7 @@ def test_what_is_refused_in_a_search_is_a_fault(monkeypatch, refused, leg):
             raise DriverError("SPC=100: ? 6 Number out of range")
 
     monkeypatch.setattr(bench.stage, "_called", called)
-    bench.core.request(protocol.HomeRequest(1, "guide_y"))
+    bench.core.request(protocol.HomeCommand(1, "guide_y"))
     done = bench.until(1)
     assert (done.state, done.why) == (SupervisorState.FAULT, "SPC=100: ? 6 Number out of range")
     assert "define" not in [call[0] for call in bench.stage.calls]

@@ -34,7 +34,7 @@ def moved(bench, numbers, steps):
     for number, _ in zip(numbers, range(steps), strict=False):
         way = 0.5 if number % 2 else -0.5
         bench.core.request(
-            protocol.StepRequest(number, 0.0, {"insertion": way, "guide_y": 0.2 * way}, 0.1, None)
+            protocol.StepCommand(number, 0.0, {"insertion": way, "guide_y": 0.2 * way}, 0.1, None)
         )
         bench.until(number)
         for kept in (bench.sent, bench.reports, bench.stage.calls):

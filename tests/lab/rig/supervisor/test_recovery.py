@@ -37,7 +37,7 @@ def test_arming_holds_a_motor_where_it_is_if_it_rests_away_from_its_commanded_po
     bench.tick(20)
     assert bench.core.state is SupervisorState.ARMED
     assert bench.reports[-1].why == "guide_y: was 0.400 mm from its commanded position, now held where it is"
-    bench.core.request(protocol.MoveRequest(1, "guide_y", 1.0, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "guide_y", 1.0, 5.0))
     assert bench.until(1).why == ""
     assert bench.position("guide_y") == pytest.approx(1.0, abs=2e-3)
 
@@ -67,17 +67,17 @@ def test_a_motor_that_still_moves_is_not_switched_off_by_arming():
 
 def test_motors_are_switched_off_after_a_stop_only():
     bench = Bench().armed()
-    bench.core.request(protocol.OffRequest())
+    bench.core.request(protocol.OffCommand())
     assert bench.sent[-1].why.startswith("off: refused while armed")
-    bench.core.request(protocol.StopRequest("the test"))
-    bench.core.request(protocol.OffRequest())
+    bench.core.request(protocol.StopCommand("the test"))
+    bench.core.request(protocol.OffCommand())
     assert "motors have not come to rest yet" in bench.sent[-1].why
     bench.tick(2)
-    bench.core.request(protocol.OffRequest())
+    bench.core.request(protocol.OffCommand())
     assert not any(motor.on for motor in bench.stage.motors.values())
     bench.tick(20)
     assert bench.core.state is SupervisorState.STOPPED
-    bench.core.request(protocol.ResetRequest())
+    bench.core.request(protocol.ResetCommand())
     bench.armed().tick(5)
     assert bench.core.state is SupervisorState.ARMED
 
@@ -94,9 +94,9 @@ def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
         kept(channel, on)
 
     bench.stage.power = power
-    bench.core.request(protocol.StopRequest("the test"))
+    bench.core.request(protocol.StopCommand("the test"))
     bench.tick(2)
-    bench.core.request(protocol.OffRequest())
+    bench.core.request(protocol.OffCommand())
     assert [motor.on for motor in bench.stage.motors.values()] == [True, True, False]
     assert bench.core.state is SupervisorState.FAULT
     assert bench.core.why == "insertion: A is in motion; rotation: the motor is still on"

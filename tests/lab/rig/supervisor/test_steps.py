@@ -13,7 +13,7 @@ from stages import TICK_S, Bench, Moves, Stage, rig_file
 
 
 def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
-    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, duration, expected)
+    return protocol.StepCommand(number, roll, travel or {"insertion": 1.0}, duration, expected)
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_counts_of_a_metre_have_the_speed_of_the_step_too():
 
 
 def test_a_roll_takes_its_own_time_before_the_travel(bench):
-    bench.core.request(protocol.StepRequest(1, math.pi, {"insertion": 1.0}, 0.2, None, 2.0))
+    bench.core.request(protocol.StepCommand(1, math.pi, {"insertion": 1.0}, 0.2, None, 2.0))
     done = bench.until(1)
     assert done.turned == pytest.approx(2.0, abs=0.1)
     assert done.ended == pytest.approx(2.2, abs=0.15)
@@ -205,7 +205,7 @@ def test_before_the_first_motion_a_position_is_uncertain_by_half_the_backlash_an
     bench.tick(2)
     found = bench.armed().position("guide_y")
     assert abs(found - axis) == pytest.approx(0.1)
-    bench.core.request(protocol.MoveRequest(1, "guide_y", 5.0, 2.0))
+    bench.core.request(protocol.MoveCommand(1, "guide_y", 5.0, 2.0))
     assert bench.until(1).why == ""
     assert motor.position / -500.0 - 0.1 == pytest.approx(5.0, abs=2e-3), "the axis, pushed by its motor"
     assert bench.position("guide_y") == pytest.approx(5.0, abs=2e-3)

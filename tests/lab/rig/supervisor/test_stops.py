@@ -13,7 +13,7 @@ FAR = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 
 
 def step(number=1, roll=0.0, expected=None, **travel):
-    return protocol.StepRequest(number, roll, travel or {"insertion": 1.0}, 0.2, expected)
+    return protocol.StepCommand(number, roll, travel or {"insertion": 1.0}, 0.2, expected)
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_a_motor_that_goes_on_after_a_stop_is_stopped_again(bench):
     bench.core.request(step())
     bench.tick(2)
     kept, bench.stage.stop = bench.stage.stop, lambda: bench.stage.calls.append(("ignored",))
-    bench.core.request(protocol.StopRequest("the test"))
+    bench.core.request(protocol.StopCommand("the test"))
     bench.stage.motors["A"].target = 90_000.0
     bench.tick(5)
     assert bench.stage.calls.count(("ignored",)) == 1
@@ -233,24 +233,24 @@ def test_after_a_stop_nothing_moves_until_the_rig_is_reset_and_armed(bench, stat
     if state == "inserting":
         bench.core.request(step())
         bench.tick(3)
-    bench.core.request(protocol.StopRequest("the keyboard"))
+    bench.core.request(protocol.StopCommand("the keyboard"))
     if state == "inserting":
         done = bench.until(1)
         assert (done.state, done.why) == (SupervisorState.STOPPED, "the keyboard")
         assert 0.0 < done.travelled["insertion"] < 1.0
     assert_rests(bench)
     bench.core.request(step(2))
-    bench.core.request(protocol.ArmRequest(10.0))
+    bench.core.request(protocol.ArmCommand(10.0))
     assert [type(one) for one in bench.sent[-2:]] == [protocol.RequestRefused, protocol.RequestRefused]
     assert bench.sent[-1].why == "arm: refused while stopped: the keyboard; accepted: stop, fault, reset, off"
-    bench.core.request(protocol.ResetRequest())
+    bench.core.request(protocol.ResetCommand())
     assert bench.core.state is SupervisorState.IDLE
-    bench.core.request(protocol.ArmRequest(10.0))
+    bench.core.request(protocol.ArmCommand(10.0))
     assert bench.core.state is SupervisorState.ARMED
 
 
 def test_without_a_heartbeat_a_motion_is_stopped(bench):
-    bench.core.request(protocol.MoveRequest(1, "insertion", 20.0, 2.0))
+    bench.core.request(protocol.MoveCommand(1, "insertion", 20.0, 2.0))
     bench.tick(30, beat=False)
     assert bench.core.state is SupervisorState.STOPPED
     assert bench.core.why.startswith("no heartbeat of the controller for 0.5")
@@ -280,7 +280,7 @@ def test_without_a_command_the_insertion_is_stopped(bench):
 def test_a_bad_reading_holds_the_needle(bench, tip, seconds, why):
     expected = protocol.Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
     bench.camera.tip = lambda time: (min(1.0, 0.5 * time), 0.0, 0.01 * time)
-    bench.core.request(protocol.StepRequest(1, 0.0, {"insertion": 1.0}, 2.0, expected))
+    bench.core.request(protocol.StepCommand(1, 0.0, {"insertion": 1.0}, 2.0, expected))
     bench.tick(8)
     bench.camera.tip = tip
     begun = bench.clock.now()
@@ -343,20 +343,20 @@ def test_a_roll_is_completed_when_the_needle_is_held(bench):
 
 
 def test_jogging_homing_and_retracting(bench):
-    bench.core.request(protocol.MoveRequest(1, "guide_y", 3.0, 5.0))
+    bench.core.request(protocol.MoveCommand(1, "guide_y", 3.0, 5.0))
     assert bench.core.state is SupervisorState.JOGGING
     assert bench.until(1).state is SupervisorState.ARMED
     assert bench.position("guide_y") == pytest.approx(3.0, abs=2e-3)
-    bench.core.request(protocol.MoveRequest(2, "insertion", 1.0, 5.0, retract=True))
+    bench.core.request(protocol.MoveCommand(2, "insertion", 1.0, 5.0, retract=True))
     assert "must withdraw the base, which is at 0.000 mm" in bench.sent[-1].why
-    bench.core.request(protocol.MoveRequest(3, "insertion", -2.0, 5.0, retract=True))
+    bench.core.request(protocol.MoveCommand(3, "insertion", -2.0, 5.0, retract=True))
     assert bench.core.state is SupervisorState.RETRACTING
     bench.until(3)
     assert bench.position("insertion") == pytest.approx(-2.0)
     for bad in (
-        protocol.MoveRequest(4, "insertion", 120.0, 5.0),
-        protocol.MoveRequest(5, "insertion", 1.0, 50.0),
-        protocol.MoveRequest(6, "x", 1.0, 5.0),
+        protocol.MoveCommand(4, "insertion", 120.0, 5.0),
+        protocol.MoveCommand(5, "insertion", 1.0, 50.0),
+        protocol.MoveCommand(6, "x", 1.0, 5.0),
     ):
         bench.core.request(bad)
         assert isinstance(bench.sent[-1], protocol.RequestRefused)

@@ -60,7 +60,7 @@ class DrivenNeedle:
 
 
 @dataclass(frozen=True)
-class TipSensor:
+class PhantomSensor:
     """The tip's sensor, `offset` mm behind the tip, in the tracker's frame without noise.
 
     to_tracker: map from the stage's frame, with the error of the registration; bias: constant error (mm).

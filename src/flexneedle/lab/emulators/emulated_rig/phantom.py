@@ -21,7 +21,7 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
 )
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
-from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, TipSensor
+from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, PhantomSensor
 from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter
 from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
@@ -40,12 +40,12 @@ def draw_phantom(job: EmulationJob) -> Truth:
     return draw(job.scenario, np.random.default_rng(Seeds.of(job.seed).phantom))
 
 
-def make_sensor(job: EmulationJob, truth: Truth) -> TipSensor:
+def make_sensor(job: EmulationJob, truth: Truth) -> PhantomSensor:
     """Return the tip's sensor with the errors of the draw. The rig file's registration replaces the scenario's."""
     registration = job.rig.registration or job.scenario.tracker.registration
     error = registration_error(registration, Seeds.of(job.seed).room)
     to_tracker = to_stage(registration).inverse().after(error)
-    return TipSensor(to_tracker, job.scenario.tracker.tip_offset_mm, truth.bias)
+    return PhantomSensor(to_tracker, job.scenario.tracker.tip_offset_mm, truth.bias)
 
 
 class EmulatedPhantom:

@@ -14,7 +14,7 @@ class WallClock:
         self._start, self._speed = monotonic() if start is None else start, speed
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return (monotonic() - self._start) * self._speed
 
     def wait(self, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""One program at a time moves a set of motors: a lock on their address, which ends with the process that holds it."""
+"""Lock on the address of a set of motors: one program at a time moves them."""
 
 import fcntl
 import hashlib
@@ -15,21 +15,21 @@ FOLDER = Path("/tmp")  # in which all users of a machine may make files; TMPDIR 
 _LONGEST = 2000
 
 
-def this_program() -> str:
-    """Number and command of this process, for the one that holds motors for it."""
+def describe_program() -> str:
+    """Return number and command of this process, for the process that holds motors for it."""
     return make_printable(f"pid {os.getpid()} ({shlex.join(sys.argv)})")[:_LONGEST]
 
 
 @contextmanager
-def held(address: str, holder: str) -> Iterator[None]:
-    """Hold the motors at an address, which no other program may do meanwhile. holder: shown to that one.
+def hold_motors(address: str, holder: str) -> Iterator[None]:
+    """Hold the motors at an address, so that no other program can. holder: shown to the other program.
 
-    The kernel releases them when this process ends, however it ends; the file stays, and means nothing by itself.
-    Raises DriverError, with the holder, if another program has them.
+    The kernel releases them when this process ends, for any reason; the file remains without effect. Raises
+    DriverError, with the holder, if another program has them.
     """
     path = lock_file(address)
     try:
-        descriptor = _opened(path)
+        descriptor = _open_file(path)
     except OSError as error:
         raise DriverError(f"{path}: the lock of {address} cannot be opened: {error.strerror}") from None
     try:
@@ -42,7 +42,7 @@ def held(address: str, holder: str) -> Iterator[None]:
 
 
 def lock_file(address: str) -> Path:
-    """The file whose lock is that of an address."""
+    """Return the lock file of an address."""
     return FOLDER / f"flexneedle-{hashlib.sha256(address.encode()).hexdigest()[:16]}.lock"
 
 
@@ -54,8 +54,8 @@ def _lock(descriptor: int, address: str) -> None:
         raise DriverError(f"{address}: in use by {make_printable(holder)}: end it first") from None
 
 
-def _opened(path: Path) -> int:
-    """A descriptor of the file, which is made for all users."""
+def _open_file(path: Path) -> int:
+    """Return a descriptor of the file, which is made for all users."""
     flags = os.O_RDWR | os.O_NOFOLLOW
     while True:
         try:  # without O_CREAT, with which Linux refuses a file of another user (fs.protected_regular)

@@ -8,11 +8,11 @@ _THREADS = Path("/proc/self/task")
 
 
 def set_realtime_priority() -> None:
-    """Give all threads of this process real-time priority where the system permits it (Linux, as root or with an rtprio
-    limit). Threads that they start later have it, too.
+    """Give all threads of this process real-time priority where the system permits it.
 
-    All, since one that is preempted while it holds Python's lock delays the others. Only for a process that mostly
-    waits: it runs ahead of all others and could block the machine.
+    On Linux that is as root or with an rtprio limit; threads that are started later have it, too. It is set for all
+    threads, since one that is preempted while it holds Python's lock delays the others. Only for a process that
+    mostly waits: it has priority over all others and could block the machine.
     """
     if not hasattr(os, "sched_setscheduler"):
         return

@@ -13,10 +13,10 @@ ENDED = "the recording has ended"
 
 
 class Replay:
-    """Replays frames on a clock, starting now: a frame recorded after t seconds arrives after t seconds.
+    """Tracker that replays frames on a clock, starting now: a frame recorded after t seconds arrives after t seconds.
 
-    frames: oldest first. Times are those of the clock, numbers those of the recording. For another speed use a faster
-    clock, so that ages and windows remain those of the recording. Raises InputError if there are no frames.
+    frames: oldest first. Times are on the clock, numbers are from the recording. For another speed use a faster
+    clock, so that ages and windows remain unchanged. Raises InputError if there are no frames.
     """
 
     def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:
@@ -32,7 +32,7 @@ class Replay:
         pass
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; may be empty."""
+        """Return the frames since the last call, oldest first; may be empty."""
         now, first = self._clock.now(), self._next
         while not self.ended and self._due(self._frames[self._next]) <= now:
             self._next += 1

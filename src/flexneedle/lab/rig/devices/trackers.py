@@ -22,7 +22,7 @@ from flexneedle.types import Frame, Measurement, SensorReading
 PathText = Annotated[str, Field(max_length=4000), AfterValidator(one_line)]
 
 
-def _different(names: tuple[str, ...]) -> tuple[str, ...]:
+def _check_names(names: tuple[str, ...]) -> tuple[str, ...]:
     if not names or not all(name.isidentifier() for name in names) or len({*names}) < len(names):
         raise ValueError("sensor names must be different identifiers, such as tip, ref1")
     return names
@@ -33,7 +33,7 @@ class AuroraSettings(Section):
 
     port: PathText
     """Serial port."""
-    sensors: Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_different)] = NAMES
+    sensors: Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_check_names)] = NAMES
     """Names of the sensors at the tracker's ports 1, 2, …"""
 
 
@@ -56,11 +56,11 @@ def replay(settings: Mapping[str, Any], clock: Clock) -> Replay:
     """Return a replay that starts now. Raises RigError for invalid settings, InputError for an invalid recording."""
     chosen = check_settings(ReplaySettings, settings)
     path = Path(chosen.file)
-    frames = frames_of_run(path) if path.is_dir() else read_frames(path)
-    return Replay(_faster(frames, chosen.speed), clock)
+    frames = read_run_frames(path) if path.is_dir() else read_frames(path)
+    return Replay(_scale_times(frames, chosen.speed), clock)
 
 
-def frames_of_run(folder: Path) -> tuple[Frame, ...]:
+def read_run_frames(folder: Path) -> tuple[Frame, ...]:
     """Return the tracker's frames of a recorded insertion, each once, in the tracker's frame of reference.
 
     Measurements without frames (a tracker of the tip alone) become frames with the sensor tip, in the stage's frame and
@@ -70,17 +70,17 @@ def frames_of_run(folder: Path) -> tuple[Frame, ...]:
 
     periods = read_trace(folder / TRACE_FILE).periods
     measurements = [judged.measurement for period in periods for judged in period.readings]
-    frames = {frame.number: frame for frame in (_frame(n, one) for n, one in enumerate(measurements))}
+    frames = {frame.number: frame for frame in (_make_frame(n, one) for n, one in enumerate(measurements))}
     if not frames:
         raise InputError(f"{folder}: the run has no tracker readings")
     return tuple(frames.values())
 
 
-def _faster(frames: Sequence[Frame], speed: float) -> tuple[Frame, ...]:
+def _scale_times(frames: Sequence[Frame], speed: float) -> tuple[Frame, ...]:
     return tuple(frames) if speed == 1.0 else tuple(replace(one, time=one.time / speed) for one in frames)
 
 
-def _frame(number: int, measurement: Measurement) -> Frame:
+def _make_frame(number: int, measurement: Measurement) -> Frame:
     if measurement.frame is not None:
         return measurement.frame
     known = measurement.x is not None and measurement.y is not None

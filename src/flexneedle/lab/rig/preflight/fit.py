@@ -88,8 +88,10 @@ def room_problems(
 def start_problems(
     rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str, advance: float
 ) -> list[str]:
-    """Return one line for each axis that is beyond its soft limits (positions: mm or rad), or has no room from there
-    for an insertion with this advance of the base (mm)."""
+    """Return one line for each axis from which an insertion with this advance of the base (mm) cannot start.
+
+    Such an axis is beyond its soft limits (positions: mm or rad), or has no room.
+    """
     outside = [(name, _outside_problem(axis, positions[name])) for name, axis in rig.axes.items()]
     found = [*outside, *_room_problems(rig, axis_needs(scenario, strategy, advance), positions)]
     return [f"{name}: {line}" for name, line in found if line]
@@ -289,8 +291,9 @@ def _format_point(point: Point) -> str:
 
 
 def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> float:
-    """Return the advance (mm) at which a straight needle is as far past a target at this depth (mm) as the guard
-    allows.
+    """Return the advance (mm) of the base at the deepest position that the guard allows, for a straight needle.
+
+    target: its depth (mm), which the needle may pass by guard.past_target_mm.
 
     tip: its measured depth at the start (mm); None: three standard deviations behind the scenario's.
     """
@@ -299,8 +302,10 @@ def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> flo
 
 
 def needed_advance(scenario: Scenario, target: float, tip: float | None = None) -> float:
-    """Return the advance (mm) of the base for which an insertion needs room: `deepest_advance` within the scenario's
-    stroke."""
+    """Return the advance (mm) of the base for which an insertion needs room.
+
+    It is `deepest_advance` within the scenario's stroke.
+    """
     return min(
         deepest_advance(scenario, target, tip), scenario.setup.stroke_mm * axis_stretch(scenario.entry.slope)
     )

@@ -99,8 +99,7 @@ def describe_axes(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
 
 
 def describe_insertion(rig: RigFile, scenario: Scenario, positions: Mapping[str, float]) -> list[str]:
-    """Return a line for the needle, and one for each axis with its position (mm or rad) and speed, before an
-    insertion."""
+    """Return a line for the needle, and one for each axis with its position (mm or rad) and its speed."""
     depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
     to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
     first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."

@@ -87,8 +87,7 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
 
 
 def is_at_rest(drive: Drive, state: MotorState, before: MotorState) -> bool:
-    """Return whether a motor rests, its servo included, which may still follow after the end of the controller's
-    profile.
+    """Return whether a motor rests, its servo included, which may still follow after the controller's profile.
 
     before: long enough ago that a servo that follows on has moved. A state that is repeated does not show it.
     """

@@ -1,5 +1,4 @@
-"""Client of the supervisor, which it starts: it requests motions, and receives their results and the reports of
-ticks."""
+"""Client of the supervisor, which it starts: requests, results and reports."""
 
 import threading
 from collections import deque
@@ -88,7 +87,7 @@ class SupervisorClient:
         """Stop the motors, and end the supervisor."""
         try:
             if self._ended is None:
-                self._send(protocol.CloseRequest(), lost=True)
+                self._send(protocol.CloseCommand(), lost=True)
             self._process.end(_END_S)
             self._thread.join()  # it ends with the supervisor's end of the channel
             with uninterrupted(), self._sending:
@@ -176,7 +175,7 @@ class SupervisorClient:
         self._check_follower()
         refused = None
         try:
-            self._request(protocol.ArmRequest(deepest))
+            self._request(protocol.ArmCommand(deepest))
         except RefusedError as error:
             refused = error
         report = self.report
@@ -187,19 +186,19 @@ class SupervisorClient:
 
     def reset(self) -> None:
         """Leave the states stopped and fault. Refused while motors move: `stop` returns when they rest."""
-        self._request(protocol.ResetRequest())
+        self._request(protocol.ResetCommand())
 
     def stop(self, who: str = CONTROLLER) -> None:
         """Stop all motors, and return when they rest, so that a reset is accepted."""
         if self._ended is not None:
             return
-        sent = self._send(protocol.StopRequest(who))
+        sent = self._send(protocol.StopCommand(who))
         self._wait(lambda: self._has_stopped(sent), _END_S, "the motors do not come to rest", stopped=True)
 
     def off(self) -> None:
         """Stop all motors, and switch them off. Raises DriverError, with the reason, if one is still on."""
         self.stop("rig off")
-        self._request(protocol.OffRequest())
+        self._request(protocol.OffCommand())
         if any(axis.motor.on for axis in self.report.axes.values()):
             raise DriverError(self.report.why)
 
@@ -208,7 +207,7 @@ class SupervisorClient:
 
         Nothing is done after the supervisor's end: it has stopped the motors.
         """
-        self._send(protocol.StopRequest(who), lost=True)
+        self._send(protocol.StopCommand(who), lost=True)
 
     def take_signals(self) -> None:
         """Let each signal of this process that has a Python handler stop the motors, until the end.
@@ -225,10 +224,12 @@ class SupervisorClient:
         expected: protocol.Expectation | None = None,
         roll_duration: float = 0.0,
     ) -> protocol.MotionResult:
-        """Carry out a step of an insertion: roll (rad) in `roll_duration` s, then travel (mm or rad by axis) in
-        `duration` s, or as soon after that as the axes can."""
+        """Carry out a step of an insertion: the roll (rad) in `roll_duration` s, then the travel in `duration` s.
+
+        travel: mm or rad by axis. An axis that needs more time takes longer.
+        """
         return self._carry_out(
-            lambda number: protocol.StepRequest(number, roll, travel, duration, expected, roll_duration)
+            lambda number: protocol.StepCommand(number, roll, travel, duration, expected, roll_duration)
         )
 
     def move_to(self, axis: str, position: float, speed: float | None = None) -> protocol.MotionResult:
@@ -241,7 +242,7 @@ class SupervisorClient:
 
     def home(self, axis: str) -> protocol.MotionResult:
         """Find the home of an axis. The rig must be armed again after it."""
-        return self._carry_out_to_goal(lambda number: protocol.HomeRequest(number, axis))
+        return self._carry_out_to_goal(lambda number: protocol.HomeCommand(number, axis))
 
     def wait(self, seconds: float) -> None:
         """Wait while nothing moves."""
@@ -253,7 +254,7 @@ class SupervisorClient:
     ) -> protocol.MotionResult:
         fastest = self._axis_of(axis).speed if speed is None else speed
         return self._carry_out_to_goal(
-            lambda number: protocol.MoveRequest(number, axis, position, fastest, retract)
+            lambda number: protocol.MoveCommand(number, axis, position, fastest, retract)
         )
 
     def _carry_out_to_goal(self, made: Callable[[int], protocol.Request]) -> protocol.MotionResult:

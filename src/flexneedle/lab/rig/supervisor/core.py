@@ -73,20 +73,20 @@ class Supervisor:
         self._heard = self._clock.now()
         self._requests += 1
         match request:
-            case protocol.StopRequest(who):
+            case protocol.StopCommand(who):
                 self.stop(who)
-            case protocol.ResetRequest():
+            case protocol.ResetCommand():
                 if self._allow(RigEvent.RESET):
                     self._change_state(RigEvent.RESET)
-            case protocol.OffRequest():
+            case protocol.OffCommand():
                 self._power_off()
-            case protocol.ArmRequest(deepest):
+            case protocol.ArmCommand(deepest):
                 self._arm(deepest)
-            case protocol.StepRequest():
+            case protocol.StepCommand():
                 self._begin_step(request)
-            case protocol.MoveRequest():
+            case protocol.MoveCommand():
                 self._begin_move(request)
-            case protocol.HomeRequest():
+            case protocol.HomeCommand():
                 self._begin_homing(request)
 
     def stop(self, who: str) -> None:
@@ -157,7 +157,7 @@ class Supervisor:
             self._change_state(RigEvent.FAULT, str(error))
             self._handle_lost_motors(str(error))
 
-    def _begin_step(self, step: protocol.StepRequest) -> None:
+    def _begin_step(self, step: protocol.StepCommand) -> None:
         if self.state is SupervisorState.HOLDING and self._stopping is not None:
             self._report_nothing_done(step.number)
             return
@@ -178,12 +178,12 @@ class Supervisor:
             protocol.MotionResult(number, dict.fromkeys(self._axes.drives, 0.0), now, now, self.state, why)
         )
 
-    def _begin_move(self, go: protocol.MoveRequest) -> None:
+    def _begin_move(self, go: protocol.MoveCommand) -> None:
         event = RigEvent.RETRACT if go.retract else RigEvent.JOG
         if self._allow(event, go.number) and self._accept(self._rules.move_problem(go), go.number):
             self._begin(event, make_move(go, self._axes.drives[go.axis], self._axes.goal(go.axis)))
 
-    def _begin_homing(self, home: protocol.HomeRequest) -> None:
+    def _begin_homing(self, home: protocol.HomeCommand) -> None:
         if not self._allow(RigEvent.HOME, home.number):
             return
         if not self._accept(self._rules.home_problem(home), home.number):
@@ -373,16 +373,17 @@ class Supervisor:
             self._tip.wait(now, leg.waited - waited)  # while the trajectory waits for its motors
 
     def _can_define_home(self, motion: CommandedMotion) -> bool:
-        """Return whether the position may be shifted after this leg: off its home an axis must rest, its servo
-        included.
+        """Return whether the position may be shifted after this leg: off its home an axis must rest.
 
-        Otherwise the shift would be computed from an outdated position.
+        Its servo must rest, too, otherwise the shift would be computed from an outdated position.
         """
         return motion.released is None or self._axes.is_at_rest(motion.released)
 
     def _handle_refused_target(self, motion: CommandedMotion, why: str) -> None:
-        """Enter the fault state after a refused target, except at the limit switch of the home, which the next tick
-        reads."""
+        """Enter the fault state after a refused target, except at the limit switch of the home.
+
+        The next tick reads that switch.
+        """
         if motion.home is not None:
             self._check_motors()
             if self._axes.is_at_switch(motion.home):

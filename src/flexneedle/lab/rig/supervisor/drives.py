@@ -58,8 +58,10 @@ def homing_speed(axis: Axis) -> float:
 
 
 def homing_reach(axis: Axis) -> float:
-    """Return the largest travel (mm or rad, signed) of an axis to the limit switch of its home, which may be beyond
-    its range."""
+    """Return the largest travel (mm or rad, signed) of an axis to the limit switch of its home.
+
+    The switch may be beyond the range.
+    """
     low, high = axis.limits
     beyond = max(low - axis.at_home, axis.at_home - high, 0.0)
     return axis.to_home * (_HOMING_REACH * (high - low) + beyond)
@@ -72,15 +74,19 @@ def position_after_homing(axis: Axis) -> float:
 
 
 def is_near_switch(axis: Axis, position: float) -> bool:
-    """Return whether the switch of the home may be active at a position (mm or rad): nearer to it than the end of
-    homing."""
+    """Return whether the switch of the home may be active at a position (mm or rad).
+
+    It may nearer to the switch than the middle between it and the position after homing.
+    """
     return axis.to_home * (position - 0.5 * (axis.at_home + position_after_homing(axis))) > 0.0
 
 
 @dataclass(frozen=True)
 class MotorReading:
-    """States of the motors by channel, and the times of the request and of the reply (s); the states are of a time
-    between."""
+    """States of the motors by channel, and the times of the request and of the reply (s).
+
+    The states are of a time between.
+    """
 
     states: Mapping[str, MotorState]
     asked: float

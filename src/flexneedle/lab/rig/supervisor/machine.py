@@ -81,8 +81,10 @@ def accepted_events(state: SupervisorState) -> tuple[RigEvent, ...]:
 
 
 def refusal_reason(state: SupervisorState, event: RigEvent, why: str, *, moving: bool) -> str:
-    """Return the reason why an event is refused in this state, or "". why: reason of the state; moving: motors still
-    move."""
+    """Return the reason why an event is refused in this state, or "".
+
+    why: reason of the state; moving: motors still move.
+    """
     because = f": {why}" if why else ""
     if next_state(state, event) is None:
         return f"{event}: refused while {state}{because}; accepted: {', '.join(accepted_events(state))}"

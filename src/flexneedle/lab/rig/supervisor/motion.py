@@ -65,7 +65,7 @@ class Leg:
         return gone if self.way(channel) > 0.0 else -gone
 
     def queued_distances(self, states: Mapping[str, MotorState]) -> dict[str, float]:
-        """Return the distance of each axis from its last target (mm or rad): its motion without another target."""
+        """Return the distance of each axis from its last target (mm or rad), which it moves without another one."""
         return {
             drive.name: abs((self.sent[name] - states[name].position) / drive.axis.scale)
             for name, drive in self.drives.items()
@@ -73,8 +73,10 @@ class Leg:
         }
 
     def record_progress(self, states: Mapping[str, MotorState], now: float) -> None:
-        """Record the share of the way that is done, by the motor with the longest way, and the time of the last
-        progress."""
+        """Record the share of the way that is done, and the time of the last progress.
+
+        The share is measured by the motor with the longest way.
+        """
         gone = sum(
             self._travelled(name, states) / drive.axis.tolerance for name, drive in self.drives.items()
         )
@@ -180,8 +182,9 @@ def make_leg(
     duration: float,
     now: float,
 ) -> Leg | None:
-    """Return the leg of a travel (mm or rad by axis) from the present goals (counts by channel); None if nothing
-    moves.
+    """Return the leg of a travel (mm or rad by axis) from the present goals, None if nothing moves.
+
+    drives: by axis, as they are before; goals: counts by channel.
 
     drives: by axis, as they are before. Positions are absolute, so that rounding does not add up.
     """
@@ -224,6 +227,8 @@ class StopUnderWay:
         return replace(self, due=now)
 
     def has_failed(self, now: float, slowing: float) -> bool:
-        """Return whether the time in which motors must come to rest is over; slowing: longest deceleration (s) of
-        one."""
+        """Return whether the time in which motors must come to rest is over.
+
+        slowing: longest deceleration (s) of one.
+        """
         return now - self.since > _RESTING_S + slowing

@@ -17,7 +17,7 @@ from typing import Any
 from flexneedle.errors import FlexneedleError, describe_error, one_line
 from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.rig.devices.clock import Suspension, WallClock
-from flexneedle.lab.rig.devices.lock import held
+from flexneedle.lab.rig.devices.lock import hold_motors
 from flexneedle.lab.rig.devices.opening import address_of, open_motors, open_tracker
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.supervisor import protocol
@@ -68,7 +68,7 @@ def _serve(channel: MessageChannel, task: protocol.SupervisorTask, signals: sock
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
         if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
-            stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
+            stack.enter_context(hold_motors(address_of(task.rig.driver, connected), task.client))
         tracked = open_tracker(task.rig, clock) if task.tracked else NoTracker()
         tracker = stack.enter_context(closing(tracked))
         motors = DryRunMotors(connected, clock) if task.dry else connected
@@ -125,7 +125,7 @@ def _tick(
 def _act_on_requests(channel: MessageChannel, core: Supervisor) -> str:
     """Act on what the client has sent; return why the supervisor shall end, "" if it shall continue."""
     for request in channel.receive():
-        if isinstance(request, protocol.CloseRequest):
+        if isinstance(request, protocol.CloseCommand):
             return _CLOSED
         core.request(request)
     return "the controller has ended" if channel.ended else ""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flexneedle.geometry.registration import Rigid
-from flexneedle.lab.rig.devices.lock import this_program
+from flexneedle.lab.rig.devices.lock import describe_program
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.ports import MotorState
@@ -34,13 +34,15 @@ class SupervisorTask:
     stale_after: float
     dry: bool = False
     tracked: bool = True
-    client: str = field(default_factory=this_program)
+    client: str = field(default_factory=describe_program)
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected positions (mm) of the tip at begin and end of a step, and the largest distance of a reading from them
-    (mm)."""
+    """Expected positions (mm) of the tip at begin and end of a step.
+
+    most_off: largest distance of a reading from them (mm).
+    """
 
     begin: Point
     end: Point
@@ -56,16 +58,19 @@ class Heartbeat:
 
 
 @dataclass(frozen=True)
-class ArmRequest:
+class ArmCommand:
     """Switch motors on and take their positions as the start. deepest: largest advance (mm) from there."""
 
     deepest: float
 
 
 @dataclass(frozen=True)
-class StepRequest:
-    """A step of an insertion: the roll (rad) in `roll_duration` s, confirmed by its position; then `travel` by axis in
-    `duration` s. An axis that cannot do that takes longer."""
+class StepCommand:
+    """A step of an insertion.
+
+    The roll (rad) takes `roll_duration` s and is confirmed by its position; then follows `travel` by axis in
+    `duration` s. An axis that needs more time takes longer.
+    """
 
     number: int
     roll: float
@@ -76,7 +81,7 @@ class StepRequest:
 
 
 @dataclass(frozen=True)
-class MoveRequest:
+class MoveCommand:
     """Move one axis alone to a position, at most at `speed` (mm/s or rad/s).
 
     retract: as a withdrawal of the base, and not as a motion of the operator.
@@ -90,7 +95,7 @@ class MoveRequest:
 
 
 @dataclass(frozen=True)
-class HomeRequest:
+class HomeCommand:
     """Find the home of an axis."""
 
     number: int
@@ -98,37 +103,37 @@ class HomeRequest:
 
 
 @dataclass(frozen=True)
-class StopRequest:
+class StopCommand:
     """Stop all motors. who: the keyboard, a service, a signal."""
 
     who: str
 
 
 @dataclass(frozen=True)
-class ResetRequest:
+class ResetCommand:
     """Leave the states stopped and fault; nothing moves."""
 
 
 @dataclass(frozen=True)
-class OffRequest:
+class OffCommand:
     """Switch all motors off, after a stop."""
 
 
 @dataclass(frozen=True)
-class CloseRequest:
+class CloseCommand:
     """Stop, and end the supervisor."""
 
 
 Request = (
     Heartbeat
-    | ArmRequest
-    | StepRequest
-    | MoveRequest
-    | HomeRequest
-    | StopRequest
-    | ResetRequest
-    | OffRequest
-    | CloseRequest
+    | ArmCommand
+    | StepCommand
+    | MoveCommand
+    | HomeCommand
+    | StopCommand
+    | ResetCommand
+    | OffCommand
+    | CloseCommand
 )
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from flexneedle.lab.rig.supervisor.drives import Drive, homing_reach, homing_speed, position_after_homing
 from flexneedle.lab.rig.supervisor.motion import CommandedMotion
-from flexneedle.lab.rig.supervisor.protocol import HomeRequest, MoveRequest, StepRequest
+from flexneedle.lab.rig.supervisor.protocol import HomeCommand, MoveCommand, StepCommand
 from flexneedle.lab.rig.supervisor.trajectory import shortest_duration
 
 _ROUNDING = 1e-9
@@ -22,13 +22,13 @@ class RequestRules:
     at: Mapping[str, float]
     deepest: float
 
-    def step_problem(self, step: StepRequest) -> str:
+    def step_problem(self, step: StepCommand) -> str:
         """Return the problem of a step, the end of its roll included, or ""."""
         spin = step.travel.get("rotation", 0.0)
         problem = self._travel_problem({**step.travel, "rotation": step.roll + spin})
         return problem or self._travel_problem({"rotation": step.roll})
 
-    def move_problem(self, go: MoveRequest) -> str:
+    def move_problem(self, go: MoveCommand) -> str:
         """Return the problem of a motion of one axis, or "". From beyond its range it may move back towards it."""
         if go.axis not in self.drives:
             return self._missing_axes([go.axis])
@@ -45,7 +45,7 @@ class RequestRules:
             return f"speed of {go.axis} = {speed}: must be above 0, at most {fastest}"
         return ""
 
-    def home_problem(self, home: HomeRequest) -> str:
+    def home_problem(self, home: HomeCommand) -> str:
         """Return the problem of the search of a home, or ""."""
         if home.axis not in self.drives:
             return self._missing_axes([home.axis])
@@ -53,8 +53,10 @@ class RequestRules:
         return f"{home.axis}: has an absolute encoder, and no home to search" if absolute else ""
 
     def _travel_problem(self, travel: Mapping[str, float]) -> str:
-        """Return the problem of a travel by axis, or "": an unknown axis, an end outside a range, or a position too
-        deep."""
+        """Return the problem of a travel by axis, or "".
+
+        It is an unknown axis, an end outside a range, or a position too deep.
+        """
         moved = {name: way for name, way in travel.items() if way}
         if missing := [name for name in moved if name not in self.drives]:
             return self._missing_axes(missing)
@@ -75,7 +77,7 @@ class RequestRules:
         return now < goal <= high if now < low else low <= goal < now if now > high else False
 
 
-def make_step(step: StepRequest) -> CommandedMotion:
+def make_step(step: StepCommand) -> CommandedMotion:
     """Return the motion of a step of an insertion: its roll, then its travel."""
     legs = [(step.travel, step.duration)]
     if step.roll:
@@ -83,7 +85,7 @@ def make_step(step: StepRequest) -> CommandedMotion:
     return CommandedMotion(step.number, legs, step.expected, roll=bool(step.roll))
 
 
-def make_move(go: MoveRequest, drive: Drive, at: float) -> CommandedMotion:
+def make_move(go: MoveCommand, drive: Drive, at: float) -> CommandedMotion:
     """Return the motion of one axis alone, from its goal `at` (mm or rad)."""
     travel = go.position - at
     return CommandedMotion(

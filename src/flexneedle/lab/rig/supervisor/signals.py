@@ -39,8 +39,10 @@ class SignalLine:
 
 
 def open_signal_socket(received: int, sent: int) -> socket.socket:
-    """Return the supervisor's side: a socket with a byte for each signal of this process, and of a client that takes
-    them."""
+    """Return the supervisor's side: a socket with a byte for each signal of this process and of its client.
+
+    The client's signals are written once it takes them.
+    """
     signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
     for number in SIGNALS:
         signal.signal(number, lambda *_: None)

@@ -56,8 +56,7 @@ class Trajectory:
 def plan_trajectory(
     drives: Mapping[str, Drive], start: Mapping[str, float], goal: Mapping[str, float], duration: float
 ) -> Trajectory:
-    """Return the motion from start to goal (counts by channel) within `duration` s, or longer if an axis needs more
-    time.
+    """Return the motion from start to goal (counts by channel) within `duration` s, or longer if an axis needs it.
 
     drives: by channel, those that move.
     """

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexneedle.lab.emulators import aurora, codec
-from flexneedle.lab.rig.devices.aurora.incoming import Incoming
+from flexneedle.lab.rig.devices.aurora.incoming import LinkReceiver
 from flexneedle.lab.rig.devices.aurora.messages import parse
 from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.types import OK, VISIBLE, Frame, SensorReading
@@ -96,7 +96,7 @@ def test_the_fuzz_notices_a_position_of_a_sensor_that_was_not_measured():
 
 @pytest.mark.parametrize("line", [b"", b"{}", b'["frames"]', b"\xff", b"[" * 9000])
 def test_the_fuzz_notices_a_line_that_was_taken_for_a_message(line, monkeypatch):
-    monkeypatch.setattr(Incoming, "take", lambda *_: None)
+    monkeypatch.setattr(LinkReceiver, "take", lambda *_: None)
     monkeypatch.setattr(fuzz_aurora, "parse", lambda data: data)
     with pytest.raises(fuzz_aurora.Failure, match="taken for a message"):
         fuzz_aurora.fed(fuzz_aurora.Feeding(), line, Random(0))

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from flexneedle.lab.rig.devices.aurora.incoming import Incoming
+from flexneedle.lab.rig.devices.aurora.incoming import LinkReceiver
 from flexneedle.lab.rig.devices.aurora.messages import LONGEST, message_channel, parse
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.types import VISIBLE
@@ -18,7 +18,7 @@ NOW = 100.0
 def incoming(*messages, now=NOW):
     """An adapter that received these messages from one link since 90 s."""
     clock = [90.0]
-    found = Incoming(NAMES, 0.0, lambda: clock[0])
+    found = LinkReceiver(NAMES, 0.0, lambda: clock[0])
     clock[0] = now
     for message in messages:
         found.take(parse(data(message)))
@@ -72,7 +72,7 @@ def test_a_message_out_of_order_or_a_frame_that_is_not_new_is_refused(sent, wron
 
 def test_the_names_of_an_earlier_link_are_not_used_for_the_next():
     found = incoming(READY, frame(7, 99.9))
-    found.begin()
+    found.begin_link()
     with pytest.raises(ValueError, match="out of order"):
         found.take(parse(data(frame(8))))
 
@@ -98,7 +98,7 @@ def test_the_status_is_that_of_the_newest_message():
     found.take(parse(data(["error", "garbled", "replies are garbled"])))
     assert found.status == "replies are garbled"
     assert found.counts.errors == {"garbled": 1}
-    found.crashed("the link failed: x")
+    found.record_crash("the link failed: x")
     assert found.counts.errors == {"garbled": 1, "crash": 1}
 
 

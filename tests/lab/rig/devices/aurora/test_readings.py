@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.lab.rig.devices.aurora.readings import NAMES, reading, readings, sensor_name
+from flexneedle.lab.rig.devices.aurora.readings import NAMES, make_reading, make_readings, sensor_name
 from flexneedle.types import VISIBLE, SensorReading
 
 POSE = (0.5, -0.5, 0.5, -0.5, 10.0, -20.0, -200.0, 0.024)
@@ -10,13 +10,13 @@ MEASURED, DISABLED, MISSING, UNOCCUPIED = 0, 1, 2, 4
 
 
 def test_a_measured_sensor_has_position_orientation_and_indicator():
-    assert reading(MEASURED, 0x31, POSE) == SensorReading(
+    assert make_reading(MEASURED, 0x31, POSE) == SensorReading(
         (10.0, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.024, VISIBLE
     )
 
 
 def test_a_rounded_quaternion_is_made_unit():
-    rounded = reading(MEASURED, 0x31, (1.0004, 0.0, 0.0, 0.0, *POSE[4:]))
+    rounded = make_reading(MEASURED, 0x31, (1.0004, 0.0, 0.0, 0.0, *POSE[4:]))
     assert rounded.orientation == (1.0, 0.0, 0.0, 0.0)
 
 
@@ -42,7 +42,7 @@ def test_a_rounded_quaternion_is_made_unit():
     ],
 )
 def test_a_sensor_with_a_fault_has_its_status_and_no_position(kind, bits, status):
-    assert reading(kind, bits, POSE) == SensorReading(None, status=status)
+    assert make_reading(kind, bits, POSE) == SensorReading(None, status=status)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_sensor_with_a_fault_has_its_status_and_no_position(kind, bits, status
     ],
 )
 def test_an_invalid_pose_gives_no_position(pose):
-    assert reading(MEASURED, 0x31, pose) == SensorReading(None, status="bad transform")
+    assert make_reading(MEASURED, 0x31, pose) == SensorReading(None, status="bad transform")
 
 
 def test_a_sensor_of_an_older_frame_than_the_others_is_stale():
@@ -68,7 +68,7 @@ def test_a_sensor_of_an_older_frame_than_the_others_is_stale():
         "11": (MEASURED, 0x31, 8, POSE),
         "12": (DISABLED, 0x31, 3, POSE),
     }
-    result = readings(found, 8, {"10": "tip", "11": "ref1", "12": "ref2"})
+    result = make_readings(found, 8, {"10": "tip", "11": "ref1", "12": "ref2"})
     assert {name: r.status for name, r in result.items()} == {
         "tip": "stale",
         "ref1": "ok",

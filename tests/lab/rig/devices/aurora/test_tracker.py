@@ -308,9 +308,9 @@ def test_closing_ends_tracking():
     with emulated() as path:
         with Aurora(path, WallClock()) as aurora:
             read_until(aurora, at_least(1))
-        device = library.Device(path)
+        device = library.AuroraDevice(path)
         device.set_timeout(1.0)
-        assert device.synchronised(1.0)
+        assert device.synchronise(1.0)
         assert device.command("TX:0001") == BAD_MODE
         assert device.command("PHSR:00") == 0
         device.close()
@@ -420,7 +420,7 @@ def test_the_reason_why_a_port_was_not_opened():
 def test_any_error_code_has_a_description(code):
     """Codes that a reply ERRORxx may have, and for which ndicapi reads beyond its tables."""
     device, host = os.openpty()
-    found = library.Device(os.ttyname(host))
+    found = library.AuroraDevice(os.ttyname(host))
     assert found.explain(code)
     found.close()
     os.close(device)

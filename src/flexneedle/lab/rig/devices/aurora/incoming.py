@@ -7,8 +7,8 @@ from threading import Lock
 from time import monotonic
 from typing import Any
 
-from flexneedle.lab.rig.devices.aurora.messages import Message, in_words
-from flexneedle.lab.rig.devices.aurora.readings import readings, sensor_name
+from flexneedle.lab.rig.devices.aurora.messages import Message, to_one_line
+from flexneedle.lab.rig.devices.aurora.readings import make_readings, sensor_name
 from flexneedle.lab.rig.devices.aurora.timing import Numbering, Timeline
 from flexneedle.types import VISIBLE, Frame
 
@@ -20,10 +20,13 @@ _LATE_S = 0.15  # six frames
 
 
 @dataclass(frozen=True)
-class Counts:
-    """Counts since the start: frames received, frame numbers missed, frames dropped before they were read, connections
-    after the first, and errors by kind ("garbled", "no reply", "error", "system", "unplugged"; "crash": the link ended
-    without a reason, or what it sent is not a message)."""
+class AuroraCounts:
+    """Counts since the start.
+
+    frames received, frame numbers missed, frames dropped before they were read, connections after the first, and
+    errors by kind ("garbled", "no reply", "error", "system", "unplugged"; "crash": the link ended without a reason,
+    or sent an invalid message).
+    """
 
     frames: int
     missed: int
@@ -32,11 +35,11 @@ class Counts:
     errors: Mapping[str, int]
 
 
-class Incoming:
-    """What the links sent. One thread feeds it, others may read.
+class LinkReceiver:
+    """Receiver of the links' messages. One thread calls `take`, others may read.
 
-    names: of the sensors at ports 1, 2, …; offset (s): from the monotonic clock to that of the run; now: the monotonic
-    clock.
+    names: of the sensors at ports 1, 2, …; offset (s): from the monotonic clock to the run's clock; now: the
+    monotonic clock.
     """
 
     def __init__(self, names: Sequence[str], offset: float, now: Callable[[], float] = monotonic) -> None:
@@ -49,10 +52,10 @@ class Incoming:
         self._errors: Counter[str] = Counter()
         self._last: tuple[int, float] | None = None
         self._reason = "connecting"
-        self.begin()
+        self.begin_link()
 
-    def begin(self) -> None:
-        """A new link: it has sent nothing yet."""
+    def begin_link(self) -> None:
+        """Reset the state of the link, for a new one."""
         self._named: dict[str, str] = {}
         self._newest = -1, self._now()
         self._ended = False
@@ -69,26 +72,26 @@ class Incoming:
             case ("error", kind, description) if tracks:
                 with self._lock:
                     self._errors[kind] += 1
-                    self._reason = in_words(description)
+                    self._reason = to_one_line(description)
             case ("end", reason) if not self._ended:
                 self._ended = True
-                self.explain(reason)
+                self.set_reason(reason)
             case _:
                 raise ValueError(f"a message out of order: {str(message)[:60]}")
 
-    def crashed(self, reason: str) -> None:
-        """Count a link that ended without a reason of its own."""
+    def record_crash(self, reason: str) -> None:
+        """Count a link that ended without a reason, or with an invalid message."""
         with self._lock:
             self._errors["crash"] += 1
-            self._reason = in_words(reason)
+            self._reason = to_one_line(reason)
 
-    def explain(self, reason: str) -> None:
+    def set_reason(self, reason: str) -> None:
         """Set the reason why there are no frames."""
         with self._lock:
-            self._reason = in_words(reason)
+            self._reason = to_one_line(reason)
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first."""
+        """Return the frames since the last call, oldest first."""
         with self._lock:
             frames = tuple(self._frames)
             self._frames.clear()
@@ -112,16 +115,16 @@ class Incoming:
 
     @property
     def connections(self) -> int:
-        """How many links were ready."""
+        """Number of links that became ready."""
         with self._lock:
             return self._connections
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> AuroraCounts:
         """Counts since the start."""
         with self._lock:
             again = max(0, self._connections - 1)
-            return Counts(self._received, self._missed, self._dropped, again, dict(self._errors))
+            return AuroraCounts(self._received, self._missed, self._dropped, again, dict(self._errors))
 
     def _set_names(self, ports: Mapping[str, tuple[str, str]]) -> None:
         named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
@@ -136,7 +139,7 @@ class Incoming:
         self._newest = device_number, requested
         number = self._numbering.count(device_number, requested)
         time = self._timeline.stamp(number, requested) + self._offset
-        frame = Frame(time, number, readings(found, device_number, self._named))
+        frame = Frame(time, number, make_readings(found, device_number, self._named))
         with self._lock:
             self._missed += 0 if self._last is None else number - self._last[0] - 1
             self._dropped += len(self._frames) == _QUEUE

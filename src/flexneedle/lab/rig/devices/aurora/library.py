@@ -58,7 +58,7 @@ def library_path() -> str:
     return found.origin
 
 
-class Device:
+class AuroraDevice:
     """An open serial line to a tracker. Raises OSError if it cannot be opened."""
 
     def __init__(self, path: str) -> None:
@@ -88,7 +88,7 @@ class Device:
         error = _ERROR.match(self._reply) if code == CHECKSUM else None
         return code if error is None else int(error[1], 16)
 
-    def synchronised(self, seconds: float) -> bool:
+    def synchronise(self, seconds: float) -> bool:
         """Discard delayed replies, within `seconds`; return whether replies match commands again.
 
         A reply that arrives after its command timed out would be taken for the reply to the next command, and its
@@ -161,6 +161,7 @@ class Device:
 
 
 def open_problem(path: str) -> str:
+    """Return the reason why a serial port cannot be opened."""
     if not Path(path).exists():
         return "the port does not exist: is the cable plugged in?"
     try:

@@ -19,7 +19,7 @@ from time import monotonic, sleep
 from typing import NoReturn
 
 from flexneedle.lab.process import MessageChannel, open_channel
-from flexneedle.lab.rig.devices.aurora.library import CHECKSUM, DISABLED, LOST, TIMEOUT, Device
+from flexneedle.lab.rig.devices.aurora.library import CHECKSUM, DISABLED, LOST, TIMEOUT, AuroraDevice
 from flexneedle.lab.rig.devices.aurora.messages import to_json
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
@@ -56,7 +56,7 @@ def main(descriptor: int, path: str, may_break: bool) -> None:
     set_realtime_priority()
     channel = open_channel(descriptor, encode=to_json)
     try:
-        device = Device(path)
+        device = AuroraDevice(path)
         try:
             _connect(device, may_break)
             _read(device, channel)
@@ -71,8 +71,8 @@ def _stop(*_: object) -> NoReturn:
     raise SystemExit
 
 
-def _connect(device: Device, may_break: bool) -> None:
-    """Find the tracker at its baud rate after power-on, or at that of an earlier connection."""
+def _connect(device: AuroraDevice, may_break: bool) -> None:
+    """Find the tracker at its baud rate after power-on, or at the rate of an earlier connection."""
     device.set_timeout(_INIT_S)
     for speed in (_SLOW, _FAST):
         device.set_baud_rate(speed)
@@ -81,24 +81,24 @@ def _connect(device: Device, may_break: bool) -> None:
             break
     else:
         if not may_break:
-            raise _End("no reply to INIT" if code == TIMEOUT else _error(device, code)[1])
+            raise _End("no reply to INIT" if code == TIMEOUT else _describe_error(device, code)[1])
         device.set_timeout(_BREAK_S)
         _require(device, None, "no reply, not even to a serial break")
         _require(device, "INIT:", "initialisation failed after a reset")
     device.set_timeout(_SET_UP_S)
     _require(device, _TO_FAST, "the baud rate cannot be set")
-    if not device.synchronised(_SYNCHRONISE_S):
+    if not device.synchronise(_SYNCHRONISE_S):
         raise _End("no reply")
 
 
-def _require(device: Device, command: str | None, problem: str) -> None:
+def _require(device: AuroraDevice, command: str | None, problem: str) -> None:
     """Send a command; raise _End with the problem if it fails."""
     code = device.command(command)
     if code:
         raise _End(f"{problem}: {device.explain(code)}")
 
 
-def _read(device: Device, channel: MessageChannel) -> None:
+def _read(device: AuroraDevice, channel: MessageChannel) -> None:
     """Enable the sensors and track; restore the tracker's state at the end if it still replies."""
     ports = set_up(device)
     _require(device, "TSTART:", "tracking cannot be started")
@@ -114,16 +114,16 @@ def _read(device: Device, channel: MessageChannel) -> None:
             device.command(_TO_SLOW)
 
 
-def set_up(device: Device) -> dict[str, tuple[str, str]]:
+def set_up(device: AuroraDevice) -> dict[str, tuple[str, str]]:
     """Initialise and enable every sensor; return port and channel by port handle."""
-    for handle in _listed(device, "01"):  # of sensors that were unplugged
+    for handle in _list_ports(device, "01"):  # of sensors that were unplugged
         _require(device, f"PHF:{handle:02X}", f"port handle {handle:02X} cannot be freed")
     ports: dict[str, tuple[str, str]] = {}
     for _ in range(_ROUNDS):
-        waiting = [handle for handle in _listed(device, "02") if str(handle) not in ports]
+        waiting = [handle for handle in _list_ports(device, "02") if str(handle) not in ports]
         for handle in waiting:
             _require(device, f"PINIT:{handle:02X}", f"port handle {handle:02X} cannot be initialised")
-            ports[str(handle)] = _location(device, handle)
+            ports[str(handle)] = _locate_port(device, handle)
         if not waiting:
             break
     if not ports:
@@ -135,7 +135,7 @@ def set_up(device: Device) -> dict[str, tuple[str, str]]:
     return ports
 
 
-def _listed(device: Device, which: str) -> list[int]:
+def _list_ports(device: AuroraDevice, which: str) -> list[int]:
     problem = "the sensors cannot be listed"
     _require(device, f"PHSR:{which}", problem)
     try:
@@ -144,7 +144,7 @@ def _listed(device: Device, which: str) -> list[int]:
         raise _End(f"{problem}: {error}") from None
 
 
-def _location(device: Device, handle: int) -> tuple[str, str]:
+def _locate_port(device: AuroraDevice, handle: int) -> tuple[str, str]:
     problem = f"port handle {handle:02X} cannot be described"
     _require(device, f"PHINF:{handle:02X}0020", problem)
     try:
@@ -153,30 +153,30 @@ def _location(device: Device, handle: int) -> tuple[str, str]:
         raise _End(f"{problem}: {error}") from None
 
 
-def _read_command(device: Device) -> str:
+def _read_command(device: AuroraDevice) -> str:
     """Return the command for readings: BX, or TX if BX is not supported."""
     device.set_timeout(_READ_S)
     code = device.command(f"BX:{_OPTIONS}")
-    if code == TIMEOUT and not device.synchronised(_SYNCHRONISE_S):
+    if code == TIMEOUT and not device.synchronise(_SYNCHRONISE_S):
         raise _End("no reply")
     return "TX" if code == _UNKNOWN_COMMAND else "BX"
 
 
-def _poll(device: Device, channel: MessageChannel, read: str, handles: list[int]) -> bool:
+def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: list[int]) -> bool:
     """Send each new frame until there are none; return whether the tracker still replies. read: BX or TX.
 
-    A frame is new if its number increased; the first one is only the reference for the next. Its time is that of the
-    request, since a reply may be delayed.
+    A frame is new if its number increased; the first one is only the reference for the next. Its time is the time of
+    the request, since a reply may be delayed.
     """
     last, last_new, reason = -1, monotonic(), "no frame"
     while (requested := monotonic()) - last_new < GIVE_UP_S:
         code = device.command(f"{read}:{_OPTIONS}")
         if code:
-            kind, reason = _error(device, code)
+            kind, reason = _describe_error(device, code)
             channel.send(("error", kind, reason))
-            if code in LOST or (code == TIMEOUT and not device.synchronised(_SYNCHRONISE_S)):
+            if code in LOST or (code == TIMEOUT and not device.synchronise(_SYNCHRONISE_S)):
                 break
-        elif fault := _SYSTEM.get(_lowest(device.system_status(read) & sum(_SYSTEM))):
+        elif fault := _SYSTEM.get(_lowest_bit(device.system_status(read) & sum(_SYSTEM))):
             reason = f"the tracker reports: {fault}"
             channel.send(("error", "system", reason))
         else:
@@ -198,11 +198,11 @@ def _poll(device: Device, channel: MessageChannel, read: str, handles: list[int]
     return code not in (TIMEOUT, *LOST)
 
 
-def _lowest(bits: int) -> int:
+def _lowest_bit(bits: int) -> int:
     return bits & -bits
 
 
-def _error(device: Device, code: int) -> tuple[str, str]:
+def _describe_error(device: AuroraDevice, code: int) -> tuple[str, str]:
     """Return kind and description of a failed reading."""
     if code == TIMEOUT:
         return "no reply", "no reply"

@@ -46,7 +46,7 @@ def parse(data: bytes) -> Message:
         raise ValueError(f"not a message: {data[:60]!r}") from None
 
 
-def in_words(reason: str) -> str:
-    """The reason in one printable line of at most 200 characters."""
+def to_one_line(reason: str) -> str:
+    """Return the reason in one printable line of at most 200 characters."""
     words = " ".join(reason.split())
     return "".join(letter if letter.isprintable() else "?" for letter in words)[:200]

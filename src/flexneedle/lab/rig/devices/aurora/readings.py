@@ -39,22 +39,22 @@ def sensor_name(port: str, channel: str, names: Sequence[str]) -> str:
     return name if channel == "00" else f"{name}.{int(channel, 16) + 1}"
 
 
-def readings(
+def make_readings(
     found: Mapping[str, Sequence[Any]], number: int, names: Mapping[str, str]
 ) -> dict[str, SensorReading]:
     """Return the readings of a frame by name. found: values from the link; names: by port handle."""
     return {
-        names[handle]: _STALE if kind == _MEASURED and frame != number else reading(kind, status, pose)
+        names[handle]: _STALE if kind == _MEASURED and frame != number else make_reading(kind, status, pose)
         for handle, (kind, status, frame, pose) in found.items()
     }
 
 
-def reading(kind: int, status: int, pose: Sequence[float]) -> SensorReading:
+def make_reading(kind: int, status: int, pose: Sequence[float]) -> SensorReading:
     """Return a sensor's reading: kind and port status from ndicapi, pose q0 qx qy qz, x y z (mm), indicator.
 
     Only a sensor completely inside the volume has a position.
     """
-    fault = _fault(kind, status)
+    fault = _find_fault(kind, status)
     if fault == VISIBLE and not _is_valid(pose):
         fault = "bad transform"
     if fault != VISIBLE:
@@ -65,7 +65,7 @@ def reading(kind: int, status: int, pose: Sequence[float]) -> SensorReading:
     return SensorReading((x, y, z), (w, qx, qy, qz), pose[7])
 
 
-def _fault(kind: int, status: int) -> str:
+def _find_fault(kind: int, status: int) -> str:
     """Return VISIBLE or the reason why a sensor has no position."""
     if kind == DISABLED:  # without a port status in ndicapi
         return "disabled"

@@ -10,7 +10,7 @@ from typing import Self
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.rig.devices.aurora.incoming import Counts, Incoming
+from flexneedle.lab.rig.devices.aurora.incoming import AuroraCounts, LinkReceiver
 from flexneedle.lab.rig.devices.aurora.library import library_path
 from flexneedle.lab.rig.devices.aurora.messages import Message, message_channel
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
@@ -37,7 +37,7 @@ class Aurora:
         library_path()
         _check_port(path)
         self._path = path
-        self._incoming = Incoming(names, clock.now() - monotonic())
+        self._incoming = LinkReceiver(names, clock.now() - monotonic())
         self._first, self._stop = Event(), Event()
         self._thread = Thread(target=self._keep_connected, name="aurora", daemon=True)
         self._thread.start()
@@ -59,7 +59,7 @@ class Aurora:
         self._thread.join()
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; may be empty."""
+        """Return the frames since the last call, oldest first; may be empty."""
         return self._incoming.read()
 
     @property
@@ -68,7 +68,7 @@ class Aurora:
         return self._incoming.status
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> AuroraCounts:
         """Counts since the start."""
         return self._incoming.counts
 
@@ -88,7 +88,7 @@ class Aurora:
                     tracked = self._connect_once(attempt % _BREAK_EVERY == 0)
                 except (OSError, ValueError) as error:  # it cannot be started, or its output is invalid
                     tracked = False
-                    self._incoming.crashed(f"the link failed: {error}")
+                    self._incoming.record_crash(f"the link failed: {error}")
                 if not self._first.is_set():
                     return
                 pause, attempt = (
@@ -116,14 +116,14 @@ class Aurora:
 
     def _listen(self, link: ChildProcess) -> None:
         """Process the link's messages until it ends, hangs, or is stopped."""
-        self._incoming.begin()
+        self._incoming.begin_link()
         received_at, limit = monotonic(), _CONNECT_S
         while not (self._stop.is_set() or link.channel.ended):
             for message in link.channel.receive(_POLL_S):
                 self._take(message)
                 received_at, limit = monotonic(), _SILENT_S
             if monotonic() - received_at > limit:
-                self._incoming.explain("no reply: the link does not respond")
+                self._incoming.set_reason("no reply: the link does not respond")
                 return
 
     def _take(self, message: Message) -> None:
@@ -143,7 +143,7 @@ class Aurora:
             if code == -signal.SIGKILL
             else f"the link ended with exit code {code}"
         )
-        self._incoming.crashed(printed or problem)
+        self._incoming.record_crash(printed or problem)
 
 
 def _check_port(path: str) -> None:

@@ -4,14 +4,16 @@ from collections.abc import Sequence
 
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices.galil.link import Link
-from flexneedle.lab.rig.devices.galil.replies import GarbledError, numbers, printable, text
+from flexneedle.lab.rig.devices.galil.replies import GarbledError, format_commands, parse_numbers, parse_text
 
 _REASON = "TC1"
 
 
 class Dialogue:
-    """What is asked on a link. Each method raises DriverError: with the controller's reason for a command that it
-    refuses; or with the problem of the link, which is then closed.
+    """Commands and queries on a link.
+
+    Each method raises DriverError: with the controller's reason for a command that it refuses; or with the problem of
+    the link, which is then closed.
     """
 
     def __init__(self, link: Link) -> None:
@@ -20,7 +22,7 @@ class Dialogue:
     def do(self, commands: Sequence[str], deadline: float) -> None:
         """Have commands carried out."""
         if any(self._data(commands, deadline)):
-            raise self._link.failed(f"data in the reply to {printable(commands)}")
+            raise self._link.failed(f"data in the reply to {format_commands(commands)}")
 
     def numbers(
         self, queries: Sequence[str], counts: Sequence[int], deadline: float
@@ -28,15 +30,15 @@ class Dialogue:
         """Return the answers to queries: `counts` numbers each."""
         found = self._data(queries, deadline)
         try:
-            return [numbers(data, count) for data, count in zip(found, counts, strict=True)]
+            return [parse_numbers(data, count) for data, count in zip(found, counts, strict=True)]
         except GarbledError as error:
-            raise self._link.failed(f"{error} (to {printable(queries)})") from None
+            raise self._link.failed(f"{error} (to {format_commands(queries)})") from None
 
     def text(self, query: str, deadline: float) -> str:
         """Return the line of text that answers a query."""
         (data,) = self._data([query], deadline)
         try:
-            return text(data)
+            return parse_text(data)
         except GarbledError as error:
             raise self._link.failed(str(error)) from None
 
@@ -45,12 +47,12 @@ class Dialogue:
         refused = [command for command, reply in zip(commands, replies, strict=True) if not reply.accepted]
         if refused:
             raise DriverError(
-                f"{self._link.name}: {printable(refused)} refused: {self._why(refused, deadline)}"
+                f"{self._link.name}: {format_commands(refused)} refused: {self._why(refused, deadline)}"
             )
         return tuple(reply.data for reply in replies)
 
     def _why(self, refused: Sequence[str], deadline: float) -> str:
-        """Return the controller's reason, its code and text: that of the last of the commands."""
+        """Return the controller's reason, its code and text, for the last of the commands."""
         if _REASON in refused:
             return "no reason given"
         try:

@@ -1,4 +1,4 @@
-"""What a controller was set up with: the queries, and their answers.
+"""Setup of a controller: the queries, and their answers.
 
 Source: Galil, Command Reference, DMC-4103.
 """
@@ -9,7 +9,7 @@ from math import inf
 from flexneedle.ports import MotorSetup
 
 SERVOS = (1.0, 1.5, 4.0)
-"""Types of motor (MT, either sign) whose position is that of an encoder; the others are steppers."""
+"""Types of motor (MT, either sign) whose position an encoder measures; the others are steppers."""
 POSITION_FORMAT = 10.0
 """Format of positions (PF): ten digits, no decimals. A shorter one would cut them off."""
 SAMPLE_TIME = 1000.0
@@ -21,17 +21,17 @@ _DISABLED = {0: "", 1: "forward", 2: "reverse"}
 _SWITCHES_OFF = (1, 3)  # values of OE
 
 
-def operands(name: str, letters: str) -> str:
+def format_operands(name: str, letters: str) -> str:
     """Return the operands of axes for MG, such as `_MTA,_MTB`."""
     return ",".join(f"_{name}{letter}" for letter in letters)
 
 
-def query(letter: str) -> tuple[str, int]:
+def make_query(letter: str) -> tuple[str, int]:
     """Return what to ask for the setup of an axis, and the number of its answers."""
     return f"MG {','.join(f'_{name}{letter}' for name in _SETUP)}", len(_SETUP)
 
 
-def setup(values: Sequence[float]) -> MotorSetup:
+def make_setup(values: Sequence[float]) -> MotorSetup:
     """Return the setup of an axis from the answers to its query. A negative ER disables the check of the error."""
     reverse, forward, error, on_error, disabled = values
     return MotorSetup(

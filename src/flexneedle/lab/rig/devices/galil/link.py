@@ -11,7 +11,13 @@ from contextlib import suppress
 from time import monotonic
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.devices.galil.replies import GarbledError, Reply, lines, parse, printable
+from flexneedle.lab.rig.devices.galil.replies import (
+    GarbledError,
+    Reply,
+    format_commands,
+    parse_replies,
+    split_lines,
+)
 
 _LARGEST_REPLY = 4096  # bytes; a reply to the longest line has a few hundred
 _MOST_UNREAD = 1 << 20
@@ -72,12 +78,14 @@ class Link:
         Raises DriverError, and closes the connection, if the replies are not there at the deadline or are not replies
         to these commands.
         """
-        return tuple(reply for line in lines(tuple(commands)) for reply in self._exchange(line, deadline))
+        return tuple(
+            reply for line in split_lines(tuple(commands)) for reply in self._exchange(line, deadline)
+        )
 
     def _exchange(self, line: tuple[str, ...], deadline: float) -> tuple[Reply, ...]:
         if self._socket is None:
             raise DriverError(f"{self.name}: not connected: {self._closed}; {_REMEDY}")
-        shown = printable(line)
+        shown = format_commands(line)
         if monotonic() >= deadline:  # before anything is sent: later replies are not in doubt
             raise DriverError(f"{self.name}: no time left for {shown}")
         try:
@@ -96,7 +104,7 @@ class Link:
 
     def _received(self, connection: socket.socket, count: int, deadline: float) -> tuple[Reply, ...]:
         received = b""
-        while (replies := parse(received, count)) is None:
+        while (replies := parse_replies(received, count)) is None:
             connection.settimeout(max(0.0, deadline - monotonic()))
             data = connection.recv(_LARGEST_REPLY)
             if not data:

@@ -14,8 +14,15 @@ from flexneedle.lab.rig.devices.galil import facts
 from flexneedle.lab.rig.devices.galil.dialogue import Dialogue
 from flexneedle.lab.rig.devices.galil.link import Link
 from flexneedle.lab.rig.devices.galil.replies import LONGEST_LINE, GarbledError
-from flexneedle.lab.rig.devices.galil.settings import AXES, GalilSettings, checked
-from flexneedle.lab.rig.devices.galil.states import ABORTED, STOPPED, Channel, Report, report, seen
+from flexneedle.lab.rig.devices.galil.settings import AXES, GalilSettings, check_galil_settings
+from flexneedle.lab.rig.devices.galil.states import (
+    ABORTED,
+    STOPPED,
+    ChannelState,
+    MotorReport,
+    make_report,
+    take_report,
+)
 from flexneedle.ports import MotorPaces, MotorSetup, MotorState
 
 CONNECT_S = 2.0
@@ -36,7 +43,7 @@ def factory(settings: Mapping[str, Any], channels: Sequence[str]) -> "GalilMotor
 
     Raises RigError for settings that are not valid, DriverError if the controller cannot be reached.
     """
-    return GalilMotors(checked(settings, channels), channels)
+    return GalilMotors(check_galil_settings(settings, channels), channels)
 
 
 class GalilMotors:
@@ -60,7 +67,7 @@ class GalilMotors:
         self._letters = "".join(sorted(channels))
         self._link = Link(settings.host, settings.port)
         self._dialogue = Dialogue(self._link)
-        self._channels = dict.fromkeys(self._letters, Channel())
+        self._channels = dict.fromkeys(self._letters, ChannelState())
         self._rates: dict[str, int] = {}
         self._slowing: dict[str, float] = {}
         self._stopping: float | None = None
@@ -78,41 +85,45 @@ class GalilMotors:
         self.close()
 
     def _connect(self, deadline: float) -> None:
-        self._channels = dict.fromkeys(self._letters, Channel())
+        self._channels = dict.fromkeys(self._letters, ChannelState())
         self._rates, self._stopping = {}, None
         self._link.farewell = ""  # it may be any device
         self._link.open(deadline)
         try:
-            self._greet(deadline)
+            self._identify(deadline)
         except DriverError as error:
             self._link.close(str(error))
             raise
         self._link.farewell = self._farewell
 
-    def _do(self, commands: Sequence[str], deadline: float) -> None:
-        """Have commands carried out; from the first on a connection in doubt is left with a stop of the motors."""
+    def _execute(self, commands: Sequence[str], deadline: float) -> None:
+        """Have commands carried out; from the first on, a connection in doubt is left with a stop of the motors."""
         self._farewell = self._link.farewell = f"ST{self._letters}"
         self._dialogue.do(commands, deadline)
 
-    def _greet(self, deadline: float) -> None:
-        """Find out what is there. Raises DriverError if it is not a controller that can be read as it is."""
+    def _identify(self, deadline: float) -> None:
+        """Identify the device. Raises DriverError if it is not a controller that can be read as it is."""
         self._link.ask(["EO 0"], deadline)  # refused where there is no echo to switch off, as on Ethernet
         self.identity = self._dialogue.text(_REVISION, deadline)
         if "DMC" not in self.identity:
-            raise self._unfit(f"not a Galil motion controller: {self.identity}")
-        queries = ["MG _PF,_TM", f"MG {facts.operands('MT', self._letters)}"]
+            raise self._unfit_error(f"not a Galil motion controller: {self.identity}")
+        queries = ["MG _PF,_TM", f"MG {facts.format_operands('MT', self._letters)}"]
         (form, sample), kinds = self._dialogue.numbers(queries, [2, len(self._letters)], deadline)
         if form != facts.POSITION_FORMAT:
-            raise self._unfit(f"positions have the format PF {form:g}: set PF {facts.POSITION_FORMAT:g}")
+            raise self._unfit_error(
+                f"positions have the format PF {form:g}: set PF {facts.POSITION_FORMAT:g}"
+            )
         if sample != facts.SAMPLE_TIME:
             rule = f"set TM {facts.SAMPLE_TIME:g}, with which speeds are in counts/s"
-            raise self._unfit(f"the sample time is TM {sample:g}: {rule}")
+            raise self._unfit_error(f"the sample time is TM {sample:g}: {rule}")
         for letter, kind in zip(self._letters, kinds, strict=True):
             if abs(kind) not in facts.SERVOS:
-                raise self._unfit(f"{letter} is no servo motor (MT {kind:g}): its position is not measured")
-        self._reports(deadline)
+                raise self._unfit_error(
+                    f"{letter} is no servo motor (MT {kind:g}): its position is not measured"
+                )
+        self._read_states(deadline)
 
-    def _unfit(self, problem: str) -> DriverError:
+    def _unfit_error(self, problem: str) -> DriverError:
         return DriverError(f"{self._link.name}: {problem}")
 
     def reconnect(self) -> None:
@@ -131,28 +142,30 @@ class GalilMotors:
         return monotonic() + self._timeout
 
     def read(self) -> Mapping[str, MotorState]:
-        """State of every channel, as of now: one line and its reply."""
-        return self._reports(self._deadline())
+        """Return the present state of every channel, by one line and its reply."""
+        return self._read_states(self._deadline())
 
-    def _reports(self, deadline: float) -> dict[str, MotorState]:
-        """Query all channels, and note what was found."""
+    def _read_states(self, deadline: float) -> dict[str, MotorState]:
+        """Query all channels, and record their states."""
         columns = self._query(("TP", "RP", "TS", "SC"), self._letters, deadline)
         states = {}
         for letter, values in zip(self._letters, zip(*columns, strict=True), strict=True):
-            self._channels[letter], states[letter] = seen(self._channels[letter], self._report(*values))
+            self._channels[letter], states[letter] = take_report(
+                self._channels[letter], self._report(*values)
+            )
         return states
 
     def _query(self, names: Sequence[str], letters: str, deadline: float) -> list[tuple[float, ...]]:
         queries = [f"{name}{letters}" for name in names]
         return self._dialogue.numbers(queries, [len(letters)] * len(queries), deadline)
 
-    def _report(self, position: float, commanded: float, switches: float, code: float) -> Report:
+    def _report(self, position: float, commanded: float, switches: float, code: float) -> MotorReport:
         try:
-            return report(position, commanded, switches, code)
+            return make_report(position, commanded, switches, code)
         except GarbledError as error:
             raise self._link.failed(str(error)) from None
 
-    def _moving(self, letters: str, deadline: float) -> set[str]:
+    def _find_moving(self, letters: str, deadline: float) -> set[str]:
         """Return the channels that the controller counts as in motion."""
         (switches,) = self._query(("TS",), letters, deadline)
         found = zip(letters, switches, strict=True)
@@ -164,34 +177,36 @@ class GalilMotors:
         In the mode `moves` a channel that is in motion finishes it first. Its new target is sent by the first call that
         finds it at rest: repeat the call until `read` reports rest.
         """
-        targets = {letter: self._target(letter, position) for letter, position in positions.items()}
+        targets = {letter: self._check_target(letter, position) for letter, position in positions.items()}
         if targets:
             self._stopping = None
             deadline = self._deadline()
             try:
                 (self._track if self._tracks else self._move)(targets, deadline)
             except DriverError as error:
-                raise DriverError("; ".join((str(error), *self._stops(deadline)))) from None
+                raise DriverError("; ".join((str(error), *self._describe_stops(deadline)))) from None
 
-    def _stops(self, deadline: float) -> list[str]:
-        """Which channels the controller itself has stopped, and why, if it says so: it refuses their targets until they
-        rest; and which are at a limit switch."""
+    def _describe_stops(self, deadline: float) -> list[str]:
+        """Return a line for each channel that the controller itself has stopped, or that is at a limit switch.
+
+        The controller refuses targets of channels that it has stopped until they rest.
+        """
         if not self._link.is_open:
             return []
         try:
-            found = self._reports(deadline)
+            found = self._read_states(deadline)
         except DriverError:  # the refusal counts
             return []
         reasons = {letter: state.stopped or _at_switch(state) for letter, state in found.items()}
         return [f"{letter}: {why}" for letter, why in reasons.items() if why]
 
-    def _target(self, letter: str, position: float) -> int:
-        self._known(letter)
+    def _check_target(self, letter: str, position: float) -> int:
+        self._check_channel(letter)
         if not math.isfinite(position) or abs(target := round(position)) > _FARTHEST:
             raise DriverError(f"{letter} = {position:.12g} counts: must be from -{_FARTHEST} to {_FARTHEST}")
         return target
 
-    def _known(self, letter: str) -> None:
+    def _check_channel(self, letter: str) -> None:
         if letter not in self._channels:
             raise DriverError(f"{letter}: no such channel; channels: {', '.join(self._letters)}")
 
@@ -199,24 +214,24 @@ class GalilMotors:
         # An axis that the controller itself has stopped has left position tracking, and a target alone does not move
         # it: it moves again only after its stop was reported to the caller.
         entering = {letter: 1 for letter in targets if not self._channels[letter].tracking}
-        commands = [_assigned("PT", entering)] if entering else []
-        self._do([*commands, *_in_lines("PA", targets)], deadline)
+        commands = [_format_assignment("PT", entering)] if entering else []
+        self._execute([*commands, *_split_assignment("PA", targets)], deadline)
         for letter, target in targets.items():
-            self._channels[letter] = self._channels[letter].follows(target, tracking=True)
+            self._channels[letter] = self._channels[letter].with_target(target, tracking=True)
 
     def _move(self, targets: Mapping[str, int], deadline: float) -> None:
         known = self._channels.items()
         wanted = {k: channel.target for k, channel in known if channel.waiting and channel.target is not None}
         wanted |= targets
         # The controller refuses a new target during a move (PA: not valid while moving).
-        moving = self._moving("".join(sorted(wanted)), deadline)
+        moving = self._find_moving("".join(sorted(wanted)), deadline)
         for letter in moving:
             self._channels[letter] = replace(self._channels[letter], target=wanted[letter], waiting=True)
         now = {letter: target for letter, target in wanted.items() if letter not in moving}
         if now:
-            self._do([*_in_lines("PA", now), f"BG{''.join(sorted(now))}"], deadline)
+            self._execute([*_split_assignment("PA", now), f"BG{''.join(sorted(now))}"], deadline)
         for letter, target in now.items():
-            self._channels[letter] = self._channels[letter].follows(target, tracking=False)
+            self._channels[letter] = self._channels[letter].with_target(target, tracking=False)
 
     def stop(self) -> None:
         """Stop all channels at once; motors stay powered.
@@ -227,22 +242,26 @@ class GalilMotors:
         deadline = self._deadline()
         first = self._stopping is None
         began = self._stopping = monotonic() if self._stopping is None else self._stopping
-        self._stopped(STOPPED)
+        self._drop_targets(STOPPED)
         try:
-            self._do([f"ST{self._letters}"], deadline)
+            self._execute([f"ST{self._letters}"], deadline)
         except DriverError:
             if self._link.is_open:  # refused
                 self._abort(deadline)
             raise
-        if not first and monotonic() >= began + self._slowing_s and self._moving(self._letters, deadline):
+        if (
+            not first
+            and monotonic() >= began + self._slowing_s
+            and self._find_moving(self._letters, deadline)
+        ):
             self._abort(deadline)
 
     def _abort(self, deadline: float) -> None:
-        self._stopped(STOPPED, ABORTED)
-        self._do(["AB 1"], deadline)
+        self._drop_targets(STOPPED, ABORTED)
+        self._execute(["AB 1"], deadline)
 
-    def _stopped(self, *codes: int) -> None:
-        self._channels = {k: channel.rests(*codes) for k, channel in self._channels.items()}
+    def _drop_targets(self, *codes: int) -> None:
+        self._channels = {k: channel.without_target(*codes) for k, channel in self._channels.items()}
 
     @property
     def _slowing_s(self) -> float:
@@ -254,55 +273,55 @@ class GalilMotors:
         They are rounded down to what the controller has: speeds to multiples of 2, accelerations to multiples of 1024.
         The deceleration is the acceleration; a controller refuses to change it during a motion to a position.
         """
-        self._known(channel)
-        pace = _whole(f"{channel} speed", speed, *_PACES.speeds, "counts/s")
-        rate = _whole(f"{channel} acceleration", acceleration, *_PACES.accelerations, "counts/s²")
+        self._check_channel(channel)
+        pace = _round_down(f"{channel} speed", speed, *_PACES.speeds, "counts/s")
+        rate = _round_down(f"{channel} acceleration", acceleration, *_PACES.accelerations, "counts/s²")
         pace, rate = pace // _SPEED_STEP * _SPEED_STEP, rate // _RATE_STEP * _RATE_STEP
         commands = [f"SP{channel}={pace}"]
         if self._rates.pop(channel, None) != rate:
             commands = [f"DC{channel}={rate}", f"AC{channel}={rate}", *commands]
-        self._do(commands, self._deadline())
+        self._execute(commands, self._deadline())
         self._rates[channel] = rate
         self._slowing[channel] = pace / rate
 
     def define(self, channel: str, position: float) -> None:
-        """Call the present position of a channel at rest `position` (counts), as at the end of homing."""
-        target = self._target(channel, position)
+        """Define the present position of a channel at rest as `position` (counts), as at the end of homing."""
+        target = self._check_target(channel, position)
         deadline = self._deadline()
-        self._rest(channel, deadline)
-        self._do([f"DP{channel}={target}"], deadline)
+        self._end_tracking(channel, deadline)
+        self._execute([f"DP{channel}={target}"], deadline)
 
     def power(self, channel: str, on: bool) -> None:
         """Switch a motor at rest on or off. Switched on, it is held where it is."""
-        self._known(channel)
+        self._check_channel(channel)
         deadline = self._deadline()
-        self._rest(channel, deadline)
-        self._do([f"{'SH' if on else 'MO'}{channel}"], deadline)
+        self._end_tracking(channel, deadline)
+        self._execute([f"{'SH' if on else 'MO'}{channel}"], deadline)
 
-    def _rest(self, letter: str, deadline: float) -> None:
+    def _end_tracking(self, letter: str, deadline: float) -> None:
         """End the position tracking of a channel at rest, in which the controller refuses other commands.
 
         One that counts as in motion, and was not sent anywhere by this connection, was left in position tracking by one
         that broke, or another program moves it: it is stopped.
         """
-        self._reports(deadline)
-        moving = self._reports(deadline)[letter].moving  # the second one: see `seen`
+        self._read_states(deadline)
+        moving = self._read_states(deadline)[letter].moving  # the second one: see `seen`
         channel = self._channels[letter]
         if moving and channel.target is not None:
             raise DriverError(f"{self._link.name}: {letter} is in motion")
         if moving or channel.tracking:
-            self._do([f"ST{letter}"], deadline)
-            while self._moving(letter, deadline):
+            self._execute([f"ST{letter}"], deadline)
+            while self._find_moving(letter, deadline):
                 pass
-        self._channels[letter] = self._channels[letter].rests(STOPPED)
+        self._channels[letter] = self._channels[letter].without_target(STOPPED)
 
     def setup(self) -> Mapping[str, MotorSetup]:
-        """How the controller is set up for each channel: limits, position errors. It changes nothing."""
+        """Return limits and position errors of the controller for each channel. It changes nothing."""
         found = {}
         for letter in self._letters:
-            query, count = facts.query(letter)
+            query, count = facts.make_query(letter)
             (values,) = self._dialogue.numbers([query], [count], self._deadline())
-            found[letter] = facts.setup(values)
+            found[letter] = facts.make_setup(values)
         return found
 
 
@@ -312,24 +331,24 @@ def _at_switch(state: MotorState) -> str:
     return f"{names} limit switch active" if names else ""
 
 
-def _assigned(name: str, values: Mapping[str, int]) -> str:
+def _format_assignment(name: str, values: Mapping[str, int]) -> str:
     """Return a command that sets values of several axes at once: `PA 100,,50`."""
     last = AXES.index(max(values)) + 1
     return f"{name} {','.join(str(values.get(letter, '')) for letter in AXES[:last])}"
 
 
-def _in_lines(name: str, values: Mapping[str, int]) -> list[str]:
+def _split_assignment(name: str, values: Mapping[str, int]) -> list[str]:
     """Return one command for all axes, or two if it is too long: eight positions of ten digits."""
-    command = _assigned(name, values)
+    command = _format_assignment(name, values)
     if len(command) <= LONGEST_LINE:
         return [command]
     letters = sorted(values)
     half = len(letters) // 2
     parts = (letters[:half], letters[half:])
-    return [_assigned(name, {letter: values[letter] for letter in part}) for part in parts]
+    return [_format_assignment(name, {letter: values[letter] for letter in part}) for part in parts]
 
 
-def _whole(name: str, value: float, least: float, most: float, unit: str) -> int:
+def _round_down(name: str, value: float, least: float, most: float, unit: str) -> int:
     """Return a value in whole units, rounded down. Raises DriverError if it is out of range."""
     if not (math.isfinite(value) and least <= value <= most):
         raise DriverError(f"{name} = {value:.12g} {unit}: must be from {least:.0f} to {most:.0f}")

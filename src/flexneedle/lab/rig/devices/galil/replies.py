@@ -31,7 +31,7 @@ class Reply:
     data: str = ""
 
 
-def lines(commands: tuple[str, ...]) -> list[tuple[str, ...]]:
+def split_lines(commands: tuple[str, ...]) -> list[tuple[str, ...]]:
     """Distribute commands, in their order, over lines that the controller accepts.
 
     Raises ValueError if a command is longer than a line.
@@ -50,7 +50,7 @@ def lines(commands: tuple[str, ...]) -> list[tuple[str, ...]]:
     return found
 
 
-def parse(received: bytes, count: int) -> tuple[Reply, ...] | None:
+def parse_replies(received: bytes, count: int) -> tuple[Reply, ...] | None:
     """Return the replies to `count` commands, or None while some are missing.
 
     Raises GarbledError for a byte that no reply has (a controller may set the highest bit of messages that were not
@@ -89,8 +89,8 @@ def _shown(data: bytes) -> str:
     return text if len(text) <= LONGEST_LINE else text[:LONGEST_LINE] + "…"
 
 
-def numbers(data: str, count: int) -> tuple[float, ...]:
-    """Return the numbers of a reply: ` 200, -10\\r\\n` of TP, ` 0.0000 1.0000\\r\\n` of MG. Raises GarbledError."""
+def parse_numbers(data: str, count: int) -> tuple[float, ...]:
+    r"""Return the numbers of a reply: ` 200, -10\r\n` of TP, ` 0.0000 1.0000\r\n` of MG. Raises GarbledError."""
     body = data.removesuffix("\r\n")
     texts = _SEPARATOR.split(body.strip(" "))
     if body == data or len(texts) != count or not all(_NUMBER.fullmatch(text) for text in texts):
@@ -98,12 +98,12 @@ def numbers(data: str, count: int) -> tuple[float, ...]:
     return tuple(map(float, texts))
 
 
-def printable(commands: Sequence[str]) -> str:
-    """Return commands as one prints them: the control characters of the query for the firmware as ^R^V."""
+def format_commands(commands: Sequence[str]) -> str:
+    """Return commands in printable form: the control characters of the query for the firmware as ^R^V."""
     return "; ".join(commands).replace("\x12\x16", "^R^V")
 
 
-def text(data: str) -> str:
+def parse_text(data: str) -> str:
     """Return the one line of a reply, such as `1 Unrecognized command` of TC1. Raises GarbledError."""
     body = data.removesuffix("\r\n")
     if body == data or "\r" in body or "\n" in body or not body.strip():

@@ -31,7 +31,7 @@ class GalilSettings(Section):
     address: Annotated[str, AfterValidator(_address)]
     """Host name or IP address of the controller, and port if it is not 23."""
     mode: Literal["tracking", "moves"] = "tracking"
-    """Position tracking (PT), or a move of its own for each target (PA, BG)."""
+    """Position tracking (PT), or a separate move for each target (PA, BG)."""
     reply_timeout_ms: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Time for a call, with all its replies, after which the connection counts as lost."""
 
@@ -48,7 +48,7 @@ class GalilSettings(Section):
         return int(form["port"] or _TELNET) if form else _TELNET
 
 
-def checked(settings: Mapping[str, Any], channels: Sequence[str]) -> GalilSettings:
+def check_galil_settings(settings: Mapping[str, Any], channels: Sequence[str]) -> GalilSettings:
     """Return the settings of a driver with these channels. Raises RigError with one line for each problem."""
     problems = [to_line(problem) for problem in _channel_problems(channels)]
     try:

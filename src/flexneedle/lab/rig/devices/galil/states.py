@@ -1,4 +1,4 @@
-"""What the controller reports of an axis, and what the driver knows of it: together the state of a motor.
+"""Reports of the controller about an axis, and the state of its motor that follows from them and from the commands.
 
 Source of the bits and codes: Galil, Command Reference, DMC-4103, TS and SC.
 """
@@ -32,7 +32,7 @@ _REASONS = {
 
 
 @dataclass(frozen=True)
-class Report:
+class MotorReport:
     """One axis at one time, as reported: positions (counts), switches (TS), stop code (SC)."""
 
     position: float
@@ -56,25 +56,25 @@ class Report:
         return not self.switches & _FORWARD_INACTIVE
 
 
-def report(position: float, commanded: float, switches: float, code: float) -> Report:
+def make_report(position: float, commanded: float, switches: float, code: float) -> MotorReport:
     """Return the report of these values. Raises GarbledError for values that an axis cannot have."""
     if max(abs(position), abs(commanded)) > _FARTHEST:
         raise GarbledError(f"no position: {position:.12g}, {commanded:.12g}")
     for value in (switches, code):
         if not (0.0 <= value <= _LARGEST_BYTE and value == int(value)):
             raise GarbledError(f"no byte: {value:.12g}")
-    return Report(position, commanded, int(switches), int(code))
+    return MotorReport(position, commanded, int(switches), int(code))
 
 
 @dataclass(frozen=True)
-class Channel:
-    """What the driver knows of an axis.
+class ChannelState:
+    """State of an axis in the driver.
 
-    target: where it was commanded to go (counts); None: nothing was commanded since it was stopped, defined or
-    switched, or the connection was opened. tracking: whether the driver has put it into position tracking, and the
-    controller has not ended that by a stop of its own. waiting: the target is not sent yet; it is given up where the
-    controller stops the axis by itself, or would at once, at a limit switch. commanded: at the last report.
-    code: stop code at the last report. old: stop codes that explain an earlier stop, not one of this motion.
+    target: commanded position (counts); None: nothing was commanded since it was stopped, defined or switched, or the
+    connection was opened. tracking: the driver has started position tracking, and the controller has not ended it by
+    a stop. waiting: the target is not sent yet; it is dropped if the controller stops the axis by itself, or would at
+    once, at a limit switch. commanded: at the last report. code: stop code at the last report. old: stop codes that
+    explain an earlier stop, not one of this motion.
     """
 
     target: int | None = None
@@ -84,18 +84,18 @@ class Channel:
     code: int = ARRIVED
     old: frozenset[int] = frozenset()
 
-    def follows(self, target: int, *, tracking: bool) -> "Channel":
-        """The channel on its way to a new target. The stop code is old until another one is reported."""
+    def with_target(self, target: int, *, tracking: bool) -> "ChannelState":
+        """Return the channel on its way to a new target. The stop code is old until another one is reported."""
         old = self.old | {self.code}
         return replace(self, target=target, tracking=tracking, waiting=False, old=old)
 
-    def rests(self, *codes: int) -> "Channel":
-        """The channel without a target; codes: stop codes that this will cause."""
+    def without_target(self, *codes: int) -> "ChannelState":
+        """Return the channel without a target; codes: stop codes that this will cause."""
         old = frozenset({self.code, *codes})
         return replace(self, target=None, tracking=False, waiting=False, old=old)
 
 
-def seen(channel: Channel, found: Report) -> tuple[Channel, MotorState]:
+def take_report(channel: ChannelState, found: MotorReport) -> tuple[ChannelState, MotorState]:
     """Return the channel after a report, and the state of the motor.
 
     In position tracking the maker does not say whether an axis at its target counts as in motion. It rests if two
@@ -104,7 +104,11 @@ def seen(channel: Channel, found: Report) -> tuple[Channel, MotorState]:
     arrived = channel.tracking and found.commanded == channel.target == channel.commanded
     good = found.code in (RUNNING, ARRIVED)
     old = channel.old if found.code in channel.old and not good else frozenset[int]()
-    stopped = _reason(found.code) if channel.target is not None and not good and found.code not in old else ""
+    stopped = (
+        _describe_code(found.code)
+        if channel.target is not None and not good and found.code not in old
+        else ""
+    )
     on = not found.switches & _OFF
     tracking = channel.tracking and on and not stopped
     waiting = channel.waiting and not stopped and not _is_blocked(channel, found)
@@ -122,11 +126,11 @@ def seen(channel: Channel, found: Report) -> tuple[Channel, MotorState]:
     )
 
 
-def _is_blocked(channel: Channel, found: Report) -> bool:
-    """Whether the target is beyond a limit switch that is active: the controller would not move there."""
+def _is_blocked(channel: ChannelState, found: MotorReport) -> bool:
+    """Return whether the target is beyond a limit switch that is active: the controller would not move there."""
     way = 0.0 if channel.target is None else channel.target - found.commanded
     return (found.reverse_limit and way < 0.0) or (found.forward_limit and way > 0.0)
 
 
-def _reason(code: int) -> str:
+def _describe_code(code: int) -> str:
     return _REASONS.get(code, f"stop code {code}")
