@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dpbsv
 
 import flexneedle
-from flexneedle.mechanics import insertion
+from flexneedle.mechanics import insertion, spring
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.law import response
 from flexneedle.mechanics.model import CONTACT
@@ -101,8 +101,8 @@ def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             full[2 * i + 2, 2 * i + 2] += scale * law.tangent
             load[2 * i + 2] = scale * (law.tangent * y[i + 1] - law.secant * u)
     cut, u = needle.cut, needle.solution.last.spring
-    _, slope = nd.spring_rest(model, needle.boundary.bevel, cut, nd.Path(1.0, tip.y), tip.x)
-    secant, tangent, *_ = nd.spring_law(model, cut.channel.front, tip.x, u)
+    _, slope = spring.spring_rest(model, needle.boundary.bevel, cut, nd.Path(1.0, tip.y), tip.x)
+    secant, tangent, *_ = spring.spring_law(model, cut.channel.front, tip.x, u)
     full[-2, -2] += slope * tangent
     load[-2] = slope * tangent * tip.y - secant * u
     given = [0, 1, *(2 * i + 2 for i in range(count) if nodes["kind"][i] != CONTACT)]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics import spring
 from flexneedle.mechanics.law import tables
 from flexneedle.mechanics.model import (
     CONTACT,
@@ -93,7 +93,7 @@ def test_all_contacts_together_have_all_of_the_tissue(estimate):
 
 def tip_spring(model, depth, u=0.7):
     """Energy and both stiffnesses of the tip spring with the tip at a depth, the sharpest law and least height."""
-    return nd.spring_energy(model, depth, depth, u), *nd.spring_law(model, depth, depth, u)
+    return spring.spring_energy(model, depth, depth, u), *spring.spring_law(model, depth, depth, u)
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from flexneedle import load_scenario
 from flexneedle.mechanics import lateral as lt
 from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics import spring
 from reference.cases import long_beam, numbers
 from reference.draws import draw_controls, draw_scenario
 from reference.space import Imposed, carried_out, commands, forces, lateral, slopes, start, turned_commands
@@ -91,7 +92,7 @@ def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
     bevel, q0 = cmath.exp(0.7j), 0.3 - 1.1j
     tip, channel = nd.NodePose(10.0, 0j, 0j), nd.CutChannel(10.0, q0)
     cut = nd.Cut(tip, channel, spin)
-    found, slope = nd.spring_rest(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
+    found, slope = spring.spring_rest(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
 
     def rate(x, q):
         return (offset * bevel * np.exp(1j * spin * (x / step - 1.0)) - q) / length

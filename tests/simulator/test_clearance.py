@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from flexneedle import Control, Simulator, controls, load_scenario
-from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation
+from flexneedle.mechanics.solve import COUPLED_ITERATIONS
 from flexneedle.types import THETA
 from reference.cases import repeat
 from reference.tight import tight
@@ -203,7 +203,7 @@ def test_rollouts_converge_and_equal_steps():
             state = simulator.step(state, Control.of(row))
             walls.add(np.sign(wall(state)))
             np.testing.assert_array_equal(state.tip, tip)
-            assert state.iterations <= nd.COUPLED_ITERATIONS
+            assert state.iterations <= COUPLED_ITERATIONS
     assert walls == {-1.0, 0.0, 1.0}
 
 

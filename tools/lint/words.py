@@ -39,6 +39,16 @@ CHECKED = (
     "src/flexneedle/loop",
     "src/flexneedle/record",
     "src/flexneedle/lab/ros",
+    "src/flexneedle/control",
+    "src/flexneedle/costs",
+    "src/flexneedle/estimation",
+    "src/flexneedle/figures",
+    "src/flexneedle/geometry",
+    "src/flexneedle/mechanics",
+    "src/flexneedle/phantom",
+    "src/flexneedle/planning",
+    "src/flexneedle/scenario",
+    "src/flexneedle/simulator",
 )
 # Construction, pattern (a space matches any white space), what to write.
 SENTENCES = (

@@ -1,7 +1,7 @@
-"""How kernels are compiled: Numba, double precision, no fast-math, no GIL, kept on disk.
+"""Compilation of kernels: Numba, double precision, no fast-math, no GIL, cached on disk.
 
-Numba's own cache checks only the file of the outermost function, so an edit of a law in another file would
-silently run the old law. Here the cache folder is named after the sources of all kernels and the columns of arrays.
+Numba's own cache checks only the file of the outermost function, so an edit of a law in another file would silently run
+the old law. Here the cache folder is named after the sources of all kernels and the columns of arrays.
 """
 
 import hashlib
@@ -21,7 +21,10 @@ HERE = Path(__file__).parent
 
 
 def cache_folder(home: Path) -> str:
-    """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
+    """Return the cache folder for the exact sources of `home` and of this folder.
+
+    It is under NUMBA_CACHE_DIR, beside the code, or in the user's cache.
+    """
     digest = hashlib.sha256(repr(_columns()).encode())
     for folder in dict.fromkeys((HERE, home)):  # in this order, wherever they are
         for source in sorted(folder.glob("*.py")):
@@ -34,7 +37,7 @@ def cache_folder(home: Path) -> str:
 
 
 def _columns() -> list[tuple[str, int]]:
-    """Columns of poses and controls by name: kernels have them as constants."""
+    """Return the columns of poses and controls by name: kernels have them as constants."""
     return [(name, value) for name, value in vars(types).items() if type(value) is int]
 
 

@@ -21,12 +21,11 @@ from flexneedle.mechanics.needle import (
     Plain,
     Work,
     from_plain,
-    solve,
-    spring_energy,
-    spring_rest,
     to_plain,
 )
 from flexneedle.mechanics.shape import put, sample
+from flexneedle.mechanics.solve import solve
+from flexneedle.mechanics.spring import spring_energy, spring_rest
 
 Bools = NDArray[np.bool_]
 DB_X, DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z, ROLL, SPIN = range(9)
@@ -38,10 +37,14 @@ POSE_SIZE = 5
 
 
 class Outputs(NamedTuple):
-    """Arrays that a rollout of N sequences of m steps fills; what is not wanted has size 0.
+    """Arrays that a rollout of N sequences of m steps fills; an array that is not wanted has size 0.
 
-    tips: poses (N, m, 5); energy: strain energy of the tissue (N, m), mJ; converged (N, m); deflection: mean square of
-    the needle's (N, m) from an axis, mm²; shapes: poses at n nodes (N, m, n, 5).
+    Attributes:
+        tips: Poses (N, m, 5).
+        energy: Strain energy of the tissue (N, m), mJ.
+        converged: Whether each step converged (N, m).
+        deflection: Mean square distance (N, m) of the needle from an axis, mm².
+        shapes: Poses at n nodes (N, m, n, 5).
     """
 
     tips: Floats
@@ -55,7 +58,7 @@ _SAME_PLACE = 1e-3  # of a part: a tip this near the end of a part is there
 
 
 def outputs(n: int, m: int, *, deflection: bool = False, nodes: int = 0) -> Outputs:
-    """Arrays for a rollout, with shapes of this number of nodes."""
+    """Return arrays for a rollout, with shapes of this number of nodes."""
     return Outputs(
         np.zeros((n, m, POSE_SIZE)),
         np.zeros((n, m)),
@@ -67,7 +70,7 @@ def outputs(n: int, m: int, *, deflection: bool = False, nodes: int = 0) -> Outp
 
 @inner
 def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Boundary:
-    """The boundary after a share of a command; `roll` (rad) with its spin."""
+    """Return the boundary after a share of a command; `roll` (rad) includes its spin."""
     base, like = boundary.base, boundary.guide
     bevel = boundary.bevel if roll == 0.0 else turned(roll, boundary.bevel)
     return Boundary(
@@ -86,9 +89,9 @@ def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Bo
 def settled(
     model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
 ) -> NeedleState:
-    """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
+    """Solve with the present base and guide, and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
 
-    Arrays in place, as in `needle.solve`. Out of the skin the channel is closed.
+    Arrays are changed in place, as in `solve`. Out of the skin the channel is closed.
     """
     boundary, cut = needle.boundary, needle.cut
     if rest.size > 0 and model.nodes[0].kind == GUIDE:
@@ -111,16 +114,16 @@ def _settle(model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: W
 def settle(
     model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
 ) -> NeedleState:
-    """`settled`, for callers outside of kernels."""
+    """Call `settled` from outside of kernels."""
     return from_plain(_settle(model, needle, rest, u, w, held))
 
 
 @inner
 def _end_of_part(model: Model, needle: NeedleState, advance: float, done: float) -> float:
-    """Share of a step at which its next part ends, `done` being the share so far.
+    """Return the share of a step at which its next part ends, `done` being the share so completed.
 
     Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state
-    stays a continuous function of the command.
+    remains a continuous function of the command.
     """
     x = needle.solution.tip.x
     if advance <= 0.0 or x >= model.zone or x + (1.0 - done) * advance <= 0.0:
@@ -134,7 +137,7 @@ def _end_of_part(model: Model, needle: NeedleState, advance: float, done: float)
 def _advanced(
     model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, command: Floats
 ) -> NeedleState:
-    """The needle after one step, in its parts."""
+    """Return the needle after one step, in its parts."""
     done, residual, converged, roll = 0.0, 0.0, True, command[ROLL]
     while done < 1.0:
         end = _end_of_part(model, needle, command[DB_X], done)
@@ -158,7 +161,7 @@ def _advanced(
 
 @inner
 def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
-    """Energy (mJ) that contact point i stores, without its weight."""
+    """Return the energy (mJ) that contact point i stores, without its weight."""
     node = model.nodes[i]
     stored = stored_energy(model.laws[node.law], size(u) / node.height)
     energy = node.stiffness * node.height * node.height * stored
@@ -168,7 +171,7 @@ def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
 
 @inner
 def _strain_energy(model: Model, needle: NeedleState, u: Laterals) -> float:
-    """Tissue strain energy Σ w_c W (mJ) of the contacts (paper eq. 12)."""
+    """Return the tissue strain energy Σ w_c W (mJ) of the contacts (paper eq. 12)."""
     total = 0.0
     for i in range(needle.solution.last.behind):
         if model.nodes[i].kind == CONTACT:
@@ -187,7 +190,7 @@ def energies(model: Model, needle: NeedleState, u: Laterals, stored: Floats) -> 
 
 @inner
 def _mean_square_deflection(model: Model, needle: NeedleState, w: Work, axis: Laterals) -> float:
-    """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam).
+    """Return ∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam).
 
     axis: y at x = 0 and slope of the line from which y counts.
     """
@@ -276,8 +279,7 @@ def rollout(
 ) -> NeedleState:
     """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1).
 
-    axes (N, 2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.
-    Fills `out`. Returns the needle after the last sample, of which `rest`, `u` and `w` are left, arrays as in
-    `needle.solve`.
+    Fills `out`. Returns the needle after the last sample, with its `rest`, `u` and `w`, arrays as in `solve`. axes (N,
+    2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.
     """
     return from_plain(_rollout(model, start, rest0, u0, rest, u, w, commands, axes, first, last, out))

@@ -16,7 +16,7 @@ Lateral = complex
 
 
 def _by_axes(plane: Callable[..., Any], space: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that is `space` for any complex argument, else `plane`, for the interpreter and for Numba."""
+    """Return a function that is `space` for any complex argument, else `plane`, for the interpreter and for Numba."""
 
     def chosen(*arguments: Any) -> Any:
         return (space if any(isinstance(each, complex) for each in arguments) else plane)(*arguments)

@@ -37,15 +37,15 @@ class Law(Protocol):
         ...
 
     def energy(self, e: Floats) -> Floats:
-        """w(e)."""
+        """Return w(e)."""
         ...
 
     def force(self, e: Floats) -> Floats:
-        """w′(e)."""
+        """Return w′(e)."""
         ...
 
     def stiffness(self, e: Floats) -> Floats:
-        """w″(e)."""
+        """Return w″(e)."""
         ...
 
 
@@ -58,7 +58,7 @@ class Response(NamedTuple):
 
 
 def tables(laws: Sequence[Law]) -> Floats:
-    """Tables (k, CELLS + 1, 8) of laws."""
+    """Return tables (k, CELLS + 1, 8) of laws."""
     return np.stack([_table(law) for law in laws])
 
 
@@ -90,7 +90,7 @@ def _table(law: Law) -> Floats:
 
 @inner
 def response(table: Floats, e: float) -> Response:
-    """The law of a table (CELLS + 1, 8) at e ≥ 0."""
+    """Return the law of a table (CELLS + 1, 8) at e ≥ 0."""
     end = table[CELLS]
     if not e < end[_LIMIT]:
         force = end[_FORCE] + end[_STIFFNESS] * (e - end[_LIMIT])
@@ -107,7 +107,7 @@ def response(table: Floats, e: float) -> Response:
 
 @inner
 def stored_energy(table: Floats, e: float) -> float:
-    """w of the law of a table (CELLS + 1, 8) at e ≥ 0."""
+    """Return w of the law of a table (CELLS + 1, 8) at e ≥ 0."""
     end = table[CELLS]
     if not e < end[_LIMIT]:
         beyond = e - end[_LIMIT]

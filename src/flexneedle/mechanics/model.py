@@ -16,7 +16,7 @@ SKIN_ZONE = 3.0  # spacings from the skin in which a step is carried out in part
 SKIN_PART = 0.25  # of this length, in spacings
 
 Nodes = NDArray[Any]
-"""What can load the needle, by increasing x: the guide, then the contact points; an array (n,) of `NODE`."""
+"""Possible loads of the needle, by increasing x: the guide, then the contact points; an array (n,) of `NODE`."""
 NODE = np.dtype(
     [
         ("x", np.float64),  # position (mm)
@@ -42,13 +42,22 @@ LAYER = np.dtype(
 
 
 class Model(NamedTuple):
-    """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
+    """A needle in layered tissue.
 
-    laws: tables of `law`; curvature: lateral, of the free needle (1/mm), relative to the bevel's direction, with which
-    it turns;
-    part, zone: length (mm) of the parts of a step down to the depth `zone` (mm); clearance: of the needle in the guide,
-    to either side (mm); tolerance: estimated distance from equilibrium at which a solve ends (mm); slide: distance (mm)
-    of the tip from the place for which it was solved, up to which it is moved there along its own line.
+    Attributes:
+        bending_stiffness: Bending stiffness (N·mm²).
+        length: Length (mm).
+        bevel_offset: Offset of the bevel (mm).
+        bevel_length: Length of the bevel (mm).
+        nodes: Possible loads.
+        layers: Tissue layers.
+        laws: Tables of `law`.
+        part: Length (mm) of the parts of a step down to the depth `zone`.
+        zone: Depth (mm) to which steps have parts.
+        curvature: Lateral curvature of the free needle (1/mm), relative to the bevel's direction, with which it turns.
+        clearance: Clearance of the needle in the guide, to either side (mm).
+        tolerance: Estimated distance from equilibrium at which a solve ends (mm).
+        slide: Largest distance (mm) by which a solved tip is moved along its own line to its depth.
     """
 
     bending_stiffness: float
@@ -67,7 +76,7 @@ class Model(NamedTuple):
 
 
 def records(dtype: np.dtype[Any], /, **columns: Any) -> NDArray[Any]:
-    """An array of records (k,) from its columns."""
+    """Return an array of records (k,) from its columns."""
     array = np.zeros(np.broadcast_shapes(*(np.shape(column) for column in columns.values())), dtype)
     for name, column in columns.items():
         array[name] = column
@@ -77,7 +86,7 @@ def records(dtype: np.dtype[Any], /, **columns: Any) -> NDArray[Any]:
 def tissue_layers(
     thickness: Floats, modulus: Floats, height: Floats, width: Floats, law: NDArray[Any]
 ) -> Layers:
-    """Layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored.
+    """Return layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored.
 
     modulus: initial modulus of compression; law: index of each layer's table.
     """
@@ -88,7 +97,7 @@ def tissue_layers(
 def contact_nodes(
     layers: Layers, weight: Floats, spacing: float, depth: float, guide_x: float | None
 ) -> Nodes:
-    """The guide, if any, and a contact point in the middle of every `spacing` down to `depth` (all mm).
+    """Return the guide, if any, and a contact point in the middle of every `spacing` down to `depth` (all mm).
 
     Below the skin the intervals are shorter. An interval that a layer's end divides becomes two, so that the stiffness
     per length is exact at any spacing.
@@ -116,19 +125,23 @@ def contact_nodes(
 
 
 def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
-    """`nodes` with essential nodes of a kind added at `x` (mm), in order of x."""
+    """Return `nodes` with essential nodes of a kind added at `x` (mm), in order of x."""
     added = records(NODE, x=x, reach=1.0, height=1.0, kind=kind)
     return np.insert(nodes, nodes["x"].searchsorted(x), added)
 
 
 class Adaptation(NamedTuple):
-    """What an observer has estimated of a model's constants.
+    """Estimated changes of a model's constants.
 
-    shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
-    cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
-    the last one has no end; bevel: factor on the bevel offset; bend: lateral distance (mm) of the free needle's tip
-    from the straight, relative to the bevel's direction, with which it turns; clearance: of the needle in the guide,
-    to either side (mm).
+    Attributes:
+        shift: Shift of the ends of all layers but the last (k − 1,), mm.
+        stiffness: Factor on the modulus of each layer (k,).
+        cell: Length (mm) of cells along the depth from the skin.
+        variation: Further factor on the modulus in each cell (c,); the last cell has no end.
+        bevel: Factor on the bevel offset.
+        bend: Lateral distance (mm) of the free needle's tip from the straight, relative to the bevel's direction, with
+            which it turns.
+        clearance: Clearance of the needle in the guide, to either side (mm).
     """
 
     shift: Floats
@@ -141,9 +154,9 @@ class Adaptation(NamedTuple):
 
 
 def adapt(model: Model, adaptation: Adaptation) -> Model:
-    """The model with other constants, its contact points where they were.
+    """Return the model with other constants and its contact points in place.
 
-    A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.
+    A contact is as stiff as the tissue along its interval; its law is the law of the layer at its middle.
     """
     old, nodes = model.layers, model.nodes
     ends = np.maximum.accumulate(np.maximum(0.0, old["end"][:-1] + adaptation.shift))
@@ -170,7 +183,7 @@ def adapt(model: Model, adaptation: Adaptation) -> Model:
 
 
 def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
-    """Integral (n,) along the intervals of the contact points of a density (l,), constant in each layer."""
+    """Return the integral (n,) along the intervals of the contact points of a density (l,), constant in each layer."""
     tops = np.append(0.0, bottoms)
     before = np.append(0.0, np.cumsum(density[:-1] * np.diff(tops)))
 

@@ -15,7 +15,7 @@ _NEWTON = 4  # iterations; the integrand of the arc length is within a percent o
 
 
 def beam_energy(x: Floats, shear: Laterals, moment: Laterals, stiffness: float) -> float:
-    """½∫|M|²/EI dx (mJ) over elements between `x` (k + 1,); shear and moment (k,) at their left ends."""
+    """Return ½∫|M|²/EI dx (mJ) over elements between `x` (k + 1,); shear and moment (k,) at their left ends."""
     length = np.diff(x)
     mixed = (moment * shear.conj()).real
     squares = np.abs(moment) ** 2 * length - mixed * length**2 + np.abs(shear) ** 2 * length**3 / 3.0
@@ -30,7 +30,7 @@ def put(row: Floats, x: float, y: Lateral, slope: Lateral) -> None:
 
 @inner
 def _cubic(x: Floats, y: Laterals, slope: Laterals, k: int) -> tuple[float, Lateral, Lateral, Lateral]:
-    """Length of element k, and y' = t + a r + b r² at r = (x − x_k)/length."""
+    """Return the length of element k, and y' = t + a r + b r² at r = (x − x_k)/length."""
     length = x[k + 1] - x[k]
     rise = times(6.0 / length, y[k + 1] - y[k])
     return (
@@ -43,7 +43,7 @@ def _cubic(x: Floats, y: Laterals, slope: Laterals, k: int) -> tuple[float, Late
 
 @inner
 def _arc(length: float, t: Lateral, a: Lateral, b: Lateral, r: float) -> float:
-    """Arc length ∫(1 + ½|y'|²) dx from the left end of an element to r."""
+    """Return the arc length ∫(1 + ½|y'|²) dx from the left end of an element to r."""
     second = (square(a) + 2.0 * dot(t, b)) / 3.0
     mean = square(t) + r * (dot(t, a) + r * (second + r * (0.5 * dot(a, b) + r * square(b) / 5.0)))
     return float(length * r * (1.0 + 0.5 * mean))

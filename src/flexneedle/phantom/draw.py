@@ -15,12 +15,24 @@ _THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
 
 @dataclass(frozen=True)
 class Truth:
-    """The true scenario, pose of the clamped base (mm, rad), and imperfections with their sign (mm).
+    """The true scenario, pose of the clamped base, and imperfections with their sign.
 
-    bend: tip deflection of the free needle, towards the bevel and turned from it by bend_angle (rad); run_out: offset
-    of the tip from the needle's axis, in the same way; both roll with the needle. load: constant force y, z on the tip
-    (N). bias x, y, z of the tracker (mm); variation: factor on μ in cells of `cell_mm` from the skin down. split: true
-    tops of layers (mm) where a hidden layer splits them, else empty.
+    Attributes:
+        scenario: The true scenario.
+        base_y: y of the base (mm).
+        base_turn: Slope θ of the base (rad).
+        bend: Deflection of the free needle's tip (mm), towards the bevel and turned from it by bend_angle. It rolls
+            with the needle.
+        run_out: Offset of the tip from the needle's axis (mm), turned from the bevel by run_out_angle. It rolls, too.
+        bias: Constant error x, y, z of the tracker (mm).
+        variation: Factor on μ in cells from the skin down.
+        cell_mm: Length of these cells.
+        base_z: z of the base (mm).
+        base_psi: Slope ψ of the base (rad).
+        bend_angle: Angle of the bend from the bevel (rad).
+        run_out_angle: Angle of the run-out from the bevel (rad).
+        load: Constant force y, z on the tip (N).
+        split: True tops of layers (mm) where a hidden layer splits them, else empty.
     """
 
     scenario: Scenario
@@ -40,7 +52,7 @@ class Truth:
 
     @property
     def layer_tops(self) -> tuple[float, ...]:
-        """True depths (mm) at which the layers of the scenario begin from which it was drawn."""
+        """True depths (mm) at which the layers of the drawn scenario begin."""
         return self.split or self.scenario.layer_tops
 
     def __repr__(self) -> str:
@@ -93,9 +105,9 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
 
 
 def _bias(scenario: Scenario, angle: float, rng: np.random.Generator) -> Point:
-    """The tracker's constant error (mm), at an angle (rad) from x in the plane.
+    """Return the tracker's constant error (mm), at an angle (rad) from x in the plane.
 
-    In space it is raised from that at random, so that every direction is as likely.
+    In space it is raised from the plane at random, so that every direction is as likely.
     """
     size = scenario.phantom.tracker_bias_mm
     z = float(rng.uniform(-1.0, 1.0)) if scenario.setup.axes == 2 else 0.0
@@ -114,7 +126,7 @@ def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
 
 
 def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
-    """Thicknesses (mm) after an independent displacement of each boundary; no layer vanishes."""
+    """Return thicknesses (mm) after an independent displacement of each boundary; no layer vanishes."""
     tops = np.array(scenario.layer_tops[1:])
     bottoms = tops + rng.normal(0.0, scenario.phantom.layer_shift_sd_mm, tops.size)
     values, top = {}, 0.0
@@ -126,7 +138,7 @@ def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]
 
 
 def _variation(scenario: Scenario, cell: float, rng: np.random.Generator) -> tuple[float, ...]:
-    """Factor on μ in cells down to the end of the stroke: log-normal of mean 1, exponentially correlated."""
+    """Return the factor on μ in cells down to the end of the stroke: log-normal of mean 1, exponentially correlated."""
     settings = scenario.phantom
     cells = math.ceil(max(scenario.setup.max_depth, 0.0) / cell) + 8
     share = math.exp(-cell / settings.variation_length_mm)
@@ -151,8 +163,10 @@ def _start(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
 
 
 def _start_range(scenario: Scenario) -> tuple[float, float]:
-    """Range of the axial start error (mm): half of the distances to skin and guide, and of the base's margin at full
-    stroke. An operator would notice a tip in the tissue or behind the guide, and correct it before the insertion.
+    """Return the range of the axial start error (mm).
+
+    It is half of the distances to skin and guide, and of the base's margin at full stroke. An operator would notice a
+    tip in the tissue or behind the guide, and correct it before the insertion.
     """
     setup = scenario.setup
     gap, guide = setup.tip_to_skin_mm, guide_to_skin(scenario)

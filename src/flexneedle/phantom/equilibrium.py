@@ -1,6 +1,6 @@
 """Equilibrium of the exact needle by Newton's method, and a step of an insertion (docs/theory.md section 11).
 
-What begins in the plane z = 0 stays there, to the last bit.
+A needle that begins in the plane z = 0 remains there, to the last bit.
 """
 
 import math
@@ -65,7 +65,7 @@ def assemble(
     before: Before,
     curved: float,
 ) -> None:
-    """Fill gradient and Hessian of loads and hinges; the energy stored (mJ) into the state."""
+    """Fill gradient and Hessian of loads and hinges; the stored energy (mJ) into the state."""
     n = len(w) - 1
     for i in range(n + 1):
         row = w[i]
@@ -88,14 +88,14 @@ def assemble(
 
 @inner
 def _turn_frames(w: Records, share: float) -> None:
-    """Frames after this share of the step in `step`, from those at its start."""
+    """Set the frames after this share of the step in `step`, from the frames at its start."""
     for i in range(len(w) - 1):
         put_turn(w[i].frame, after(small_turn(times(share, vector(w[i].step))), turn(w[i].start)))
 
 
 @inner
 def _along_wall(y: float, z: float, y_now: float, z_now: float) -> bool:
-    """Whether the needle is at the guide's wall before and after, and not at the same place of the circle."""
+    """Return whether the needle is at the guide's wall before and after, but at another point of the circle."""
     return abs(y * z_now - z * y_now) > _SAME_RAD * math.hypot(y, z) * math.hypot(y_now, z_now)
 
 
@@ -110,7 +110,7 @@ def _search(
     largest: float,
     strict: bool,
 ) -> bool:
-    """Line search along the step in `step` on its slope, since bevel and friction have no energy.
+    """Search along the step in `step` on its slope, since bevel and friction have no energy.
 
     A wall makes the slope flat, then steep: the secant through the last two steps that are too long finds the bend.
     Unless it is strict, it leaves a full step that is too long, and returns False.
@@ -141,7 +141,7 @@ def _search(
 def _newton(
     rod: Rod, s: State, w: Records, channel: Records, count: int, before: Before
 ) -> tuple[bool, float]:
-    """A Newton step from assembled forces into `step`: (whether the Hessian is definite, its largest displacement)."""
+    """Write a Newton step into `step`; return whether the Hessian is definite, and the largest displacement (mm)."""
     stable = sweep(rod, s, w, 1.0)
     if not stable:  # near buckling, or a poor initial guess
         assemble(rod, s, w, channel, count, before, 0.0)
@@ -151,10 +151,10 @@ def _newton(
 
 @inner
 def _iterate(rod: Rod, s: State, w: Records, channel: Records, count: int, before: Before) -> None:
-    """Newton's method from the present frames; its iterations are added to those before.
+    """Iterate by Newton's method from the present frames; its iterations are added to those before.
 
     Along the round wall of the guide each descent would be short. So a few full steps may lead uphill, if the work of
-    the last of them is below half of that of the first; else the solve returns to where it began with them.
+    the last of them is below half of the work of the first; else the solve returns to where it began with them.
     """
     move_nodes(rod, s, w)
     assemble(rod, s, w, channel, count, before, 1.0)

@@ -24,7 +24,7 @@ from flexneedle.phantom.space import (
 
 @inner
 def clamp(s: State) -> Turn:
-    """The frame of the base."""
+    """Return the frame of the base."""
     return after(tilt_turn(s.tilt[0], s.tilt[1]), (s.half_roll[0], s.half_roll[1], 0.0, 0.0))
 
 
@@ -32,7 +32,7 @@ def clamp(s: State) -> Turn:
 def _add_hinge(
     rod: Rod, row: Records, span: float, last: Turn, frame: Turn, curved: float
 ) -> tuple[float, float]:
-    """Moment and stiffness of a hinge that stands for `span` mm of needle. Returns its energy (mJ) and twist (rad)."""
+    """Add moment and stiffness of a hinge for `span` mm of needle. Returns its energy (mJ) and twist (rad)."""
     phi, beta, dbeta = logarithm(after(frame, inverse(last)))
     t = vector(row.tangent)
     bend, twist = rod.stiffness / span, (rod.torsion - rod.stiffness) / span
@@ -61,7 +61,7 @@ def _add_hinge(
 
 @inner
 def add_hinges(rod: Rod, s: State, w: Records, curved: float) -> float:
-    """Bending and twist between base and tip. Returns its energy (mJ)."""
+    """Add bending and twist between base and tip. Returns the energy (mJ)."""
     total, twist, last = 0.0, 0.0, clamp(s)
     for i in range(len(w) - 1):
         frame = turn(w[i].frame)

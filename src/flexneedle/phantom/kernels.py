@@ -1,4 +1,4 @@
-"""Compiled kernels of the closed loop: those of the model and of the virtual phantoms, in the plane or in space."""
+"""Compiled kernels of the closed loop, for the model and the virtual phantoms, in the plane or in space."""
 
 import fcntl
 import subprocess
@@ -23,7 +23,7 @@ same for every scenario."""
 
 
 def all_compiled(axes: int) -> bool:
-    """Whether the kernels for scenarios with `setup.axes` are in the cache, so that no compilation is needed."""
+    """Return whether the kernels for scenarios with `setup.axes` are in the cache, so that no compilation is needed."""
     return _mark(axes).exists()
 
 
@@ -58,7 +58,7 @@ def _compiling_exact_plant() -> Iterator[None]:
 
 
 def _mark(axes: int) -> Path:
-    """A file beside the kernels of the phantoms, whose folder has the name of the sources of all kernels."""
+    """Return a file beside the kernels of the phantoms, whose folder is named after the sources of all kernels."""
     return Path(cache_folder(Path(str(phantom.__file__)).parent)) / f"axes-{axes}"
 
 

@@ -51,7 +51,7 @@ class Before(NamedTuple):
 
 @inner
 def _law(table: Floats, height: float, stiffness: float, u: float) -> tuple[float, float, float, float]:
-    """W′/u (N/mm), W″ (N/mm), W (mJ) and stretch of tissue displaced by u ≥ 0 (mm)."""
+    """Return W′/u (N/mm), W″ (N/mm), W (mJ) and stretch of tissue displaced by u ≥ 0 (mm)."""
     e = u / height
     law = response(table, e)
     stored = stiffness * height * height * stored_energy(table, e)
@@ -68,7 +68,7 @@ def _add_form(row: Records, k: float, a: Vector, b: Vector) -> None:
 
 @inner
 def add_guide(rod: Rod, s: State, w: Records, curved: float) -> float:
-    """The guide: a stiff round wall beyond its clearance, across the needle. Returns its energy (mJ)."""
+    """Add the guide: a stiff round wall beyond its clearance, across the needle. Returns its energy (mJ)."""
     s.guide_force[0] = s.guide_force[1] = 0.0
     if math.isnan(rod.guide_x) or w[len(w) - 1].node[0] <= rod.guide_x:
         return 0.0
@@ -110,7 +110,7 @@ def add_guide(rod: Rod, s: State, w: Records, curved: float) -> float:
 
 @inner
 def _foot(rod: Rod, s: State, w: Records, point: Vector, first: int) -> tuple[int, float]:
-    """Segment nearest to a channel point, and the distance along it (mm); the search starts at `first`."""
+    """Return the segment nearest to a channel point, and the distance along it (mm); the search starts at `first`."""
     n = len(w) - 1
     i = min(max(first, 0), n - 1)
     low, high = -_STEADY * rod.segment, (1.0 + _STEADY) * rod.segment
@@ -128,7 +128,7 @@ def _foot(rod: Rod, s: State, w: Records, point: Vector, first: int) -> tuple[in
 
 @inner
 def add_channel(rod: Rod, s: State, w: Records, channel: Records, count: int, curved: float) -> float:
-    """Tissue at the channel's points, across the needle. Returns its energy (mJ)."""
+    """Add the tissue at the channel's points, across the needle. Returns its energy (mJ)."""
     total, weighted, least = 0.0, 0.0, 1.0
     tip, tangent = vector(s.tip), vector(s.tangent)
     for j in range(count):
@@ -156,7 +156,7 @@ def add_channel(rod: Rod, s: State, w: Records, channel: Records, count: int, cu
 def _add_contact(
     row: Records, secant: float, tangent: float, t: Vector, u: Vector, e: float, along: float, curved: float
 ) -> None:
-    """The energy W(e) of a point displaced by u, |u| = e, `along` a segment with the tangent t."""
+    """Add the energy W(e) of a point displaced by u, |u| = e, `along` a segment with the tangent t."""
     accumulate(row.force, secant, u)
     accumulate(row.couple, secant * along, cross(t, u))
     out = times(1.0 / e, u) if e > _NO_DIRECTION_MM else normal_to(t)
@@ -171,7 +171,7 @@ def _add_contact(
 
 @inner
 def cut_length(s: State) -> float:
-    """Distance (mm) of the tip past the front of the channel, in its direction; negative after retraction."""
+    """Return the distance (mm) of the tip past the front of the channel, in its direction; negative if retracted."""
     if s.cut <= 0.0:  # no channel yet: the front is at the skin
         return float(s.tip[0] / s.tangent[0])
     return dot(minus(vector(s.tip), vector(s.front)), vector(s.front_tangent))
@@ -179,7 +179,7 @@ def cut_length(s: State) -> float:
 
 @inner
 def new_offset(rod: Rod, s: State, before: Before) -> tuple[Vector, float]:
-    """(η, g): offset of the bevel's rest point from the tip after the move, and −dη/d(drift).
+    """Return (η, g): offset of the bevel's rest point from the tip after the move, and −dη/d(drift).
 
     The bevel turns evenly over the advance. While the tip lags, only by the part of the spin that reaches it.
     """
@@ -216,7 +216,7 @@ def new_offset(rod: Rod, s: State, before: Before) -> tuple[Vector, float]:
 
 @inner
 def add_bevel(rod: Rod, s: State, w: Records, before: Before) -> float:
-    """The bevel's spring, across the tip, in the tissue around it. Returns its energy (mJ)."""
+    """Add the bevel's spring, across the tip, in the tissue around it. Returns its energy (mJ)."""
     if not s.tip[0] > 0.0:  # NaN included
         return 0.0
     offset, g = new_offset(rod, s, before)
@@ -241,7 +241,7 @@ def add_bevel(rod: Rod, s: State, w: Records, before: Before) -> float:
 
 @inner
 def set_friction(rod: Rod, s: State, w: Records) -> None:
-    """Friction opposite to the last sliding direction, on the part of each segment inside the tissue, as it is now."""
+    """Set friction opposite to the last sliding direction, on the part of each segment that is inside the tissue."""
     for i in range(len(w) - 1):
         left, right = w[i].node[0], w[i + 1].node[0]
         inside = 0.0
@@ -253,14 +253,14 @@ def set_friction(rod: Rod, s: State, w: Records) -> None:
 
 @inner
 def slip_angle(w: Records, i: int, rotation: float) -> float:
-    """Rotation (rad) of a segment from where friction does not act; beyond the largest one it slides."""
+    """Return the rotation (rad) of a segment from where friction does not act; beyond the largest one it slides."""
     angle: float = w[i].slip + rotation + roll_about_x(after(inverse(turn(w[i].rest)), turn(w[i].frame)))
     return min(max(angle, -_STICK_RAD), _STICK_RAD)
 
 
 @inner
 def add_rotation_friction(rod: Rod, w: Records, rotation: float) -> None:
-    """Friction against rotation of the shaft: elastic up to a small angle, then constant."""
+    """Add friction against rotation of the shaft: elastic up to a small angle, then constant."""
     for i in range(len(w) - 1):
         couple = rod.rotation_friction * w[i].inside
         if couple <= 0.0:

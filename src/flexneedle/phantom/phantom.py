@@ -38,10 +38,15 @@ _WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
 class Condition(NamedTuple):
-    """True state: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ since the start, convergence.
+    """True state.
 
-    shape: points x, y, z (n, 3) of the needle's axis at equal distances along it, the base first (mm); None if the
-    plant has no nodes.
+    Attributes:
+        tip: Pose of the tip (mm, rad).
+        strain_energy: Strain energy of the tissue (mJ).
+        least_stretch: Smallest stretch λ since the start.
+        converged: Whether all steps converged.
+        shape: Points x, y, z (n, 3) of the needle's axis at equal distances along it, the base first (mm); None if the
+            plant has no nodes.
     """
 
     tip: Floats
@@ -65,14 +70,14 @@ class Phantom:
         self._path = [(0.0, *self._tip().tolist())]  # time and pose
 
     def condition(self) -> Condition:
-        """The true state, for the record only; not available to controllers."""
+        """Return the true state, for the record only; it is not available to controllers."""
         plant = self._plant
         return Condition(
             self._tip(), plant.strain_energy, self._least_stretch, plant.converged, self._shape()
         )
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the time (s) since the start."""
         return self._time
 
     def wait(self, seconds: float) -> None:
@@ -83,9 +88,11 @@ class Phantom:
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll, then travel at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
-        The roll takes its own time before that. Motors move to the multiple of their resolution nearest to the sum of
-        all commands, so that rounding errors do not accumulate. A driver of half turns turns to and fro. Raises
-        CommandError if the command exceeds a limit of the setup.
+        The roll takes a time before the travel. Motors move to the multiple of their resolution nearest to the sum of
+        all commands, so that rounding errors do not accumulate. A driver of half turns turns to and fro.
+
+        Raises:
+            CommandError: The command exceeds a limit of the setup.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)
@@ -140,7 +147,7 @@ class Phantom:
         self._path.append((time, *self._tip().tolist()))
 
     def _rounded(self, command: Control) -> Floats:
-        """The command in whole motor steps, within the limits; the rotation of the base is not rounded."""
+        """Return the command in whole motor steps, within the limits; the rotation of the base is not rounded."""
         row = np.array(command, dtype=float)
         grid = self._truth.scenario.phantom.motor_resolution_mm
         if grid > 0.0:
@@ -155,7 +162,7 @@ class Phantom:
         return row
 
     def _shape(self) -> Floats | None:
-        """As many points as the model of the scenario has nodes; None if the plant has none."""
+        """Return as many points as the model of the scenario has nodes; None if the plant has none."""
         nodes = getattr(self._plant, "nodes", None)
         return None if nodes is None else evenly_spaced(nodes, self._truth.scenario.needle.nodes)
 
@@ -164,14 +171,14 @@ class Phantom:
 
 
 def tip_of(needle: Plant, truth: Truth) -> Floats:
-    """The pose x, y, z, θ, ψ (mm, rad) of the tip, which is offset from the needle's axis by the run-out."""
+    """Return the pose x, y, z, θ, ψ (mm, rad) of the tip, which is offset from the needle's axis by the run-out."""
     pose, off = needle.tip, truth.run_out
     x, y, z = across(float(pose[THETA]), float(pose[PSI]), needle.roll + truth.run_out_angle)
     return np.array([pose[X] + off * x, pose[Y] + off * y, pose[Z] + off * z, *pose[THETA:]])
 
 
 def _between(before: Sequence[float], after: Sequence[float], part: float, share: complex) -> list[float]:
-    """The pose with a part of the way along x done, and a share of that across it."""
+    """Return the pose with a part of the way along x done, and a share of the way across it."""
     x = before[X] + part * (after[X] - before[X])
     lateral = (
         complex(*before[k : k + 2]) + share * (complex(*after[k : k + 2]) - complex(*before[k : k + 2]))
@@ -181,13 +188,13 @@ def _between(before: Sequence[float], after: Sequence[float], part: float, share
 
 
 def of_arc(roll: float, part: float) -> complex:
-    """Share of the chord, as a lateral quantity, that a point on an arc by `roll` (rad) has done at a part of it."""
+    """Return the share of the chord, as a lateral quantity, at a part of an arc by `roll` (rad)."""
     whole = cmath.exp(1j * roll) - 1.0
     return (cmath.exp(1j * roll * part) - 1.0) / whole if abs(whole) > _WHOLE else complex(part)
 
 
 def evenly_spaced(nodes: Floats, count: int) -> Floats:
-    """Points (count, 3) at equal distances along the chain of nodes (n, 3), its ends included."""
+    """Return points (count, 3) at equal distances along the chain of nodes (n, 3), its ends included."""
     lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     wanted = np.linspace(0.0, along[-1], count)
@@ -195,7 +202,7 @@ def evenly_spaced(nodes: Floats, count: int) -> Floats:
 
 
 def across(theta: float, psi: float, roll: float) -> Point:
-    """Direction of the bevel of a needle that is rolled and then tilted (rad); exactly in the plane for half turns."""
+    """Return the direction of the bevel of a needle that is rolled and then tilted (rad); exact for half turns."""
     halves = np.rint(roll / math.pi)
     sign, left = (-1.0 if halves % 2 else 1.0), roll - halves * math.pi
     y, z = sign * math.cos(left), sign * math.sin(left)

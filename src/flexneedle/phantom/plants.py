@@ -154,7 +154,7 @@ class ExactPlant:
 
     @property
     def roll(self) -> float:
-        """Roll of the bevel (rad) before its tilt, from −π to π: that of the base less what the shaft twists."""
+        """Roll of the bevel (rad) before its tilt, from −π to π: the base's roll less the twist of the shaft."""
         return roll_about_x(turn(self.state["frame"]))
 
     @property
@@ -180,13 +180,13 @@ class ExactPlant:
 
 
 def _tilt(slope: complex) -> complex:
-    """The angle (rad) of a slope, in its direction."""
+    """Return the angle (rad) of a slope, in its direction."""
     size = abs(slope)
     return slope * (math.atan(size) / size) if size > 0.0 else 0.0
 
 
 def build_rod(truth: Truth, segments: int) -> rd.Rod:
-    """The constants of the true needle with this number of segments, and of the true tissue in cells."""
+    """Return the constants of the true needle with this number of segments, and of the true tissue in cells."""
     scenario, settings = truth.scenario, truth.scenario.phantom
     needle, cell = scenario.needle, truth.cell_mm
     cells = math.ceil(max(scenario.setup.max_depth, 0.0) / cell) + 8
@@ -226,7 +226,10 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
 
 
 def _rotation_friction(scenario: Scenario) -> float:
-    """Largest couple (N·mm per mm) against rotation: that given, or the axial friction at the needle's surface."""
+    """Return the largest couple (N·mm per mm) against rotation.
+
+    It is the given one, or the axial friction at the needle's surface.
+    """
     settings = scenario.phantom
     if settings.rotation_friction_mn is not None:
         return 1e-3 * settings.rotation_friction_mn

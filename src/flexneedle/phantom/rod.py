@@ -105,11 +105,28 @@ Records = Any
 
 
 class Rod(NamedTuple):
-    """Constants: bending and torsional stiffness (N·mm²), segment length (mm), natural curvature towards the bevel and
-    towards a quarter turn from it (1/mm), bevel offset and length (mm), guide plane (mm, NaN: none), its clearance (mm)
-    and stiffness (N/mm), friction along the axis (N/mm) and against rotation (N·mm/mm), spacing of channel points (mm);
-    laws: tables of `mechanics.law`; tissue by depth in cells of `cell` mm: index of its law, height (mm), initial
-    stiffness (N/mm) of 1 mm of needle, and layer weight.
+    """Constants of the exact needle.
+
+    Attributes:
+        stiffness: Bending stiffness (N·mm²).
+        torsion: Torsional stiffness (N·mm²).
+        segment: Length of a segment (mm).
+        curvature: Natural curvature towards the bevel (1/mm).
+        curvature_across: Natural curvature towards a quarter turn from the bevel (1/mm).
+        bevel_offset: Offset of the bevel (mm).
+        bevel_length: Length of the bevel (mm).
+        guide_x: Plane of the guide (mm, NaN: none).
+        clearance: Clearance of the guide (mm).
+        guide_stiffness: Stiffness of the guide (N/mm).
+        friction: Friction along the axis (N/mm).
+        rotation_friction: Friction against rotation (N·mm/mm).
+        spacing: Spacing of channel points (mm).
+        cell: Length of the cells of tissue along the depth (mm).
+        laws: Tables of `mechanics.law`.
+        law: Index of the law of each cell.
+        height: Compression length of each cell (mm).
+        foundation: Initial stiffness (N/mm) of 1 mm of needle in each cell.
+        weight: Layer weight of each cell.
     """
 
     stiffness: float
@@ -136,7 +153,7 @@ class Rod(NamedTuple):
 def start(
     base: Vector, tilt: tuple[float, float], length: float, segments: int, roll: float = 0.0
 ) -> tuple[State, Records]:
-    """A straight needle at rest in air, by the pose of its base and its roll (mm, rad): its state and segments."""
+    """Return state and segments of a straight needle at rest in air, by the pose of its base and its roll (mm, rad)."""
     half = roll_turn(roll)
     turned = after(tilt_turn(*tilt), half)
     tangent = first_axis(turned)
@@ -151,7 +168,7 @@ def start(
 
 @inner
 def move_nodes(rod: Rod, s: State, w: Records) -> None:
-    """Nodes and tangents from frames; the tip into the state."""
+    """Set nodes and tangents from frames, and the tip in the state."""
     n = len(w) - 1
     node = vector(s.base)
     for i in range(n):

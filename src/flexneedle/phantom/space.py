@@ -21,7 +21,7 @@ _SERIES = 0.0025  # sin² of half the angle, below which series of a logarithm h
 
 @inner
 def vector(a: Floats) -> Vector:
-    """A vector in an array (3,)."""
+    """Return a vector in an array (3,)."""
     return a[0], a[1], a[2]
 
 
@@ -41,43 +41,43 @@ def accumulate(into: Floats, k: float, a: Vector) -> None:
 
 @inner
 def plus(a: Vector, b: Vector) -> Vector:
-    """a + b."""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inner
 def minus(a: Vector, b: Vector) -> Vector:
-    """a − b."""
+    """Return a − b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inner
 def times(k: float, a: Vector) -> Vector:
-    """k a."""
+    """Return k a."""
     return k * a[0], k * a[1], k * a[2]
 
 
 @inner
 def dot(a: Vector, b: Vector) -> float:
-    """a · b."""
+    """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inner
 def cross(a: Vector, b: Vector) -> Vector:
-    """a × b."""
+    """Return a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inner
 def length(a: Vector) -> float:
-    """|a|."""
+    """Return |a|."""
     return math.sqrt(dot(a, a))
 
 
 @inner
 def normal_to(a: Vector) -> Vector:
-    """A unit vector across a unit vector, in the plane z = 0 where that is possible."""
+    """Return a unit vector across a unit vector, in the plane z = 0 where that is possible."""
     across = math.hypot(a[0], a[1])
     if across < 1e-3:
         return 1.0, 0.0, 0.0
@@ -86,13 +86,13 @@ def normal_to(a: Vector) -> Vector:
 
 @inner
 def carried(a: Vector, old: Vector, new: Vector) -> Vector:
-    """A vector across the unit vector `old`, turned by the smallest rotation that turns `old` into `new`."""
+    """Return a vector across the unit vector `old`, turned by the smallest rotation that turns `old` into `new`."""
     return minus(a, times(dot(a, new) / (1.0 + dot(old, new)), plus(old, new)))
 
 
 @inner
 def rows(a: Floats) -> Matrix:
-    """A matrix in an array (9,)."""
+    """Return a matrix in an array (9,)."""
     return (a[0], a[1], a[2]), (a[3], a[4], a[5]), (a[6], a[7], a[8])
 
 
@@ -106,13 +106,13 @@ def put_rows(into: Floats, a: Matrix) -> None:
 
 @inner
 def symmetric(a: Floats) -> Symmetric:
-    """A symmetric matrix in an array (6,)."""
+    """Return a symmetric matrix in an array (6,)."""
     return a[0], a[1], a[2], a[3], a[4], a[5]
 
 
 @inner
 def full(a: Symmetric) -> Matrix:
-    """All rows of a symmetric matrix."""
+    """Return all rows of a symmetric matrix."""
     return (a[0], a[1], a[2]), (a[1], a[3], a[4]), (a[2], a[4], a[5])
 
 
@@ -137,25 +137,25 @@ def add_product(into: Floats, k: float, a: Vector, b: Vector) -> None:
 
 @inner
 def of_rows(m: Matrix, a: Vector) -> Vector:
-    """M a."""
+    """Return M a."""
     return dot(m[0], a), dot(m[1], a), dot(m[2], a)
 
 
 @inner
 def of_columns(m: Matrix, a: Vector) -> Vector:
-    """Mᵀ a."""
+    """Return Mᵀ a."""
     return plus(plus(times(a[0], m[0]), times(a[1], m[1])), times(a[2], m[2]))
 
 
 @inner
 def total(a: Matrix, b: Matrix) -> Matrix:
-    """A + B."""
+    """Return A + B."""
     return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
 
 
 @inner
 def less(a: Matrix, b: Matrix, c: Matrix) -> Matrix:
-    """A − B Cᵀ, which is symmetric."""
+    """Return A − B Cᵀ, which is symmetric."""
     xy, xz, yz = a[0][1] - dot(b[0], c[1]), a[0][2] - dot(b[0], c[2]), a[1][2] - dot(b[1], c[2])
     return (
         (a[0][0] - dot(b[0], c[0]), xy, xz),
@@ -166,7 +166,7 @@ def less(a: Matrix, b: Matrix, c: Matrix) -> Matrix:
 
 @inner
 def crossed(a: Vector, m: Matrix) -> Matrix:
-    """The matrix whose columns are a × (columns of M)."""
+    """Return the matrix whose columns are a × (columns of M)."""
     return (
         minus(times(a[1], m[2]), times(a[2], m[1])),
         minus(times(a[2], m[0]), times(a[0], m[2])),
@@ -176,7 +176,7 @@ def crossed(a: Vector, m: Matrix) -> Matrix:
 
 @inner
 def after(p: Turn, q: Turn) -> Turn:
-    """The rotation p after q."""
+    """Return the rotation p after q."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -187,13 +187,13 @@ def after(p: Turn, q: Turn) -> Turn:
 
 @inner
 def inverse(q: Turn) -> Turn:
-    """The rotation back."""
+    """Return the rotation back."""
     return q[0], -q[1], -q[2], -q[3]
 
 
 @inner
 def turn(a: Floats) -> Turn:
-    """A rotation in an array (4,)."""
+    """Return a rotation in an array (4,)."""
     return a[0], a[1], a[2], a[3]
 
 
@@ -206,13 +206,13 @@ def put_turn(into: Floats, q: Turn) -> None:
 
 @inner
 def small_turn(a: Vector) -> Turn:
-    """The rotation by the vector a, up to its third power and its length."""
+    """Return the rotation by the vector a, up to its third power and its length."""
     return 1.0, 0.5 * a[0], 0.5 * a[1], 0.5 * a[2]
 
 
 @inner
 def roll_turn(angle: float) -> Turn:
-    """The rotation about x by an angle (rad), exactly for whole half turns."""
+    """Return the rotation about x by an angle (rad), exactly for whole half turns."""
     halves = math.floor(angle / math.pi + 0.5)
     left = 0.5 * (angle - halves * math.pi)
     c, s = math.cos(left), math.sin(left)
@@ -228,7 +228,7 @@ def roll_turn(angle: float) -> Turn:
 
 @inner
 def tilt_turn(theta: float, psi: float) -> Turn:
-    """The rotation that tilts x by √(θ² + ψ²) in the direction (θ, ψ) of y and z (rad)."""
+    """Return the rotation that tilts x by √(θ² + ψ²) in the direction (θ, ψ) of y and z (rad)."""
     angle = math.hypot(theta, psi)
     part = 0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle
     return math.cos(0.5 * angle), 0.0, -part * psi, part * theta
@@ -236,28 +236,28 @@ def tilt_turn(theta: float, psi: float) -> Turn:
 
 @inner
 def first_axis(q: Turn) -> Vector:
-    """Where x is turned."""
+    """Return the turned x axis."""
     x = q[0] * q[0] + q[1] * q[1] - (q[2] * q[2] + q[3] * q[3])
     return x, 2.0 * (q[1] * q[2] + q[0] * q[3]), 2.0 * (q[1] * q[3] - q[0] * q[2])
 
 
 @inner
 def second_axis(q: Turn) -> Vector:
-    """Where y is turned."""
+    """Return the turned y axis."""
     y = q[0] * q[0] - q[1] * q[1] + (q[2] * q[2] - q[3] * q[3])
     return 2.0 * (q[1] * q[2] - q[0] * q[3]), y, 2.0 * (q[2] * q[3] + q[0] * q[1])
 
 
 @inner
 def third_axis(q: Turn) -> Vector:
-    """Where z is turned."""
+    """Return the turned z axis."""
     z = q[0] * q[0] - q[1] * q[1] - (q[2] * q[2] - q[3] * q[3])
     return 2.0 * (q[1] * q[3] + q[0] * q[2]), 2.0 * (q[2] * q[3] - q[0] * q[1]), z
 
 
 @inner
 def tilt_of(t: Vector) -> tuple[float, float]:
-    """(θ, ψ) of a `tilt_turn` that tilts x to a unit vector."""
+    """Return (θ, ψ) of a `tilt_turn` that tilts x to a unit vector."""
     across = math.hypot(t[1], t[2])
     if across == 0.0:
         return 0.0, 0.0
@@ -267,7 +267,7 @@ def tilt_of(t: Vector) -> tuple[float, float]:
 
 @inner
 def logarithm(q: Turn) -> tuple[Vector, float, float]:
-    """Rotation vector φ of a rotation by less than a turn, and two functions of its angle a = |φ|.
+    """Return the rotation vector φ of a rotation by less than a turn, and two functions of its angle a = |φ|.
 
     β = (1 − y)/a² with y = ½a cot ½a, which the derivative I + ½[φ]× + β [φ]×² of the logarithm needs, and β′/a.
     """
@@ -288,6 +288,6 @@ def logarithm(q: Turn) -> tuple[Vector, float, float]:
 
 @inner
 def roll_about_x(q: Turn) -> float:
-    """Angle (rad), above −π and up to π, of the roll about x before a tilt, for a rotation that is both."""
+    """Return the angle (rad), above −π and up to π, of the roll about x before a tilt, for a rotation that is both."""
     angle = 2.0 * math.atan2(q[1], q[0])
     return angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5)

@@ -12,7 +12,7 @@ _THINNEST_MM = 1e-3  # least thickness of a piece of a layer
 
 
 def guide_to_skin(scenario: Scenario) -> float | None:
-    """Distance (mm) of the phantom's guide from the skin, or None without a guide."""
+    """Return the distance (mm) of the phantom's guide from the skin, or None without a guide."""
     guide = scenario.setup.guide_to_skin_mm
     return None if guide is None else guide - scenario.phantom.structure.guide_shift_mm
 
@@ -53,10 +53,10 @@ def with_hidden_layer(truth: Scenario, scenario: Scenario) -> Scenario:
 
 
 def _extents(scenario: Scenario) -> Iterator[tuple[float, float]]:
-    """First and last depth (mm) of each layer; the last layer is unbounded."""
+    """Return the first and last depth (mm) of each layer; the last layer is unbounded."""
     return pairwise((*scenario.layer_tops, math.inf))
 
 
 def _edges(first: float, last: float, cuts: tuple[float, ...]) -> list[float]:
-    """Depths (mm) at which a layer begins, is split, and ends."""
+    """Return the depths (mm) at which a layer begins, is split, and ends."""
     return [first, *(cut for cut in cuts if first + _THINNEST_MM < cut < last - _THINNEST_MM), last]

@@ -36,8 +36,10 @@ _LEAST_PIVOT = 1e-3  # of the hinge's stiffness
 
 
 class _Beyond(NamedTuple):
-    """Cost of all stages from one on: gradient and second derivatives in the node (p) and the previous rotation (t),
-    and the resultant force on the needle beyond (N)."""
+    """Cost of all stages from one on: gradient and second derivatives, and the resultant force on the needle (N).
+
+    p, pp, pt: in the node; t, tt, pt: in the previous rotation.
+    """
 
     pp: Matrix
     pt: Matrix
@@ -49,7 +51,7 @@ class _Beyond(NamedTuple):
 
 @inner
 def _inverted(m: Symmetric, least: float) -> tuple[bool, Symmetric]:
-    """(whether all pivots of a symmetric matrix are above `least`, its inverse)."""
+    """Return whether all pivots of a symmetric matrix are above `least`, and its inverse."""
     a, b, c, d, e, f = m
     minor = a * d - b * b
     x, y, z = d * f - e * e, c * e - b * f, b * e - c * d
@@ -62,7 +64,7 @@ def _inverted(m: Symmetric, least: float) -> tuple[bool, Symmetric]:
 
 @inner
 def _own_rotation(row: Records, arm: Vector, beyond: _Beyond, curved: float) -> tuple[Matrix, Symmetric]:
-    """Second derivatives in (node, rotation) and in the rotation of a segment, without its own hinge.
+    """Return second derivatives in (node, rotation) and in the rotation of a segment, without its own hinge.
 
     The next node moves by δp + δ × arm, up to the second power of δ by ½ δ × (δ × arm).
     """
@@ -121,7 +123,7 @@ def _stage(rod: Rod, row: Records, beyond: _Beyond, least: float, curved: float)
 
 @inner
 def sweep(rod: Rod, s: State, w: Records, curved: float) -> bool:
-    """Riccati sweep from the tip to the base: the gains of a Newton step, and the reactions at the base.
+    """Make a Riccati sweep from the tip to the base: the gains of a Newton step, and the reactions at the base.
 
     Returns False if the Hessian is not positive definite, where a Newton step may lead uphill.
     """
@@ -140,7 +142,7 @@ def sweep(rod: Rod, s: State, w: Records, curved: float) -> bool:
 
 @inner
 def newton_step(rod: Rod, w: Records) -> float:
-    """Rotations of the segments into `step`; returns the largest displacement of a node (mm)."""
+    """Write the rotations of the segments into `step`; return the largest displacement of a node (mm)."""
     moved = last = (0.0, 0.0, 0.0)
     largest = 0.0
     for i in range(len(w) - 1):
@@ -157,7 +159,7 @@ def newton_step(rod: Rod, w: Records) -> float:
 
 @inner
 def slope(rod: Rod, w: Records) -> float:
-    """Work (mJ) of the unbalanced forces along the step in `step`; negative for a descent direction."""
+    """Return the work (mJ) of the unbalanced forces along the step in `step`; negative for a descent direction."""
     moved = last = (0.0, 0.0, 0.0)
     total = 0.0
     for i in range(len(w) - 1):

@@ -1,4 +1,4 @@
-"""Placement of the reference sensors: around the workspace, at positions with a low indicator."""
+"""Placement of the reference sensors around the workspace, at positions with a low indicator."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -18,7 +18,7 @@ _READINGS = 40
 def placed_references(
     room: Room, center: Point, limit: float, rng: np.random.Generator, plate_distance: float | None = None
 ) -> Mapping[str, SensorPose]:
-    """Return poses of the three references near those of the environment, each with an indicator below `limit`.
+    """Return poses of the references near those given by the environment, each with an indicator below `limit`.
 
     In the paper all indicators are below the threshold at the start of the experiment (section IV-B). A reference above
     it is moved by at most 30 mm; the best of forty positions is used if none is below the limit. plate_distance (mm):
@@ -57,7 +57,7 @@ def _indicator(
     rng: np.random.Generator,
     plate_distance: float | None,
 ) -> float:
-    """Median indicator over a second at rest."""
+    """Return the median indicator over a second at rest."""
     positions, orientations = (values.repeat(_READINGS, 0) for values in (position, orientation))
     exact = noiseless(room, name, positions, orientations, plate_distance)
     indicators = noisy(room.environment, exact, rng).indicators

@@ -10,12 +10,20 @@ from flexneedle.types import VISIBLE, Measurement, Point
 
 
 class NoisyTracker:
-    """Reads `tip_at(time)` → x, y, z in mm every `period` s with white noise of `jitter` mm on each axis.
+    """Simulated tip tracker with white noise: a `TipTracker`. With one lateral axis z is not measured.
 
-    A reading arrives `delay` s after it was taken and has the time of measurement; `bias` (x, y, z) in mm is added to
-    all. A share `missing` of them has no tip, except the first, which is available at the start. With one lateral axis
-    z is not measured. `direction_at(time)` → slopes θ, ψ of the tip (rad), if given, is measured with white noise of
-    `direction_jitter` rad. A `TipTracker`.
+    Args:
+        tip_at: Returns the true tip x, y, z (mm) at a time.
+        clock: Clock of the run.
+        period: Time between two readings (s).
+        jitter: Standard deviation of the noise on each axis (mm).
+        rng: Random numbers.
+        delay: Time (s) from a reading to its arrival; a reading has the time of measurement.
+        missing: Share of readings without a tip, except the first, which is available at the start.
+        bias: Constant error x, y, z (mm).
+        axes: Lateral axes.
+        direction_at: Returns the slopes θ, ψ of the tip (rad) at a time (default: not measured).
+        direction_jitter: Standard deviation of the noise of the slopes (rad).
     """
 
     def __init__(

@@ -31,9 +31,7 @@ def tip_on_stage(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Meas
 
 
 def tilt_of(axis: Floats) -> Lateral:
-    """Slopes θ, ψ (rad) of a needle along a vector (3,): the angle by which it is tilted from x, in the direction y,
-    z.
-    """
+    """Return slopes θ, ψ (rad) of a needle along a vector (3,): its tilt from x in the directions y and z."""
     x, y, z = axis.tolist()
     across = math.hypot(y, z)
     if across == 0.0:

@@ -36,15 +36,15 @@ class Field:
     constant: Floats
 
     def scaled(self, factor: float) -> "Field":
-        """The field times a number."""
+        """Return the field times a number."""
         return Field(factor * self.weights, factor * self.constant)
 
     def plus(self, other: "Field") -> "Field":
-        """The sum of two fields."""
+        """Return the sum of two fields."""
         return Field(self.weights + other.weights, self.constant + other.constant)
 
     def at(self, features: Floats) -> Floats:
-        """Values (n, 3) at points of these features (n, 2m)."""
+        """Return values (n, 3) at points of these features (n, 2m)."""
         values: Floats = features @ self.weights + self.constant
         return values
 
@@ -59,7 +59,7 @@ class Part(NamedTuple):
 class Room:
     """The errors of sensors in one room of an environment. Points are in the environment's frame, mm.
 
-    The sensors are those of `SENSORS`: "tip", and "ref1" to "ref3" with two coils each. The distance of the plate is
+    The sensors are `SENSORS`: "tip", and "ref1" to "ref3" with two coils each. The distance of the plate is
     the environment's by default. Same seed, same fields, for any distance of the plate.
     """
 
@@ -106,7 +106,7 @@ class Room:
         features: Floats,
         distance: float | None,
     ) -> Floats:
-        """The field of the room without a plate plus that of its plate; None: zero."""
+        """Return the field of the room without a plate plus the field of its plate; None: zero."""
         total = np.zeros(points.shape)
         if bias is not None:
             total += bias.field.at(features) * bias.envelope(points, None)
@@ -116,8 +116,14 @@ class Room:
 
 
 class SensorFields(NamedTuple):
-    """Fields of one sensor: error without a plate and part due to the plate; for two coils also the error of the second
-    minus that of the first."""
+    """Fields of one sensor.
+
+    Attributes:
+        bias: Error without a plate.
+        plate: Part of the error due to the plate.
+        coils: With two coils, the error of the second minus the error of the first, without a plate.
+        plate_coils: The part of this difference due to the plate.
+    """
 
     bias: Part
     plate: Part | None = None
@@ -179,7 +185,7 @@ class _Draws:
         return SensorFields(bias[0], distortion[0], bias[1], distortion[1])
 
     def _biases(self, is_tip: bool, field: Field, of_coils: Field) -> tuple[Part, Part | None]:
-        """Error without a plate, and its difference between two coils."""
+        """Return the error without a plate, and its difference between two coils."""
         environment, envelope = self._environment, growing(self._environment)
         if is_tip:
             return self._sized(field, environment.tip.bias_mm, envelope), None
@@ -189,7 +195,7 @@ class _Draws:
     def _distortions(
         self, plate: Plate, is_tip: bool, field: Field, of_coils: Field
     ) -> tuple[Part, Part | None]:
-        """Error due to the plate, and its difference between two coils."""
+        """Return the error due to the plate, and its difference between two coils."""
         envelope = decaying(plate, plate.decay_mm)
         if is_tip:
             return self._sized(field, plate.tip_mm, envelope), None

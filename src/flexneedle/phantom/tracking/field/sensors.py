@@ -44,8 +44,10 @@ def noiseless(
     orientations: Floats,
     plate_distance: float | None = None,
 ) -> Noiseless:
-    """Return the readings of `sensor` without noise, from its true positions (n, 3) in the environment's frame and
-    orientations (n, 4)."""
+    """Return the readings of `sensor` without noise.
+
+    positions (n, 3): true positions in the environment's frame; orientations (n, 4).
+    """
     if sensor == TIP:
         error = room.error(sensor, positions, plate_distance)
         return Noiseless((positions + error)[:, None], _tilted(room.environment, error, orientations))

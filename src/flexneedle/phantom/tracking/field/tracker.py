@@ -19,14 +19,24 @@ MISSING = "missing"
 
 
 class FieldTracker:
-    """Reads the sensors of `poses_at(time)`, by name, poses in the stage's frame, every `period` s. A `Tracker`.
+    """Simulated electromagnetic tracker: a `Tracker`.
 
-    room: errors of the sensors; its center is at `center` (mm) in the stage's frame. A frame arrives `delay` s after it
-    was taken and has the time of measurement; the first one was taken `delay` + `ahead` s before the start. Each sensor
-    is missing in a share `missing` of the frames, independently of the others.
-    to_tracker: map from the stage's frame to the tracker's. plate_distance_at(time): distance (mm) of the plate from
-    the center (default, and None: the environment's). The roll of the tip sensor, which has one coil, is not measured:
-    its orientation is the shortest rotation of the z axis to its axis.
+    The roll of the tip sensor, which has one coil, is not measured: its orientation is the shortest rotation of the z
+    axis to its axis.
+
+    Args:
+        room: Errors of the sensors.
+        poses_at: Returns the true poses of the sensors by name, in the stage's frame, at a time.
+        clock: Clock of the run.
+        period: Time between two frames (s).
+        rng: Random numbers.
+        center: Center of the room in the stage's frame (mm).
+        delay: Time (s) from a frame to its arrival; a frame has the time of measurement.
+        ahead: Further time (s) before the start from which frames are available.
+        missing: Share of the frames in which a sensor is missing, independently of the others.
+        to_tracker: Map from the stage's frame to the tracker's.
+        plate_distance_at: Returns the distance (mm) of the plate from the center at a time (default, and None: the
+            environment's).
     """
 
     def __init__(
@@ -90,7 +100,7 @@ class FieldTracker:
         return self._in_tracker_frame(name, readings)
 
     def _noiseless(self, name: str, pose: SensorPose, plate: float | None) -> Noiseless:
-        """The reading without noise; that of the previous frame for a sensor at rest, such as a reference."""
+        """Return the reading without noise; the previous one for a sensor at rest, such as a reference."""
         last, exact = self._at_rest.get(name, (None, None))
         if exact is None or last != (pose, plate):
             position = np.array([pose.position]) - self._center
