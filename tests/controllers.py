@@ -75,4 +75,4 @@ def estimated():
 @pytest.fixture
 def all_fresh(monkeypatch):
     """Every derivative simulated in every period."""
-    monkeypatch.setattr(Identified, "_due", lambda self: iter(range(self.parameters.size)))
+    monkeypatch.setattr(Identified, "_due_parameters", lambda self: iter(range(self.parameters.size)))

@@ -380,7 +380,7 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
         trajectories = rollout(fitted, controls)
         return replace(trajectories, converged=np.zeros_like(trajectories.converged))
 
-    monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
+    monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)
     decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert decision.command == STILL
     assert decision.why == "no path converges on the fitted model"

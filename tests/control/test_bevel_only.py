@@ -73,7 +73,7 @@ def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, es
         calls.append((*args[2:], options))
         return rule(*args, **options)
 
-    monkeypatch.setattr(bang_bang, "wanted_roll", spied)
+    monkeypatch.setattr(bang_bang, "choose_roll", spied)
     command(quick_plan, estimated(along(quick_plan, 50)), curvature_per_m=2.0, flip_dead_band=0.25)
     noise = pytest.approx(3 * 0.07 / 3**0.5)
     assert calls == [(pytest.approx(2e-3), quick_plan.target, 0.25, noise, {"within": None})]

@@ -290,6 +290,6 @@ def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, mo
         noises.append(args[-1])
         return rule(*args, **options)
 
-    monkeypatch.setattr(bang_bang, "wanted_roll", spied)
+    monkeypatch.setattr(bang_bang, "choose_roll", spied)
     decide(plan, estimated(along(plan, 40)))
     assert noises == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

@@ -169,7 +169,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], idn.improve_fit, idn.Identified._with
+    costs, tried, improved, with_ = [], [], idn.improve_fit, idn.Identified._simulate_with
 
     def spied(estimate):
         tried.append(0)
@@ -182,8 +182,8 @@ def test_a_step_never_fits_worse(monkeypatch):
         tried[-1] += 1
         return with_(estimate, parameters)
 
-    monkeypatch.setattr(idn, "improved", spied)
-    monkeypatch.setattr(idn.Identified, "_with", counted)
+    monkeypatch.setattr(idn, "improve_fit", spied)
+    monkeypatch.setattr(idn.Identified, "_simulate_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
             Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1))),
@@ -215,14 +215,14 @@ def spoilt(estimate):
 
 def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
     estimate, readings = off_the_prior(45)
-    with_, tried = idn.Identified._with, []
+    with_, tried = idn.Identified._simulate_with, []
 
     def failing(self, parameters):
         tried.append(parameters)
         other = with_(self, parameters)
         return spoilt(other) if len(tried) <= 2 else other
 
-    monkeypatch.setattr(idn.Identified, "_with", failing)
+    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
     fitted = idn.improve_fit(estimate)
     assert len(tried) >= 3
     assert np.isfinite(fitted.tips).all()
@@ -231,13 +231,13 @@ def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
 
 def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
     estimate, _ = off_the_prior(45)
-    with_ = idn.Identified._with
+    with_ = idn.Identified._simulate_with
 
     def failing(self, parameters):
         other = with_(self, parameters)
         return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
 
-    monkeypatch.setattr(idn.Identified, "_with", failing)
+    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
     fitted = idn.improve_fit(estimate)
     np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
     np.testing.assert_array_equal(fitted.tips, estimate.tips)
@@ -245,7 +245,7 @@ def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
 
 def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
     estimate, _ = off_the_prior(45)
-    with_ = idn.Identified._with
+    with_ = idn.Identified._simulate_with
 
     def failing(self, parameters):
         other = with_(self, parameters)
@@ -256,7 +256,7 @@ def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
             other, state=replace(other.state, needle=other.state.needle._replace(solution=solution))
         )
 
-    monkeypatch.setattr(idn.Identified, "_with", failing)
+    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
     assert idn.improve_fit(estimate).state.converged
 
 

@@ -93,7 +93,7 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
         kept = next(calls) < 20
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
-    monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
+    monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)
     done = run(plan, Tank(plan.roll).rig(), controller=DEFAULT)
     assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
     assert {period.applied for period in done.periods[-3:]} == {STILL}

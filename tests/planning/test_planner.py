@@ -115,9 +115,9 @@ def test_same_seed_same_bytes_whatever_the_threads(monkeypatch):
 def test_a_sketch_is_the_plan_of_one_search(monkeypatch, strategy, changes):
     """Of that of one roll, where the bevel is alone."""
     given = {"plan.samples": 64, "plan.iterations": 8, "plan.max_iterations": 8, "target.lateral_mm": 1.0}
-    scenario, search = PHANTOM.with_values(given | changes), planner.steer
+    scenario, search = PHANTOM.with_values(given | changes), planner.search_rolls
     sketch = planner.sketch(scenario, strategy, 3)
-    monkeypatch.setattr(planner, "steer", lambda *args: search(*args[:5], 1))
+    monkeypatch.setattr(planner, "search_rolls", lambda *args: search(*args[:5], 1))
     plan = flexneedle.plan(scenario, strategy=strategy, seed=3)
     assert plan.reached  # so that it is of one search, too
     np.testing.assert_allclose(sketch.tips, plan.tips, atol=1e-9)
@@ -375,7 +375,7 @@ def test_a_target_near_the_skin_that_one_search_misses_is_reached(scenario, targ
 
 
 def test_a_plan_that_reaches_its_target_is_not_searched_again(monkeypatch):
-    monkeypatch.setattr(planner, "widened", None)
+    monkeypatch.setattr(planner, "widen_search", None)
     assert coarse(target=(40.0, 1.0)).reached
 
 

@@ -10,6 +10,7 @@ from flexneedle.errors import InputError
 from flexneedle.planning.insertion import PlanProblem, entry_bounds, mount_needle
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import bevel_reach
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, across
@@ -128,7 +129,7 @@ def test_a_sample_of_the_entry_is_a_line_within_its_disc(axes):
     goal = (30.0, 0.0, 0.0)
     one = np.ones(7)
     problem = PlanProblem(
-        goal, 60.0, 30.0, 1, one, one, np.ones(5 + 3 * axes), 1.0, 1.0, 1.0, 1.0, 1.0, axes=axes,
+        goal, 60.0, 30.0, 1, one, one, np.ones(5 + 3 * axes), PlanSettings(), axes=axes,
         frame=1.0 if axes == 1 else 1.0j, entry=(2.0, 0.05), mounts=(-150.0, -40.0),
     )  # fmt: skip
     bounds = entry_bounds(problem)

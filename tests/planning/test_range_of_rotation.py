@@ -10,6 +10,7 @@ import flexneedle
 from flexneedle.planning import planner, steering
 from flexneedle.planning.insertion import PlanProblem, make_controls
 from flexneedle.planning.planner import bevel_reach
+from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import ROLL
@@ -124,7 +125,7 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
 def test_rolls_take_the_shortest_way_that_the_range_has(most, wanted, expected):
     ones = np.ones(7)
     problem = PlanProblem(
-        (30.0, 0.0, 0.0), 60.0, 30.0, 3, ones, ones, np.ones(9), 1.0, 1.0, 1.0, 1.0, 1.0, axes=2,
+        (30.0, 0.0, 0.0), 60.0, 30.0, 3, ones, ones, np.ones(9), PlanSettings(), axes=2,
         half_turns=False, rotation=math.radians(most),
     )  # fmt: skip
     z = np.zeros((1, 3, problem.coordinates))
