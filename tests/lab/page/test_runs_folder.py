@@ -7,6 +7,7 @@ import os
 import zipfile
 from contextlib import contextmanager
 from http.client import HTTPConnection
+from itertools import product
 from threading import Event
 
 import pytest
@@ -135,23 +136,17 @@ NO_RUNS = [
 ]
 
 
-@pytest.mark.parametrize("name", NO_RUNS)
-def test_no_other_name_is_a_run_or_a_study(runs, name):
-    for found in (RunsFolder(runs).run, RunsFolder(runs).study):
-        with pytest.raises(Refusal, match="of this name in the folder of runs"):
-            found(name)
-
-
-@pytest.mark.parametrize("name", ["..", "../x", "a/b", ".hidden", "", "a\0", "-rf", "a\nb"])
-def test_no_other_name_is_one_to_save_under(runs, name):
-    with pytest.raises(Refusal, match="must be letters"):
-        RunsFolder(runs).new(name)
-
-
-@pytest.mark.parametrize("name", ["older", "link", "file"])
-def test_nothing_is_overwritten(runs, name):
-    with pytest.raises(Refusal, match="already something of this name"):
-        RunsFolder(runs).new(name)
+def test_no_other_name_is_a_run_or_a_study_or_one_to_save_under(runs):
+    for name in NO_RUNS:
+        for found in (RunsFolder(runs).run, RunsFolder(runs).study):
+            with pytest.raises(Refusal, match="of this name in the folder of runs"):
+                found(name)
+    for name in ("..", "../x", "a/b", ".hidden", "", "a\0", "-rf", "a\nb"):
+        with pytest.raises(Refusal, match="must be letters"):
+            RunsFolder(runs).new(name)
+    for name in ("older", "link", "file"):
+        with pytest.raises(Refusal, match="already something of this name"):
+            RunsFolder(runs).new(name)
 
 
 def test_an_archive_has_the_files_of_the_run_alone(runs):
@@ -165,14 +160,12 @@ def test_an_archive_has_the_files_of_the_run_alone(runs):
 # Over sockets: tmp_path / "runs" is the server's folder
 
 
-@pytest.mark.parametrize(
-    "path", ["older/figure.png", "older/run.zip", "older/trace.csv", "older/replay.html"]
-)
-def test_a_link_within_a_run_is_not_followed(runs, server, path):
+def test_a_link_within_a_run_is_not_followed(runs, server):
     (runs.parent / "secret" / "insertion.png").write_text("secret")
     (runs / "older" / "insertion.png").symlink_to(runs.parent / "secret" / "insertion.png")
     reason = "older: insertion.png is a link, which may lead elsewhere\n"
-    assert get(server, f"/runs/{path}")[:2] == (404, reason)
+    for file in ("figure.png", "run.zip", "trace.csv", "replay.html"):
+        assert get(server, f"/runs/older/{file}")[:2] == (404, reason)
 
 
 def test_a_run_with_a_link_is_not_opened(runs, client):
@@ -202,10 +195,13 @@ def test_a_run_is_opened_and_closed(runs, server, client):
         assert "first" not in other.rows
 
 
-@pytest.mark.usefixtures("runs")
-@pytest.mark.parametrize("name", [name for name in NO_RUNS if name])
-def test_what_is_no_run_is_not_opened(client, name):
-    assert client.refused("open", name=name) == f"{name!r}: no run of this name in the folder of runs"
+@pytest.mark.usefixtures("study")
+def test_what_is_no_run_or_study_is_not_opened(client):
+    for name in filter(None, NO_RUNS):
+        assert client.refused("open", name=name) == f"{name!r}: no run of this name in the folder of runs"
+        reason = f"{name!r}: no study of this name in the folder of runs"
+        assert client.refused("study", name=name) == reason
+        assert client.refused("open", name=name, row=3) == reason
 
 
 @pytest.mark.usefixtures("study")
@@ -235,24 +231,6 @@ def test_a_row_of_a_study_is_opened(runs, client):
     client.do("open", name="older", second=True)
     client.job("recording", "done")
     assert client.refused("save", name="other", of="second").startswith("no row of a study is shown there")
-
-
-@pytest.mark.usefixtures("study")
-@pytest.mark.parametrize("name", [name for name in NO_RUNS if name])
-def test_what_is_no_study_has_no_rows(client, name):
-    reason = f"{name!r}: no study of this name in the folder of runs"
-    assert client.refused("study", name=name) == reason
-    assert client.refused("open", name=name, row=3) == reason
-
-
-@pytest.mark.usefixtures("study")
-@pytest.mark.parametrize("index", [-1, 1_000_000, 1.5, "3", True])
-@pytest.mark.parametrize(("request_", "key"), [("study", "index"), ("open", "row")])
-def test_what_is_no_index_is_refused(client, request_, key, index):
-    client.send(request_, name="many", **{key: index})
-    refused = client.wait(lambda: client.newest.get("refused"))
-    assert refused["what"] == "message"
-    assert key in refused["reason"]
 
 
 def test_the_last_insertion_is_saved(runs, client):
@@ -353,18 +331,16 @@ PATHS = [
 
 
 @pytest.mark.usefixtures("runs")
-@pytest.mark.parametrize("path", PATHS)
-def test_no_path_leads_out(server, path):
-    status, text, _headers = get(server, path)
-    assert status == 404
-    assert len(text) < 200
-
-
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
-@pytest.mark.parametrize("path", ["/", "/runs/older/run.zip", "/static/index.html"])
-def test_nothing_is_written_over_http(shared_server, method, path):
-    with requested(shared_server, method, path) as response:
-        assert response.status == 405
+def test_no_path_leads_out_and_nothing_is_written_over_http(server):
+    for path in PATHS:
+        status, text, _headers = get(server, path)
+        assert status == 404, path
+        assert len(text) < 200
+    for method, path in product(
+        ("POST", "PUT", "DELETE", "OPTIONS", "TRACE"), ("/", "/runs/older/run.zip", "/static/index.html")
+    ):
+        with requested(server, method, path) as response:
+            assert response.status == 405, (method, path)
 
 
 @contextmanager
