@@ -6,6 +6,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 
 from flexneedle.errors import InputError, make_printable
@@ -78,8 +79,6 @@ def _has(law: type[Layer], part: str) -> bool:
 
 def _broken_rule(layer: Layer) -> str:
     """Return the first rule of laws that a user's law breaks, or ""."""
-    import numpy as np  # only here: a scenario of the package's laws is read without it
-
     if not 0.0 < layer.limit < 1.0:
         return f"limit = {layer.limit!r}: must be above 0 and below 1"
     e = np.linspace(0.0, layer.limit, _POINTS)

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from flexneedle.scenario.tissue.layer import Layer
@@ -36,8 +37,6 @@ class Ogden(Layer):
 
     def energy(self, e: "Floats") -> "Floats":
         """Return the energy at relative compressions e, over k h²."""
-        import numpy as np  # here: scenarios are read without it
-
         # 2 t + t⁻² − 3 with t = λ^(−α/2) = 1 + d, without the cancellation at small e
         log = np.log1p(-e)
         d = np.expm1(-0.5 * self.alpha * log)
@@ -45,8 +44,6 @@ class Ogden(Layer):
 
     def force(self, e: "Floats") -> "Floats":
         """Return the force, over k h."""
-        import numpy as np
-
         log = np.log1p(-e)
         return (
             (2.0 / (3.0 * self.alpha)) * np.exp((self.alpha - 1.0) * log) * np.expm1(-1.5 * self.alpha * log)
