@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.lab.tracker_evaluation.simulate import Columns, Experiment, measure
+from flexneedle.lab.tracker_evaluation.simulate import Columns, Experiment, measure_grid
 from flexneedle.phantom.tracking.table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
 
@@ -88,7 +88,7 @@ def measure_environments(
     environments = [load_environment(name) for name in names]
     found: dict[str, list[dict[str, float]]] = {environment.name: [] for environment in environments}
     for seed in seeds:
-        table = measure(environments, Experiment(seed, seed if other_rooms else None))
+        table = measure_grid(environments, Experiment(seed, seed if other_rooms else None))
         for name, rows in found.items():
             rows.append(summarize(table, name))
     return {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 from flexneedle.phantom.tracking.table import REQUIRED
 
 GRID = np.stack(np.meshgrid(*[np.arange(3) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -71,7 +71,7 @@ def plain(rows):
 
 def refusal(path, **options):
     with pytest.raises(InputError) as caught:
-        evaluate(path, EvaluationOptions(**options))
+        evaluate_table(path, EvaluationOptions(**options))
     message = str(caught.value)
     assert "\n" not in message
     assert str(path) in message
@@ -79,4 +79,4 @@ def refusal(path, **options):
 
 
 def one(path, **options):
-    return evaluate(path, EvaluationOptions(**options)).values()["results"][0]
+    return evaluate_table(path, EvaluationOptions(**options)).values()["results"][0]

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from flexneedle.lab.tracker_evaluation.recording.record import Operator, open_session, record
+from flexneedle.lab.tracker_evaluation.recording.record import StageOperator, open_session, record_grid
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 GRID = """\
@@ -54,12 +54,12 @@ class Stage:
         self.time += 3.0
 
     def operator(self, **settings):
-        return Operator(self.move, self.reports.append, **settings)
+        return StageOperator(self.move, self.reports.append, **settings)
 
 
 def run(out, grid, stage, **settings):
     with open_session(out, grid) as session:
-        return record(session, stage, stage, grid, stage.operator(**settings))
+        return record_grid(session, stage, stage, grid, stage.operator(**settings))
 
 
 def rows_of(path):

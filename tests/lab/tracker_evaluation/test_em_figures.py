@@ -7,12 +7,12 @@ from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, distance_figure
-from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, field_figure
+from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, draw_distance
+from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, draw_field
 from flexneedle.lab.tracker_evaluation.figures.indicator import (
     IndicatorPanel,
     PlottedPoints,
-    indicator_figure,
+    draw_indicator,
 )
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -32,7 +32,7 @@ def arrows(figure):
 
 def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
     row = field_row()
-    figure = field_figure([row])
+    figure = draw_field([row])
     drawn = [one[0] for one in arrows(figure) if one]
     assert [len(one.U) for one in drawn] == [25] * 5
     chosen = GRID[:, 2] == 25.0
@@ -45,14 +45,14 @@ def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
 
 def test_scattered_points_are_divided_into_five_slabs():
     true = np.random.default_rng(1).uniform(-50, 50, (300, 3))
-    drawn = [one[0] for one in arrows(field_figure([field_row(true)])) if one]
+    drawn = [one[0] for one in arrows(draw_field([field_row(true)])) if one]
     assert len(drawn) == 5
     assert sum(len(one.U) for one in drawn) == 300
 
 
 @pytest.mark.parametrize("true", [GRID[:1], GRID[:2], GRID[GRID[:, 2] == 0.0]])
 def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
-    figure = field_figure([field_row(true), field_row(true, error=0.0)])
+    figure = draw_field([field_row(true), field_row(true, error=0.0)])
     assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
 
 
@@ -60,7 +60,7 @@ def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
 def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(shift):
     row = field_row()
     row = FieldRow(row.title, row.true, row.error + np.array([shift, 0.0, 0.0]))
-    figure = field_figure([row])
+    figure = draw_field([row])
     drawn = [(ax, one) for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
     ends = np.concatenate([one.XY + np.stack([one.U, one.V], axis=1) for _, one in drawn])
     (low, high), (bottom, top) = drawn[0][0].get_xlim(), drawn[0][0].get_ylim()
@@ -73,7 +73,7 @@ def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(sh
 
 def test_single_slices_are_drawn_in_pairs():
     plane = GRID[GRID[:, 2] == 0.0]
-    one, two, three = (field_figure([field_row(plane)] * k) for k in (1, 2, 3))
+    one, two, three = (draw_field([field_row(plane)] * k) for k in (1, 2, 3))
     assert two.get_figheight() <= one.get_figheight() < three.get_figheight() <= 2 * two.get_figheight()
     two.draw_without_rendering()
     left, right = (ax.get_window_extent() for ax in two.axes[::2])
@@ -82,7 +82,7 @@ def test_single_slices_are_drawn_in_pairs():
 
 
 def test_rows_beyond_the_sixth_are_counted():
-    figure = field_figure([field_row(title=f"coil {k}") for k in range(8)])
+    figure = draw_field([field_row(title=f"coil {k}") for k in range(8)])
     assert "2 more not shown" in words(figure)
     assert "coil 5" in words(figure)
     assert "coil 6" not in words(figure)
@@ -108,7 +108,7 @@ def shown_points(figure):
 
 
 def test_all_indicators_are_shown():
-    figure = indicator_figure([panel()])
+    figure = draw_indicator([panel()])
     assert [len(one) for one in shown_points(figure)] == [20, 40]
     assert figure.axes[0].get_xlim() == pytest.approx((0.0, 1.04 * 0.5))
     assert "not shown" not in words(figure)
@@ -117,7 +117,7 @@ def test_all_indicators_are_shown():
 
 def test_a_few_indicators_far_out_are_counted_instead():
     indicator, error = np.append(np.linspace(0.1, 0.5, 40), 6.0), np.append(np.full(40, 2.0), 90.0)
-    figure = indicator_figure([panel(noisy=PlottedPoints("noisy", indicator, error, "a line"))])
+    figure = draw_indicator([panel(noisy=PlottedPoints("noisy", indicator, error, "a line"))])
     assert [len(one) for one in shown_points(figure)] == [20, 40]
     assert "(1 point not shown, up to I = 6)" in words(figure)
     (ax,) = figure.axes
@@ -126,12 +126,12 @@ def test_a_few_indicators_far_out_are_counted_instead():
 
 
 def test_omitted_sensors_are_counted():
-    assert "5 more sensors not shown" in words(indicator_figure([panel()] * 3, 5))
-    assert "1 more sensor not shown" in words(indicator_figure([panel()] * 3, 1))
+    assert "5 more sensors not shown" in words(draw_indicator([panel()] * 3, 5))
+    assert "1 more sensor not shown" in words(draw_indicator([panel()] * 3, 1))
 
 
 def test_a_threshold_beyond_all_indicators_is_shown():
-    figure = indicator_figure([panel(noisy=None, line=None, threshold=0.9)])
+    figure = draw_indicator([panel(noisy=None, line=None, threshold=0.9)])
     assert figure.axes[0].get_xlim()[1] > 0.9
 
 
@@ -145,13 +145,13 @@ def test_a_threshold_beyond_all_indicators_is_shown():
     ],
 )
 def test_an_environment_or_a_fit_may_be_missing(changes):
-    assert "reference" in words(indicator_figure([panel(**changes), panel()]))
+    assert "reference" in words(draw_indicator([panel(**changes), panel()]))
 
 
 def test_the_figure_of_distances_shows_rmse_limit_and_note():
     far, rmse = np.array([500.0, 600.0, 700.0]), np.array([1.2, 0.8, 0.5])
     lines = [DistanceLine("tip, ideal", far, rmse, 0.7, "within 0.7 mm from 700 mm")]
-    figure = distance_figure([*lines, DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")])
+    figure = draw_distance([*lines, DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")])
     assert "limit 0.7" in words(figure)
     assert "within 0.7 mm from 700 mm" in words(figure)
     assert_allclose(figure.axes[0].lines[0].get_xydata(), np.stack([far, rmse], axis=1))
@@ -162,7 +162,7 @@ def test_legends_stay_inside_the_figure_and_off_the_axes(count):
     names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
     values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)
     note = "within 1.4 mm up to 700 mm, and the first bin beyond is too far off"
-    distance = distance_figure([DistanceLine(name, *values, 0.7, note) for name in names])
+    distance = draw_distance([DistanceLine(name, *values, 0.7, note) for name in names])
     for figure in (distance,):
         figure.draw_without_rendering()
         legends = [legend for part in (figure, *figure.subfigs) for legend in part.legends]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from flexneedle.errors import InputError
 from flexneedle.lab.tables.write import write_table
-from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure
+from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure_grid
 from flexneedle.phantom.tracking.table import COLUMNS
 from flexneedle.scenario.files import load_environment
 from rooms import environment
@@ -25,7 +25,7 @@ def column(table, name, sensor="tip"):
 
 def test_the_papers_experiment_is_500_samples_at_each_of_125_points():
     """5 × 5 × 5 points in 1000 cm³, 100 samples, 5 times, two sensors, two environments."""
-    table = measure([load_environment("ideal"), load_environment("noisy")], Experiment())
+    table = measure_grid([load_environment("ideal"), load_environment("noisy")], Experiment())
     assert tuple(table) == COLUMNS
     counts = Counter(
         zip(*(table[name].tolist() for name in ("environment", "sensor", "point_id")), strict=True)
@@ -37,7 +37,7 @@ def test_the_papers_experiment_is_500_samples_at_each_of_125_points():
 
 
 def test_a_tracker_without_errors_measures_the_grid():
-    table = measure([environment()], SMALL)
+    table = measure_grid([environment()], SMALL)
     for sensor in ("tip", "reference"):
         for axis in "xyz":
             true, measured = column(table, f"true_{axis}_mm", sensor), column(table, f"{axis}_mm", sensor)
@@ -47,12 +47,12 @@ def test_a_tracker_without_errors_measures_the_grid():
 
 
 def test_each_repeat_visits_the_grid_and_takes_all_samples_of_a_point_at_once():
-    ids = column(measure([environment()], SMALL), "point_id")
+    ids = column(measure_grid([environment()], SMALL), "point_id")
     np.testing.assert_array_equal(ids, np.tile(np.repeat(np.arange(8), 3), 4))
 
 
 def test_the_tip_sensor_points_along_x_and_the_reference_along_z():
-    table = measure([environment()], SMALL)
+    table = measure_grid([environment()], SMALL)
     for sensor, axis in (("tip", [1.0, 0.0, 0.0]), ("reference", [0.0, 0.0, 1.0])):
         quaternions = np.stack([column(table, name, sensor) for name in ("qw", "qx", "qy", "qz")], axis=1)
         measured = Rotation.from_quat(quaternions, scalar_first=True).apply([0.0, 0.0, 1.0])
@@ -60,7 +60,7 @@ def test_the_tip_sensor_points_along_x_and_the_reference_along_z():
 
 
 def test_the_distance_is_that_to_the_field_generator():
-    table = measure([environment(generator_mm=[0.0, 700.0, 0.0])], SMALL)
+    table = measure_grid([environment(generator_mm=[0.0, 700.0, 0.0])], SMALL)
     positions = np.stack([column(table, f"true_{axis}_mm") for axis in "xyz"], axis=1)
     assert set(positions[:, 1]) == {-50.0, 50.0}
     distance = np.linalg.norm(positions - (0.0, 700.0, 0.0), axis=1)
@@ -68,7 +68,7 @@ def test_the_distance_is_that_to_the_field_generator():
 
 
 def test_a_missing_sample_has_no_position_indicator_or_orientation():
-    table = measure([environment(missing_fraction=0.3)], Experiment(points=3, samples=50))
+    table = measure_grid([environment(missing_fraction=0.3)], Experiment(points=3, samples=50))
     lost = np.isnan(table["x_mm"])
     assert lost.mean() == pytest.approx(0.3, rel=0.05)
     for name in ("y_mm", "z_mm", "indicator", "qw", "qx", "qy", "qz"):
@@ -85,7 +85,7 @@ def test_the_seed_draws_the_noise_and_the_field_seed_the_field_errors():
     clear = environment(tip={"bias_mm": 1.0, "jitter_mm": 0.1})
 
     def bias(**seeds):
-        table = measure([clear], Experiment(points=2, samples=2000, repeats=1, **seeds))
+        table = measure_grid([clear], Experiment(points=2, samples=2000, repeats=1, **seeds))
         off = column(table, "x_mm") - column(table, "true_x_mm")
         return off.reshape(8, 2000).mean(axis=1)
 
@@ -97,7 +97,7 @@ def test_the_seed_draws_the_noise_and_the_field_seed_the_field_errors():
 
 def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
     ideal, noisy = load_environment("ideal"), load_environment("noisy")
-    alone, both = measure([noisy], SMALL), measure([ideal, noisy], SMALL)
+    alone, both = measure_grid([noisy], SMALL), measure_grid([ideal, noisy], SMALL)
     for name in COLUMNS:
         np.testing.assert_array_equal(both[name][ROWS:], alone[name])
     assert not np.allclose(*(column(table, "y_mm")[:5] for table in (both, alone)))
@@ -105,13 +105,13 @@ def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
 
 def test_two_environments_have_independent_noise():
     twins = [environment(name=name, tip={"jitter_mm": 0.1}) for name in ("one", "other")]
-    one, other = np.split(column(measure(twins, SMALL), "x_mm"), 2)
+    one, other = np.split(column(measure_grid(twins, SMALL), "x_mm"), 2)
     assert (one != other).all()
 
 
 def test_two_sensors_have_independent_noise():
     both = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
-    table = measure([both], Experiment(points=2, samples=500))
+    table = measure_grid([both], Experiment(points=2, samples=500))
     off = [column(table, "x_mm", name) - column(table, "true_x_mm", name) for name in ("tip", "reference")]
     assert abs(np.corrcoef(off)[0, 1]) < 0.05
 
@@ -121,14 +121,14 @@ def test_same_seed_same_bytes(tmp_path, suffix):
     files = [tmp_path / f"{name}{suffix}" for name in ("one", "same", "other")]
     for file, seed in zip(files, (5, 5, 6), strict=True):
         write_table(
-            measure([load_environment("noisy")], Experiment(seed, points=2, samples=3, repeats=4)), file
+            measure_grid([load_environment("noisy")], Experiment(seed, points=2, samples=3, repeats=4)), file
         )
     one, same, other = (file.read_bytes() for file in files)
     assert one == same != other
 
 
 def test_csv_and_parquet_hold_the_same_table(tmp_path):
-    table = measure([load_environment("noisy")], Experiment(points=2, samples=30))
+    table = measure_grid([load_environment("noisy")], Experiment(points=2, samples=30))
     text, columns = tmp_path / "a.csv", tmp_path / "a.parquet"
     write_table(table, text)
     write_table(table, columns)
@@ -144,14 +144,14 @@ def test_csv_and_parquet_hold_the_same_table(tmp_path):
 
 def test_two_environments_with_the_same_name_are_refused():
     with pytest.raises(InputError, match="two environments have the name ideal"):
-        measure([load_environment("ideal")] * 2, SMALL)
+        measure_grid([load_environment("ideal")] * 2, SMALL)
 
 
 def test_too_many_samples_are_refused():
     with pytest.raises(InputError, match="200000000 samples: must be at most"):
-        measure([load_environment("ideal")], Experiment(points=10, samples=100_000, repeats=1))
+        measure_grid([load_environment("ideal")], Experiment(points=10, samples=100_000, repeats=1))
 
 
 def test_an_unknown_suffix_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"must end in \.csv or \.parquet"):
-        write_table(measure([environment()], SMALL), tmp_path / "a.xlsx")
+        write_table(measure_grid([environment()], SMALL), tmp_path / "a.xlsx")

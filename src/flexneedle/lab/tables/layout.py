@@ -19,7 +19,7 @@ _FIRST_LINES = 1000  # searched for the decimal mark
 
 
 @dataclass(frozen=True)
-class Layout:
+class CsvLayout:
     """Layout of a CSV file. skipped: number of lines before the one with the column names."""
 
     header: tuple[str, ...]
@@ -27,7 +27,7 @@ class Layout:
     skipped: int
 
 
-def read_layout(path: Path) -> Layout:
+def read_layout(path: Path) -> CsvLayout:
     """Return the layout of a CSV file; lines before the header may be blank, comments (#) or `sep=;`.
 
     Raises InputError if there are no column names or no row.
@@ -46,10 +46,10 @@ def read_layout(path: Path) -> Layout:
         if not file.read(1):
             raise InputError(f"has no rows, only the header {text[:SHOWN]!r}")
     separator = separator or max(_SEPARATORS, key=lambda each: len(_split_line(text, each)))
-    return Layout(tuple(name.strip() for name in _split_line(text, separator)), separator, skipped)
+    return CsvLayout(tuple(name.strip() for name in _split_line(text, separator)), separator, skipped)
 
 
-def has_decimal_commas(path: Path, layout: Layout, columns: Container[str]) -> bool:
+def has_decimal_commas(path: Path, layout: CsvLayout, columns: Container[str]) -> bool:
     """Return whether the first number with a decimal mark in these columns has a comma.
 
     Only files with semicolons or tabs between the columns can have decimal commas.
@@ -64,7 +64,7 @@ def has_decimal_commas(path: Path, layout: Layout, columns: Container[str]) -> b
         return next(marks, ".") == ","
 
 
-def find_line(path: Path, layout: Layout, row: int) -> tuple[int, str]:
+def find_line(path: Path, layout: CsvLayout, row: int) -> tuple[int, str]:
     """Return number and text of the line with a row; rows count from 1, and blank lines are no rows."""
     for count, (number, text) in enumerate(_rows(path, layout), 1):
         if count == row:
@@ -79,7 +79,7 @@ def find_other_line_end(path: Path) -> int | None:
         return next((number for number, (one, other) in enumerate(pairwise(ends), 2) if one != other), None)
 
 
-def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, str]]:
+def _rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, str]]:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             if number > layout.skipped + 1 and line.rstrip("\r\n"):

@@ -51,7 +51,7 @@ _SHORT, _SURPLUS = "fewer fields", "more fields"
 
 
 @dataclass(frozen=True)
-class Table:
+class SampleTable:
     """An open table. Its view `samples` has the requested columns and a row for each row of the file.
 
     Text is without surrounding blanks, empty in any of the spellings `EMPTY`. Numbers are finite DOUBLE with lengths in
@@ -116,7 +116,7 @@ def open_table(
     mapping: Mapping[str, str] | None = None,
     labels: Mapping[str, str] | None = None,
     unit: str = "mm",
-) -> Iterator[Table]:
+) -> Iterator[SampleTable]:
     """Open a table with the extra `em`.
 
     mapping: see `map_columns`; labels: value for all rows by column, for columns that the table lacks.
@@ -165,7 +165,7 @@ def _open(
     mapping: Mapping[str, str] | None,
     labels: Mapping[str, str],
     scale: float,
-) -> Table:
+) -> SampleTable:
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
     if not start:
@@ -177,7 +177,7 @@ def _open(
         raise InputError(f"has a column {given[0]}: --{given[0]} is only for a table without it")
     names = tuple(dict.fromkeys((*requested[0], *requested[1], *labels)))
     _create_samples(connection, source, names, labels, scale)
-    return Table(connection, frozenset(source.fields), source.find_row)
+    return SampleTable(connection, frozenset(source.fields), source.find_row)
 
 
 def _create_samples(

@@ -22,8 +22,8 @@ from flexneedle.geometry.registration import (
 )
 from flexneedle.lab.tables.columns import map_columns
 from flexneedle.lab.tables.rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
-from flexneedle.lab.tables.table import Table, open_table
-from flexneedle.lab.tracker_evaluation.figures.registration import registration_figure
+from flexneedle.lab.tables.table import SampleTable, open_table
+from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
 from flexneedle.phantom.tracking.table import REQUIRED
 from flexneedle.scenario.sections.registration import Registration
 
@@ -156,7 +156,7 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
 
 def _draw(registered: RegistrationResult, path: Path) -> None:
     stage, fle = registered.pairs.stage, registered.fle
-    figure = registration_figure(
+    figure = draw_registration(
         stage,
         registered.rigid.apply(registered.pairs.tracker),
         registered.targets,
@@ -179,7 +179,7 @@ _POINTS = """
 """
 
 
-def _pairs(table: Table, labels: Mapping[str, str | None]) -> PointPairs:
+def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
     given = {name: value for name, value in labels.items() if value is not None}
     for name, value in labels.items():
         _check_label(table, name, value)
@@ -204,7 +204,7 @@ def _pairs(table: Table, labels: Mapping[str, str | None]) -> PointPairs:
     )
 
 
-def _check_label(table: Table, name: str, label: str | None) -> None:
+def _check_label(table: SampleTable, name: str, label: str | None) -> None:
     query = f"SELECT DISTINCT {name} AS label FROM samples WHERE {name} <> '' ORDER BY label"
     present = table.arrays(query)["label"].tolist() if name in table.columns else []
     if label is None and len(present) > 1:

@@ -7,7 +7,7 @@ from flexneedle.errors import InputError
 from flexneedle.files import create_folder
 
 
-def results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:
+def make_results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:
     """Create the folder `out`, or a new one in `runs/` named by date and `name`, and return it.
 
     Raises InputError if `out` already contains one of the files `results` or cannot be created.

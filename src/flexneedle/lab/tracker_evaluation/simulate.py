@@ -36,7 +36,7 @@ class Experiment:
     repeats: int = 5
 
 
-def measure(environments: Sequence[Environment], experiment: Experiment) -> Columns:
+def measure_grid(environments: Sequence[Environment], experiment: Experiment) -> Columns:
     """Return the table of both sensors in all environments: the columns `COLUMNS`, NaN for missing values.
 
     The tip sensor points along x, the reference along z. The rows of an environment depend only on it and on the

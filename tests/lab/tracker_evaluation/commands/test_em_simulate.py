@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.cli.main import main
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import indicator_means
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import average_indicator
 from flexneedle.scenario.files import load_scenario
 
 DOCS = Path(__file__).resolve().parents[4] / "docs" / "tracking" / "simulate.md"
@@ -117,8 +117,10 @@ def test_the_indicator_detects_the_documented_plate(tmp_path):
     (tmp_path / "room.toml").write_text(examples()[1])
     arguments = ("--points", 4, "--samples", 10, "--repeats", 1, "--out", tmp_path / "out.csv")
     assert simulate(*arguments, "--environment", tmp_path / "room.toml", "ideal") == 0
-    results = evaluate(tmp_path / "out.csv", EvaluationOptions()).results
-    means = {grid.environment: indicator_means(grid)[0] for grid in (r.grid for r in results) if grid.samples}
+    results = evaluate_table(tmp_path / "out.csv", EvaluationOptions()).results
+    means = {
+        grid.environment: average_indicator(grid)[0] for grid in (r.grid for r in results) if grid.samples
+    }
     assert np.mean(means["operating room"][:, None] > means["ideal"]) > 0.9  # the area under the ROC curve
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from em_tables import random_rows, write_csv
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 @pytest.fixture
@@ -14,7 +14,7 @@ def rows():
 
 @pytest.fixture
 def found(tmp_path, rows):
-    return evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0]
+    return evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0]
 
 
 def test_intervals_are_quantiles_of_resampled_points(found, rows):

@@ -6,7 +6,7 @@ import pytest
 
 from em_tables import rows_of, write_csv
 from flexneedle.lab.tracker_evaluation.evaluation.distance import DistanceBin, DistanceErrors
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 def bins(rmse):
@@ -55,7 +55,7 @@ def test_the_rmse_of_a_bin_is_compared_with_the_limit_not_its_largest_error(tmp_
         for point, distance, error in points
         for _ in range(2)
     ]
-    found = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(limit_mm=0.7)).values()[
+    found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(limit_mm=0.7)).values()[
         "results"
     ][0]
     assert found["distance"]["smallest_mm"] == pytest.approx(710.0)
@@ -68,7 +68,7 @@ def test_errors_of_a_bin_are_those_of_its_points(tmp_path):
     samples = [[(x, k + 1.0, 0.1), (x, k + 1.0, -0.1)] for k, (x, _, _) in enumerate(true)]
     rows = rows_of(true, samples, "coil")
     rows = [{**row, "distance_mm": 710.0 if row["point_id"] < 5 else 790.0} for row in rows]
-    found = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0][
+    found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0][
         "distance"
     ]["bins"]
     near = [found[0][name] for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
 from flexneedle.lab.tables.columns import map_columns
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 LAWS = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
@@ -30,7 +30,7 @@ BY_HAND = rows_of(
 def results(path, **options):
     return {
         (r["sensor"], r["environment"]): r
-        for r in evaluate(path, EvaluationOptions(**options)).values()["results"]
+        for r in evaluate_table(path, EvaluationOptions(**options)).values()["results"]
     }
 
 
@@ -55,7 +55,7 @@ def test_the_papers_equations_on_a_table_worked_out_by_hand(tmp_path):
 
 def test_points_weigh_equally_in_the_errors_and_samples_in_the_jitter(tmp_path):
     rows = rows_of([(0, 0, 0), (10, 0, 0)], [[(1, 0, 0)], [(12, 1, 0), (12, -1, 0), (12, 0, 0)]])
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
+    evaluation = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
     found = evaluation.values()["results"][0]
     assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
     assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
@@ -158,7 +158,7 @@ def test_points_on_a_line_cannot_be_registered(tmp_path):
     with pytest.raises(
         InputError, match=r"t\.csv: --register: sensor 'tip', environment 'ideal'.*at least 3"
     ):
-        evaluate(path, EvaluationOptions(register=True))
+        evaluate_table(path, EvaluationOptions(register=True))
 
 
 def test_sensors_and_environments_are_evaluated_separately_in_the_papers_order(tmp_path):
@@ -191,7 +191,7 @@ def test_errors_over_distance_are_those_after_registration(tmp_path):
             {**row, "distance_mm": 612.0}
             | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, position), strict=True))
         )
-    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(register=True)).values()[
+    (found,) = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(register=True)).values()[
         "results"
     ]
     (bin_,) = found["distance"]["bins"]
@@ -206,7 +206,7 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         around = np.array([(off, 0.01, 0.0), (off, -0.01, 0.0)])
         own = rows_of(GRID, GRID[:, None] + around)
         rows += [{**row, "distance_mm": distance} for row in own]
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
+    evaluation = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
     found = evaluation.values()["results"][0]["distance"]
     assert [b["distance_mm"] for b in found["bins"]] == pytest.approx(list(error))
     assert [b["rmse_mm"] for b in found["bins"]] == pytest.approx(list(error.values()))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from em_tables import GRID, rows_of, write_csv
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import fit_line
 
 N = len(GRID)
@@ -25,7 +25,7 @@ def planted(path, **more):
 
 
 def test_fits_and_threshold_are_the_planted_ones(tmp_path):
-    (found,) = evaluate(planted(tmp_path / "t.csv"), EvaluationOptions()).values()["indicator"]
+    (found,) = evaluate_table(planted(tmp_path / "t.csv"), EvaluationOptions()).values()["indicator"]
     assert found["ideal"]["mean_mm"] == pytest.approx((14 * 0.5 + 13 * 0.7) / 27)
     assert found["noisy"]["slope_mm"] == pytest.approx(9.0)
     assert found["noisy"]["intercept_mm"] == pytest.approx(0.1)
@@ -36,23 +36,23 @@ def test_fits_and_threshold_are_the_planted_ones(tmp_path):
 
 def test_the_environments_can_have_other_names(tmp_path):
     path = planted(tmp_path / "t.csv", names=("clear", "plate"))
-    evaluation = evaluate(path, EvaluationOptions())
+    evaluation = evaluate_table(path, EvaluationOptions())
     (found,) = evaluation.values()["indicator"] or [None]
     assert found is None
     assert any("use --ideal and --noisy to name the two" in note for note in evaluation.notes)
-    (found,) = evaluate(path, EvaluationOptions(ideal="clear", noisy="plate")).values()["indicator"]
+    (found,) = evaluate_table(path, EvaluationOptions(ideal="clear", noisy="plate")).values()["indicator"]
     assert found["noisy"]["slope_mm"] == pytest.approx(9.0)
 
 
 def test_one_environment_gives_a_threshold_but_no_line(tmp_path):
     rows = rows_of(GRID, [[p + 0.1] for p in GRID], "reference", "ideal", np.linspace(0.01, 0.06, N).tolist())
-    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["indicator"]
+    (found,) = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["indicator"]
     assert found["threshold"] == pytest.approx(0.0575)
     assert found["noisy"] is None
 
 
 def test_a_sensor_without_indicator_has_no_analysis(tmp_path):
-    evaluation = evaluate(
+    evaluation = evaluate_table(
         write_csv(tmp_path / "t.csv", rows_of(GRID, [[p] for p in GRID])), EvaluationOptions()
     )
     assert evaluation.fits == []
@@ -65,7 +65,7 @@ def test_statistics_of_single_samples_are_exact(tmp_path):
     rows = rows_of(GRID, [[p] * 40 for p in GRID], "reference")
     for row, value in zip(rows, values.ravel().tolist(), strict=True):
         row["indicator"] = value
-    found = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0][
+    found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"][0][
         "indicator"
     ]
     expected = {"n_samples": values.size, "mean": values.mean(), "max": values.max(), "min": values.min()}
@@ -80,7 +80,7 @@ def test_single_samples_of_shuffled_sensors_and_environments_are_not_mixed_up(tm
         values = rng.uniform(k + 1.0, k + 1.5, N).tolist()
         rows += rows_of(GRID, [[p] for p in GRID], sensor, name, values)
     rng.shuffle(rows)
-    found = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"]
+    found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"]
     starts = {("ref2", "noisy"): 1.0, ("ref2", "ideal"): 2.0, ("ref1", "noisy"): 3.0, ("ref1", "ideal"): 4.0}
     for one in found:
         start, samples = starts[one["sensor"], one["environment"]], one["indicator"]["samples"]

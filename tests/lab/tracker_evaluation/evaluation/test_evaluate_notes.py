@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 def notes(path, rows, **options):
-    return evaluate(write_csv(path / "t.csv", rows), EvaluationOptions(**options)).notes
+    return evaluate_table(write_csv(path / "t.csv", rows), EvaluationOptions(**options)).notes
 
 
 def rotated(rows):
@@ -23,7 +23,7 @@ def rotated(rows):
 def test_a_note_suggests_register_for_a_tracker_with_another_frame(tmp_path):
     rows = rotated(random_rows(0)) + rotated(random_rows(1, sensor="reference"))
     (found,) = notes(tmp_path, rows)
-    fit = evaluate(tmp_path / "t.csv", EvaluationOptions(register=True)).results
+    fit = evaluate_table(tmp_path / "t.csv", EvaluationOptions(register=True)).results
     assert "add --register" in found
     assert ", and 1 more)" in found
     assert any(f"to {result.accuracy.rmse_mm:.2g} mm (" in found for result in fit)

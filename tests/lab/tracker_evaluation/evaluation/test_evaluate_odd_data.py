@@ -9,7 +9,7 @@ import pytest
 from em_tables import one, plain, refusal, write_csv
 from flexneedle.cli.main import main
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 def test_missing_columns_are_named_with_the_option_that_maps_them(tmp_path, rows):
@@ -42,7 +42,7 @@ def test_columns_with_other_names_are_mapped_and_all_others_ignored(tmp_path, ro
 )
 def test_an_invalid_mapping_is_refused(tmp_path, rows, columns, expected):
     with pytest.raises(InputError, match=expected):
-        evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(columns=columns))
+        evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(columns=columns))
 
 
 def test_a_field_that_is_not_a_number_is_named_by_line_and_column(tmp_path, rows):
@@ -129,7 +129,7 @@ def test_samples_without_a_position_are_ignored_and_counted(tmp_path, rows):
     for row in lost[:5]:  # all three of the first point, two of the second
         row |= {"x_mm": None, "y_mm": float("nan"), "z_mm": None}
     path = write_csv(tmp_path / "t.csv", lost)
-    evaluation = evaluate(path, EvaluationOptions())
+    evaluation = evaluate_table(path, EvaluationOptions())
     found = evaluation.values()["results"][0]
     assert (found["n_missing"], found["n_samples"], found["n_points"], found["n_unseen"]) == (5, 76, 26, 1)
     assert found["rmse_mm"] == pytest.approx(plain(rows[5:])["rmse_mm"])

@@ -8,7 +8,7 @@ import pytest
 from em_tables import GRID, random_rows, write_csv
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
     EvaluationOptions,
-    evaluate,
+    evaluate_table,
     write_evaluation,
 )
 
@@ -16,7 +16,7 @@ from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
 def points(path, rows, **options):
     """Return the rows of `points.csv` as dictionaries of text."""
     values = write_evaluation(
-        evaluate(write_csv(path / "t.csv", rows), EvaluationOptions(**options)), path, []
+        evaluate_table(write_csv(path / "t.csv", rows), EvaluationOptions(**options)), path, []
     )
     assert values["points"] == str(path / "points.csv")
     with (path / "points.csv").open(newline="", encoding="utf-8") as file:
@@ -46,7 +46,7 @@ def test_each_grid_point_of_each_sensor_and_environment_has_a_row(tmp_path):
 
 def test_the_rmse_is_that_of_the_errors_in_the_table_of_points(tmp_path):
     rows = random_rows(3, samples=4)
-    result = evaluate(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).results[0]
+    result = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).results[0]
     errors = np.array([float(row["error_mm"]) for row in points(tmp_path, rows)])
     assert np.sqrt((errors**2).mean()) == result.accuracy.rmse_mm  # all digits
 

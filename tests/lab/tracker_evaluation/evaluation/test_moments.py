@@ -9,7 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from em_tables import GRID, rows_of, write_csv
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate, read_table
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
+    EvaluationOptions,
+    evaluate_table,
+    read_table,
+)
 
 
 def written(path, rows, row_group_size=None):
@@ -45,7 +49,7 @@ def test_the_jitter_is_accurate_far_from_the_origin(tmp_path, offset, suffix):
             found = sqrt(grid.points.scatter[k, axis] / 60)
             assert found == pytest.approx(sqrt(squares[axis] / 60), abs=1e-9)
     jitter = sqrt(sum(sum(squares) for _, squares in exact) / 300)
-    (result,) = evaluate(path, EvaluationOptions()).results
+    (result,) = evaluate_table(path, EvaluationOptions()).results
     assert result.accuracy.jitter_mm == pytest.approx(jitter, abs=1e-9)
 
 
@@ -83,7 +87,7 @@ def test_the_order_of_rows_of_a_long_table_does_not_matter(tmp_path):
     values = []
     for order in (np.arange(count), rng.permutation(count)):
         pq.write_table(table.take(order), tmp_path / "t.parquet", row_group_size=40_000)
-        values.append(evaluate(tmp_path / "t.parquet", EvaluationOptions()).values()["results"])
+        values.append(evaluate_table(tmp_path / "t.parquet", EvaluationOptions()).values()["results"])
     assert flat(values[0]) == pytest.approx(flat(values[1]), rel=1e-9, abs=1e-9, nan_ok=True)
     squares = sum(((x[point == k] - x[point == k].mean(axis=0)) ** 2).sum() for k in range(27))
     assert values[0][0]["jitter_mm"] == pytest.approx(np.sqrt(squares / count), abs=1e-11)

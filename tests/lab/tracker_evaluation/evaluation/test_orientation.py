@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, rows_of, write_csv
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 def table(path, rotations):
@@ -23,7 +23,7 @@ def test_any_mean_orientation_and_any_small_scatter_are_measured(tmp_path):
     rng = np.random.default_rng(0)
     middle = Rotation.random(len(GRID), random_state=1)
     rotations = [one * Rotation.from_rotvec(rng.normal(0.0, 0.003, (40, 3))) for one in middle]
-    found = evaluate(table(tmp_path / "t.csv", rotations), EvaluationOptions()).values()["results"][0][
+    found = evaluate_table(table(tmp_path / "t.csv", rotations), EvaluationOptions()).values()["results"][0][
         "orientation"
     ]
     angle, axis = [], []
@@ -42,7 +42,7 @@ def test_quaternions_that_are_rounded_to_a_percent_are_scaled_to_length_1(tmp_pa
     rng = np.random.default_rng(2)
     rotations = [Rotation.from_rotvec(rng.normal(0.0, 0.003, (20, 3))) for _ in GRID]
     path = table(tmp_path / "t.csv", rotations)
-    before = evaluate(path, EvaluationOptions()).values()["results"][0]["orientation"]
+    before = evaluate_table(path, EvaluationOptions()).values()["results"][0]["orientation"]
     header, *lines = path.read_text().splitlines()
     names = header.split(",")
     scaled = []
@@ -52,6 +52,6 @@ def test_quaternions_that_are_rounded_to_a_percent_are_scaled_to_length_1(tmp_pa
             fields[names.index(name)] = repr(float(fields[names.index(name)]) * (1.004, 0.996)[k % 2])
         scaled.append(",".join(fields))
     path.write_text("\n".join([header, *scaled]) + "\n")
-    after = evaluate(path, EvaluationOptions()).values()["results"][0]["orientation"]
+    after = evaluate_table(path, EvaluationOptions()).values()["results"][0]["orientation"]
     assert after["jitter_deg"] == pytest.approx(before["jitter_deg"], rel=1e-9)
     assert after["axis_jitter_deg"] == pytest.approx(before["axis_jitter_deg"], rel=1e-9)

@@ -8,7 +8,7 @@ from em_tables import random_rows, write_csv
 from flexneedle import load_scenario
 from flexneedle.lab.tracker_evaluation.commands import check
 from flexneedle.lab.tracker_evaluation.evaluation import published
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 def errors(*values):
@@ -46,16 +46,18 @@ def test_check_and_monitor_use_the_papers_threshold():
 
 @pytest.mark.parametrize("name", ["ref", "ref1", "Ref12", "reference", "reference2", " REFERENCE "])
 def test_names_of_reference_sensors(name):
-    assert published.paper_sensor(name) == "reference"
+    assert published.find_paper_sensor(name) == "reference"
 
 
 @pytest.mark.parametrize("name", ["1", "0", "", "reflector", "ref1b", "xref", "tip2", "coil 7"])
 def test_no_other_name_is_one_of_the_papers_sensors(name):
-    assert published.paper_sensor(name) is None
-    assert published.paper_sensor("Tip") == "tip"
+    assert published.find_paper_sensor(name) is None
+    assert published.find_paper_sensor("Tip") == "tip"
 
 
 def test_a_sensor_named_1_is_not_compared_with_the_paper(tmp_path):
-    evaluation = evaluate(write_csv(tmp_path / "t.csv", random_rows(0, sensor="1")), EvaluationOptions())
+    evaluation = evaluate_table(
+        write_csv(tmp_path / "t.csv", random_rows(0, sensor="1")), EvaluationOptions()
+    )
     (result,), (found,) = (evaluation.values()[key] for key in ("results", "indicator"))
     assert (result["official"], result["paper"], found["paper"]) == (None, None, None)

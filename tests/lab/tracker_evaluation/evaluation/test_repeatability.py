@@ -5,7 +5,7 @@ import math
 import pytest
 
 from em_tables import rows_of, write_csv
-from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate
+from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 
 @pytest.fixture
@@ -14,7 +14,7 @@ def found(tmp_path):
     true, measured, off = ((0, 0, 0), (10, 0, 0), (30, 0, 0)), (0, 9, 27), (1, 2, 6)
     samples = [[(x, y, 0), (x, -y, 0)] for x, y in zip(measured, off, strict=True)]
     path = write_csv(tmp_path / "t.csv", rows_of(true, samples))
-    return evaluate(path, EvaluationOptions()).values()["results"][0]
+    return evaluate_table(path, EvaluationOptions()).values()["results"][0]
 
 
 def test_distances_measured_too_short_count_as_errors(found):

@@ -3,7 +3,7 @@
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.recording.grid import GRIDS, Stop, read_grid
+from flexneedle.lab.tracker_evaluation.recording.grid import GRIDS, GridStop, read_grid
 
 LATTICE = """\
 environment = "ideal"
@@ -31,7 +31,7 @@ def test_a_lattice_varies_z_fastest_and_is_completed_before_it_repeats(read):
     grid = read(LATTICE)
     assert grid.points == ((1, 2, 3), (1, 2, 33), (1, 22, 3), (1, 22, 33))
     stops = list(grid.stops())
-    assert stops[1] == Stop(1, 2, (1, 2, 33))
+    assert stops[1] == GridStop(1, 2, (1, 2, 33))
     assert [(stop.repeat, stop.point_id) for stop in stops] == [(r, p) for r in (1, 2) for p in (1, 2, 3, 4)]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
-from flexneedle.lab.tracker_evaluation.recording.record import EXTRA, Operator, open_session, record
+from flexneedle.lab.tracker_evaluation.recording.record import EXTRA, StageOperator, open_session, record_grid
 from flexneedle.phantom.tracking.table import COLUMNS
 from flexneedle.types import Frame, SensorReading
 from recordings import ALL, Stage, assert_complete, rows_of, run
@@ -56,7 +56,7 @@ def test_a_drifting_stage_is_reported_and_the_point_retried(grid, out):
         stage.speed = 0.0
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Operator(stage.move, report_and_stop))
+        record_grid(session, stage, stage, grid, StageOperator(stage.move, report_and_stop))
     (report,) = stage.reports
     assert report == (
         "no 6 good samples within 2 s: tip drifts by 0.50 mm from the first to the last third of samples, "
@@ -200,7 +200,7 @@ def test_a_rejected_mismatch_measures_the_point_again(grid, out):
         return False
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Operator(forget_the_second, print, accepts=correct))
+        record_grid(session, stage, stage, grid, StageOperator(forget_the_second, print, accepts=correct))
     assert stage.moves == ALL
     assert_complete(out)
     assert {row["x_mm"] for row in rows_of(out) if row["point_id"] == "2"} == {"110.0"}
@@ -215,7 +215,7 @@ def test_motion_is_checked_across_an_interruption(grid, out):
         stage.move(stop)
 
     with open_session(out, grid) as session, pytest.raises(KeyboardInterrupt):
-        record(session, stage, stage, grid, Operator(move_once, print))
+        record_grid(session, stage, stage, grid, StageOperator(move_once, print))
     again = Stage()
     again.move = lambda _: None  # the stage does not move
     with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2, the stage 10\.0 mm"):

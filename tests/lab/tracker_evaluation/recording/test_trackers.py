@@ -6,7 +6,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.devices.replay import Replay
 from flexneedle.lab.tracker_evaluation.recording import trackers
-from flexneedle.lab.tracker_evaluation.recording.trackers import clock_for, open_tracker
+from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n0.0,1,tip,1,2,3\n1.0,2,tip,1,2,3\n"
 
@@ -33,7 +33,7 @@ def test_a_file_may_have_an_at_sign_in_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(trackers, "WallClock", lambda speed: speed)
     path = tmp_path / "k@home.csv"
     path.write_text(RECORDING)
-    assert [clock_for(f"replay:{path}"), clock_for(f"replay:{path}@2")] == [1.0, 2.0]
+    assert [make_clock(f"replay:{path}"), make_clock(f"replay:{path}@2")] == [1.0, 2.0]
     for spec in (f"replay:{path}", f"replay:{path}@2"):
         with open_tracker(spec, WallClock()) as replay:
             assert len(replay.read()) == 1
@@ -43,7 +43,7 @@ def test_a_faster_replay_has_a_faster_clock(monkeypatch):
     now, slept = [100.0], []
     monkeypatch.setattr("flexneedle.lab.rig.devices.clock.monotonic", lambda: now[0])
     monkeypatch.setattr("flexneedle.lab.rig.devices.clock.sleep", slept.append)
-    clocks = [clock_for(spec) for spec in ("replay:a.csv@4", "replay:a.csv", "aurora:/dev/tty@4")]
+    clocks = [make_clock(spec) for spec in ("replay:a.csv@4", "replay:a.csv", "aurora:/dev/tty@4")]
     now[0] = 101.0
     assert [clock.now() for clock in clocks] == [4.0, 1.0, 1.0]
     for clock in clocks:
@@ -54,7 +54,7 @@ def test_a_faster_replay_has_a_faster_clock(monkeypatch):
 @pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
 def test_an_invalid_speed_is_refused(speed):
     with pytest.raises(InputError, match="the speed must be finite and above 0"):
-        clock_for(f"replay:a.csv@{speed}")
+        make_clock(f"replay:a.csv@{speed}")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from flexneedle.errors import InputError
 from flexneedle.lab.rig.devices.recording import read_frames
 from flexneedle.lab.rig.devices.replay import ENDED, Replay
-from flexneedle.lab.tracker_evaluation.recording.watch import check_field, field_checker, watch
+from flexneedle.lab.tracker_evaluation.recording.watch import check_field, make_field_check, watch_tracker
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
@@ -41,7 +41,7 @@ class Silent:
 
 def test_each_frame_is_shown_once_with_its_verdict():
     clock, snapshots = Clock(), []
-    assert watch(Replay(frames(60), clock), clock, snapshots.append) == 60
+    assert watch_tracker(Replay(frames(60), clock), clock, snapshots.append) == 60
     assert [snapshot.frame.number for snapshot in snapshots if snapshot.is_new] == list(range(60))
     verdicts = [snapshot.verdict for snapshot in snapshots if snapshot.is_new]
     assert all(verdict.startswith("field not known: observed for") for verdict in verdicts[:20])
@@ -50,7 +50,7 @@ def test_each_frame_is_shown_once_with_its_verdict():
 
 def test_a_custom_check_receives_the_history():
     clock, snapshots = Clock(), []
-    watch(
+    watch_tracker(
         Replay(frames(500), clock),
         clock,
         snapshots.append,
@@ -62,12 +62,12 @@ def test_a_custom_check_receives_the_history():
 
 def test_it_stops_after_the_given_seconds():
     clock, snapshots = Clock(), []
-    assert watch(Replay(frames(60), clock), clock, snapshots.append, seconds=0.5) == 20
+    assert watch_tracker(Replay(frames(60), clock), clock, snapshots.append, seconds=0.5) == 20
 
 
 def test_without_frames_the_status_is_shown_periodically():
     clock, snapshots = Clock(), []
-    assert watch(Silent(), clock, snapshots.append, seconds=3.0) == 0
+    assert watch_tracker(Silent(), clock, snapshots.append, seconds=3.0) == 0
     assert 4 <= len(snapshots) <= 6
     assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
 
@@ -75,13 +75,13 @@ def test_without_frames_the_status_is_shown_periodically():
 def test_it_stops_at_the_end_of_a_replay():
     clock, tracker = Clock(), Silent()
     tracker.status = ENDED
-    assert watch(tracker, clock, lambda _: None, seconds=3.0) == 0
+    assert watch_tracker(tracker, clock, lambda _: None, seconds=3.0) == 0
     assert clock.time == 0.0
 
 
 def test_what_is_recorded_can_be_replayed(tmp_path):
     path, clock = tmp_path / "kept.csv", Clock()
-    watch(
+    watch_tracker(
         Replay(frames(60, tip=SensorReading(None, status="missing")), clock),
         clock,
         lambda _: None,
@@ -97,7 +97,7 @@ def test_a_recording_overwrites_nothing(tmp_path):
     (tmp_path / "kept.csv").write_text("mine")
     clock = Clock()
     with pytest.raises(InputError, match="already exists"):
-        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
+        watch_tracker(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
     assert (tmp_path / "kept.csv").read_text() == "mine"
 
 
@@ -149,7 +149,7 @@ def test_the_verdict_follows_the_monitor_of_a_held_insertion():
     script += [(0.052, VISIBLE)]
     measured = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **readings_of(*one))]
     clock, snapshots, monitor = Clock(), [], Monitor(MonitorSettings())
-    watch(Replay(measured, clock), clock, snapshots.append)
+    watch_tracker(Replay(measured, clock), clock, snapshots.append)
     assert len(snapshots) == len(measured)
     for frame, snapshot in zip(measured, snapshots, strict=True):
         monitor, _ = monitor.check(
@@ -168,7 +168,7 @@ def test_the_verdict_follows_the_monitor_of_a_held_insertion():
 def test_a_recording_is_a_csv(tmp_path):
     clock = Clock()
     with pytest.raises(InputError, match="the output is CSV"):
-        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
+        watch_tracker(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
     assert not (tmp_path / "kept.parquet").exists()
 
 
@@ -181,7 +181,7 @@ def sensors(*names, indicator=0.02):
 
 def test_without_a_number_all_present_references_are_used():
     def check(frames):
-        return field_checker()(frames, False)[0]
+        return make_field_check()(frames, False)[0]
 
     assert check(sensors("tip", "ref1")) == VISIBLE
     assert "field distorted" in check(sensors("tip", "ref1", indicator=0.06))
@@ -191,5 +191,5 @@ def test_without_a_number_all_present_references_are_used():
 
 
 def test_the_number_of_references_can_be_set():
-    assert "field not known: 1 of 2" in field_checker(2)(sensors("tip", "ref1"), False)[0]
-    assert field_checker(0)(sensors("tip"), False) == (VISIBLE, False)
+    assert "field not known: 1 of 2" in make_field_check(2)(sensors("tip", "ref1"), False)[0]
+    assert make_field_check(0)(sensors("tip"), False) == (VISIBLE, False)

@@ -8,7 +8,7 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.lab.tables.rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.table import EMPTY, Table, open_table
+from flexneedle.lab.tables.table import EMPTY, SampleTable, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
@@ -46,7 +46,7 @@ def read_frames(path: Path) -> tuple[Frame, ...]:
         return _frames(table, [dict(zip(columns, row, strict=True)) for row in rows])
 
 
-def _frames(table: Table, rows: Sequence[_Row]) -> tuple[Frame, ...]:
+def _frames(table: SampleTable, rows: Sequence[_Row]) -> tuple[Frame, ...]:
     frames: list[Frame] = []
     numbered = enumerate(rows, 1)
     for (time, number), group in groupby(

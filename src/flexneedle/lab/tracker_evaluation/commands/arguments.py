@@ -7,7 +7,7 @@ from collections.abc import Callable
 from math import inf, isfinite
 
 
-def within(
+def make_number_type(
     minimum: float, maximum: float = inf, kind: type[float] | type[int] = float
 ) -> Callable[[str], float]:
     """Return the argparse type of a finite number from `minimum` to `maximum`."""
@@ -23,7 +23,7 @@ def within(
     return number
 
 
-def name(text: str) -> str:
+def parse_name(text: str) -> str:
     """Return a name without leading and trailing blanks."""
     if not text.strip():
         raise argparse.ArgumentTypeError("must not be blank")
@@ -53,7 +53,7 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     for column in ("sensor", "environment"):
         parser.add_argument(
             f"--{column}",
-            type=name,
+            type=parse_name,
             metavar="NAME",
             help=f"{column} of all rows, for a table without a column {column}",
         )

@@ -10,7 +10,12 @@ from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
 from flexneedle.cli.values import positive
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
-from flexneedle.lab.tracker_evaluation.commands.tables import number, print_notes, print_rows, span
+from flexneedle.lab.tracker_evaluation.commands.tables import (
+    format_interval,
+    format_number,
+    print_notes,
+    print_rows,
+)
 
 if TYPE_CHECKING:
     from flexneedle.lab.tracker_evaluation.evaluation.check import PowerCheck, PowerComparison
@@ -70,7 +75,7 @@ def _check(args: argparse.Namespace) -> int:
 
 def _print(found: PowerCheck) -> None:
     rows = [row for sensor in found.sensors for row in _rows(sensor)]
-    rows.append((" paper, power on", number(found.paper, ".4f"), *[""] * 5))
+    rows.append((" paper, power on", format_number(found.paper, ".4f"), *[""] * 5))
     heads = ("indicator", "mean", "95 %", "max", "points", "samples", "samples above")
     print_rows("Indicator with power off and on (means at grid points)", heads, rows)
     for sensor in found.sensors:
@@ -82,7 +87,7 @@ def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
     return [
         (
             f"{sensor.sensor}, power {name}",
-            *(number(value, ".4f") for value in (level.mean, level.p95, level.max)),
+            *(format_number(value, ".4f") for value in (level.mean, level.p95, level.max)),
             f"{level.n_points}",
             f"{level.samples.n_samples}",
             f"{100.0 * level.samples.above:.2f} %",
@@ -94,11 +99,13 @@ def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
 def _verdict(sensor: PowerComparison) -> str:
     interval, on = sensor.difference_interval, sensor.on
     certainty = (
-        f"95 % interval {span(interval, '.4f')}" if interval else "too few grid points for an interval"
+        f"95 % interval {format_interval(interval, '.4f')}"
+        if interval
+        else "too few grid points for an interval"
     )
     side = "above" if sensor.above else "not above"
     return (
-        f"{sensor.sensor}: power adds {number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
+        f"{sensor.sensor}: power adds {format_number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
         f"with power on, {side} the threshold of {sensor.threshold:g} "
         f"({sensor.points_above} of {on.n_points} grid points above)"
     )

@@ -61,16 +61,16 @@ def _evaluate(args: argparse.Namespace) -> int:
     from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
         RESULT_FILES,
         EvaluationOptions,
-        evaluate,
+        evaluate_table,
         write_evaluation,
     )
     from flexneedle.lab.tracker_evaluation.figures.evaluation import draw_evaluation
-    from flexneedle.lab.tracker_evaluation.results_folder import results_folder
+    from flexneedle.lab.tracker_evaluation.results_folder import make_results_folder
 
     names = ("register", "unit", "bin_mm", "limit_mm", "ideal", "noisy", "sensor", "environment")
     options = EvaluationOptions(tuple(args.columns), **{name: getattr(args, name) for name in names})
-    evaluation = evaluate(args.data, options)
-    folder = results_folder(args.out, args.data.stem, RESULT_FILES)
+    evaluation = evaluate_table(args.data, options)
+    folder = make_results_folder(args.out, args.data.stem, RESULT_FILES)
     values = write_evaluation(evaluation, folder, draw_evaluation(evaluation, folder))
     if args.json:
         print_json(values)

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
-from flexneedle.lab.tracker_evaluation.commands.arguments import within
+from flexneedle.lab.tracker_evaluation.commands.arguments import make_number_type
 
 if TYPE_CHECKING:
-    from flexneedle.lab.tracker_evaluation.recording.grid import StageGrid, Stop
-    from flexneedle.lab.tracker_evaluation.recording.record import Operator
+    from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
+    from flexneedle.lab.tracker_evaluation.recording.record import StageOperator
 
 
 def add_parser(commands: Commands) -> None:
@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--dwell",
-        type=within(0),
+        type=make_number_type(0),
         metavar="S",
         help="time for a motorised stage to reach each point (default: prompt for Enter)",
     )
@@ -56,32 +56,36 @@ def add_parser(commands: Commands) -> None:
 
 def _record(args: argparse.Namespace) -> int:
     from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
-    from flexneedle.lab.tracker_evaluation.recording.record import open_session, record
-    from flexneedle.lab.tracker_evaluation.recording.trackers import clock_for, open_tracker
+    from flexneedle.lab.tracker_evaluation.recording.record import open_session, record_grid
+    from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
 
-    grid, clock = read_grid(args.grid), clock_for(args.tracker)
+    grid, clock = read_grid(args.grid), make_clock(args.tracker)
     with open_session(args.out, grid) as session:
         if session.remaining:
             if session.done:
                 _print(f"{args.out}: resuming after {session.done} recorded points")
             with open_tracker(args.tracker, clock) as tracker:
-                record(session, tracker, clock, grid, _operator(grid, args.dwell, args.force, clock.wait))
+                record_grid(
+                    session, tracker, clock, grid, _operator(grid, args.dwell, args.force, clock.wait)
+                )
         else:
             _print(f"{args.out}: complete, {session.done} points")
     print(args.out)
     return 0
 
 
-def _operator(grid: StageGrid, dwell: float | None, force: bool, wait: Callable[[float], None]) -> Operator:
+def _operator(
+    grid: StageGrid, dwell: float | None, force: bool, wait: Callable[[float], None]
+) -> StageOperator:
     """Return the operator: a person who presses Enter, or a wait. Mismatches are confirmed only at a terminal."""
-    from flexneedle.lab.tracker_evaluation.recording.record import Operator
+    from flexneedle.lab.tracker_evaluation.recording.record import StageOperator
 
-    def announce(stop: Stop) -> None:
+    def announce(stop: GridStop) -> None:
         _print(f"{_progress(grid, stop)}: {_target(stop)}")
         wait(dwell or 0.0)
 
     motorised = dwell is not None
-    operator = Operator(
+    operator = StageOperator(
         announce if motorised else lambda stop: _ask(grid, stop), _print, retries=not motorised
     )
     if force:
@@ -89,18 +93,18 @@ def _operator(grid: StageGrid, dwell: float | None, force: bool, wait: Callable[
     return replace(operator, accepts=_confirm) if not motorised and sys.stdin.isatty() else operator
 
 
-def _progress(grid: StageGrid, stop: Stop) -> str:
+def _progress(grid: StageGrid, stop: GridStop) -> str:
     return f"point {stop.point_id} of {len(grid.points)}, repeat {stop.repeat} of {grid.file.repeats}"
 
 
-def _target(stop: Stop) -> str:
+def _target(stop: GridStop) -> str:
     x, y, z = stop.position
     return (
         f"stage at {x:g}, {y:g}, {z:g} mm"  # read by scripts that move a stage, see docs/tracking/aurora.md
     )
 
 
-def _ask(grid: StageGrid, stop: Stop) -> None:
+def _ask(grid: StageGrid, stop: GridStop) -> None:
     _answer(f"{_progress(grid, stop)}: press Enter with the {_target(stop)}:")
 
 

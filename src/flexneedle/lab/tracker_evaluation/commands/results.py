@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from flexneedle.lab.tracker_evaluation.commands.tables import number, print_notes, print_rows, span
+from flexneedle.lab.tracker_evaluation.commands.tables import (
+    format_interval,
+    format_number,
+    print_notes,
+    print_rows,
+)
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, IndicatorSummary
@@ -46,13 +51,13 @@ def _print_tables(evaluation: Evaluation) -> None:
 def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     found, values = result.accuracy, result.values()
     counts = f"{found.n_points}", f"{found.n_samples}"
-    yield (result.grid.title, *(number(values[key]) for key in _ERRORS), *counts)
+    yield (result.grid.title, *(format_number(values[key]) for key in _ERRORS), *counts)
     if any(found.intervals.values()):
-        intervals = (span(found.intervals.get(key)) for key in _ERRORS)
+        intervals = (format_interval(found.intervals.get(key)) for key in _ERRORS)
         yield (" 95 % interval", *intervals, "", "")
     for name, key in (("paper", "paper"), ("manufacturer", "official")):
         if values[key]:
-            yield (f" {name}", *(number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
+            yield (f" {name}", *(format_number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
 
 
 def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
@@ -62,17 +67,17 @@ def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     yield (result.grid.title, *_levels(found), f"{found.n_points}")
     yield (" single samples", *_levels(found.samples), f"{found.samples.n_samples}")
     paper = published.INDICATOR.get(result.grid.environment)
-    if paper and published.paper_sensor(result.grid.sensor) == REFERENCE:
-        yield (" paper", *(number(paper.get(key), ".4f") for key in _INDICATOR), "")
+    if paper and published.find_paper_sensor(result.grid.sensor) == REFERENCE:
+        yield (" paper", *(format_number(paper.get(key), ".4f") for key in _INDICATOR), "")
 
 
 def _levels(found: IndicatorSummary | IndicatorSamples) -> list[str]:
-    return [number(getattr(found, key, None), ".4f") for key in _INDICATOR]
+    return [format_number(getattr(found, key, None), ".4f") for key in _INDICATOR]
 
 
 def _fit_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the fits, with the paper's values for its sensor and environments."""
-    as_in_paper = published.paper_sensor(found.sensor) == REFERENCE
+    as_in_paper = published.find_paper_sensor(found.sensor) == REFERENCE
     as_in_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
     fits = published.FITS
     papers = {
@@ -92,30 +97,39 @@ def _found_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[
         constant, intervals = found.ideal, found.ideal.intervals
         yield (
             f"{name}, {ideal}: error (mm)",
-            f"{number(constant.mean_mm)} ± {number(constant.sd_mm)}",
-            span(intervals["mean_mm"]),
+            f"{format_number(constant.mean_mm)} ± {format_number(constant.sd_mm)}",
+            format_interval(intervals["mean_mm"]),
         )
     if found.noisy:
         line, intervals = found.noisy, found.noisy.intervals
-        yield f"{name}, {noisy}: slope (mm)", number(line.slope_mm), span(intervals["slope_mm"])
-        yield f"{name}, {noisy}: intercept (mm)", number(line.intercept_mm), span(intervals["intercept_mm"])
-        yield f"{name}, {noisy}: residual sd of the line (mm)", number(line.scatter_mm), ""
+        for part in ("slope", "intercept"):
+            value, interval = getattr(line, f"{part}_mm"), intervals[f"{part}_mm"]
+            yield f"{name}, {noisy}: {part} (mm)", format_number(value), format_interval(interval)
+        yield f"{name}, {noisy}: residual sd of the line (mm)", format_number(line.scatter_mm), ""
     if found.threshold is not None:
-        yield f"{name}: threshold", number(found.threshold, ".4f"), span(found.threshold_interval, ".4f")
+        yield (
+            f"{name}: threshold",
+            format_number(found.threshold, ".4f"),
+            format_interval(found.threshold_interval, ".4f"),
+        )
 
 
 def _details(results: list[SensorResult]) -> Iterator[tuple[str, ...]]:
     def row(name: str, text: Callable[[SensorResult], str]) -> tuple[str, ...]:
         return (name, *map(text, results))
 
-    yield row("mean error ± sd", lambda r: f"{number(r.accuracy.mean_mm)} ± {number(r.accuracy.sd_mm)}")
-    yield row("distance error, rms", lambda r: number(r.relative_distance.rms_mm))
     yield row(
-        " 95 %, max", lambda r: f"{number(r.relative_distance.p95_mm)}, {number(r.relative_distance.max_mm)}"
+        "mean error ± sd",
+        lambda r: f"{format_number(r.accuracy.mean_mm)} ± {format_number(r.accuracy.sd_mm)}",
     )
-    yield row(" rms, closest neighbours", lambda r: number(r.relative_distance.neighbours_rms_mm))
-    yield row("repeatability, sd", lambda r: number(r.repeatability.sd_mm))
-    yield row(" at the worst point", lambda r: number(r.repeatability.worst_mm))
+    yield row("distance error, rms", lambda r: format_number(r.relative_distance.rms_mm))
+    yield row(
+        " 95 %, max",
+        lambda r: f"{format_number(r.relative_distance.p95_mm)}, {format_number(r.relative_distance.max_mm)}",
+    )
+    yield row(" rms, closest neighbours", lambda r: format_number(r.relative_distance.neighbours_rms_mm))
+    yield row("repeatability, sd", lambda r: format_number(r.repeatability.sd_mm))
+    yield row(" at the worst point", lambda r: format_number(r.repeatability.worst_mm))
     if any(r.orientation for r in results):
         yield row("orientation jitter, rms (°)", lambda r: _part(r.orientation, "jitter_deg"))
         yield row(" of the sensor axis (°)", lambda r: _part(r.orientation, "axis_jitter_deg"))
@@ -127,8 +141,8 @@ def _details(results: list[SensorResult]) -> Iterator[tuple[str, ...]]:
         yield row(" rotation angle (°)", lambda r: _part(r.registration, "angle_deg"))
         for k, axis in enumerate("xyz"):
             shifts = [r.registration.translation_mm[k] if r.registration else None for r in results]
-            yield (f" translation {axis}", *map(number, shifts))
+            yield (f" translation {axis}", *map(format_number, shifts))
 
 
 def _part(found: object, name: str, form: str = ".3f") -> str:
-    return number(getattr(found, name, None), form)
+    return format_number(getattr(found, name, None), form)

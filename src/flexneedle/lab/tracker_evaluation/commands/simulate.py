@@ -8,7 +8,7 @@ from pathlib import Path
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import add_seed
 from flexneedle.cli.values import seed
-from flexneedle.lab.tracker_evaluation.commands.arguments import within
+from flexneedle.lab.tracker_evaluation.commands.arguments import make_number_type
 
 
 def add_parser(commands: Commands) -> None:
@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
     for name, minimum, maximum, default, meaning in counts:
         parser.add_argument(
             f"--{name}",
-            type=within(minimum, maximum, int),
+            type=make_number_type(minimum, maximum, int),
             default=default,
             metavar="N",
             help=f"{meaning} (default: {default})",
@@ -62,13 +62,13 @@ def add_parser(commands: Commands) -> None:
 def _simulate(args: argparse.Namespace) -> int:
     from flexneedle.arguments import require_extra
     from flexneedle.lab.tables.write import check_new, write_table
-    from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure
+    from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure_grid
     from flexneedle.scenario.files import load_environment
 
     require_extra("em", "duckdb")
     check_new(args.out)
     experiment = Experiment(args.seed, args.field_seed, args.points, args.samples, args.repeats)
-    table = measure([load_environment(source) for source in args.environment], experiment)
+    table = measure_grid([load_environment(source) for source in args.environment], experiment)
     write_table(table, args.out)
     print(args.out)
     return 0

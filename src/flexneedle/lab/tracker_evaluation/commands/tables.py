@@ -9,17 +9,21 @@ from math import isfinite
 _WIDEST = 200
 
 
-def number(value: float | None, form: str = ".3f") -> str:
+def format_number(value: float | None, form: str = ".3f") -> str:
     """Return a number as text, – if it is unknown."""
     return "–" if value is None or not isfinite(value) else f"{value:{form}}".replace("-", "−")
 
 
-def span(interval: tuple[float, float] | None, form: str = ".3f") -> str:
+def format_interval(interval: tuple[float, float] | None, form: str = ".3f") -> str:
     """Return an interval as text, empty if there is none."""
     if interval is None:
         return ""
     low, high = interval
-    return f"{number(low, form)}–{number(high, form)}" if isfinite(high) else f"from {number(low, form)}"
+    return (
+        f"{format_number(low, form)}–{format_number(high, form)}"
+        if isfinite(high)
+        else f"from {format_number(low, form)}"
+    )
 
 
 def print_notes(notes: Iterable[str]) -> None:

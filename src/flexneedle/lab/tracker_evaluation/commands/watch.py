@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from flexneedle.lab.tracker_evaluation.recording.watch import Snapshot
+    from flexneedle.lab.tracker_evaluation.recording.watch import TrackerSnapshot
     from flexneedle.types import Frame, SensorReading
 
 
@@ -58,21 +58,21 @@ def add_parser(commands: Commands) -> None:
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.recording.trackers import clock_for, open_tracker
-    from flexneedle.lab.tracker_evaluation.recording.watch import field_checker, watch
+    from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
+    from flexneedle.lab.tracker_evaluation.recording.watch import make_field_check, watch_tracker
 
-    clock = clock_for(args.tracker)
+    clock = make_clock(args.tracker)
     try:
         with ExitStack() as stack:
             tracker = stack.enter_context(open_tracker(args.tracker, clock))
-            check = field_checker(args.references)
-            watch(tracker, clock, _display(stack, args.json), args.seconds, check, args.record)
+            check = make_field_check(args.references)
+            watch_tracker(tracker, clock, _display(stack, args.json), args.seconds, check, args.record)
     except KeyboardInterrupt:
         print(file=sys.stderr)  # the usual way to stop
     return 0
 
 
-def _display(stack: ExitStack, as_json: bool) -> Callable[[Snapshot], None]:
+def _display(stack: ExitStack, as_json: bool) -> Callable[[TrackerSnapshot], None]:
     """Return the function that shows a snapshot: as JSON, in a live table, or as a line."""
     if as_json:
         return _print_json
@@ -83,7 +83,7 @@ def _display(stack: ExitStack, as_json: bool) -> Callable[[Snapshot], None]:
     return lines.show
 
 
-def _print_json(snapshot: Snapshot) -> None:
+def _print_json(snapshot: TrackerSnapshot) -> None:
     values: dict[str, Any] = {"time_s": snapshot.time, "frame_number": None, "status": snapshot.status}
     values |= {"verdict": snapshot.verdict, "sensors": {}}
     if snapshot.frame is not None and snapshot.is_new:
@@ -106,10 +106,10 @@ class _Lines:
 
     def __init__(self) -> None:
         self._due = -inf
-        self._last: Snapshot | None = None
-        self._printed: Snapshot | None = None
+        self._last: TrackerSnapshot | None = None
+        self._printed: TrackerSnapshot | None = None
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: TrackerSnapshot) -> None:
         """Print a snapshot if it is due."""
         self._last = snapshot
         if snapshot.time >= self._due or self._changed(snapshot):
@@ -121,18 +121,18 @@ class _Lines:
         if self._last is not None and self._last is not self._printed:
             self._print(self._last)
 
-    def _changed(self, snapshot: Snapshot) -> bool:
+    def _changed(self, snapshot: TrackerSnapshot) -> bool:
         from flexneedle.types import VISIBLE
 
         before = self._printed
         return before is not None and (snapshot.verdict == VISIBLE) != (before.verdict == VISIBLE)
 
-    def _print(self, snapshot: Snapshot) -> None:
+    def _print(self, snapshot: TrackerSnapshot) -> None:
         self._printed = snapshot
         print(_line(snapshot), flush=True)
 
 
-def _line(snapshot: Snapshot) -> str:
+def _line(snapshot: TrackerSnapshot) -> str:
     if snapshot.frame is None or not snapshot.is_new:
         return f"{snapshot.time:8.2f} s  verdict: {snapshot.verdict}"
     time, sensors = snapshot.frame.time, "  ".join(_cells(snapshot.frame))
@@ -152,14 +152,14 @@ def _cells(frame: Frame) -> Iterator[str]:
         yield f"{name}{position}" + ("" if reading.indicator is None else f" I {reading.indicator:.4f}")
 
 
-def _live_table(stack: ExitStack) -> Callable[[Snapshot], None]:
+def _live_table(stack: ExitStack) -> Callable[[TrackerSnapshot], None]:
     from rich.live import Live
 
     live = stack.enter_context(Live(auto_refresh=True, refresh_per_second=10))
     return lambda snapshot: live.update(_table(snapshot))
 
 
-def _table(snapshot: Snapshot) -> Table:
+def _table(snapshot: TrackerSnapshot) -> Table:
     from rich.table import Table
     from rich.text import Text
 

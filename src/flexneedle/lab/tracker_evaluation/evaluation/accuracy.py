@@ -70,14 +70,14 @@ class RigidFit:
     n_points: int
 
 
-def error_vectors(moments: Moments) -> Floats:
+def compute_error_vectors(moments: Moments) -> Floats:
     """Return mean measured minus true position (n, 3), mm; NaN without samples."""
     return moments.position - moments.true
 
 
-def errors(moments: Moments) -> Floats:
+def compute_errors(moments: Moments) -> Floats:
     """Return err_i (n,), mm."""
-    lengths: Floats = np.linalg.norm(error_vectors(moments), axis=1)
+    lengths: Floats = np.linalg.norm(compute_error_vectors(moments), axis=1)
     return lengths
 
 
@@ -86,7 +86,7 @@ def root_mean_square(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else nan
 
 
-def jitter(moments: Moments) -> float:
+def compute_jitter(moments: Moments) -> float:
     """Return the jitter over all samples (mm), NaN if no point has two."""
     if moments.count.max(initial=0) < 2:
         return nan
@@ -98,8 +98,8 @@ def compute_accuracy(grid: MeasuredGrid) -> Accuracy:
     measured = grid.measured
     if not len(measured):
         raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: all samples are missing")
-    error, count = errors(measured), measured.count
-    bias = error_vectors(measured).mean(axis=0).tolist()
+    error, count = compute_errors(measured), measured.count
+    bias = compute_error_vectors(measured).mean(axis=0).tolist()
     return Accuracy(
         n_points=len(measured),
         n_unseen=len(grid.points) - len(measured),
@@ -111,7 +111,7 @@ def compute_accuracy(grid: MeasuredGrid) -> Accuracy:
         rmse_mm=root_mean_square(error),
         p95_mm=float(np.quantile(error, P95)),
         max_mm=float(error.max()),
-        jitter_mm=jitter(measured),
+        jitter_mm=compute_jitter(measured),
         mean_mm=float(error.mean()),
         sd_mm=float(error.std(ddof=1)) if len(error) > 1 else nan,
         bias_mm=(bias[0], bias[1], bias[2]),

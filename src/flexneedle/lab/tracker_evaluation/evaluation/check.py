@@ -15,7 +15,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, read_table
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import indicator_means
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import average_indicator
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import Interval, bootstrap
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples, MeasuredGrid
 from flexneedle.lab.tracker_evaluation.evaluation.notes import find_differing_points, find_missing_sensors
@@ -104,7 +104,7 @@ def check_power(data: Path, off: str, on: str, threshold: float, options: Evalua
 
 def compare_power(off: MeasuredGrid, on: MeasuredGrid, threshold: float) -> PowerComparison:
     """Return the comparison of two grids of one sensor, both with an indicator."""
-    low, high = indicator_means(off)[0], indicator_means(on)[0]
+    low, high = average_indicator(off)[0], average_indicator(on)[0]
     paired = _names(off) == _names(on)
     return PowerComparison(
         sensor=on.sensor,
@@ -140,7 +140,7 @@ def _difference(low: Floats, high: Floats, axis: int) -> Floats:
 
 
 def _level(grid: MeasuredGrid) -> PowerLevel:
-    values = indicator_means(grid)[0]
+    values = average_indicator(grid)[0]
     if grid.samples is None:
         raise ValueError(f"{grid.title}: no indicator")
     return PowerLevel(

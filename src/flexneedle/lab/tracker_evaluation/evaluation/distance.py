@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95, errors, jitter, root_mean_square
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
+    P95,
+    compute_errors,
+    compute_jitter,
+    root_mean_square,
+)
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 
@@ -71,7 +76,7 @@ def bin_errors(grid: MeasuredGrid, bin_mm: float, limit_mm: float | None) -> Dis
 
 def _bin(grid: MeasuredGrid, number: int, bin_mm: float) -> DistanceBin:
     cells = grid.cells[(grid.cells.bins == number) & (grid.cells.count > 0)]
-    error, count = errors(cells), cells.count
+    error, count = compute_errors(cells), cells.count
     return DistanceBin(
         from_mm=number * bin_mm,
         to_mm=(number + 1) * bin_mm,
@@ -81,5 +86,5 @@ def _bin(grid: MeasuredGrid, number: int, bin_mm: float) -> DistanceBin:
         rmse_mm=root_mean_square(error),
         p95_mm=float(np.quantile(error, P95)),
         max_mm=float(error.max()),
-        jitter_mm=jitter(cells),
+        jitter_mm=compute_jitter(cells),
     )

@@ -25,7 +25,7 @@ from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
 )
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid, read_grids
 from flexneedle.lab.tracker_evaluation.evaluation.notes import find_notes
-from flexneedle.lab.tracker_evaluation.evaluation.points import POINTS_FILE, points_text
+from flexneedle.lab.tracker_evaluation.evaluation.points import POINTS_FILE, format_points
 from flexneedle.lab.tracker_evaluation.evaluation.repeatability import (
     Orientation,
     RelativeDistance,
@@ -83,7 +83,7 @@ class SensorResult:
 
     def values(self) -> dict[str, Any]:
         """Return the result as plain values; lengths in mm, full precision."""
-        sensor = published.paper_sensor(self.grid.sensor) or ""
+        sensor = published.find_paper_sensor(self.grid.sensor) or ""
         return {
             "sensor": self.grid.sensor,
             "environment": self.grid.environment,
@@ -124,7 +124,7 @@ class Evaluation:
         }
 
 
-def evaluate(data: Path, options: EvaluationOptions) -> Evaluation:
+def evaluate_table(data: Path, options: EvaluationOptions) -> Evaluation:
     """Return the evaluation of a table. Raises InputError for an invalid table."""
     grids, rows = read_table(data, options)
     try:
@@ -158,7 +158,7 @@ def read_table(
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
     """Write `points.csv` and `evaluation.json` and return the values of the latter."""
     points = folder / POINTS_FILE
-    replace_file(points, points_text([result.grid for result in evaluation.results]).encode())
+    replace_file(points, format_points([result.grid for result in evaluation.results]).encode())
     files = {"folder": str(folder), "points": str(points), "figures": [str(path) for path in figures]}
     values = {**evaluation.values(), **files}
     replace_file(folder / _RESULT_FILE, to_text(values).encode())
@@ -175,7 +175,7 @@ def _check_names(grids: Sequence[MeasuredGrid], options: EvaluationOptions) -> N
 
 def _result(grid: MeasuredGrid, options: EvaluationOptions) -> SensorResult:
     grid, registration = register_grid(grid) if options.register else (grid, None)
-    official = published.OFFICIAL.get(published.paper_sensor(grid.sensor) or "", {})
+    official = published.OFFICIAL.get(published.find_paper_sensor(grid.sensor) or "", {})
     limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
     return SensorResult(
         grid,
@@ -208,6 +208,6 @@ def _fit_values(found: IndicatorFits, options: EvaluationOptions) -> dict[str, A
         "ideal_environment": ideal,
         "noisy_environment": noisy,
         "paper": {"threshold": published.THRESHOLD, **published.FITS, "indicator": published.INDICATOR}
-        if published.paper_sensor(found.sensor) == REFERENCE
+        if published.find_paper_sensor(found.sensor) == REFERENCE
         else None,
     }

@@ -6,7 +6,7 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95, errors
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95, compute_errors
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import (
     Interval,
     bootstrap,
@@ -72,15 +72,15 @@ class IndicatorFits:
     threshold_interval: Interval
 
 
-def indicator_means(grid: MeasuredGrid) -> tuple[Floats, Floats]:
+def average_indicator(grid: MeasuredGrid) -> tuple[Floats, Floats]:
     """Return mean indicator and error (mm) (n,) of the grid points with an indicator."""
     known = grid.points[grid.points.indicators > 0]
-    return known.indicator, errors(known)
+    return known.indicator, compute_errors(known)
 
 
 def summarize_indicator(grid: MeasuredGrid) -> IndicatorSummary | None:
     """Return the summary of the indicator, None if the sensor has none."""
-    values, _ = indicator_means(grid)
+    values, _ = average_indicator(grid)
     if grid.samples is None:
         return None
     return IndicatorSummary(
@@ -103,8 +103,8 @@ def fit_indicator(
     sensor: str, ideal: MeasuredGrid | None, noisy: MeasuredGrid | None
 ) -> IndicatorFits | None:
     """Return the fits to the errors of a sensor in one or two environments, None without any indicator."""
-    low, low_error = indicator_means(ideal) if ideal else (np.empty(0), np.empty(0))
-    high, high_error = indicator_means(noisy) if noisy else (np.empty(0), np.empty(0))
+    low, low_error = average_indicator(ideal) if ideal else (np.empty(0), np.empty(0))
+    high, high_error = average_indicator(noisy) if noisy else (np.empty(0), np.empty(0))
     if not len(low) and not len(high):
         return None
     return IndicatorFits(

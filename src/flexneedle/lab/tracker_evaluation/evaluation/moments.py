@@ -22,7 +22,7 @@ from flexneedle.lab.tables.rules import (
     TRUE_POSITIONS,
     require_text,
 )
-from flexneedle.lab.tables.table import EMPTY, Rule, Table, first_violation
+from flexneedle.lab.tables.table import EMPTY, Rule, SampleTable, first_violation
 from flexneedle.phantom.tracking.table import REFERENCE, TIP
 
 Floats = NDArray[np.float64]
@@ -137,7 +137,7 @@ class MeasuredGrid:
 _Arrays = dict[str, NDArray[Any]]
 
 
-def read_grids(table: Table, bin_mm: float, threshold: float) -> tuple[list[MeasuredGrid], int]:
+def read_grids(table: SampleTable, bin_mm: float, threshold: float) -> tuple[list[MeasuredGrid], int]:
     """Return a grid for each sensor and environment, and the number of rows.
 
     bin_mm: width of the distance bins; threshold: of the indicator. Raises InputError for rows that violate a rule, or
@@ -159,13 +159,13 @@ def read_grids(table: Table, bin_mm: float, threshold: float) -> tuple[list[Meas
     return [_grid(cells, indicators, sensor, environment) for sensor, environment in pairs], rows
 
 
-def _choose_rules(table: Table) -> tuple[Rule, ...]:
+def _choose_rules(table: SampleTable) -> tuple[Rule, ...]:
     optional = {"indicator": INDICATORS, "distance_mm": DISTANCES, "qw": ORIENTATIONS}
     others = (rule for column, rules in optional.items() if column in table.columns for rule in rules)
     return (*TRUE_POSITIONS, *POSITIONS, *others)
 
 
-def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
+def _cells_query(table: SampleTable, rules: tuple[Rule, ...]) -> str:
     """Return the SQL for the moments by grid point (pooled = 1) and by grid point and distance bin (pooled = 0).
 
     Indicator, distance and orientation of samples without a position are ignored.
@@ -192,7 +192,7 @@ def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
     """
 
 
-def _refuse_moved(table: Table, cells: _Arrays) -> None:
+def _refuse_moved(table: SampleTable, cells: _Arrays) -> None:
     """Raise InputError for the first row of a grid point whose true position differs from the first one."""
     moved = np.max([cells[f"moved_{a}"] for a in _AXES], axis=0)
     if moved.max() <= SAME_POSITION_MM:

@@ -4,7 +4,11 @@ from collections.abc import Iterator, Sequence
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.registration import misfit
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import errors, register_grid, root_mean_square
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
+    compute_errors,
+    register_grid,
+    root_mean_square,
+)
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 _UNREGISTERED = 5.0
@@ -89,7 +93,7 @@ def _fit(grid: MeasuredGrid) -> tuple[float, float] | None:
         residual = register_grid(grid)[1].residual_mm
     except InputError:  # collinear points: no fit to compare with
         return None
-    raw = root_mean_square(errors(measured))
+    raw = root_mean_square(compute_errors(measured))
     return (raw, residual) if raw > _UNREGISTERED * residual else None
 
 

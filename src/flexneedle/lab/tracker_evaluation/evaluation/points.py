@@ -7,7 +7,7 @@ from math import isfinite
 
 import numpy as np
 
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import error_vectors, errors
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import compute_error_vectors, compute_errors
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 POINTS_FILE = "points.csv"
@@ -20,7 +20,7 @@ _COLUMNS = (
 )
 
 
-def points_text(grids: Iterable[MeasuredGrid]) -> str:
+def format_points(grids: Iterable[MeasuredGrid]) -> str:
     """Return CSV with one row per grid point, with all digits; unknown values are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -35,10 +35,10 @@ def _rows(grid: MeasuredGrid) -> Iterator[list[str]]:
     several = np.where(points.count > 1, points.count, np.nan)
     jitter = np.sqrt(points.scatter.sum(axis=1) / several)
     columns = [
-        *np.hstack([points.true, points.position, error_vectors(points)]).T.tolist(),
+        *np.hstack([points.true, points.position, compute_error_vectors(points)]).T.tolist(),
         *(
             column.tolist()
-            for column in (errors(points), points.count, points.missing, jitter, points.indicator)
+            for column in (compute_errors(points), points.count, points.missing, jitter, points.indicator)
         ),
     ]
     for name, *values in zip(grid.names, *columns, strict=True):

@@ -37,7 +37,7 @@ POWERED = 0.04
 _REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
 
 
-def paper_sensor(sensor: str) -> str | None:
+def find_paper_sensor(sensor: str) -> str | None:
     """Return the paper's sensor of this name: the tip, a reference (ref, ref1, …), or None."""
     name = sensor.strip().lower()
     if name == TIP:

@@ -28,7 +28,7 @@ class DistanceLine:
     note: str
 
 
-def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
+def draw_distance(lines: Sequence[DistanceLine]) -> Figure:
     """Return the figure with a line for each sensor and environment; its limit is dashed in the same colour."""
     labels = [f"{short(line.name, _LINE)}\n{fill(line.note, _LINE)}" for line in lines]
     limits = dict.fromkeys(line.limit for line in lines if line.limit is not None)

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.figures.style import save, signed
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import error_vectors
+from flexneedle.lab.tracker_evaluation.evaluation.accuracy import compute_error_vectors
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, LineFit, indicator_means
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, LineFit, average_indicator
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
-from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, distance_figure
-from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, field_figure
+from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, draw_distance
+from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, draw_field
 from flexneedle.lab.tracker_evaluation.figures.indicator import (
     IndicatorPanel,
     PlottedPoints,
-    indicator_figure,
+    draw_indicator,
 )
 
 MOST_PANELS = 3
@@ -22,21 +22,21 @@ MOST_PANELS = 3
 
 def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
     """Draw `field`, `indicator` and `distance` as PNG and SVG, omitting those without data."""
-    paths = save(field_figure([_field(result) for result in evaluation.results]), folder, "field")
+    paths = save(draw_field([_field(result) for result in evaluation.results]), folder, "field")
     panels = [_indicator(evaluation, found) for found in evaluation.fits[:MOST_PANELS]]
     if panels:
-        paths += save(indicator_figure(panels, len(evaluation.fits) - len(panels)), folder, "indicator")
+        paths += save(draw_indicator(panels, len(evaluation.fits) - len(panels)), folder, "indicator")
     binned = [
         _distance(result)
         for result in evaluation.results
         if result.distances and len(result.distances.bins) > 1
     ]
-    return paths + (save(distance_figure(binned), folder, "distance") if binned else [])
+    return paths + (save(draw_distance(binned), folder, "distance") if binned else [])
 
 
 def _field(result: SensorResult) -> FieldRow:
     measured = result.grid.measured
-    return FieldRow(result.grid.title, measured.true, error_vectors(measured))
+    return FieldRow(result.grid.title, measured.true, compute_error_vectors(measured))
 
 
 def _indicator(evaluation: Evaluation, found: IndicatorFits) -> IndicatorPanel:
@@ -63,7 +63,7 @@ def _is_of(result: SensorResult, found: IndicatorFits) -> bool:
 
 
 def _points(grid: MeasuredGrid, fit: str) -> PlottedPoints:
-    return PlottedPoints(grid.environment, *indicator_means(grid), fit)
+    return PlottedPoints(grid.environment, *average_indicator(grid), fit)
 
 
 def _distance(result: SensorResult) -> DistanceLine:

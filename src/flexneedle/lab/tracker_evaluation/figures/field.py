@@ -35,7 +35,7 @@ class FieldRow:
     error: Floats
 
 
-def field_figure(rows: Sequence[FieldRow]) -> Figure:
+def draw_field(rows: Sequence[FieldRow]) -> Figure:
     """Return the figure: a row of slices (x, y at constant z) for each of up to six sensors and environments."""
     shown = rows[:MOST_ROWS]
     layers = [_slices(row.true[:, 2]) for row in shown]

@@ -44,7 +44,7 @@ class IndicatorPanel:
     threshold: float | None
 
 
-def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
+def draw_indicator(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
     """Return the figure with a panel for each sensor, side by side; more: number of sensors not shown."""
     with styled():
         figure = new_figure(_HIGH)

@@ -18,7 +18,7 @@ _ARROW = 0.15  # length of the longest residual, as a share of the panel
 _VIEWS = ((0, 1, "x (mm)", "y (mm)"), (0, 2, "x (mm)", "z (mm)"))
 
 
-def registration_figure(
+def draw_registration(
     stage: Floats, mapped: Floats, targets: Floats, expected: Callable[[Floats], Floats]
 ) -> Figure:
     """Draw fiducials (n, 3), arrows along their residuals to the positions `mapped` (n, 3), and targets (k, 3); mm.

@@ -46,7 +46,7 @@ class Lattice(Section):
         return self
 
 
-class Rest(Section):
+class RestSettings(Section):
     """Table `rest`: when the stage is considered at rest, and the time limit for a point."""
 
     drift_mm: Positive = 0.2
@@ -71,7 +71,7 @@ class GridFile(Section):
     """List of points in the stage's frame, instead of `grid`."""
     settle_s: NonNegative = 0.0
     """Waiting time at each point before sampling."""
-    rest: Rest = Rest()
+    rest: RestSettings = RestSettings()
 
     @model_validator(mode="after")
     def _check_together(self) -> "GridFile":
@@ -82,12 +82,12 @@ class GridFile(Section):
             [Problem("grid", None, "give either the table grid or the list points_mm")] * ambiguous
             + [Problem("sensors", None, 'must name at least one sensor, such as tip = "tip"')] * unnamed
             + [Problem("points_mm", point, "is listed twice") for point in repeated]
-            + _shared_names(self.sensors)
+            + _check_names(self.sensors)
         )
         return self
 
 
-def _shared_names(sensors: dict[str, str]) -> list[Problem]:
+def _check_names(sensors: dict[str, str]) -> list[Problem]:
     """Return a problem for each sensor whose name in the table is already used."""
     first = {label: name for name, label in reversed(sensors.items())}
     return [
@@ -98,7 +98,7 @@ def _shared_names(sensors: dict[str, str]) -> list[Problem]:
 
 
 @dataclass(frozen=True)
-class Stop:
+class GridStop:
     """A grid point in one repeat: repeat and point_id count from 1; position (mm) in the stage's frame."""
 
     repeat: int
@@ -113,20 +113,20 @@ class StageGrid:
     file: GridFile
     points: tuple[Point, ...]
 
-    def stops(self) -> Iterator[Stop]:
+    def stops(self) -> Iterator[GridStop]:
         """Yield all points of the first repeat, then of the next."""
         for repeat in range(1, self.file.repeats + 1):
             for number, position in enumerate(self.points, 1):
-                yield Stop(repeat, number, position)
+                yield GridStop(repeat, number, position)
 
 
 def read_grid(source: str) -> StageGrid:
     """Return a shipped grid by its name, or the grid of a TOML file. Raises FileError."""
     file = GRIDS.load(source, GridFile)
-    return StageGrid(file, file.points_mm or _lattice_points(file.grid or Lattice()))
+    return StageGrid(file, file.points_mm or _list_points(file.grid or Lattice()))
 
 
-def _lattice_points(lattice: Lattice) -> tuple[Point, ...]:
+def _list_points(lattice: Lattice) -> tuple[Point, ...]:
     axes = [
         [start + step * k for k in range(n)]
         for start, step, n in zip(lattice.origin_mm, lattice.spacing_mm, lattice.counts, strict=True)

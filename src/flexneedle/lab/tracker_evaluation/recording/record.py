@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.interrupts import uninterrupted
-from flexneedle.lab.tracker_evaluation.recording.grid import StageGrid, Stop
-from flexneedle.lab.tracker_evaluation.recording.steps import Visit, motion_mismatch
+from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
+from flexneedle.lab.tracker_evaluation.recording.steps import StageVisit, find_mismatch
 from flexneedle.phantom.tracking.table import COLUMNS
 from flexneedle.ports import Clock, Tracker
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
@@ -35,21 +35,21 @@ def _refuse(mismatch: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Operator:
+class StageOperator:
     """Moves the stage. move: moves it to a stop and returns when it has arrived; report: prints a line.
 
     retries: a failed point is measured again instead of ending the recording. accepts: called with a message if a
     sensor did not move as the stage did; True keeps the point, False measures it again; may raise RunError.
     """
 
-    move: Callable[[Stop], None]
+    move: Callable[[GridStop], None]
     report: Callable[[str], None]
     retries: bool = True
     accepts: Callable[[str], bool] = _refuse
 
 
 @dataclass
-class Session:
+class RecordingSession:
     """An open, locked table and its remaining stops.
 
     size: number of valid bytes, after which rows are appended; done: number of recorded stops; last_time: last time in
@@ -58,14 +58,14 @@ class Session:
 
     file: BinaryIO
     size: int
-    remaining: Sequence[Stop]
+    remaining: Sequence[GridStop]
     done: int
     last_time: float
-    last: Visit | None
+    last: StageVisit | None
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Append the rows of a stop and sync them to disk."""
-        data = _text(rows) if self.size else _FIRST_LINE + _text(rows)
+        data = _format_rows(rows) if self.size else _FIRST_LINE + _format_rows(rows)
         with uninterrupted():
             self.file.truncate(self.size)
             self.file.write(data)
@@ -75,7 +75,7 @@ class Session:
 
 
 @contextmanager
-def open_session(path: Path, grid: StageGrid) -> Iterator[Session]:
+def open_session(path: Path, grid: StageGrid) -> Iterator[RecordingSession]:
     """Open a new or partial table with the remaining stops.
 
     The rows of an incomplete stop are dropped when new rows are appended (at once if no stop remains), and the stop is
@@ -102,7 +102,9 @@ def open_session(path: Path, grid: StageGrid) -> Iterator[Session]:
                 path.unlink(missing_ok=True)
 
 
-def record(session: Session, tracker: Tracker, clock: Clock, grid: StageGrid, operator: Operator) -> int:
+def record_grid(
+    session: RecordingSession, tracker: Tracker, clock: Clock, grid: StageGrid, operator: StageOperator
+) -> int:
     """Measure the remaining stops and return their number.
 
     Raises InputError if the tracker lacks a sensor of the grid; RunError if it sends no frames, or if a point cannot be
@@ -113,13 +115,13 @@ def record(session: Session, tracker: Tracker, clock: Clock, grid: StageGrid, op
     start, before = session.last_time, session.last
     for stop in session.remaining:
         frames, before = _measure(tracker, clock, grid, operator, stop, before)
-        session.add([row for frame in frames for row in _rows(grid, stop, frame, start)])
+        session.add([row for frame in frames for row in _make_rows(grid, stop, frame, start)])
     return len(session.remaining)
 
 
 def _check_sensors(tracker: Tracker, clock: Clock, grid: StageGrid, report: Callable[[str], None]) -> None:
     """Check, before the stage is moved, that the first frame has the grid's sensors."""
-    frames = next(filter(None, _new_frames(tracker, clock, grid.file.rest.timeout_s, report)), ())
+    frames = next(filter(None, _read_frames(tracker, clock, grid.file.rest.timeout_s, report)), ())
     if not frames:
         raise RunError(f"no frames within {grid.file.rest.timeout_s:g} s: {tracker.status}")
     present = frames[-1].readings
@@ -128,7 +130,7 @@ def _check_sensors(tracker: Tracker, clock: Clock, grid: StageGrid, report: Call
             raise InputError(f"sensors.{name}: the tracker has no such sensor; it has {', '.join(present)}")
 
 
-def _new_frames(
+def _read_frames(
     tracker: Tracker, clock: Clock, seconds: float, report: Callable[[str], None]
 ) -> Iterator[tuple[Frame, ...]]:
     """Yield new frames for a number of seconds; report when they stop and when they resume."""
@@ -147,15 +149,20 @@ def _new_frames(
 
 
 def _measure(
-    tracker: Tracker, clock: Clock, grid: StageGrid, operator: Operator, stop: Stop, before: Visit | None
-) -> tuple[list[Frame], Visit]:
+    tracker: Tracker,
+    clock: Clock,
+    grid: StageGrid,
+    operator: StageOperator,
+    stop: GridStop,
+    before: StageVisit | None,
+) -> tuple[list[Frame], StageVisit]:
     operator.move(stop)
     while True:
         clock.wait(grid.file.settle_s)
-        frames, fault = _samples(tracker, clock, grid, operator.report)
+        frames, fault = _collect_samples(tracker, clock, grid, operator.report)
         if not fault:
-            visit = _visit(grid, stop, frames)
-            mismatch = "" if before is None else motion_mismatch(before, visit)
+            visit = _make_visit(grid, stop, frames)
+            mismatch = "" if before is None else find_mismatch(before, visit)
             if not mismatch or operator.accepts(mismatch):
                 return frames, visit
             continue
@@ -165,7 +172,7 @@ def _measure(
         operator.move(stop)
 
 
-def _samples(
+def _collect_samples(
     tracker: Tracker, clock: Clock, grid: StageGrid, report: Callable[[str], None]
 ) -> tuple[list[Frame], str]:
     """Return the new frames of a point at rest, and "" or the fault that prevents them; report the cause of a wait.
@@ -175,25 +182,25 @@ def _samples(
     began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
     good: list[Frame] = []
     last_fault, reported, good_at = "no frames", "", began
-    for frames in _new_frames(tracker, clock, grid.file.rest.timeout_s, report):
+    for frames in _read_frames(tracker, clock, grid.file.rest.timeout_s, report):
         for frame in frames:
             if frame.time < began:
                 continue
-            fault = _faults(frame, sensors)
+            fault = _find_faults(frame, sensors)
             last_fault, good_at = fault or last_fault, good_at if fault else frame.time
             if fault != reported and frame.time - good_at > _SILENT_S:
                 report(f"waiting: {fault}")
                 reported = fault
             good = good if fault else [*good, frame][-wanted:]
             if not fault and len(good) == wanted:
-                last_fault = _drift(good, sensors, grid.file.rest.drift_mm)
+                last_fault = _find_drift(good, sensors, grid.file.rest.drift_mm)
                 if not last_fault:
                     return good, ""
         last_fault = last_fault if tracker.status == VISIBLE else tracker.status
     return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {last_fault}"
 
 
-def _faults(frame: Frame, sensors: Sequence[str]) -> str:
+def _find_faults(frame: Frame, sensors: Sequence[str]) -> str:
     absent = SensorReading(None, status="no such sensor")
     found = {name: frame.readings.get(name, absent) for name in sensors}
     return "; ".join(
@@ -201,41 +208,41 @@ def _faults(frame: Frame, sensors: Sequence[str]) -> str:
     )
 
 
-def _drift(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:
+def _find_drift(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:
     """Return a message on the first sensor whose first and last third of samples differ in their means; "" if none."""
     third = max(1, len(frames) // 3)
     for name in sensors:
-        positions = _positions(frames, name)
+        positions = _stack_positions(frames, name)
         drift = dist(positions[:third].mean(axis=0), positions[-third:].mean(axis=0))
         if drift > limit:
             return f"{name} drifts by {drift:.2f} mm from the first to the last third of samples, limit {limit:g} mm"
     return ""
 
 
-def _positions(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
+def _stack_positions(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
     return np.array([frame.readings[name].position for frame in frames], dtype=float)
 
 
-def _visit(grid: StageGrid, stop: Stop, frames: Sequence[Frame]) -> Visit:
-    return Visit(
-        stop, {sensor: _mean(_positions(frames, name)) for name, sensor in grid.file.sensors.items()}
+def _make_visit(grid: StageGrid, stop: GridStop, frames: Sequence[Frame]) -> StageVisit:
+    return StageVisit(
+        stop, {sensor: _average(_stack_positions(frames, name)) for name, sensor in grid.file.sensors.items()}
     )
 
 
-def _mean(positions: NDArray[np.float64]) -> Point:
+def _average(positions: NDArray[np.float64]) -> Point:
     x, y, z = map(float, positions.mean(axis=0))
     return x, y, z
 
 
-def _rows(grid: StageGrid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
+def _make_rows(grid: StageGrid, stop: GridStop, frame: Frame, start: float) -> list[dict[str, Any]]:
     return [
-        _row(stop, frame.readings[name], sensor, grid.file.environment)
+        _make_row(stop, frame.readings[name], sensor, grid.file.environment)
         | {"time_s": start + frame.time, "frame_number": frame.number, "repeat": stop.repeat}
         for name, sensor in grid.file.sensors.items()
     ]
 
 
-def _row(stop: Stop, reading: SensorReading, sensor: str, environment: str) -> dict[str, Any]:
+def _make_row(stop: GridStop, reading: SensorReading, sensor: str, environment: str) -> dict[str, Any]:
     if reading.position is None:
         raise RunError(f"{sensor}: no position")
     quaternion = reading.orientation or (None,) * 4
@@ -249,7 +256,7 @@ def _row(stop: Stop, reading: SensorReading, sensor: str, environment: str) -> d
     )
 
 
-def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
+def _format_rows(rows: Sequence[Mapping[str, Any]]) -> bytes:
     text = io.StringIO()
     csv.DictWriter(text, _HEADER, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
@@ -258,14 +265,14 @@ def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
 # Continuing a table
 
 
-def _resume(path: Path, file: BinaryIO, grid: StageGrid) -> Session:
+def _resume(path: Path, file: BinaryIO, grid: StageGrid) -> RecordingSession:
     file.seek(0)
     data = file.read()
     stops = list(grid.stops())
     if not data.startswith(_FIRST_LINE):
         if not _FIRST_LINE.startswith(data):
             raise InputError(f"{path}: is not a table of `em record`: choose another file with --out")
-        return Session(file, 0, stops, 0, 0.0, None)  # new, or truncated in its first line
+        return RecordingSession(file, 0, stops, 0, 0.0, None)  # new, or truncated in its first line
     lines = data[len(_FIRST_LINE) :].splitlines(keepends=True)
     complete = (
         lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]
@@ -277,23 +284,25 @@ def _resume(path: Path, file: BinaryIO, grid: StageGrid) -> Session:
     if done == len(stops):
         file.truncate(kept)  # nothing will be appended
     if not done:
-        return Session(file, kept, stops, 0, 0.0, None)
-    rows = [_fields(line) for line in complete[(done - 1) * size : done * size]]
-    return Session(
-        file, kept, stops[done:], done, float(rows[-1]["time_s"]), _last_visit(stops[done - 1], rows)
+        return RecordingSession(file, kept, stops, 0, 0.0, None)
+    rows = [_parse_line(line) for line in complete[(done - 1) * size : done * size]]
+    return RecordingSession(
+        file, kept, stops[done:], done, float(rows[-1]["time_s"]), _restore_visit(stops[done - 1], rows)
     )
 
 
-def _last_visit(stop: Stop, rows: Sequence[Mapping[str, str]]) -> Visit:
+def _restore_visit(stop: GridStop, rows: Sequence[Mapping[str, str]]) -> StageVisit:
     names = {row["sensor"] for row in rows}
-    return Visit(stop, {n: _mean(np.array([_position(r) for r in rows if r["sensor"] == n])) for n in names})
+    return StageVisit(
+        stop, {n: _average(np.array([_parse_position(r) for r in rows if r["sensor"] == n])) for n in names}
+    )
 
 
-def _position(row: Mapping[str, str]) -> Point:
+def _parse_position(row: Mapping[str, str]) -> Point:
     return float(row["x_mm"]), float(row["y_mm"]), float(row["z_mm"])
 
 
-def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid: StageGrid) -> None:
+def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[GridStop], grid: StageGrid) -> None:
     size = grid.file.samples * len(grid.file.sensors)
     for number, line in enumerate(lines):
         stop = stops[number // size] if number // size < len(stops) else None
@@ -303,8 +312,8 @@ def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid:
             )
 
 
-def _matches(line: bytes, stop: Stop | None, grid: StageGrid) -> bool:
-    fields = _fields(line)
+def _matches(line: bytes, stop: GridStop | None, grid: StageGrid) -> bool:
+    fields = _parse_line(line)
     if stop is None or len(fields) != len(_HEADER):
         return False
     try:
@@ -315,7 +324,7 @@ def _matches(line: bytes, stop: Stop | None, grid: StageGrid) -> bool:
             stop.position,
         )
         float(fields["time_s"])
-        _position(fields)
+        _parse_position(fields)
     except ValueError:
         return False
     return (
@@ -325,6 +334,6 @@ def _matches(line: bytes, stop: Stop | None, grid: StageGrid) -> bool:
     )
 
 
-def _fields(line: bytes) -> dict[str, str]:
+def _parse_line(line: bytes) -> dict[str, str]:
     values = next(csv.reader([line.decode("utf-8", "replace")]), [])
     return dict(zip(_HEADER, values, strict=False))

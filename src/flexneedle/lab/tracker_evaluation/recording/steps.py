@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import dist
 
-from flexneedle.lab.tracker_evaluation.recording.grid import Stop
+from flexneedle.lab.tracker_evaluation.recording.grid import GridStop
 from flexneedle.types import Point
 
 _LIMIT_MM, _SHARE = 5.0, 0.2
@@ -12,14 +12,14 @@ _LIMIT_MM, _SHARE = 5.0, 0.2
 
 
 @dataclass(frozen=True)
-class Visit:
+class StageVisit:
     """A stop and the mean position of each sensor at it (mm, tracker's frame)."""
 
-    stop: Stop
+    stop: GridStop
     means: Mapping[str, Point]
 
 
-def motion_mismatch(before: Visit, after: Visit) -> str:
+def find_mismatch(before: StageVisit, after: StageVisit) -> str:
     """Return a message on the first sensor that did not move as far as the stage between two stops; "" if all did."""
     stage = dist(before.stop.position, after.stop.position)
     limit = max(_LIMIT_MM, _SHARE * stage)

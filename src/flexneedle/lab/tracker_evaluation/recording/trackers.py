@@ -19,24 +19,24 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip` names
     those at ports 1 and 2. `replay:FILE` plays back a recording or the readings in a run folder, at the speed of the
-    clock (`clock_for`). Raises InputError for any other `spec`, RunError if the tracker does not respond.
+    clock (`make_clock`). Raises InputError for any other `spec`, RunError if the tracker does not respond.
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("aurora", "replay"):
         raise InputError(f"tracker {spec}: must be {FORMS}")
-    return _opened(spec, _aurora if kind == "aurora" else _replay, rest, clock)
+    return _open(spec, _open_aurora if kind == "aurora" else _open_replay, rest, clock)
 
 
-def clock_for(spec: str) -> WallClock:
+def make_clock(spec: str) -> WallClock:
     """Return the clock for the tracker given by `spec`; for `replay:FILE@2` it runs at twice the speed.
 
     Raises InputError for an invalid speed.
     """
     kind, _, rest = spec.partition(":")
-    return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
+    return WallClock(_split_speed(rest)[1] if kind == "replay" else 1.0)
 
 
-def _opened(
+def _open(
     spec: str, make: Callable[[str, Clock], AbstractContextManager[Tracker]], rest: str, clock: Clock
 ) -> AbstractContextManager[Tracker]:
     try:
@@ -45,17 +45,17 @@ def _opened(
         raise InputError(f"tracker {spec}: {one_line(error)}") from error
 
 
-def _aurora(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+def _open_aurora(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
     port, equals, names = rest.partition("=")
     sensors = {"sensors": names.split(",")} if equals and names else {}
     return trackers.aurora({"port": port, **sensors}, clock)
 
 
-def _replay(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
-    return trackers.replay({"file": _file_and_speed(rest)[0]}, clock)
+def _open_replay(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    return trackers.replay({"file": _split_speed(rest)[0]}, clock)
 
 
-def _file_and_speed(rest: str) -> tuple[str, float]:
+def _split_speed(rest: str) -> tuple[str, float]:
     """Return file and speed of FILE@SPEED; the name of an existing file may contain @.
 
     Raises InputError for an invalid speed.

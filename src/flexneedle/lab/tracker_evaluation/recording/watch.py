@@ -25,7 +25,7 @@ _HISTORY = 400  # frames: 10 s
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class TrackerSnapshot:
     """The newest frame (None before the first), whether it is new, the status of the tracker, and the verdict."""
 
     time: float
@@ -35,10 +35,10 @@ class Snapshot:
     verdict: str
 
 
-def watch(
+def watch_tracker(
     tracker: Tracker,
     clock: Clock,
-    show: Callable[[Snapshot], None],
+    show: Callable[[TrackerSnapshot], None],
     seconds: float = inf,
     check: FieldCheck | None = None,
     record: Path | None = None,
@@ -48,18 +48,18 @@ def watch(
     check: verdict on the field (default: `field_checker()`). record: new CSV file for all frames. Returns the number of
     frames. Raises InputError if the file cannot be written.
     """
-    chosen = check if check is not None else field_checker()
+    chosen = check if check is not None else make_field_check()
     history: deque[Frame] = deque(maxlen=_HISTORY)
     start, count, shown_at, distorted = clock.now(), 0, -inf, False
     with ExitStack() as files:
-        write = _recorder(files, record)
+        write = _open_recorder(files, record)
         while (now := clock.now()) - start < seconds:
             frames = tracker.read()
             for frame in frames:
                 history.append(frame)
                 write(frame)
                 verdict, distorted = chosen(history, distorted)
-                show(Snapshot(now, frame, True, tracker.status, verdict))
+                show(TrackerSnapshot(now, frame, True, tracker.status, verdict))
             count += len(frames)
             if frames:
                 shown_at = now
@@ -72,9 +72,9 @@ def watch(
     return count
 
 
-def _without_new(now: float, history: Sequence[Frame], status: str) -> Snapshot:
+def _without_new(now: float, history: Sequence[Frame], status: str) -> TrackerSnapshot:
     last = history[-1] if history else None
-    return Snapshot(now, last, False, status, "no new frames" if status == VISIBLE else status)
+    return TrackerSnapshot(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
 def check_field(
@@ -90,7 +90,7 @@ def check_field(
     return fault or str(field), is_distorted(field, distorted)
 
 
-def field_checker(references: int | None = None) -> FieldCheck:
+def make_field_check(references: int | None = None) -> FieldCheck:
     """Return `check_field` with the settings of the default monitor and this number of references.
 
     references: None for the number that the tracker has, at least one and at most what an insertion needs.
@@ -105,7 +105,7 @@ def field_checker(references: int | None = None) -> FieldCheck:
     return check
 
 
-def _recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
+def _open_recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
     if path is None:
         return lambda _: None
     if path.suffix == ".parquet":
