@@ -75,15 +75,15 @@ rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decis
 rig-families: setup  ## insertions on 100 random rigs, emulated and in simulated time (hours)
 	$(BIN)/python campaigns/rig_families.py --out $(or $(DIR),runs/rig-families)
 
-rig-ros: setup  ## what ROS subscribers cost an insertion on an emulated rig, and stops over ROS (an hour)
+rig-ros: setup  ## cost of ROS subscribers for an insertion on an emulated rig, and stops over ROS (an hour)
 	$(BIN)/python campaigns/rig_ros.py --pairs 5 --out $(or $(DIR),runs/rig-ros)
 
-fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
+fuzz: setup  ## a million random and damaged inputs each to the readers of the Galil, the Aurora and rig files
 	$(BIN)/python campaigns/fuzz_galil.py
 	$(BIN)/python campaigns/fuzz_aurora.py
 	$(BIN)/python campaigns/fuzz_rig_file.py
 
-fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
+fuzz-ros: setup  ## a million random and damaged messages to the readers of ROS topics, and to a running node
 	$(BIN)/python campaigns/fuzz_ros.py
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)

@@ -1,9 +1,9 @@
-"""The insertions into which faults are injected: a family of scenarios, one a number, the same for each fault.
+"""Insertions for the injection of faults: a family of scenarios by number, the same for each fault.
 
 Every second one is in space, with drivers of each kind alternately; of both, every second is a preset with a random
 target, the others random worlds (needle, bevel, 1 to 4 layers, target). All have a guide and fit the shipped rig file.
 They are short, so that a trial is: at most 40 mm from the tip's start to the target. In every third case a fault that
-may fall in a roll does so, and what would be wrong with the motor of the base is wrong with that of the roll.
+may fall in a roll does so, and a fault of the base's motor is a fault of the rotation's motor instead.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How faults are injected into a trial: what the insertion needs before it begins, and what happens at the time."""
+"""Injection of faults into a trial: preparation of the insertion, and the injection at its time."""
 
 import os
 import subprocess
@@ -59,7 +59,7 @@ _CHANNELS = {"insertion": "A", "rotation": "B", "guide_y": "C"}  # of the shippe
 
 @dataclass(frozen=True)
 class Setting:
-    """Where the insertion keeps its record, and variables of its environment."""
+    """Folder of the insertion's record, and variables of its environment."""
 
     record: Path
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -114,7 +114,7 @@ class Nothing(_Plain):
 
 @dataclass(frozen=True)
 class Device(_Plain):
-    """A fault of an emulated device, with {channel} for that of the faulty axis."""
+    """A fault of an emulated device, with {channel} for the channel of the faulty axis."""
 
     order: str
 

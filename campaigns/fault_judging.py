@@ -1,4 +1,4 @@
-"""Whether a trial was as required: what the supervisor has recorded, the outcome, the times, and the true motions."""
+"""Judgement of a trial: recorded states, outcome, times, and true motions against the required reaction."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from fault_list import RESTED, Fault
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.types import DB_X, DG_Y, Floats
-from rig_trials import moved_between, rests
+from rig_trials import is_at_rest, moved_between
 
 MOTION_MM = 0.5
 """The most that the base may move after detection."""
@@ -42,7 +42,7 @@ class State:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
+    """Evidence of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
     taken effect (s, monotonic), true states, `run.json`, messages, how many processes were left, and for an axis that
     moves seldom the commands (m, 9). step: of the base (mm).
 
@@ -79,7 +79,7 @@ class Evidence:
             "travelled_mm": self._travelled(),
             "commanded_mm": self._commanded(),
             "during": self._during(),
-            "rests": rests(self.truth),
+            "rests": is_at_rest(self.truth),
             "left": self.left,
             "errors": self.errors[-4000:],
         }
@@ -109,9 +109,9 @@ class Evidence:
     def _from_motion(self, time: float) -> float | None:
         """Time since the fault, or since the axis was to begin to move if that is later; None if it never was.
 
-        Base and guide move together, so that those which are not faulty show when the other was to begin. For a guide,
-        which moves seldom, the last time before detection counts; for a base the first one after the fault, and that
-        only if the fault found it at rest, or next to the end of a step.
+        Base and guide move together, so that the other axes show when the faulty one had to begin. For a guide, which
+        moves seldom, the last time before detection counts; for a base the first one after the fault, and that only if
+        the base was at rest at the fault, or next to the end of a step.
         """
         others = [
             self.truth.positions[axis] for axis in _TOGETHER - {self.axis} if axis in self.truth.positions
@@ -125,12 +125,12 @@ class Evidence:
         return float(time - max(begins[-1], self.injected)) if len(begins) else None
 
     def _rested(self) -> bool:
-        """Whether the base was at rest as the fault was injected, or nearer to the end of a step than must be seen."""
+        """Return whether the base was at rest at the fault, or too near to the end of a step for a detection."""
         short = -self._travelled() % self.step
         return self._during() != "advance" or min(short, self.step - short) <= _unseen_mm(self.axis)
 
     def _commanded(self) -> float | None:
-        """The farthest (mm) that the faulty axis was to be from where the fault found it, by commands after that."""
+        """Return the largest commanded distance (mm) of the faulty axis from its position at the fault."""
         if self.commands is None or not len(self.commands):
             return None
         before = np.cumsum(self.commands[:, DB_X]) - self.commands[:, DB_X]
@@ -138,12 +138,12 @@ class Evidence:
         return float(np.abs(after).max(initial=0.0))
 
     def _travelled(self) -> float:
-        """How far (mm) the base had moved as the fault was injected."""
+        """Return the advance (mm) of the base at the time of the fault."""
         base = self.truth.positions["insertion"]
         return float(np.interp(self.injected, self.truth.time, base) - base[0])
 
     def _during(self) -> str:
-        """What the needle did as the fault was injected."""
+        """Return the motion of the needle at the time of the fault."""
         for axis, name in (("rotation", "roll"), ("insertion", "advance")):
             if self._moved(axis, self.injected - _PAUSE_S, self.injected) > 1e-4:
                 return name
@@ -166,12 +166,12 @@ def _changes(states: Sequence[Mapping[str, Any]]) -> Iterator[State]:
 
 
 def good(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Whether a trial was as required."""
+    """Return whether a trial was as required."""
     return not problems(fault, row)
 
 
 def problems(fault: Fault, row: Mapping[str, Any]) -> list[str]:
-    """What was not as required."""
+    """Return the requirements that were not met."""
     reaction = fault.reaction
     required = [
         outcome for pattern, outcome in reaction.outcomes.items() if re.fullmatch(pattern, row["states"])
@@ -197,19 +197,19 @@ def seconds_of(fault: Fault, row: Mapping[str, Any]) -> float | None:
 
 
 def _reason(fault: Fault, row: Mapping[str, Any]) -> str:
-    """The reason of the detection: that of the state, and where that has none that of the outcome."""
+    """Return the reason of the detection: from the state, or from the outcome if the state has none."""
     return str(row["why" if set(fault.reaction.detected) & set(_RECORDED) else "reason"])
 
 
 def _is_because(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Whether the reason is that of the fault; without a detection by the supervisor there is none to compare."""
+    """Return whether the reason names the fault; without a detection by the supervisor there is none to compare."""
     if row["detection_s"] is None and set(fault.reaction.detected) & set(_RECORDED):
         return True
     return re.search(fault.because.format(axis=row["axis"]), _reason(fault, row)) is not None
 
 
 def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Whether it was in time. What shows only in a motion need not be detected, if there is none before the end."""
+    """Return whether it was in time. A fault that shows only in a motion need not be detected without one."""
     seconds = seconds_of(fault, row)
     if fault.within is None:
         return True

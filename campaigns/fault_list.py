@@ -11,12 +11,12 @@ from flexneedle.lab.rig.rig_file import load_rig
 
 @dataclass(frozen=True)
 class Reaction:
-    """What must happen. outcomes: of the insertion, by a pattern of the states that the supervisor has recorded after
+    """Required reaction. outcomes: of the insertion, by a pattern of the states that the supervisor has recorded after
     the fault, with spaces; `end` is the stop by the controller at the end of an insertion, "running" an insertion
     whose record has no outcome.
 
-    detected: by which of these states, none where the supervisor records nothing. The reason is that of the state, but
-    for `end` and for none, where it is that of the outcome.
+    detected: by which of these states, none where the supervisor records nothing. The reason is from the state, but
+    for `end` and for none, where it is from the outcome.
     """
 
     text: str
@@ -61,7 +61,7 @@ class Fault:
     timed: str = field(default="detection_s", kw_only=True)
 
     def falls_in_roll(self, rolls: bool) -> bool:
-        """Whether it falls in a roll, in a case in which faults do so or not."""
+        """Return whether it falls in a roll, in a case in which faults do so or not."""
         return self.rolls == "all" or (self.rolls == "some" and rolls)
 
 
@@ -79,7 +79,7 @@ _GARBLED = (
 
 
 def _rest_s() -> float:
-    """The longest time (s) in which motors rest without a supervisor: that of the queue, of slowing down from the
+    """Return the longest time (s) until motors rest without a supervisor: the queue, the deceleration from the
     largest speed, and 50 ms for the emulated controller, which may be late itself.
     """
     rig = load_rig("emulated")

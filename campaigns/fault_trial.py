@@ -1,4 +1,4 @@
-"""One trial: an emulated rig of its own, an insertion on it, a fault at a random time, and what was recorded."""
+"""One trial: a separate emulated rig, an insertion on it, a fault at a random time, and the record."""
 
 import json
 import os
@@ -25,7 +25,7 @@ from fault_judging import Evidence, good
 from fault_list import Fault
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.types import Floats
-from rig_trials import EmulatedRig, emulated_rig, ended, insertion
+from rig_trials import EmulatedRig, emulated_rig, insertion, wait_for_end
 
 _LEFT = 6  # steps: some faults show only after a few
 _FIRST_STEP = 3  # in which a decision is late or rolls
@@ -72,7 +72,7 @@ class Trial:
 
     @property
     def rolls(self) -> bool:
-        """Whether the fault falls in a roll."""
+        """Return whether the fault falls in a roll."""
         return self.fault.falls_in_roll(self.case.rolls)
 
     @property
@@ -108,13 +108,13 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
     Raises RuntimeError if the insertion ends before the fault is injected, or a process of the rig does.
     """
     for attempt in range(_ATTEMPTS):
-        row = _attempted(trial, trial.rng(attempt), keep)
+        row = _attempt(trial, trial.rng(attempt), keep)
         if not trial.rolls or row["during"] == "roll" or not good(trial.fault, row):
             break
     return row | {"attempts": attempt + 1}
 
 
-def _attempted(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dict[str, Any]:
+def _attempt(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dict[str, Any]:
     fault, case = trial.fault, trial.case
     begun = monotonic()
     with ExitStack() as stack:
@@ -137,12 +137,12 @@ def _attempted(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dic
         effective = fault.injection.inject(Running(rig, folder, trial.axis, controller, others))
         injected = due if fault.decision_s else effective
         _await_end(fault, process, injected, setting.record / "run.json")
-        status, printed, errors = ended(process, _END_S)
+        status, printed, errors = wait_for_end(process, _END_S)
         sleep(_REST_S)
         if keep is not None and setting.record.exists():
             name = f"{fault.group}-{fault.name}-{case.number}".replace(" ", "-")
             shutil.copytree(setting.record, keep / name, dirs_exist_ok=True)
-        run = _recorded(setting.record, printed)
+        run = _read_record(setting.record, printed)
         times, left = (ordered, injected), _ended_by_force(others)
         truth, commands = rig.read_truth(), _commands(setting.record, trial.axis)
         step = case.scenario.setup.max_advance_mm
@@ -152,7 +152,7 @@ def _attempted(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dic
 
 
 def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generator) -> tuple[str, ...]:
-    """Options of the insertion for a controller of its own, where one decision is late or rolls."""
+    """Return the options for a custom controller, of which one decision is late or rolls."""
     if not (roll or trial.fault.decision_s):
         return ()
     step = int(rng.integers(_FIRST_STEP, int(trial.case.steps) - _LEFT))
@@ -172,10 +172,10 @@ def _await_moment(
     """Wait until the fault is due; return that time (s, monotonic): of a late decision its beginning."""
     begun = _first_advance(rig, process)
     if trial.fault.decision_s:
-        return _marked(folder / "marker", process)
+        return _read_marker(folder / "marker", process)
     if roll:
         shares = rng.uniform(*_ROLL_SHARES)
-        due = _marked(folder / "marker", process) + shares * trial.case.roll_s(roll)
+        due = _read_marker(folder / "marker", process) + shares * trial.case.roll_s(roll)
     else:
         step = float(rng.uniform(0.0, trial.case.steps - _LEFT))
         _await_depth(step * trial.case.scenario.setup.max_advance_mm, rig, process)
@@ -199,7 +199,7 @@ def _first_advance(rig: EmulatedRig, process: subprocess.Popen[bytes]) -> float:
 
 
 def _await_depth(travel: float, rig: EmulatedRig, process: subprocess.Popen[bytes]) -> None:
-    """Wait until the base has moved so far (mm)."""
+    """Wait until the base has moved by this distance (mm)."""
     while True:
         base = rig.read_truth().positions["insertion"]
         if base[-1] - base[0] >= travel:
@@ -208,7 +208,7 @@ def _await_depth(travel: float, rig: EmulatedRig, process: subprocess.Popen[byte
         sleep(0.05)
 
 
-def _marked(marker: Path, process: subprocess.Popen[bytes]) -> float:
+def _read_marker(marker: Path, process: subprocess.Popen[bytes]) -> float:
     """Wait for the time that the controller writes."""
     while not (marker.exists() and marker.read_text().endswith("\n")):
         _check_running(process)
@@ -218,11 +218,11 @@ def _marked(marker: Path, process: subprocess.Popen[bytes]) -> float:
 
 def _check_running(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is not None:
-        raise RuntimeError(f"the insertion ended before its fault: {ended(process)}")
+        raise RuntimeError(f"the insertion ended before its fault: {wait_for_end(process)}")
 
 
 def _await_end(fault: Fault, process: subprocess.Popen[bytes], injected: float, record: Path) -> None:
-    """Wait until the insertion ends; one that is stopped by a signal goes on once that must have been detected.
+    """Wait until the insertion ends; one that is stopped by a signal continues once that must have been detected.
 
     One whose record is complete is ended: its pictures would take more of the processor than the insertion.
     """
@@ -258,8 +258,8 @@ def _commands(record: Path, axis: str) -> Floats | None:
     return np.array([period.command for period in flexneedle.load(record).periods])
 
 
-def _recorded(record: Path, printed: str) -> Mapping[str, Any]:
-    """What the insertion has recorded in its folder, or printed where that could not be written."""
+def _read_record(record: Path, printed: str) -> Mapping[str, Any]:
+    """Return the record of the insertion in its folder, or its printed error if that could not be written."""
     file = record / "run.json"
     run: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     if run.get("status") == "running" and printed.startswith("{"):

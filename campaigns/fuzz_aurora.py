@@ -1,4 +1,4 @@
-"""Random and damaged data to all that reads an Aurora: no crash, no hang, no old or damaged frame.
+"""Random and damaged data to all readers of an Aurora: no crash, no hang, no old or damaged frame.
 
     python campaigns/fuzz_aurora.py [--inputs N] [--seconds S] [--seed N] [--part readings|link|emulator|watch|live]
 
@@ -38,8 +38,8 @@ from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.phantom.tracking.stage import tip_on_stage
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
-from fuzz_aurora_line import BYTES, decoded, episodes
-from fuzzing import Failure, Part, main, mutated
+from fuzz_aurora_line import BYTES, decode_binary, episodes
+from fuzzing import Failure, Part, main, mutate
 
 FARTHEST_MM = 10_000.0
 ODD = (0.0, -0.0, 1.0, -1.0, 5e-324, -2e-308, 9999.9, 1e4, 3.4e38, 1e39, 1e308, math.inf, -math.inf, math.nan)
@@ -55,13 +55,13 @@ ROUNDED_S = 1e-5  # of times of frame numbers above 2³², at which a new connec
 def readings_inputs(random: Random) -> Iterator[str]:
     """Convert the values of one sensor after another."""
     while True:
-        checked_reading(random_sensor(random), random.choice((7, 7, 7, 0, 2**32 - 1)))
-        checked_names(*([f"{random.randrange(100):02d}", f"{random.randrange(256):02X}"] for _ in "ab"))
+        check_reading(random_sensor(random), random.choice((7, 7, 7, 0, 2**32 - 1)))
+        check_names(*([f"{random.randrange(100):02d}", f"{random.randrange(256):02X}"] for _ in "ab"))
         yield ""
 
 
 def random_sensor(random: Random) -> tuple[int, int, int, tuple[float, ...]]:
-    """Kind, port status, frame and pose, half of them nearly those of a measured sensor."""
+    """Kind, port status, frame and pose, half of them similar to a measured sensor's."""
     pose = list(POSE)
     for _ in range(random.choice((0, 1, 2, 8))):
         drawn = (
@@ -75,7 +75,7 @@ def random_sensor(random: Random) -> tuple[int, int, int, tuple[float, ...]]:
     return kind, bits, random.choice((7, 7, 7, 7, 7, 8, 0)), tuple(pose)
 
 
-def checked_reading(
+def check_reading(
     sensor: tuple[int, int, int, tuple[float, ...]],
     number: int,
     read: Callable[..., dict[str, SensorReading]] = make_readings,
@@ -103,7 +103,7 @@ def checked_reading(
     return found
 
 
-def checked_names(first: list[str], second: list[str]) -> None:
+def check_names(first: list[str], second: list[str]) -> None:
     """Raise Failure if two sensors at different places have one name."""
     if first != second and sensor_name(*first, NAMES) == sensor_name(*second, NAMES):
         raise Failure(f"{first} and {second}: one name")
@@ -132,11 +132,11 @@ def link_inputs(random: Random) -> Iterator[str]:
         feeding = Feeding()
         for _ in range(2000):
             feeding.time += random.choice((0.0, 0.003, 0.025, 1.0))
-            fed(feeding, random_line(random, feeding), random)
+            feed_message(feeding, random_bytes(random, feeding), random)
             yield ""
 
 
-def random_line(random: Random, feeding: Feeding) -> bytes:
+def random_bytes(random: Random, feeding: Feeding) -> bytes:
     """Bytes, most of them a message that may be damaged."""
     kind = random.random()
     if kind < 0.03:
@@ -146,7 +146,7 @@ def random_line(random: Random, feeding: Feeding) -> bytes:
     if kind < 0.062:
         return random.choice((b"[", b'{"a":', b"9", b" ", b"\x00")) * random.choice((1000, 70000, 200000))
     line = json.dumps(random_message(random, feeding)).encode()
-    return mutated(random, line, BYTES) if random.random() < 0.15 else line
+    return mutate(random, line, BYTES) if random.random() < 0.15 else line
 
 
 def random_json(random: Random, depth: int) -> Any:
@@ -195,7 +195,7 @@ def random_message(random: Random, feeding: Feeding) -> list[Any]:
     return ["frame", feeding.device_number, requested, found]
 
 
-def fed(feeding: Feeding, line: bytes, random: Random) -> None:
+def feed_message(feeding: Feeding, line: bytes, random: Random) -> None:
     """Take a message, as the thread of the adapter does; then read. Raises Failure."""
     incoming = feeding.incoming
     try:
@@ -218,7 +218,7 @@ def fed(feeding: Feeding, line: bytes, random: Random) -> None:
 
 
 def is_no_message(line: bytes) -> bool:
-    """Whether these bytes are none of the link's messages, by their first item."""
+    """Return whether these bytes are none of the link's messages, by their first item."""
     try:
         found = json.loads(line)
     except (ValueError, RecursionError):
@@ -262,7 +262,7 @@ def emulator_inputs(random: Random) -> Iterator[str]:
     while True:
         device = aurora.power_on(random.randint(0, 4), has_bx=random.random() < 0.8)
         for _ in range(random.randint(1, 600)):
-            device = checked_command(device, random_command(random), random_frame(random))
+            device = check_command(device, random_command(random), random_frame(random))
             yield ""
 
 
@@ -272,7 +272,7 @@ def random_command(random: Random) -> bytes:
         return random.randbytes(random.randint(0, 20))
     text = f"{random.choice(NAMES_OF_COMMANDS)}:{random.choice(ARGUMENTS)}".encode()
     line = text + b"%04X" % codec.crc16(text) if random.random() < 0.9 else text.replace(b":", b" ", 1)
-    return mutated(random, line, BYTES) if random.random() < 0.1 else line
+    return mutate(random, line, BYTES) if random.random() < 0.1 else line
 
 
 def random_frame(random: Random) -> aurora.EmulatedFrame:
@@ -286,7 +286,7 @@ def random_frame(random: Random) -> aurora.EmulatedFrame:
     )
 
 
-def checked_command(
+def check_command(
     device: aurora.AuroraState,
     line: bytes,
     frame: aurora.EmulatedFrame,
@@ -298,7 +298,7 @@ def checked_command(
     except Exception as error:
         raise Failure(f"{line!r} on {device}: {error!r}") from error
     text = complete.endswith(b"\r") and complete[-5:-1] == b"%04X" % codec.crc16(complete[:-5])
-    if not (text or decoded(complete) is not None):
+    if not (text or decode_binary(complete) is not None):
         raise Failure(f"{line!r}: {complete!r}")
     ports = all(
         0 < handle <= 0xFF and port.enabled <= port.initialized <= (port.sensor is not None)
@@ -323,7 +323,7 @@ def watch_inputs(random: Random) -> Iterator[str]:
         monitor = Monitor(MonitorSettings(enabled=random.random() < 0.8), random.choice((1, 2)))
         watching = Watching(TipWatch(monitor, STALE_S, 0.0), to_stage, random.choice((0.0, 0.0, 7.5)))
         for _ in range(random.randint(1, 300)):
-            ticked(watching, random)
+            check_tick(watching, random)
             yield ""
 
 
@@ -339,7 +339,7 @@ class Watching:
     accepted: float = -math.inf
 
 
-def ticked(watching: Watching, random: Random) -> None:
+def check_tick(watching: Watching, random: Random) -> None:
     """Check the frames of a tick. Raises Failure."""
     watching.now += random.choice((0.025, 0.025, 0.025, 0.0, 0.4))
     if random.random() < 0.1:
@@ -375,7 +375,7 @@ def check_verdict(watching: Watching, found: tuple[Measurement, ...]) -> None:
 
 
 def fault_of(one: Measurement, watching: Watching) -> str:
-    """Why a reading must not be used, by its numbers alone, or ""."""
+    """Return why a reading must not be used, by its numbers alone, or ""."""
     values = [value for value in (one.time, one.x, one.y, one.z, *(one.direction or ())) if value is not None]
     if not all(map(math.isfinite, values)):
         return "not a number"

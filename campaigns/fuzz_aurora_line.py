@@ -26,7 +26,7 @@ from flexneedle.lab.emulators.server import SerialPort
 from flexneedle.lab.rig.devices.aurora import tracker
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.types import VISIBLE, Frame
-from fuzzing import Failure, mutated
+from fuzzing import Failure, mutate
 
 READ_S, CLOSE_S, OPEN_S, RECOVERY_S = 0.5, 8.0, 60.0, 60.0  # longest times of a call; the machine may be busy
 RESET_AFTER_S = 0.4  # without commands: as the reply to a serial break, which a pseudo-terminal does not have
@@ -40,7 +40,7 @@ Damage = Callable[[bytes], bytes]
 # What was sent
 
 
-def decoded(reply: bytes) -> list[Point] | None:
+def decode_binary(reply: bytes) -> list[Point] | None:
     """Return the positions in a complete, intact reply to BX, or None. Written apart from driver and emulator."""
     if len(reply) < 8 or reply[:2] != b"\xc4\xa5":
         return None
@@ -56,7 +56,7 @@ def decoded(reply: bytes) -> list[Point] | None:
     return found
 
 
-def decoded_text(reply: bytes) -> list[Point] | None:
+def decode_text(reply: bytes) -> list[Point] | None:
     """Return the positions in a complete, intact reply to TX, or None."""
     if reply[-5:] != b"%04X\r" % codec.crc16(reply[:-5]):
         return None
@@ -73,18 +73,18 @@ class Sent:
 
     def add(self, reply: bytes, now: float) -> bool:
         """Add a reply, if it is intact and has readings; return whether it is."""
-        found = decoded(reply) or decoded_text(reply)
+        found = decode_binary(reply) or decode_text(reply)
         if not found:
             return False
         for position in found:
-            self.by_position.setdefault(_rounded(position), set()).add(len(self.times))
+            self.by_position.setdefault(_round(position), set()).add(len(self.times))
         self.times.append(now)
         return True
 
     def problem(self, frame: Frame) -> str:
-        """Why a frame must not have been delivered, or ""."""
+        """Return why a frame must not have been delivered, or ""."""
         visible = [reading.position for reading in frame.readings.values() if reading.position is not None]
-        replies = [self.by_position.get(_rounded(position), set()) for position in visible]
+        replies = [self.by_position.get(_round(position), set()) for position in visible]
         together = set.intersection(*replies) if replies else set(range(len(self.times)))
         if not together:
             return f"{frame}: positions {visible} were not sent in one intact reply"
@@ -92,17 +92,17 @@ class Sent:
         return "" if frame.time <= latest else f"{frame}: dated {frame.time - latest:.3f} s after it was made"
 
 
-def _rounded(position: Point) -> Point:
+def _round(position: Point) -> Point:
     return tuple(round(part, 3) for part in position)
 
 
 # Damage
 
 
-def _recomputed(random: Random, true: bytes) -> bytes:
+def _recompute(random: Random, true: bytes) -> bytes:
     """A reply to BX whose checksum is right, with other values in its rows: of a tracker that is out of order."""
-    if not decoded(true):
-        return mutated(random, true, BYTES)
+    if not decode_binary(true):
+        return mutate(random, true, BYTES)
     body = bytearray(true[6:-2])
     for _ in range(random.randint(1, 4)):
         at = 1 + ROW * random.randrange(len(body) // ROW) + random.randint(2, ROW - 4)
@@ -130,7 +130,7 @@ def _error(random: Random, _true: bytes) -> bytes:
 
 DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
     "garbage": lambda random, _: random.randbytes(random.randint(0, 300)),
-    "mutated": lambda random, true: mutated(random, true, BYTES),
+    "mutated": lambda random, true: mutate(random, true, BYTES),
     "cut": lambda random, true: true[: random.randint(0, len(true))],
     "huge": _huge,
     "flood": lambda random, true: (
@@ -140,7 +140,7 @@ DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
     "none": lambda _random, true: true,
     "twice": lambda _random, true: true * 2,
     "before": lambda random, true: random.randbytes(random.randint(1, 20)) + true,
-    "recomputed": _recomputed,
+    "recomputed": _recompute,
     "nonsense": _nonsense,
     "error": _error,
     "no end": lambda _random, true: true.replace(b"\r", b"") + b"0" * 3000,
@@ -266,7 +266,7 @@ class Tally:
 
 
 def episodes(random: Random) -> Iterator[str]:
-    """Yield a note on all so far after each episode. Raises Failure."""
+    """Yield a note on all episodes after each episode. Raises Failure."""
     # More connections in the time; the waits are nothing that is tried here.
     tracker._FIRST_WAIT_S, tracker._LONGEST_WAIT_S = 0.05, 0.5
     tally = Tally()

@@ -30,7 +30,7 @@ from flexneedle.lab.rig.devices.galil.motors import GalilMotors, factory
 from flexneedle.lab.rig.devices.galil.replies import GarbledError, parse_numbers, parse_replies, parse_text
 from flexneedle.lab.rig.devices.galil.states import make_report
 from flexneedle.ports import MotorState
-from fuzzing import Failure, Part, main, mutated
+from fuzzing import Failure, Part, main, mutate
 
 FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
@@ -55,7 +55,7 @@ BYTES = b" -0123456789,.:?\r\n;$eEnaif\x00\x7f\x80\xba\xbf\xff"
 def parser_inputs(random: Random) -> Iterator[str]:
     """Parse one input after another."""
     while True:
-        received = mutated(random, random.choice(REPLIES), BYTES)
+        received = mutate(random, random.choice(REPLIES), BYTES)
         count = random.randint(1, 5)
         with suppress(GarbledError):
             found = parse_replies(received, count)
@@ -90,7 +90,7 @@ def controller_inputs(random: Random) -> Iterator[str]:
         device = ControllerState()
         for _ in range(random.randint(1, 300)):
             line = random_line(random)
-            device = checked_line(device, line, random.randint(0, 8))
+            device = check_line(device, line, random.randint(0, 8))
             yield ""
 
 
@@ -113,7 +113,7 @@ def random_command(random: Random) -> str:
     return name + axes
 
 
-def checked_line(
+def check_line(
     device: ControllerState,
     line: str,
     samples: int,
@@ -227,12 +227,12 @@ def driver_inputs(random: Random) -> Iterator[str]:
             server.device, _ = reply(server.device, "SH")
             rigs.append((motors, server))
         while True:
-            longest = max(longest, called(*random.choice(rigs), random.choice(CALLS), random))
+            longest = max(longest, call_driver(*random.choice(rigs), random.choice(CALLS), random))
             yield f", longest call {1e3 * longest:.0f} ms of {TIMEOUT_MS:.0f}"
 
 
 def damages(random: Random) -> Callable[[bytes], bytes | None] | None:
-    """Return what becomes of true replies."""
+    """Return damages of true replies."""
     kind = random.random()
     if kind < 0.2:
         return None
@@ -248,10 +248,10 @@ def damages(random: Random) -> Callable[[bytes], bytes | None] | None:
         return lambda true: b" 17.0000\r\n" + true
     if kind < 0.6:
         return lambda true: true + true
-    return lambda true: mutated(random, true, BYTES) or None
+    return lambda true: mutate(random, true, BYTES) or None
 
 
-def called(motors: GalilMotors, server: Server, name: str, random: Random) -> float:
+def call_driver(motors: GalilMotors, server: Server, name: str, random: Random) -> float:
     """Make a call with damaged replies; return how long it took. Raises Failure."""
     server.damage = damages(random)
     server.lines.clear()
@@ -266,16 +266,16 @@ def called(motors: GalilMotors, server: Server, name: str, random: Random) -> fl
     if took > TIMEOUT_MS / 1e3 + SLACK_S:
         raise Failure(f"{name} answered by {server.sent!r} took {took:.3f} s")
     if name == "read" and found is not None:
-        compare(found, server.sent)
+        compare_states(found, server.sent)
     server.damage = None
-    if not connected(motors):
+    if not connect(motors):
         recover(motors)
     if name != "follow" and (moves := [line for line in server.lines if MOVES.search(line)]):
         raise Failure(f"{name} answered by {server.sent!r} sent {moves}")
     return took
 
 
-def compare(states: Mapping[str, MotorState], sent: bytes) -> None:
+def compare_states(states: Mapping[str, MotorState], sent: bytes) -> None:
     """Raise Failure if states are not those that were sent."""
     first, second = re.findall(rb"-?[0-9.]+", sent)[:2], re.findall(rb"-?[0-9.]+", sent)[2:4]
     true = [float(value) for value in first + second]
@@ -284,8 +284,8 @@ def compare(states: Mapping[str, MotorState], sent: bytes) -> None:
         raise Failure(f"{sent!r} read as {states}")
 
 
-def connected(motors: GalilMotors) -> bool:
-    """Whether a reading succeeds."""
+def connect(motors: GalilMotors) -> bool:
+    """Return whether a reading succeeds."""
     try:
         motors.read()
     except DriverError:

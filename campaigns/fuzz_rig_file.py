@@ -117,7 +117,7 @@ TABLES = (
 SLOWEST_S = 1.0  # of the processor: the machine may be busy with other processes
 
 
-def fuzzed(valid: Sequence[bytes], draw: Random) -> bytes:
+def mutate_file(valid: Sequence[bytes], draw: Random) -> bytes:
     """Return an input, made of a valid one."""
     data = draw.choice(valid)
     for _ in range(draw.randint(1, 3)):
@@ -274,20 +274,20 @@ def read_profile(path: Path) -> str:
 
 def files(random: Random) -> Iterator[str]:
     """Read one rig file after another."""
-    return _tried(RIGS, read_rig, random)
+    return _try(RIGS, read_rig, random)
 
 
 def profiles(random: Random) -> Iterator[str]:
     """Read one profile after another."""
-    return _tried(PROFILES, read_profile, random)
+    return _try(PROFILES, read_profile, random)
 
 
-def _tried(valid: Sequence[bytes], read: Callable[[Path], str], random: Random) -> Iterator[str]:
+def _try(valid: Sequence[bytes], read: Callable[[Path], str], random: Random) -> Iterator[str]:
     counts, slowest = Counter[str](), 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.toml"
         while True:
-            data = fuzzed(valid, random)
+            data = mutate_file(valid, random)
             path.write_bytes(data)
             begun = process_time()
             found, took = outcome(path, read), process_time() - begun

@@ -1,4 +1,4 @@
-"""Random and damaged messages to all that reads ROS topics: no crash, no hang, no motion (`make fuzz-ros`).
+"""Random and damaged messages to all readers of ROS topics: no crash, no hang, no motion (`make fuzz-ros`).
 
     python campaigns/fuzz_ros.py [--inputs N] [--seconds S] [--seed N] [--part messages|live]
 
@@ -64,7 +64,7 @@ def random_bytes(rng: np.random.Generator, _key: str) -> bytes:
     return header + rng.bytes(int(rng.integers(200)))
 
 
-def damaged(rng: np.random.Generator, key: str) -> bytes:
+def damage(rng: np.random.Generator, key: str) -> bytes:
     """A valid message with changed, missing or repeated bytes."""
     data = bytearray(valid(rng, key))
     for _ in range(int(rng.integers(1, 6))):
@@ -138,14 +138,14 @@ MESSAGES = {
     "arm": _flag,
     "joint_states": _joints,
 }
-KINDS: dict[str, Bytes] = {"random": random_bytes, "damaged": damaged, "valid": valid}
+KINDS: dict[str, Bytes] = {"random": random_bytes, "damaged": damage, "valid": valid}
 
 
 # What must hold
 
 
 def problem(key: str, data: bytes, record: Received | None) -> str:
-    """Why a record must not be made of these bytes, or ""."""
+    """Return why a record must not be made of these bytes, or ""."""
     match record:
         case None:
             nothing = key == "stop" and data[HEADER_BYTES : HEADER_BYTES + 1] == FALSE
@@ -179,7 +179,7 @@ def _far(points: Iterable[Sequence[float]]) -> str:
 
 
 class SilentNode:
-    """In place of a node: hands out records, and keeps what is to be published."""
+    """In place of a node: hands out records, and keeps what would be published."""
 
     status = VISIBLE
 
@@ -212,7 +212,7 @@ class Consumers:
             self.motors.set_speed(channel, 1.0, 1.0)
 
     def take(self, record: Received) -> str:
-        """Why they must not do what they do with a record, or ""."""
+        """Return why they must not do what they do with a record, or ""."""
         for node in self.nodes:
             node.records.append(record)
         for frame in self.tracker.read():
@@ -240,7 +240,7 @@ def messages(random: Random) -> Iterator[str]:
             subscription, kind = everything[rng.integers(len(everything))], str(rng.choice(list(KINDS)))
             data = KINDS[kind](rng, subscription.key)
             begun = time.perf_counter()
-            record = _taken(consumers, subscription, data)
+            record = _take(consumers, subscription, data)
             took = time.perf_counter() - begun
             if took > SLOWEST_S:
                 raise Failure(f"{subscription.topic}: {data.hex()} took {took:.1f} s")
@@ -257,7 +257,7 @@ def _subscriptions() -> Iterator[Subscription]:
                 yield Subscription(profile, key)
 
 
-def _taken(consumers: Consumers, subscription: Subscription, data: bytes) -> str:
+def _take(consumers: Consumers, subscription: Subscription, data: bytes) -> str:
     """Return the type of the record of a message. Raises Failure."""
     try:
         record = subscription.read(data, time.monotonic())

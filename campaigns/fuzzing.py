@@ -1,7 +1,7 @@
-"""What the studies that try random inputs share: arguments, limits, progress and how a failure is reported.
+"""Shared parts of the fuzzing campaigns: arguments, limits, progress and reports of failures.
 
 A part of a study is a generator: from randomness it makes one input after another, tries it, and yields a note on all
-so far. It has no end, and raises `Failure` if a rule does not hold. Parts with the same seed try the same inputs.
+inputs. It has no end, and raises `Failure` if a rule does not hold. Parts with the same seed try the same inputs.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def run(part: Part, inputs: int, seconds: float, seed: int) -> tuple[int, str]:
     return done, note
 
 
-def mutated(random: Random, data: bytes, likely: bytes) -> bytes:
+def mutate(random: Random, data: bytes, likely: bytes) -> bytes:
     """Return data with up to three changes: bytes replaced, removed, repeated or added; or only `likely` bytes."""
     if random.random() < 0.1:
         return bytes(random.choices(likely, k=random.randint(0, 40)))

@@ -2,7 +2,7 @@
 
 python campaigns/rig_demo.py [--insertions 20] [--out runs/rig-demo]
 
-Each insertion has an emulated Galil, an emulated Aurora and a phantom of its own seed in three processes; the
+Each insertion has an emulated Galil, an emulated Aurora and a phantom with a separate seed in three processes; the
 controller gets nothing but the two protocols. Every tenth is in space. Beside it the same insertion runs on the
 virtual rig, in simulated time. A witness, a process that only sleeps, records the machine's own stalls: a tick that was
 left out counts as missed unless the witness was late at the same time. Exit status 1 if a bound is exceeded, which is
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import flexneedle
 from decision_time import MOST_GROWTH_MM
 from flexneedle.scenario.files import dump_scenario
-from rig_trials import axial_innovation, inserted, percentile, witness
+from rig_trials import axial_innovation, percentile, run_insertion, witness
 
 _SPACE_EVERY, _FIRST_SEED = 10, 400_000
 _ROTATION_DEG = 1080.0  # of the emulated rig
@@ -49,11 +49,11 @@ class Result:
     unexplained: int
 
 
-def measured(scenario: str, seed: int, out: Path) -> Result:
+def measure(scenario: str, seed: int, out: Path) -> Result:
     """Carry out one insertion on the emulated rig, and the same on the virtual one."""
     with tempfile.TemporaryDirectory() as folder, witness() as seen:
         file = _scenario_file(scenario, Path(folder))
-        found = inserted(Path(folder), file, seed, out)
+        found = run_insertion(Path(folder), file, seed, out)
         unexplained = found.unexplained(seen)
     if found.status not in (0, 1):
         raise SystemExit(f"{scenario}, seed {seed}: exit status {found.status}\n{found.errors}")
@@ -105,7 +105,7 @@ def main() -> None:
     for number in range(args.insertions):
         scenario = "phantom3d" if args.space or number % _SPACE_EVERY == _SPACE_EVERY - 1 else "phantom"
         seed = args.seed + number
-        one = measured(scenario, seed, args.out / f"{scenario}-{seed}")
+        one = measure(scenario, seed, args.out / f"{scenario}-{seed}")
         results.append(one)
         print(
             f"{one.scenario:10} {one.seed:6} {one.outcome:8} {one.true_error:7.3f} mm {one.simulated_error:7.3f} mm "

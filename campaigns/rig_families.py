@@ -35,7 +35,7 @@ from flexneedle.lab.rig.rig_file import RIGS, LoopSettings
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.worlds import has_rig, world
-from rig_trials import Inserted, Witness, inserted, resumed, witness
+from rig_trials import Inserted, Witness, resume_rows, run_insertion, witness
 
 FIRST_WORLD, FIRST_SEED = 13_000_000, 730_000
 _WORLDS_OF_A_RIG = 100  # the first of these numbers that has, or has not, a guide
@@ -63,7 +63,7 @@ class Rig:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the table and the picture show of it."""
+        """Values for the table and the picture."""
         axes, loop = self.file["axes"], self.file["loop"]
         return {
             "number": self.number,
@@ -79,7 +79,7 @@ class Rig:
         }
 
 
-def drawn(number: int) -> Rig:
+def draw_case(number: int) -> Rig:
     """The rig of a number."""
     rng = np.random.default_rng([_STREAM, number])
     has_guide, in_space, any_angle, preset = rng.random(4) < (0.8, 0.4, 0.5, 0.3)
@@ -90,7 +90,7 @@ def drawn(number: int) -> Rig:
         scenario = _world(number, guides, in_space=in_space, any_angle=any_angle)
     file = _rig(rng, f"Random rig {number}", scenario, guides, any_angle=any_angle)
     strategy = "manipulation" if guides or not scenario.setup.has_guide else "steering"
-    return Rig(number, file, _adapted(scenario, file, rng), strategy)
+    return Rig(number, file, _adapt(scenario, file, rng), strategy)
 
 
 def _preset(rng: np.random.Generator, guides: int, *, in_space: bool, any_angle: bool) -> Scenario:
@@ -185,7 +185,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _adapted(scenario: Scenario, file: dict[str, Any], rng: np.random.Generator) -> Scenario:
+def _adapt(scenario: Scenario, file: dict[str, Any], rng: np.random.Generator) -> Scenario:
     """The scenario as a user adapts it to the rig: speeds, the guide's step, the range of the rotation, and the rate of
     the tracker where the loop is slower.
     """
@@ -205,9 +205,9 @@ def _adapted(scenario: Scenario, file: dict[str, Any], rng: np.random.Generator)
     return scenario.with_values(values)
 
 
-def measured(number: int, out: Path, seen: Witness) -> dict[str, Any]:
+def measure(number: int, out: Path, seen: Witness) -> dict[str, Any]:
     """Insert on the emulated rig of a number and on the virtual one; return its row."""
-    rig, record, begun = drawn(number), out / str(number), monotonic()
+    rig, record, begun = draw_case(number), out / str(number), monotonic()
     shutil.rmtree(record, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix="families-") as folder:
         path, setup = Path(folder) / "scenario.toml", rig.scenario.setup
@@ -215,7 +215,7 @@ def measured(number: int, out: Path, seen: Witness) -> dict[str, Any]:
         limit = _START_S + _TIMES * setup.stroke_mm / setup.insertion_speed_mm_s
         options = ("--strategy", rig.strategy)
         text = tomli_w.dumps(rig.file)
-        found = inserted(Path(folder), path, rig.seed, record, *options, text=text, seconds=limit)
+        found = run_insertion(Path(folder), path, rig.seed, record, *options, text=text, seconds=limit)
     row = {
         **rig.facts,
         "outcome": found.outcome,
@@ -224,7 +224,7 @@ def measured(number: int, out: Path, seen: Witness) -> dict[str, Any]:
         "unexplained": found.unexplained(seen),
         "queued": found.ticks.get("queued", {}),
         "seconds": monotonic() - begun,
-        **(_compared(found, rig) if found.status in (0, 1) else {}),
+        **(_compare(found, rig) if found.status in (0, 1) else {}),
     }
     if row["outcome"] == _DONE:
         shutil.rmtree(record)
@@ -233,7 +233,7 @@ def measured(number: int, out: Path, seen: Witness) -> dict[str, Any]:
     return row
 
 
-def _compared(found: Inserted, rig: Rig) -> dict[str, Any]:
+def _compare(found: Inserted, rig: Rig) -> dict[str, Any]:
     """True errors (mm) of the insertion and of the same in simulated time."""
     done = flexneedle.load(found.out)
     with _SIMULATING:
@@ -249,7 +249,7 @@ def _compared(found: Inserted, rig: Rig) -> dict[str, Any]:
 
 
 def is_bad(row: dict[str, Any]) -> bool:
-    """Whether an insertion failed, or was held where the simulated one is done."""
+    """Return whether an insertion failed, or was held where the simulated one is done."""
     if row["outcome"] == "held":
         return row["simulated_outcome"] == _DONE
     return bool(row["outcome"] != _DONE)
@@ -267,7 +267,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
         _errors(both),
         _queues(rows),
         *(
-            f"- {shown(row)}"
+            f"- {format_row(row)}"
             for row in sorted(rows, key=lambda row: row["number"])
             if row["outcome"] != _DONE
         ),
@@ -308,7 +308,7 @@ def _queues(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def shown(row: dict[str, Any]) -> str:
+def format_row(row: dict[str, Any]) -> str:
     """A row in a line."""
     error, simulated = row.get("true_error_mm", math.nan), row.get("simulated_error_mm", math.nan)
     queued = ", ".join(f"{axis} {way:.3g}" for axis, way in row["queued"].items() if way)
@@ -364,7 +364,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for row, new in _rows(numbers, args.out, seen, args.workers):
             rows.append(row)
             if new:
-                print(f"{len(rows)} of {len(numbers)}: {shown(row)}", file=sys.stderr, flush=True)
+                print(f"{len(rows)} of {len(numbers)}: {format_row(row)}", file=sys.stderr, flush=True)
     if not rows:
         return 1
     print(summary(rows))
@@ -375,10 +375,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _rows(numbers: range, out: Path, seen: Witness, workers: int) -> Iterator[tuple[dict[str, Any], bool]]:
-    yield from resumed(
+    yield from resume_rows(
         out / "rows.jsonl",
         numbers,
-        lambda number: measured(number, out, seen),
+        lambda number: measure(number, out, seen),
         workers,
         lambda number: {"number": number},
     )

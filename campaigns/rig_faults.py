@@ -1,8 +1,8 @@
-"""Faults injected into a running rig: what happens, how soon, and how far the needle moves after that.
+"""Faults injected into a running rig: reaction, time to detection, and motion of the needle after it.
 
     python campaigns/rig_faults.py [--timings 20] [--workers 3] [--only stall,unplugged] [--out runs/rig-faults]
 
-Each trial has an emulated rig of its own (controller, tracker and phantom in three processes) and an insertion on it,
+Each trial has a separate emulated rig (controller, tracker and phantom in three processes) and an insertion on it,
 of a family of scenarios in the plane and in space, one for each timing (campaigns/fault_cases.py). At a random time of
 the insertion a fault is injected (campaigns/fault_list.py), in some cases during a roll. The states that the supervisor
 has recorded after it, and the outcome, are compared with the required reaction; they give the time to detection, and
@@ -25,7 +25,7 @@ from fault_judging import problems
 from fault_list import FAULTS, Fault
 from fault_report import draw, table
 from fault_trial import Trial, run_trial
-from rig_trials import Row, resumed
+from rig_trials import Row, resume_rows
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,10 +45,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     run = partial(run_trial, keep=args.out if args.keep else None)
     rows: list[Row] = []
     try:
-        for row, new in resumed(args.out / "rows.jsonl", trials, run, args.workers, lambda trial: trial.key):
+        for row, new in resume_rows(
+            args.out / "rows.jsonl", trials, run, args.workers, lambda trial: trial.key
+        ):
             rows.append(row)
             if new:
-                print(f"{len(rows)} of {len(trials)}: {shown(row, faults)}", file=sys.stderr, flush=True)
+                print(f"{len(rows)} of {len(trials)}: {format_row(row, faults)}", file=sys.stderr, flush=True)
     except KeyboardInterrupt:
         return 130
     if not rows:
@@ -58,8 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(len(rows) < len(trials) or any(problems(_fault_of(row, faults), row) for row in rows))
 
 
-def shown(row: Row, faults: Sequence[Fault]) -> str:
-    """A row in a line."""
+def format_row(row: Row, faults: Sequence[Fault]) -> str:
+    """Return a row in a line."""
     wrong = problems(_fault_of(row, faults), row)
     detection = "" if row["detection_s"] is None else f" after {row['detection_s']:.3f} s"
     return (

@@ -1,21 +1,21 @@
-"""ROS and an insertion on an emulated rig: what subscribers cost it, and how soon a stop from there ends its motion.
+"""ROS and an insertion on an emulated rig: the cost of subscribers, and the time of a stop over ROS.
 
 python campaigns/rig_ros.py [--pairs 3] [--stops 10] [--out runs/rig-ros] [--seed N]
 
-Each insertion has an emulated rig of its own (processes for motors, tracker and phantom), and a section `[ros]`.
+Each insertion has a separate emulated rig (processes for motors, tracker and phantom), and a section `[ros]`.
 
 Cost: each insertion runs twice, without subscribers and with four processes that subscribe to all topics, one of which
 reads nothing for seconds at a time. A witness, a process that only sleeps, records the machine's own stalls: a tick
 that was left out counts as missed unless the witness was late at the same time.
 
 Stops: another process arms the rig, and at a random time of the insertion it publishes `true` on the topic of stops or
-`false` on that of arms, or the node of the insertion is killed. The record has when the supervisor reported the stop,
-at its first tick after it; the true positions have how far the base moved, and until when.
+`false` on the topic of arms, or the node of the insertion is killed. The record has the time of the
+supervisor's report, at its first tick after the stop; the true positions have the motion of the base after it.
 
 Results are appended to OUT/results.jsonl as they end, and not repeated: the study can be interrupted. DDS is kept on
 the loopback interface. Exit status 1 if an insertion that was stopped moved by more than 0.5 mm after the stop, or did
 not end as interrupted with all axes at rest; or if one with subscribers was not done, left out a tick that no stall of
-the machine explains, or had a late decision. Those of an insertion without subscribers are no cost of theirs.
+the machine explains, or had a late decision. Problems of an insertion without subscribers are not their cost.
 """
 
 import argparse
@@ -41,7 +41,16 @@ import psutil
 
 import flexneedle
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
-from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_between, rests, shipped_rig, witness
+from rig_trials import (
+    EmulatedRig,
+    emulated_rig,
+    insertion,
+    is_at_rest,
+    moved_between,
+    shipped_rig,
+    wait_for_end,
+    witness,
+)
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 LOOPBACK = (
@@ -62,7 +71,7 @@ _PIPE = subprocess.PIPE
 Row = dict[str, Any]
 
 
-def resumed(path: Path, key: Row, run: Callable[[], Row]) -> Row:
+def resume(path: Path, key: Row, run: Callable[[], Row]) -> Row:
     """The row with these values in a file of rows (JSON, a line each); where it is missing it is made and appended."""
     rows = map(json.loads, path.read_text().splitlines()) if path.exists() else ()
     found = next((row for row in rows if key.items() <= row.items()), None)
@@ -104,9 +113,9 @@ def subscribers(count: int) -> Iterator[list[int]]:
 
 
 def cost(seed: int, count: int, out: Path) -> Row:
-    """Carry out an insertion with so many subscribers."""
+    """Carry out an insertion with this number of subscribers."""
     with rig_with("[ros]", seed, out) as rig, subscribers(count) as received, witness() as seen:
-        status, _, errors = ended(insertion(rig.rig, "phantom", out, "--seed", str(seed)), 180.0)
+        status, _, errors = wait_for_end(insertion(rig.rig, "phantom", out, "--seed", str(seed)), 180.0)
     if status not in (0, 1):
         raise SystemExit(f"seed {seed}: exit status {status}\n{errors}")
     done, timing = flexneedle.load(out), json.loads((out / "run.json").read_text())["timing"]
@@ -143,7 +152,7 @@ class Operator:
         self._process.communicate()
 
     def publish(self, order: str) -> float:
-        """Publish as an order such as `stop true` says; return when (s, monotonic)."""
+        """Publish as an order such as `stop true` demands; return the time (s, monotonic)."""
         self._process.stdin.write(f"{order} 0\n")
         self._process.stdin.flush()
         return float(self._process.stdout.readline())
@@ -160,12 +169,12 @@ def stop(how: str, timing: int, out: Path) -> Row:
             operator.publish("arm true")
             sleep(max(0.0, rig.first_motion(process) + after - monotonic()))
             order = STOPS[how]
-            sent = _killed(process.pid) if order is None else operator.publish(order)
-            status, _, errors = ended(process)
+            sent = _kill_node(process.pid) if order is None else operator.publish(order)
+            status, _, errors = wait_for_end(process)
         sleep(1.0)
         truth = rig.read_truth()
     run = json.loads((out / "run.json").read_text())
-    return {"status": status, "reason": run["reason"] or errors[-300:], **_judged(truth, sent, run)}
+    return {"status": status, "reason": run["reason"] or errors[-300:], **_judge(truth, sent, run)}
 
 
 def _await_line(process: "subprocess.Popen[bytes]", text: bytes) -> None:
@@ -178,7 +187,7 @@ def _await_line(process: "subprocess.Popen[bytes]", text: bytes) -> None:
     raise SystemExit("".join(["the insertion has ended\n", *lines]))
 
 
-def _killed(pid: int) -> float:
+def _kill_node(pid: int) -> float:
     """Kill the ROS node of an insertion; return when."""
     children = psutil.Process(pid).children()
     node = next(child for child in children if "flexneedle.lab.ros.node" in child.cmdline())
@@ -187,7 +196,7 @@ def _killed(pid: int) -> float:
     return now
 
 
-def _judged(truth: TruthRecord, sent: float, run: Row) -> Row:
+def _judge(truth: TruthRecord, sent: float, run: Row) -> Row:
     """Speed of the base (mm/s) at an order; times (ms) from it to the report of the stop and to the end of all motion;
     how far the base moved (mm) after the order and after the report.
     """
@@ -202,18 +211,18 @@ def _judged(truth: TruthRecord, sent: float, run: Row) -> Row:
         "rest_ms": 1e3 * max(0.0, float(truth.time[1:][turned][-1]) - sent),
         "moved_mm": moved_between(truth, sent),
         "moved_after_mm": moved_between(truth, reported),
-        "rests": rests(truth),
+        "rests": is_at_rest(truth),
     }
 
 
 def good(row: Row) -> bool:
-    """Whether an insertion ended as it must."""
+    """Return whether an insertion ended as it must."""
     stopped = row["status"] == _INTERRUPTED and not isnan(row["reported_ms"])
     return bool(stopped and row["rests"] and row["moved_after_mm"] <= _MOST_MM)
 
 
 def costs_nothing(row: Row) -> bool:
-    """Whether an insertion is done, with no tick left out but for stalls of the machine and no late decision."""
+    """Return whether an insertion is done, with no tick left out but for stalls of the machine and no late decision."""
     return bool(row["outcome"] == "done" and row["unexplained"] == 0 and row["late"] == 0)
 
 
@@ -229,7 +238,7 @@ def costs(pairs: int, first: int, out: Path) -> bool:
     for seed in range(first, first + pairs):
         for count in (0, len(KINDS)):
             key = {"subscribers": count, "seed": seed}
-            row = resumed(out / RESULTS, key, partial(cost, seed, count, out / f"{seed}-{count}"))
+            row = resume(out / RESULTS, key, partial(cost, seed, count, out / f"{seed}-{count}"))
             bad = bool(count) and not costs_nothing(row)
             fine &= not bad
             print(
@@ -247,7 +256,7 @@ def stops(count: int, out: Path) -> bool:
     rows: dict[str, list[Row]] = {how: [] for how in STOPS}
     for timing, how in product(range(count), STOPS):
         folder = out / f"{how}-{timing}".replace(" ", "-")
-        row = resumed(out / RESULTS, {"stop": how, "timing": timing}, partial(stop, how, timing, folder))
+        row = resume(out / RESULTS, {"stop": how, "timing": timing}, partial(stop, how, timing, folder))
         rows[how].append(row)
         mark = "" if good(row) else "not as required: "
         print(f"{_line(how, str(timing), row)} {mark}{row['reason']}", flush=True)

@@ -86,10 +86,10 @@ class EmulatedRig:
             if moved is not None:
                 return float(moved["time_s"])
             self.lines.wait(0.1)
-        raise RuntimeError(f"no motion: {ended(process, 0.0)}")
+        raise RuntimeError(f"no motion: {wait_for_end(process, 0.0)}")
 
     def read_truth(self) -> TruthRecord:
-        """The true states so far."""
+        """Return the true states until now."""
         return read_truth(self.truth)
 
 
@@ -132,7 +132,7 @@ def insertion(
     environment: Mapping[str, str] = {},
     cwd: Path | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Start an insertion on a rig, in a session of its own."""
+    """Start an insertion on a rig, in a separate session."""
     command = [sys.executable, "-m", "flexneedle", "insert", scenario, "--rig", str(rig), "--yes"]
     return subprocess.Popen(
         [*command, "--plan-seed", "0", "--out", str(out), "--json", *options],
@@ -144,7 +144,7 @@ def insertion(
     )
 
 
-def ended(process: subprocess.Popen[bytes], seconds: float = END_S) -> tuple[int, str, str]:
+def wait_for_end(process: subprocess.Popen[bytes], seconds: float = END_S) -> tuple[int, str, str]:
     """Wait for the end of an insertion; return its exit status and what it has printed on stdout and stderr.
 
     One that hangs is killed; stderr has where each of its threads was.
@@ -182,7 +182,7 @@ class Inserted:
 
     @property
     def reason(self) -> str:
-        """Why it ended as it did, in one line."""
+        """Return why it ended as it did, in one line."""
         printed = self.errors.strip().splitlines() if self.status not in (0, 1) else ()
         return str(self.run.get("reason") or "") or next(reversed(printed), "")
 
@@ -196,7 +196,7 @@ class Inserted:
         return sum(not seen.explains(one["time_s"], one["late_s"]) for one in self.ticks.get("stalls", ()))
 
 
-def inserted(
+def run_insertion(
     folder: Path,
     scenario: Path | str,
     seed: int,
@@ -205,13 +205,13 @@ def inserted(
     text: str | None = None,
     seconds: float = 180.0,
 ) -> Inserted:
-    """Insert into a scenario on an emulated rig of its own, with its files in a folder, within `seconds`.
+    """Insert into a scenario on a separate emulated rig, with its files in a folder, within `seconds`.
 
     text: of the rig file, as for `emulated_rig`; options: of the insertion, which runs in the folder.
     """
     with emulated_rig(folder, str(scenario), seed, text=text) as rig:
         process = insertion(rig.rig, str(scenario), out.resolve(), "--seed", str(seed), *options, cwd=folder)
-        status, _, errors = ended(process, seconds)
+        status, _, errors = wait_for_end(process, seconds)
         x, y, z = map(float, rig.read_truth().tips[-1, :3])
     run = json.loads(file.read_text()) if (file := out / "run.json").exists() else {}
     return Inserted(status, errors, run, (x, y, z), out)
@@ -227,7 +227,7 @@ Task = TypeVar("Task")
 Row = dict[str, Any]
 
 
-def resumed(
+def resume_rows(
     file: Path, tasks: Sequence[Task], run: Callable[[Task], Row], workers: int, key: Callable[[Task], Row]
 ) -> Iterator[tuple[Row, bool]]:
     """Yield the row of each task, and whether it is new: those in a file first, then others as they end.
@@ -265,11 +265,11 @@ def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
     """The rows of tasks as they end, without those that fail. Raises KeyboardInterrupt once `interrupted` is set."""
     left = set(running)
     while left:
-        ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
+        wait_for_end, left = wait(left, _POLL_S, FIRST_COMPLETED)
         if interrupted.is_set():
             raise KeyboardInterrupt
         # Those that raise come last: another's exception loses no row.
-        for one in sorted(ended, key=lambda one: one.exception() is not None):
+        for one in sorted(wait_for_end, key=lambda one: one.exception() is not None):
             try:
                 yield one.result()
             except RuntimeError as error:
@@ -280,10 +280,10 @@ def _end(pool: ThreadPoolExecutor) -> None:
     """Cancel tasks, and end all processes below this one until no task runs: one may start another in between."""
     closing = Thread(target=pool.shutdown, kwargs={"cancel_futures": True})
     closing.start()
-    ended = set[psutil.Process]()
+    wait_for_end = set[psutil.Process]()
     while closing.is_alive():
-        for process in set(psutil.Process().children(recursive=True)) - ended:
-            ended.add(process)
+        for process in set(psutil.Process().children(recursive=True)) - wait_for_end:
+            wait_for_end.add(process)
             with suppress(psutil.NoSuchProcess):
                 process.terminate()
                 process.resume()  # one that is stopped does not end
@@ -301,7 +301,7 @@ class Witness:
     text: str | None = None
 
     def explains(self, time: float, late: float) -> bool:
-        """Whether it was late, too, by at least half as much, when a tick began late at this time."""
+        """Return whether it was late, too, by at least half as much, when a tick began late at this time."""
         begun = time - late - 0.005
         return any(begun <= at <= time + 0.05 and gap >= 0.5 * late for at, gap in self._stalls())
 
@@ -342,14 +342,14 @@ def watch() -> None:
 def moved_between(
     truth: TruthRecord, since: float, until: float = math.inf, axis: str = "insertion"
 ) -> float:
-    """How far an axis has moved (mm, rad) from where it was at a time (s, monotonic) until another."""
+    """Return the motion of an axis (mm, rad) between two times (s, monotonic)."""
     places = truth.positions[axis]
     after = places[(truth.time >= since) & (truth.time <= until)]
     return float(np.abs(after - np.interp(since, truth.time, places)).max()) if len(after) else 0.0
 
 
-def rests(truth: TruthRecord, seconds: float = 0.5, most: float = 0.005) -> bool:
-    """Whether no axis has moved by `most` (mm, rad) in the last `seconds`."""
+def is_at_rest(truth: TruthRecord, seconds: float = 0.5, most: float = 0.005) -> bool:
+    """Return whether no axis has moved by `most` (mm, rad) in the last `seconds`."""
     last = truth.time >= truth.time[-1] - seconds
     return all(np.ptp(place[last]) < most for place in truth.positions.values())
 

@@ -1,12 +1,12 @@
-"""What the time of a decision costs on a real clock: insertions on an emulated rig, in pairs.
+"""Effect of the time of a decision on a real clock: insertions on an emulated rig, in pairs.
 
     python campaigns/rig_wall_clock.py [--pairs 150] [--workers 2] [--out runs/rig-wall-clock]
 
-Each insertion has an emulated rig of its own (controller, tracker and phantom in three processes), and each of its
+Each insertion has a separate emulated rig (controller, tracker and phantom in three processes), and each of its
 decisions takes 0, 50 or 150 ms longer. A pair is the same world and seed with all of these times: every second one a
 random world with a guide that fits the rig, the others the preset `phantom` with the paper's 15 targets, each with a
-seed of its own. No setting was chosen on these worlds and seeds. The table has the growth of the mean true error over
-that of the same insertions without a delay with its 95 % interval (bootstrap over pairs), the mean axial innovation,
+separate seed. No setting was chosen on these worlds and seeds. The table has the growth of the mean true error over
+the same insertions without a delay with its 95 % interval (bootstrap over pairs), the mean axial innovation,
 and decisions and ticks that were late: a tick that was left out counts as missed, and as the machine's unless a
 process that only sleeps was in time.
 
@@ -43,7 +43,7 @@ import flexneedle
 from decision_time import MOST_GROWTH_MM, MOST_INNOVATION_MM, TARGETS
 from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
-from rig_trials import Witness, axial_innovation, inserted, resumed, witness
+from rig_trials import Witness, axial_innovation, resume_rows, run_insertion, witness
 
 FIRST_WORLD, FIRST_SEED = 14_000_000, 720_000
 DECISIONS_MS = (0, 50, 150)
@@ -95,7 +95,7 @@ def scenario_of(pair: int) -> tuple[str, tuple[str, ...]]:
     raise AssertionError
 
 
-def measured(job: Job, out: Path, seen: Witness) -> dict[str, Any]:
+def measure(job: Job, out: Path, seen: Witness) -> dict[str, Any]:
     """Carry out one insertion; return its row."""
     scenario, options = scenario_of(job.pair)
     record = out / f"{job.pair}-{job.decision_ms}"
@@ -104,7 +104,7 @@ def measured(job: Job, out: Path, seen: Witness) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="wall-") as folder:
         (Path(folder) / "slow.py").write_text(_LATE.replace("{seconds}", f"{1e-3 * job.decision_ms}"))
         options = (*options, "--controller", "slow:LATE")
-        found = inserted(Path(folder), scenario, job.seed, record, *options)
+        found = run_insertion(Path(folder), scenario, job.seed, record, *options)
     row = {
         "pair": job.pair,
         "decision_ms": job.decision_ms,
@@ -148,7 +148,7 @@ class Line:
 
     @property
     def problems(self) -> list[str]:
-        """What exceeds its bound."""
+        """Return the bounds that are exceeded."""
         failed = sum(row["outcome"] not in ("done", "held") for row in self.rows)
         late, periods, unexplained = self.sums("late", "periods", "unexplained")
         with_it, without = self.held
@@ -191,12 +191,12 @@ def mean_with_interval(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def tail(least: int, count: int) -> float:
-    """Probability of at least so many heads in `count` throws of a coin."""
+    """Return the probability of at least this number of heads in `count` throws of a coin."""
     return sum(math.comb(count, number) for number in range(least, count + 1)) / 2**count
 
 
-def held(rows: Sequence[dict[str, Any]], ms: int) -> tuple[int, int]:
-    """Numbers of pairs that are held with a delay and done without, and the other way round."""
+def count_held(rows: Sequence[dict[str, Any]], ms: int) -> tuple[int, int]:
+    """Return the numbers of pairs that are held with a delay and done without, and the other way round."""
     outcomes = {(row["pair"], row["decision_ms"]): row["outcome"] for row in rows}
     both = Counter(
         (outcomes[pair, ms], outcomes.get((pair, DECISIONS_MS[0]))) for pair, at in outcomes if at == ms
@@ -222,7 +222,7 @@ def lines(rows: Sequence[dict[str, Any]]) -> Iterator[Line]:
             mean_with_interval(errors - base),
             float(np.quantile(errors, 0.95)),
             mean_with_interval(innovations),
-            held(rows, ms),
+            count_held(rows, ms),
         )
 
 
@@ -270,7 +270,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     axes[0].axhline(MOST_GROWTH_MM, color="#d55e00")
     axes[1].axhline(MOST_INNOVATION_MM, color="#d55e00")
     axes[1].axhline(-MOST_INNOVATION_MM, color="#d55e00")
-    axes[0].set_ylabel("true error, less that of 0 ms (mm)")
+    axes[0].set_ylabel("true error, less the error at 0 ms (mm)")
     axes[1].set_ylabel("axial innovation, mean (mm)")
     for first, axis in zip((1, 0), axes, strict=True):
         axis.set_xticks(range(first, len(DECISIONS_MS)), [f"{ms} ms" for ms in DECISIONS_MS[first:]])
@@ -296,8 +296,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs = [Job(*one) for one in product(range(args.pairs), DECISIONS_MS)]
     rows: list[dict[str, Any]] = []
     with witness() as seen:
-        for row, new in resumed(
-            args.out / "rows.jsonl", jobs, lambda job: measured(job, args.out, seen), args.workers, vars
+        for row, new in resume_rows(
+            args.out / "rows.jsonl", jobs, lambda job: measure(job, args.out, seen), args.workers, vars
         ):
             rows.append(row)
             if new:
@@ -312,7 +312,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def problems(results: Sequence[Line], missing: int) -> list[str]:
-    """What is not as required, with the number of insertions that have no row."""
+    """Return the requirements that are not met, with the number of insertions that have no row."""
     found = [problem for line in results for problem in line.problems]
     if missing:
         found.append(f"{missing} insertions have no row")

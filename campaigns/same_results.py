@@ -46,13 +46,13 @@ def insertions() -> Iterator[tuple[str, Any, str, str, int]]:
     for index in range(CASES):
         scenario = flexneedle.load_scenario(f"world:{FIRST_WORLD + index}")
         yield f"world {index}", scenario, "adaptive-mpc", "manipulation", FIRST_SEED + 200 + index
-    from rig_families import drawn
+    from rig_families import draw_case
 
-    for rig in (drawn(index) for index in range(CASES)):
+    for rig in (draw_case(index) for index in range(CASES)):
         yield f"rig {rig.number}", rig.scenario, "adaptive-mpc", rig.strategy, rig.seed
 
 
-def computed(scenario: Any, controller: str, strategy: str, seed: int) -> dict[str, Any]:
+def compute(scenario: Any, controller: str, strategy: str, seed: int) -> dict[str, Any]:
     """Return the results of one insertion."""
     try:
         plan = flexneedle.plan(scenario, strategy=strategy, seed=seed)
@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return compare(*args.compare)
     results = {}
     for name, *rest in islice(insertions(), args.first, args.first + args.count):
-        results[name] = computed(*rest)
+        results[name] = compute(*rest)
         print(name, results[name].get("outcome", results[name].get("error")), file=sys.stderr, flush=True)
         args.out.write_text(json.dumps(results, indent=1))
     return 0

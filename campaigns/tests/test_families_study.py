@@ -20,7 +20,7 @@ NUMBERS = range(40)
 
 @pytest.fixture(scope="module")
 def rigs():
-    return [study.drawn(number) for number in NUMBERS]
+    return [study.draw_case(number) for number in NUMBERS]
 
 
 def test_a_rig_is_valid_and_fits_its_scenario(rigs):
@@ -29,7 +29,7 @@ def test_a_rig_is_valid_and_fits_its_scenario(rigs):
 
 
 def test_rigs_depend_on_the_number_alone_and_are_of_all_families(rigs):
-    assert study.drawn(7) == rigs[7]
+    assert study.draw_case(7) == rigs[7]
     axes = [rig.file["axes"] for rig in rigs]
     assert {rig.file["driver"]["mode"] for rig in rigs} == {"tracking", "moves"}
     assert {rig.file["loop"]["rate_hz"] for rig in rigs} == {20.0, 40.0, 60.0}

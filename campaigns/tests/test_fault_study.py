@@ -333,7 +333,7 @@ def test_a_fault_that_came_too_late_for_its_roll_is_tried_again(monkeypatch):
         tried.append((trial, rng.random(), keep))
         return {"during": "rest" if len(tried) < 3 else "roll"}
 
-    monkeypatch.setattr("fault_trial._attempted", attempted)
+    monkeypatch.setattr("fault_trial._attempt", attempted)
     monkeypatch.setattr("fault_trial.good", lambda _, row: row["during"] != "bad")
     in_roll, elsewhere = Trial(BY_NAME["roll stalls"], case(3)), Trial(BY_NAME["motor off"], case(3))
     assert run_trial(in_roll) == {"during": "roll", "attempts": 3}
@@ -341,7 +341,7 @@ def test_a_fault_that_came_too_late_for_its_roll_is_tried_again(monkeypatch):
     assert tried[0][1] == in_roll.rng().random()
     tried.clear()
     assert run_trial(elsewhere) == {"during": "rest", "attempts": 1}
-    monkeypatch.setattr("fault_trial._attempted", lambda *_: {"during": "bad"})
+    monkeypatch.setattr("fault_trial._attempt", lambda *_: {"during": "bad"})
     assert run_trial(in_roll) == {"during": "bad", "attempts": 1}  # whatever it was, it is no good
 
 
@@ -381,7 +381,7 @@ INTERRUPTED = """
 import os, signal, subprocess, sys
 from pathlib import Path
 sys.path.insert(0, {studies!r})
-from rig_trials import resumed
+from rig_trials import resume_rows
 
 def run(task):
     for _ in range(2):  # what a task starts after the interrupt ends, too
@@ -392,7 +392,7 @@ def run(task):
         process.wait()
     raise RuntimeError("ended")
 
-list(resumed(Path({file!r}), [1, 2, 3], run, 2, lambda task: {{"task": task}}))
+list(resume_rows(Path({file!r}), [1, 2, 3], run, 2, lambda task: {{"task": task}}))
 """
 
 

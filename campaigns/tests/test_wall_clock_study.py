@@ -1,4 +1,4 @@
-"""campaigns/rig_wall_clock.py: pairs, their growth with its interval, bounds, and a study that goes on where it was."""
+"""campaigns/rig_wall_clock.py: pairs, their growth with its interval, bounds, and a study that is continued."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ from flexneedle.scenario.files import load_scenario
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "campaigns"))
 import rig_wall_clock as study
-from rig_trials import resumed
+from rig_trials import resume_rows
 
 
 def row(pair, ms, error=0.03, innovation=0.001, outcome="done"):
@@ -125,9 +125,9 @@ def test_a_study_goes_on_where_it_was(tmp_path):
         return {"task": task}
 
     with pytest.raises(KeyboardInterrupt):
-        list(resumed(file, [1, 2, 3], run, 1, key))
+        list(resume_rows(file, [1, 2, 3], run, 1, key))
     assert [json.loads(line)["task"] for line in file.read_text().splitlines()] == [1, 2]
-    found = list(resumed(file, [2, 1, 5], run, 2, key))
+    found = list(resume_rows(file, [2, 1, 5], run, 2, key))
     assert found == [
         ({"task": 1, "value": 2}, False),
         ({"task": 2, "value": 4}, False),

@@ -37,7 +37,7 @@ LINE = st.lists(COMMAND, min_size=1, max_size=3).map(";".join)
 def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
     device, _ = reply(ControllerState(), "SHAB")
     for line, samples in lines:
-        before, device = device, fuzz_galil.checked_line(device, line, samples)
+        before, device = device, fuzz_galil.check_line(device, line, samples)
         pairs = zip(before.axes, device.axes, strict=True)
         begun = [now for was, now in pairs if now.running and not was.running]
         assert all(axis.servo for axis in begun)
@@ -47,7 +47,7 @@ def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
 def test_the_fuzz_notices_a_motion_that_nothing_began():
     moving = advance_controller(reply(ControllerState(), "SHA;JGA=5000;BGA")[0], 50)
     with pytest.raises(fuzz_galil.Failure, match="began to move"):
-        fuzz_galil.checked_line(ControllerState(), "SPA=100", 0, answered=lambda *_: (moving, ":"))
+        fuzz_galil.check_line(ControllerState(), "SPA=100", 0, answered=lambda *_: (moving, ":"))
 
 
 @pytest.fixture(scope="module")

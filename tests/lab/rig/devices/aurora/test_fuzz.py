@@ -49,7 +49,7 @@ def test_a_line_that_damages_replies_gives_no_frame_that_was_not_sent():
     pose=st.lists(FINITE, max_size=10) | st.tuples(*[FINITE] * 8),
 )
 def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, frame, pose):
-    found = fuzz_aurora.checked_reading((kind, bits, frame, tuple(pose)), 2)
+    found = fuzz_aurora.check_reading((kind, bits, frame, tuple(pose)), 2)
     assert (found.position is None) == (found.status != VISIBLE)
     assert all(abs(part) < fuzz_aurora.FARTHEST_MM for part in found.position or ())
 
@@ -63,7 +63,7 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
 def test_any_line_that_is_no_message_is_refused_and_counted(lines):
     feeding = fuzz_aurora.Feeding()
     for number, line in enumerate(lines):
-        fuzz_aurora.fed(feeding, line, Random(number))
+        fuzz_aurora.feed_message(feeding, line, Random(number))
     assert feeding.incoming.counts.errors.get("crash", 0) == len(lines)
     assert feeding.incoming.read() == ()
 
@@ -78,7 +78,7 @@ def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
             frame = fuzz_aurora.random_frame(Random(number))
             _, answer = aurora.reply(device, sent, frame)
             assert answer.endswith(b"\r") or fuzz_aurora.decoded(answer) is not None
-            device = fuzz_aurora.checked_command(device, sent, frame)
+            device = fuzz_aurora.check_command(device, sent, frame)
 
 
 # What it must notice
@@ -87,11 +87,11 @@ def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
 def test_the_fuzz_notices_a_position_of_a_sensor_that_was_not_measured():
     wrong = {"tip": SensorReading((0.0, 0.0, 1e5), (1.0, 0.0, 0.0, 0.0), 0.0)}
     with pytest.raises(fuzz_aurora.Failure):
-        fuzz_aurora.checked_reading((0, 0x31, 7, fuzz_aurora.POSE), 7, read=lambda *_: wrong)
+        fuzz_aurora.check_reading((0, 0x31, 7, fuzz_aurora.POSE), 7, read=lambda *_: wrong)
     right = {"tip": SensorReading((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), 0.0)}
     with pytest.raises(fuzz_aurora.Failure):
-        fuzz_aurora.checked_reading((0, 0x31, 6, fuzz_aurora.POSE), 7, read=lambda *_: right)
-    assert fuzz_aurora.checked_reading((0, 0x31, 7, fuzz_aurora.POSE), 7, read=lambda *_: right)
+        fuzz_aurora.check_reading((0, 0x31, 6, fuzz_aurora.POSE), 7, read=lambda *_: right)
+    assert fuzz_aurora.check_reading((0, 0x31, 7, fuzz_aurora.POSE), 7, read=lambda *_: right)
 
 
 @pytest.mark.parametrize("line", [b"", b"{}", b'["frames"]', b"\xff", b"[" * 9000])
@@ -99,13 +99,13 @@ def test_the_fuzz_notices_a_line_that_was_taken_for_a_message(line, monkeypatch)
     monkeypatch.setattr(LinkReceiver, "take", lambda *_: None)
     monkeypatch.setattr(fuzz_aurora, "parse", lambda data: data)
     with pytest.raises(fuzz_aurora.Failure, match="taken for a message"):
-        fuzz_aurora.fed(fuzz_aurora.Feeding(), line, Random(0))
+        fuzz_aurora.feed_message(fuzz_aurora.Feeding(), line, Random(0))
 
 
 def test_the_fuzz_notices_tracking_that_nothing_began():
     moving = replace(aurora.power_on(), mode="tracking")
     with pytest.raises(fuzz_aurora.Failure):
-        fuzz_aurora.checked_command(
+        fuzz_aurora.check_command(
             aurora.power_on(), b"INIT:", None, answered=lambda *_: (moving, codec.encode_text("OKAY"))
         )
 
