@@ -42,25 +42,26 @@ Laterals = NDArray[Any]
 
 
 def laterals(rows: Floats, first: int, axes: int) -> Laterals:
-    """`across` in space, the column of y in the plane."""
+    """Return `across` in space, the column of y in the plane."""
     return rows[..., first] if axes == 1 else across(rows, first)
 
 
 def across(rows: Floats, first: int) -> NDArray[np.complex128]:
-    """The lateral quantities y + iz (…) of rows (…, k); `first`: the column of y, as Y, THETA, DB_Y or DG_Y."""
+    """Return the lateral quantities y + iz (…) of rows (…, k); first: the column of y, as Y, THETA, DB_Y or DG_Y."""
     lateral: NDArray[np.complex128] = rows[..., first] + 1j * rows[..., first + 1]
     return lateral
 
 
 def wrap_angles(angle: Floats) -> Floats:
-    """Angles (rad) from −π, excluded, to π."""
+    """Return angles (rad) from −π, excluded, to π."""
     within: Floats = np.pi - (np.pi - angle) % (2.0 * np.pi)
     return within
 
 
 class Pose(NamedTuple):
-    """Position x, y, z (mm), and slopes θ = dy/dx and ψ = dz/dx (rad): of a needle that is bent far, the angle by which
-    it is tilted from x, in the directions y and z.
+    """Position x, y, z (mm), and slopes θ = dy/dx and ψ = dz/dx (rad).
+
+    For a needle that is bent far, the slopes are the angle by which it is tilted from x, in the directions y and z.
     """
 
     x: float
@@ -83,13 +84,16 @@ class Pose(NamedTuple):
 
     @staticmethod
     def of(row: Iterable[float]) -> "Pose":
-        """The pose of five columns."""
+        """Return the pose of five columns."""
         return Pose(*map(float, row))
 
 
 class Shape(NamedTuple):
-    """A predicted shape: poses (n, 5) at the nodes of the needle, and standard deviations (n, 2) of their y and z
-    (mm).
+    """A predicted shape.
+
+    Attributes:
+        nodes: Poses (n, 5) at the nodes of the needle.
+        sd: Standard deviations (n, 2) of their y and z (mm).
     """
 
     nodes: Floats
@@ -113,9 +117,22 @@ COLUMNS: tuple[str, ...] = _Columns._fields
 
 
 class Control(_Columns):
-    """One control step, a row of nine columns: motion of the base by db_x, db_y, db_z (mm) and of its slopes by
-    db_theta, db_psi (rad), of the guide by dg_y, dg_z (mm); `roll` of the needle before the step, and `spin` evenly
-    during it (rad). `flip` is a roll by half a turn. Raises InputError for anything but numbers.
+    """One control step, a row of nine columns.
+
+    Args:
+        db_x: Motion of the base along x (mm).
+        db_y: Motion of the base along y (mm).
+        db_z: Motion of the base along z (mm).
+        db_theta: Change of the base's slope θ (rad).
+        db_psi: Change of the base's slope ψ (rad).
+        dg_y: Motion of the guide along y (mm).
+        dg_z: Motion of the guide along z (mm).
+        roll: Roll of the needle before the step (rad).
+        spin: Even roll during the step (rad).
+        flip: Whether half a turn is added to `roll`.
+
+    Raises:
+        InputError: A value is not a number.
     """
 
     __slots__ = ()
@@ -163,10 +180,14 @@ STILL = Control()
 
 
 class Motion(NamedTuple):
-    """A control as a driver carried it out, from `begun` to `ended` (s, on the clock of the run).
+    """A control as a driver carried it out.
 
-    The needle rolls first: `turned` is when the roll had ended and the travel began. None: there was no roll. held: why
-    the rig ended it before its goal, or did not begin it; "" if it was carried out.
+    Attributes:
+        control: The control.
+        begun: Start (s, on the clock of the run).
+        ended: End (s).
+        turned: End of the roll and start of the travel (s); None: there was no roll.
+        held: Reason why the rig ended it before its goal, or did not begin it; "" if it was carried out.
     """
 
     control: Control
@@ -177,7 +198,7 @@ class Motion(NamedTuple):
 
     @property
     def travel_begun(self) -> float:
-        """When the travel began (s)."""
+        """Start of the travel (s)."""
         return self.begun if self.turned is None else self.turned
 
 
@@ -206,7 +227,7 @@ class SensorReading:
 
 
 def is_reference(sensor: str) -> bool:
-    """Whether a sensor is a fixed reference beside the workspace, by its name: ref1, ref2, reference, …"""
+    """Return whether a sensor is a fixed reference beside the workspace, by its name, such as ref1 or reference."""
     return sensor.lower().startswith("ref")
 
 
@@ -235,7 +256,7 @@ class Measurement:
 
     frame: all sensors of the tracker, for the monitor; None if there is only the tip. direction: slopes dy/dx and dz/dx
     (rad) of the needle at the tip; points: x, y, z (mm) measured along the needle, from the base on. Covariances as
-    the tracker reports them, of position (3, 3), mm², and direction (2, 2), rad²; None: those of the scenario. Only
+    the tracker reports them, of position (3, 3), mm², and direction (2, 2), rad²; None: the scenario's. Only
     the observer of `adaptive-mpc` uses direction and covariances; others use the position, with the scenario's noise.
 
     Arrays and lists become tuples. Raises InputError for other shapes, and for covariances that are not symmetric up to
@@ -271,10 +292,24 @@ class Measurement:
 class Plan:
     """A planned insertion of m steps.
 
-    target: x, y, z (mm); roll: of the needle before the first step (rad); controls (m, 9): columns of `Control`;
-    tips (m + 1, 5): planned tip poses, the start first; strain_energy (m + 1,): weighted tissue energy (mJ); guide
-    (m + 1, 2): guide position y, z (mm); shapes (m + 1, n, 5): poses at the nodes of the needle; terms: cost by name;
-    history: one dict per iteration of the planner; scenario: that of the plan, None if unknown.
+    Attributes:
+        strategy: "manipulation" or "steering".
+        target: x, y, z (mm).
+        seed: Seed of the search.
+        roll: Angle of the needle before the first step (rad).
+        controls: Columns of `Control` (m, 9).
+        tips: Planned tip poses (m + 1, 5), the start first.
+        strain_energy: Weighted tissue energy (m + 1,), mJ.
+        guide: Guide position y, z (m + 1, 2), mm.
+        shapes: Poses at the nodes of the needle (m + 1, n, 5).
+        cost: Cost.
+        terms: Cost by name.
+        iterations: Iterations of the search.
+        converged: Whether the search converged.
+        history: One dict per iteration of the planner.
+        limit: Limit that binds if the target is out of reach, else "".
+        seconds: Wall-clock time (s) of the search.
+        scenario: Scenario of the plan, None if unknown.
     """
 
     strategy: str
@@ -312,7 +347,7 @@ class Plan:
 
     @property
     def reached(self) -> bool:
-        """Whether the plan ends within 1 mm, the radius of the paper's target circles."""
+        """Whether the plan ends within 1 mm of the target, the radius of the paper's target circles."""
         return self.error_mm <= 1.0
 
     @property
@@ -342,7 +377,7 @@ class Plan:
 
     @property
     def flips(self) -> int:
-        """Number of rolls of the bevel (bevel flips, in the plane) during the insertion, without that at the start."""
+        """Number of rolls of the bevel (flips, in the plane) during the insertion, without the roll at the start."""
         return int(np.count_nonzero(self.controls[:, ROLL]))
 
     def __repr__(self) -> str:
@@ -396,7 +431,7 @@ class Action(StrEnum):
 
 
 class Outcome(StrEnum):
-    """How an insertion ended."""
+    """Outcome of an insertion."""
 
     REFUSED = "refused"  # before the needle moved
     DONE = "done"
@@ -570,6 +605,6 @@ def scenario_of(record: Plan | Insertion) -> "Scenario":
 
 
 def _mm(position: Sequence[float]) -> str:
-    """A position, without z in the plane."""
+    """Return a position as text, without z in the plane."""
     x, y, *out = position[:3]
     return f"({', '.join(f'{value:.4g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"

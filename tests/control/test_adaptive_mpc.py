@@ -317,16 +317,22 @@ def test_without_a_guide_none_is_moved(quick_plan):
     assert {decision.spread for decision in decisions} == {0.0}
 
 
-def test_on_the_exact_model_it_ends_at_the_target(quick_plan):
-    decisions, truth, _ = carried_out(quick_plan, PHANTOM)
+@pytest.fixture(scope="module")
+def on_the_exact_model(quick_plan):
+    """Decisions of a whole insertion, and the true needle at its end."""
+    return carried_out(quick_plan, PHANTOM)[:2]
+
+
+def test_on_the_exact_model_it_ends_at_the_target(on_the_exact_model):
+    decisions, truth = on_the_exact_model
     assert abs(truth.tip[Y] - 5.0) < 0.1
     last = [decision for decision in decisions if np.isfinite(decision.miss)][-1]
     assert abs(last.miss) < 0.1
 
 
-def test_the_predicted_miss_gets_no_less_sure_on_the_way(quick_plan):
+def test_the_predicted_miss_gets_no_less_sure_on_the_way(on_the_exact_model):
     """Where the readings are those of the model: what is to come was counted on from the start."""
-    decisions, _, _ = carried_out(quick_plan, PHANTOM)
+    decisions, _ = on_the_exact_model
     sds = np.array([decision.miss_sd for decision in decisions])
     assert (sds > 0.0).all()
     assert sds[-10:].mean() < 1.1 * sds[:10].mean()
