@@ -21,6 +21,7 @@ from ros_peers import Peer
 from stages import RIG, Stage
 
 TESTS = Path(__file__).parent
+PATIENCE_S = 300.0
 START_MM = flexneedle.load_scenario("phantom").setup.start_tip_x
 QUICK = {
     "target.depth_mm": 6.0,
@@ -124,7 +125,7 @@ class Started:
                 one.readers for one in peer.writers.values()
             )
 
-        until(lambda: found() or self.over, 60.0)
+        until(lambda: found() or self.over, PATIENCE_S)
         return peer
 
     @property
@@ -134,7 +135,18 @@ class Started:
 
     def until_state(self, peer, state):
         """Wait until the rig reports a state."""
-        until(lambda: state in [one.data for one in peer.received("state")], 60.0)
+        self.await_that(lambda: state in [one.data for one in peer.received("state")])
+
+    def await_that(self, condition):
+        """Wait for a condition: the first insertion compiles, on a machine that may be busy."""
+
+        def holds():
+            if self.process.poll() is None:
+                return condition()
+            until(condition)  # what the process sent last is on its way
+            return True
+
+        until(holds, PATIENCE_S)
 
     def calls(self, *wanted):
         """The calls of the motors with these names: (what, when, where)."""
@@ -153,14 +165,14 @@ class Started:
         children = psutil.Process(self.process.pid).children()
         return next(child for child in children if module in child.cmdline())
 
-    def end(self, seconds=60.0):
+    def end(self, seconds=PATIENCE_S):
         """Wait for its end; return exit status, stdout and the lines of stderr."""
         out, errors = self.process.communicate(timeout=seconds)
         return self.process.returncode, out, errors.splitlines()
 
     def end_followed_by(self, peer):
         """The same, while a peer takes what is published."""
-        until(lambda: list(map(peer.received, peer.readers)) and self.process.poll() is not None, 60.0)
+        until(lambda: list(map(peer.received, peer.readers)) and self.process.poll() is not None, PATIENCE_S)
         return self.end()
 
     @property

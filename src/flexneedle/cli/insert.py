@@ -58,6 +58,9 @@ class Connection:
         """Connect what must be connected before planning, until the stack closes; return the scenario to plan for."""
         return scenario
 
+    def add_record(self, folder: Folder) -> None:
+        """Add the record of the connection to `run.json`."""
+
     def listeners(self, progress: Progress) -> tuple[Listener, ...]:
         """Return further listeners, called after the progress."""
         return ()
@@ -168,6 +171,7 @@ def _execute(
     from flexneedle.record.recording import record_insertion
     from flexneedle.types import Outcome
 
+    connection.add_record(folder)
     with Progress() as progress:
         insertion = record_insertion(
             folder,

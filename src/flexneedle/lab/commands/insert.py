@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from flexneedle.lab.rig.rig_file import RigFile, RosSettings
     from flexneedle.lab.ros.bridge import Bridge
     from flexneedle.loop.events import Listener
+    from flexneedle.record.folder import Folder
     from flexneedle.scenario.model import Scenario
 
 
@@ -80,6 +81,11 @@ class RosConnection(Connection):
 
         self._bridge = stack.enter_context(Bridge(settings, partial(print, file=sys.stderr, flush=True)))
         return with_target(scenario, self._bridge.await_target()) if settings.target else scenario
+
+    def add_record(self, folder: Folder) -> None:
+        """Add what was received and refused, and a loss of the node, to `timing`."""
+        if self._bridge is not None:
+            folder.timing["ros"] = self._bridge.record
 
     def listeners(self, progress: Progress) -> tuple[Listener, ...]:
         """Return the connection to ROS, whose lines are printed above the progress from now on."""

@@ -76,6 +76,7 @@ def insert_on_rig(reporter: InsertionReporter) -> Insertion:
         if rig.ros is not None:
             bridge = stack.enter_context(Bridge(rig.ros, partial(print, file=sys.stderr, flush=True)))
             listeners, gates = [*listeners, bridge], [bridge, gate]
+            folder.timing["ros"] = bridge.record
         insertion = record_insertion(
             folder, scenario, order.strategy, choices, listeners=listeners, gate=AllGates(*gates)
         )
