@@ -28,7 +28,7 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class DecisionRefusal:
     """Reason to carry out no decision, "" for none, and the time (s) held for it.
 
     No path reaches the target, the command would exceed a limit, or the rig, whose checks may differ from the loop's,
@@ -39,13 +39,13 @@ class Refusal:
     reason: str = ""
     duration: float = 0.0
 
-    def after(self, reason: str) -> "Refusal":
+    def after(self, reason: str) -> "DecisionRefusal":
         """Return the refusal after a decision."""
-        return Refusal(reason, self.duration) if reason else Refusal()
+        return DecisionRefusal(reason, self.duration) if reason else DecisionRefusal()
 
-    def extend(self, seconds: float) -> "Refusal":
+    def extend(self, seconds: float) -> "DecisionRefusal":
         """Return the refusal after a period of this length."""
-        return Refusal(self.reason, self.duration + seconds) if self.reason else self
+        return DecisionRefusal(self.reason, self.duration + seconds) if self.reason else self
 
     def ending(self, limit: float) -> tuple[Outcome, str] | None:
         """Return outcome and reason once the hold has lasted for `limit` (s)."""
@@ -106,7 +106,7 @@ class LoopState:
     observation: Observation
     memory: Any  # of the controller
     hold: Hold | None
-    refused: Refusal = Refusal()
+    refused: DecisionRefusal = DecisionRefusal()
     arrived_at: float | None = None
     moves: int = 0
     in_a_row: int = 0
