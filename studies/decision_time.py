@@ -1,11 +1,11 @@
-"""What the time of a decision costs: errors on a clock that goes on while the controller decides.
+"""Cost of the time of a decision: errors on a clock that runs while the controller decides.
 
     python studies/decision_time.py [--pairs N] [--seed FIRST] [--decision MS ...] [--jobs N] [--out FILE]
 
-The default controller inserts into the phantoms of the paper's 15 targets (exact plant, preset `phantom`), each with a
-seed of its own, once without and once with each decision time. While it decides the needle rests, and the clock of the
-virtual rig, tracker included, goes on. The table has the growth of the mean true error over that of the same insertions
-with decisions that take no time, and the mean axial innovation: a bias along the axis would mean that readings are
+The default controller inserts into the phantoms of the paper's 15 targets (exact plant, preset `phantom`), each with
+its seed, once without and once with each decision time. While it decides the needle rests, and the clock of the virtual
+rig, tracker included, runs. The table has the growth of the mean true error over the same insertions with decisions
+that take no time, and the mean axial innovation: a bias along the axis would mean that readings are
 compared with a needle that moves while it rests. No setting was chosen on the default seeds. FILE gets one row per
 insertion as JSON. Exit status 1 if an insertion is not done, or a bound is exceeded.
 """
@@ -50,12 +50,12 @@ class Job:
 
 @cache
 def plan_to(target: tuple[float, float]) -> Plan:
-    """The plan to a target, the same for all seeds."""
+    """Return the plan to a target, the same for all seeds."""
     return flexneedle.plan("phantom", target, seed=0, threads=1)
 
 
 def taking(seconds: float, clock: Clock) -> Controller:
-    """The default controller, whose decisions take time on a clock."""
+    """Return the default controller, whose decisions take time on a clock."""
     controller = CONTROLLERS[DEFAULT]
 
     def decide(task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Any]:
@@ -67,7 +67,7 @@ def taking(seconds: float, clock: Clock) -> Controller:
 
 
 def inserted(job: Job) -> Insertion:
-    """The insertion of a job; without a decision time that of `flexneedle.insert`."""
+    """Return the insertion of a job; without a decision time as by `flexneedle.insert`."""
     plan, scenario = plan_to(job.target), flexneedle.load_scenario("phantom")
     rig = virtual_rig(scenario, plan.roll, Seeds.of(job.seed))
     controller = taking(job.decision, rig.clock)
@@ -75,7 +75,7 @@ def inserted(job: Job) -> Insertion:
 
 
 def row(job: Job) -> dict[str, Any]:
-    """Errors (mm) of an insertion."""
+    """Return errors (mm) of an insertion."""
     done = inserted(job)
     innovations = [period.innovation[0] for period in done.periods if period.innovation != (0.0, 0.0, 0.0)]
     return {
@@ -90,7 +90,7 @@ def row(job: Job) -> dict[str, Any]:
 
 
 def jobs(pairs: int, first_seed: int, decisions_ms: Sequence[float]) -> Iterator[Job]:
-    """Each pair with every decision time."""
+    """Yield each pair with every decision time."""
     for number, decision in product(range(pairs), decisions_ms):
         yield Job(TARGETS[number % len(TARGETS)], first_seed + number, 1e-3 * decision)
 
@@ -119,7 +119,7 @@ class Line:
 
 
 def lines(rows: Sequence[dict[str, Any]]) -> list[Line]:
-    """A line for each decision time; the growth is over the shortest one."""
+    """Return a line for each decision time; the growth is over the shortest one."""
     by_time: dict[float, list[dict[str, Any]]] = {}
     for one in sorted(rows, key=lambda one: (one["decision_ms"], one["seed"])):
         by_time.setdefault(one["decision_ms"], []).append(one)
@@ -146,7 +146,7 @@ def _line(decision: float, rows: Sequence[dict[str, Any]], base: np.ndarray) -> 
 
 
 def table(results: Sequence[Line]) -> str:
-    """Markdown table."""
+    """Return a Markdown table."""
     head = "| decision, ms | insertions | done | mean true error, mm | growth | 95 % | mean axial innovation, mm |"
     body = (
         f"| {one.decision_ms:g} | {one.count} | {one.done} | {one.error:.4f} | {one.growth:+.4f} ± {one.growth_se:.4f} "

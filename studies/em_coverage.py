@@ -46,7 +46,7 @@ class TrueParameters:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> "TrueParameters":
-        """Draw values around those of the paper."""
+        """Draw values around the ones in the paper."""
         return cls(
             *(
                 float(rng.uniform(*ends))
@@ -56,7 +56,7 @@ class TrueParameters:
         )
 
     def values(self) -> dict[str, float]:
-        """True value of each estimate; errors: noncentral χ distribution with three degrees of freedom."""
+        """Return the true value of each estimate; errors: noncentral χ distribution with three degrees of freedom."""
         axis = np.sqrt(self.spread**2 + self.jitter**2 / 3 / SAMPLES)
         law = stats.ncx2(3, self.bias**2 / axis**2)
         errors = axis * np.sqrt(law.ppf((np.arange(20000) + 0.5) / 20000))
@@ -74,20 +74,20 @@ class TrueParameters:
 
 @cache
 def field_factor() -> np.ndarray:
-    """Cholesky factor of the covariance of a smooth unit field at the grid points and VOLUME_POINTS."""
+    """Return Cholesky factor of the covariance of a smooth unit field at the grid points and VOLUME_POINTS."""
     points = np.concatenate([GRID, VOLUME_POINTS])
     squared_distance = ((points[:, None] - points[None]) ** 2).sum(axis=2)
     return np.linalg.cholesky(np.exp(-squared_distance / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(points)))
 
 
 def draw_field(rng: np.random.Generator, smooth: bool) -> np.ndarray:
-    """Unit normal errors (k, 3) at the grid points and VOLUME_POINTS: independent, or correlated over SMOOTH_MM."""
+    """Return normal errors (k, 3) at the grid points and VOLUME_POINTS: independent, or correlated over SMOOTH_MM."""
     drawn = rng.normal(size=(POINTS + len(VOLUME_POINTS), 3))
     return field_factor() @ drawn if smooth else drawn
 
 
 def volume_statistics(error: np.ndarray) -> dict[str, float]:
-    """Statistics of the errors (k, 3) of this field in the whole volume."""
+    """Return statistics of the errors (k, 3) of this field in the whole volume."""
     length = np.linalg.norm(error, axis=1)
     return {
         "rmse": float(np.sqrt((length**2).mean())),
@@ -100,7 +100,7 @@ def volume_statistics(error: np.ndarray) -> dict[str, float]:
 def draw_rows(
     rng: np.random.Generator, drawn: TrueParameters, environment: str, error: np.ndarray, level: np.ndarray
 ) -> Columns:
-    """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and jitter."""
+    """Return rows with errors (n, 3) and mean indicators (n,) of the grid points, and jitter."""
     place = np.repeat(np.arange(POINTS), SAMPLES)
     noise = rng.normal(0.0, drawn.jitter / np.sqrt(3), (len(place), 3))
     measured = (GRID + error)[place] + noise
@@ -113,7 +113,7 @@ def draw_rows(
 def draw_table(
     rng: np.random.Generator, drawn: TrueParameters, smooth: bool
 ) -> tuple[Columns, dict[str, float]]:
-    """Both environments of a data set, and the statistics of the errors in `ideal` in the whole volume."""
+    """Return both environments of a data set, and the statistics of the errors in `ideal` in the whole volume."""
     towards = rng.normal(size=3)
     error = drawn.bias * towards / np.linalg.norm(towards) + drawn.spread * draw_field(rng, smooth)
     ideal = rng.gamma(drawn.shape, drawn.level / drawn.shape, POINTS)
@@ -130,7 +130,7 @@ def draw_table(
 
 
 def evaluate_table(table: Columns) -> dict[str, tuple[float, tuple[float, float]]]:
-    """Estimate and interval of each parameter."""
+    """Return estimate and interval of each parameter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "table.parquet"
         write_table(table, path)
@@ -150,7 +150,7 @@ def evaluate_table(table: Columns) -> dict[str, tuple[float, tuple[float, float]
 def evaluate_sets(
     sets: int, seed: int, smooth: bool
 ) -> list[tuple[dict[str, float], dict[str, tuple], dict[str, float]]]:
-    """True values, estimates, and statistics of the whole volume, for each data set."""
+    """Return the true values, estimates, and statistics of the whole volume, for each data set."""
     done = []
     for own in np.random.SeedSequence(seed).spawn(sets):
         rng = np.random.default_rng(own)
@@ -161,7 +161,7 @@ def evaluate_sets(
 
 
 def format_coverage(done: list, name: str, truth: int) -> str:
-    """Share of intervals that contain the true value: of the distribution (0), or of the volume (2)."""
+    """Return the share of intervals that contain the true value: of the distribution (0), or of the volume (2)."""
     covered = [
         found[name][1][0] <= own[name] <= found[name][1][1] for own, found in ((d[truth], d[1]) for d in done)
     ]

@@ -60,7 +60,7 @@ def summarize(table: Columns, environment: str) -> dict[str, float]:
 
 
 def _points(table: Columns, sensor: str, environment: str) -> tuple[Floats, float, Floats]:
-    """Error (mm) and mean indicator of each grid point, and the jitter (mm), without missing samples."""
+    """Return error (mm) and mean indicator of each grid point, and the jitter (mm), without missing samples."""
     own = (table["sensor"] == sensor) & (table["environment"] == environment) & ~np.isnan(table["x_mm"])
     rows = {name: column[own] for name, column in table.items()}
     ids = rows["point_id"]
@@ -77,7 +77,7 @@ def _points(table: Columns, sensor: str, environment: str) -> tuple[Floats, floa
 
 
 def tolerance(name: str) -> float:
-    """Tolerance of a median, relative to the value of the paper."""
+    """Return the tolerance of a median, relative to the value of the paper."""
     return WIDE if name.endswith(("max", "min")) else CLOSE
 
 

@@ -6,7 +6,7 @@ Each world has two random depths, log-uniform from 3 mm to 97 % of the deepest t
 with targets at shares of the edge. The edge is where a plan with wide samples to the largest lateral offset ends. Each
 target is planned with one search; one that this misses by more than 1 mm is planned as the planner ships, and searched
 with other widths and another seed, too. A plan that one search finds is the one that ships. Tables are printed on
-stdout; FILE gets one row per target as JSON. Times are those of one processor, without waiting. Worlds below 1000 are
+stdout; FILE gets one row per target as JSON. Times are for one processor, without waiting. Worlds below 1000 are
 for tuning, those from 100,000 on for reports.
 """
 
@@ -34,31 +34,31 @@ LEAST_DEPTH_MM, SHARE_OF_DEPTH = 3.0, 0.97
 HIT_MM, MISSED_MM = 0.5, 1.0
 NEAR_SKIN_MM = 15.0
 WIDTHS = (0.12, 0.25, 0.5, 1.0)
-"""First standard deviations, as shares of the largest step of the guide; the first is that of the preset."""
+"""First standard deviations, as shares of the largest step of the guide; the first one is from the preset."""
 _STREAM = 0x666172  # separates the targets from other streams that are seeded by a small number
 _OTHER_SEED = 1
 
 
 def once(scenario: Scenario, target: tuple[float, float], seed: int = 0) -> Plan:
-    """The plan of the first search alone: one that counts as reached is not searched again."""
+    """Return the plan of the first search alone: one that counts as reached is not searched again."""
     with patch.object(Plan, "reached", True):
         return flexneedle.plan(scenario, target, seed=seed, threads=1)
 
 
 def with_width(scenario: Scenario, width: float) -> Scenario:
-    """The scenario whose first samples of the guide's step have this standard deviation, of the largest step."""
+    """Return the scenario whose first samples of the guide's step have this standard deviation, of the largest step."""
     return scenario.with_values({"plan.guide_sigma_mm": width * scenario.setup.max_guide_step_mm})
 
 
 def edge(scenario: Scenario, depth: float, side: float) -> float:
-    """Lateral offset (mm) to a side that a plan with wide samples reaches at a depth, at most the largest allowed."""
+    """Return the lateral offset (mm) that a plan with wide samples reaches at a depth, at most the largest allowed."""
     most = scenario.setup.max_lateral
     end = once(with_width(scenario, WIDTHS[-1]), (depth, side * most), _OTHER_SEED).tip_mm
     return min(max(0.0, side * end[1]), most)
 
 
 def plan_world(number: int) -> list[dict[str, Any]]:
-    """A row for each target of a world; none without a guide."""
+    """Return a row for each target of a world; none without a guide."""
     scenario, rows = world(number), []
     if not scenario.setup.has_guide:
         return []
@@ -75,7 +75,7 @@ def plan_world(number: int) -> list[dict[str, Any]]:
 
 
 def plan_target(scenario: Scenario, target: tuple[float, float]) -> dict[str, Any]:
-    """Errors (mm) and times (s) of both plans, and the searches with other widths where the first misses."""
+    """Return errors (mm) and times (s) of both plans, and the searches with other widths where the first misses."""
     begun = time.process_time()
     first = once(scenario, target)
     seconds = time.process_time() - begun
@@ -94,12 +94,12 @@ def plan_target(scenario: Scenario, target: tuple[float, float]) -> dict[str, An
 
 
 def wide_hits(row: dict[str, Any]) -> bool:
-    """Whether a search with wider samples than the preset's hits the target."""
+    """Return whether a search with wider samples than the preset's hits the target."""
     return any(row["widths"][str(width)]["error_mm"] <= HIT_MM for width in WIDTHS[1:])
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown table: all targets, near the skin and below, each from the axis to the edge."""
+    """Return a Markdown table: all targets, near the skin and below, each from the axis to the edge."""
     head = (
         "| targets | n | a wide search hits, one search misses | and now | no search hits, missed now "
         "| time of a plan (s), median, 95 %, mean: one search | now |"
@@ -114,7 +114,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def line(name: str, rows: Sequence[dict[str, Any]]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     missed = [row for row in rows if row["before_mm"] > MISSED_MM]
     local = [row for row in missed if wide_hits(row)]
     left = sum(row["after_mm"] > MISSED_MM for row in local)
@@ -129,7 +129,7 @@ def line(name: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def table_of_widths(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown table of single searches with each width, to the targets that one search misses and some search hits."""
+    """Return a Markdown table of single searches with each width, to targets that some searches miss and some hit."""
     local = [row for row in rows if "widths" in row and wide_hits(row)]
     lines = [
         "| first standard deviation / largest step | n | hit | cost, median, 95 % | iterations, mean |",

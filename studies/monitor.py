@@ -53,7 +53,7 @@ class Approach:
     speed: float
 
     def distance_at(self, time: float) -> float:
-        """Distance (mm) of the plate from the center of the workspace."""
+        """Return the distance (mm) of the plate from the center of the workspace."""
         return max(NEAR_MM, FAR_MM - self.speed * max(0.0, time - self.begins))
 
 
@@ -83,7 +83,7 @@ def approach(scenario: Scenario, number: int) -> Approach:
 
 
 def world(plate: bool, monitor: bool) -> Scenario:
-    """The phantom in `ideal`; with the plate of `noisy`."""
+    """Return the phantom in `ideal`; with the plate of `noisy`."""
     ideal = load_scenario("phantom").with_values({"tracker.environment": "ideal", "monitor.enabled": monitor})
     noisy = ideal.with_values({"tracker.environment": "noisy"}).tracker.environment
     if not plate or noisy is None or noisy.plate is None:
@@ -92,17 +92,17 @@ def world(plate: bool, monitor: bool) -> Scenario:
 
 
 @cache
-def planned(target: tuple[float, float]) -> Plan:
-    """The plan for a target, independent of tracker and monitor."""
+def plan_to(target: tuple[float, float]) -> Plan:
+    """Return the plan for a target, independent of tracker and monitor."""
     return make_plan(load_scenario("phantom"), target=target, seed=0, threads=1)
 
 
-def carried_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
+def carry_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
     """Execute a run."""
     scenario = world(plate, monitor)
     depth, lateral = drawn.target
     scenario = scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
-    plan = planned(drawn.target)
+    plan = plan_to(drawn.target)
     seeds = Seeds.of(drawn.seed)
     rig = virtual_rig(
         scenario,
@@ -135,7 +135,7 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
 
 
 def medians(periods: Sequence[Any], window: float) -> Floats:
-    """Largest median indicator of the references over the window, after each period."""
+    """Return the largest median indicator of the references over the window, after each period."""
     window_values: list[tuple[float, dict[str, float]]] = []
     largest = []
     for period in periods:
@@ -153,7 +153,7 @@ def medians(periods: Sequence[Any], window: float) -> Floats:
 
 
 def unplaced_indicator(number: int) -> float:
-    """Largest median indicator of the three references at their default positions, in the room of run `number`."""
+    """Return the largest median indicator of the references at their default positions, in the room of a run."""
     scenario = world(plate=False, monitor=True).with_values({"monitor.indicator_limit": 9.9})
     phantom, tracker, _, room = np.random.SeedSequence(FIRST_SEED + number).spawn(4)
     rig = virtual_rig(scenario, 1, Seeds(phantom, tracker, room))
@@ -165,18 +165,18 @@ def unplaced_indicator(number: int) -> float:
 
 
 def first(flags: NDArray[np.bool_]) -> int | None:
-    """Index of the first true flag, or None."""
+    """Return the index of the first true flag, or None."""
     return int(flags.argmax()) if flags.any() else None
 
 
 def tip_distance(one: RunRecord, other: RunRecord, time: float) -> float:
-    """Distance (mm) of the true tips of two runs at a time (s); after the end of a run its tip is constant."""
+    """Return the distance (mm) of the true tips of two runs at a time (s); after its end a tip is constant."""
     tips = [np.array([np.interp(time, run.time, run.tip[:, k]) for k in (0, 1)]) for run in (one, other)]
     return float(np.hypot(*(tips[0] - tips[1])))
 
 
 def path_deviation(one: RunRecord, other: RunRecord, time: float) -> float:
-    """Lateral distance (mm) of the true tip at a time (s) from the path of another run, at the same depth.
+    """Return the lateral distance (mm) of the true tip at a time (s) from the path of another run, at the same depth.
 
     Not at the same time: a controller may rest, so that two runs on the same path are at different depths.
     """
@@ -188,7 +188,7 @@ def path_deviation(one: RunRecord, other: RunRecord, time: float) -> float:
 @dataclass(frozen=True)
 class Hold:
     """A hold: delay (s) after the start of the plate and after its distortion of the tip reading exceeds 0.5 mm (NaN if
-    it never does); distance (mm) of the true tip from that of the run without a plate (NaN if that run is held), and
+    it never does); distance (mm) of the true tip from the run without a plate (NaN if that run is held), and
     from the estimated tip.
     """
 
@@ -199,7 +199,7 @@ class Hold:
 
 
 def hold_of(drawn: Approach, clean: RunRecord, kept: RunRecord) -> Hold | None:
-    """The first hold of a run with plate and monitor; None if there was none."""
+    """Return the first hold of a run with plate and monitor; None if there was none."""
     index = first(kept.held)
     if index is None:
         return None
@@ -223,12 +223,12 @@ class Runs:
     unplaced: Floats
 
     def holds(self) -> list[tuple[float, Hold]]:
-        """The speed of the plate (mm/s) and the hold of each run that was held."""
+        """Return the speed of the plate (mm/s) and the hold of each run that was held."""
         found = zip(self.drawn, self.clean, self.kept, strict=True)
         return [(one.speed, hold) for one, clean, kept in found if (hold := hold_of(one, clean, kept))]
 
     def clean_estimate_errors(self) -> list[float]:
-        """Distance (mm) of true and estimated tip without a plate, at the times of the holds."""
+        """Return the distance (mm) of true and estimated tip without a plate, at the times of the holds."""
         pairs = zip(self.clean, self.kept, strict=True)
         times = [(one, float(kept.time[kept.held.argmax()])) for one, kept in pairs if kept.held.any()]
         held = [
@@ -238,7 +238,7 @@ class Runs:
 
 
 def curve(runs: Runs) -> tuple[Floats, Floats, Floats]:
-    """For each threshold: rate of false holds (runs without a plate), the same with references at their default
+    """Return for each threshold: rate of false holds (runs without a plate), the same with references at their default
     positions, and rate of missed holds (distorted runs).
 
     Distorted: the plate distorts the tip reading by more than 1 mm, at least a second before the end. Missed: the
@@ -254,14 +254,14 @@ def curve(runs: Runs) -> tuple[Floats, Floats, Floats]:
 
 
 def row(name: str, values: Sequence[float]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     known = np.array(values)[np.isfinite(values)]
     cells = [np.mean(known), *np.percentile(known, (50, 95, 100))]
     return f"| {name} | {len(known)} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |"
 
 
 def within(errors: Sequence[float]) -> str:
-    """The share of the known errors that are at most the limit."""
+    """Return the share of the known errors that are at most the limit."""
     known = np.array(errors)[np.isfinite(errors)]
     return f"{np.mean(known <= LIMIT_MM):.1%}"
 
@@ -307,7 +307,7 @@ def print_tables(runs: Runs) -> None:
 
 
 def draw_figure(runs: Runs, folder: Path) -> None:
-    """Time to the hold against the speed of the plate, tip error at the hold, choice of the threshold."""
+    """Draw time to the hold against the speed of the plate, tip error at the hold, choice of the threshold."""
     speeds, holds = zip(*runs.holds(), strict=True)
     with style.styled():
         figure = style.new_figure(3.65)
@@ -315,7 +315,7 @@ def draw_figure(runs: Runs, folder: Path) -> None:
         times.plot(speeds, [hold.after_begin for hold in holds], ".", color=style.ESTIMATE, ms=4)
         times.set(xscale="log", xlabel="speed of the plate (mm/s)", ylim=(0, None))
         times.set_title("Start of the plate to the hold (s)")
-        plain_ticks(times, [30, 50, 100, 200, 400])
+        format_ticks(times, [30, 50, 100, 200, 400])
         for values, name, color, line in (
             ([hold.deviation for hold in holds], "from the path without a plate", style.TRUE, "-"),
             ([hold.estimate_error for hold in holds], "error of the estimated tip", style.ESTIMATE, "--"),
@@ -338,12 +338,12 @@ def draw_figure(runs: Runs, folder: Path) -> None:
         choice.plot(THRESHOLDS, missed, color=style.TRUE, ls="--", label="missed holds")
         choice.axvline(load_scenario("phantom").monitor.indicator_limit, color=style.QUIET, lw=0.8)
         choice.set(xscale="log", xlabel="limit of the indicator", title="Share of runs", ylim=(0, 1.02))
-        plain_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
+        format_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
         choice.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))
         style.save(figure, folder, "monitor")
 
 
-def plain_ticks(ax: Axes, ticks: Sequence[float]) -> None:
+def format_ticks(ax: Axes, ticks: Sequence[float]) -> None:
     """Label the ticks of a logarithmic axis with plain numbers."""
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_xticks([], minor=True)
@@ -363,7 +363,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     drawn = [approach(load_scenario("phantom"), number) for number in range(chosen.runs)]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
         calls = [
-            [pool.submit(carried_out, one, plate, monitor) for one in drawn]
+            [pool.submit(carry_out, one, plate, monitor) for one in drawn]
             for plate, monitor in ((False, True), (True, False), (True, True))
         ]
         unplaced = [pool.submit(unplaced_indicator, number) for number in range(chosen.runs)]

@@ -34,7 +34,7 @@ _MOST_TILT = 0.15  # rad, of the base
 
 @dataclass
 class Tally:
-    """Counts of a run; steps are those of the plant, a quarter of a millimetre or less."""
+    """Counts of a run; steps of the plant are a quarter of a millimetre or less."""
 
     insertions: int = 0
     steps: int = 0
@@ -56,7 +56,7 @@ class Tally:
 
 
 def rough(scenario: Scenario, rng: np.random.Generator) -> Scenario:
-    """The scenario in space, with twice the errors of a rig and more."""
+    """Return the scenario in space, with twice the errors of a rig and more."""
     return scenario.with_values(
         {
             "setup.axes": 2,
@@ -78,7 +78,7 @@ def rough(scenario: Scenario, rng: np.random.Generator) -> Scenario:
 
 
 def draw_rows(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
-    """(STEPS, 9): up to the limits of a step in each column, from calm to bang-bang, within the travel."""
+    """Return (STEPS, 9): up to the limits of a step in each column, from calm to bang-bang, within the travel."""
     limits = Limits.of(scenario)
     rows = np.zeros((STEPS, SPIN + 1))
     for column in range(MOVES):
@@ -95,7 +95,7 @@ def draw_rows(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
 
 
 def _within(steps: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Steps clipped so that their sum stays between low and high."""
+    """Return steps clipped so that their sum stays between low and high."""
     position, kept = 0.0, np.empty_like(steps)
     for k, step in enumerate(steps.tolist()):
         kept[k] = min(max(position + step, low), high) - position
@@ -104,7 +104,7 @@ def _within(steps: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def run_one(seed: int, number: int, tally: Tally) -> None:
-    """One insertion; failures are counted, not raised."""
+    """Run one insertion; failures are counted, not raised."""
     rng = np.random.default_rng((seed, number))
     options = f"--seed {seed} --number {number}"
     try:
@@ -148,7 +148,7 @@ def _count(phantom: Phantom, rows: np.ndarray, options: str, tally: Tally) -> No
 
 
 def summary(tally: Tally, seed: int, seconds: float) -> str:
-    """The JSON summary."""
+    """Return the JSON summary."""
     result = asdict(tally) | {
         "failures": tally.failures[:SHOWN],
         "seed": seed,

@@ -48,7 +48,7 @@ class Tally:
 
 
 def draw_layer(rng: np.random.Generator) -> dict[str, float]:
-    """μ 0.1 to 100 kPa and α 1 to 30, the required ranges; h and w around those of the phantom."""
+    """Return μ 0.1 to 100 kPa and α 1 to 30, the required ranges; h and w around the phantom."""
     return {
         "shear_modulus_kpa": float(10 ** rng.uniform(-1, 2)),
         "alpha": float(rng.uniform(1, 30)),
@@ -59,7 +59,7 @@ def draw_layer(rng: np.random.Generator) -> dict[str, float]:
 
 
 def draw_scenario(rng: np.random.Generator) -> Scenario:
-    """1 to 5 layers, needles of 17 to 27 gauge with and without stylet, with and without a guide."""
+    """Return 1 to 5 layers, needles of 17 to 27 gauge with and without stylet, with and without a guide."""
     layers = [draw_layer(rng) for _ in range(rng.integers(1, 6))]
     for layer in layers[:-1]:
         layer["thickness_mm"] = float(rng.choice([5.0, rng.uniform(0.05, 20.0)]))
@@ -93,7 +93,7 @@ def draw_scenario(rng: np.random.Generator) -> Scenario:
 
 
 def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, STEPS, 9): steps up to the limits in both directions, constant over runs or changing every step."""
+    """Return (count, STEPS, 9): steps up to the limits, constant over runs or changing every step."""
     setup = scenario.setup
     shape = (count, STEPS)
     forward = _runs(rng, shape, 0.9)
@@ -115,7 +115,7 @@ def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> n
 
 
 def draw_controls_in_space(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, STEPS, 9): as in the plane along y and z, rolls by half turns or to any angle, spins in some."""
+    """Return (count, STEPS, 9): as in the plane along y and z, rolls by half turns or to any angle, spins in some."""
     rows, across = (draw_controls(scenario, count, rng) for _ in range(2))
     rows[..., [DB_Z, DB_PSI, DG_Z]] = across[..., [DB_Y, DB_THETA, DG_Y]]
     free, angles = rng.random((count, 1)) < 0.5, rng.uniform(-4.0, 4.0, rows.shape[:2])
@@ -126,7 +126,7 @@ def draw_controls_in_space(scenario: Scenario, count: int, rng: np.random.Genera
 
 
 def bent(simulator: Simulator, rng: np.random.Generator) -> Simulator:
-    """The simulator of a needle with a bend (mm) in half of the cases, and in half with a clearance in its guide."""
+    """Return the simulator of a needle with a bend (mm) in half of the cases, and a clearance in half."""
     layers, axes = len(simulator.scenario.tissue), simulator.scenario.setup.axes
     y, z = rng.uniform(-2.0, 2.0, 2).tolist()
     bend = float(rng.choice([0.0, 1.0])) * (y if axes == 1 else complex(y, z))
@@ -136,14 +136,14 @@ def bent(simulator: Simulator, rng: np.random.Generator) -> Simulator:
 
 
 def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> np.ndarray:
-    """−1 and +1 in runs of 1 to 12 steps, +1 with the given probability."""
+    """Return −1 and +1 in runs of 1 to 12 steps, +1 with the given probability."""
     signs = np.where(rng.random(shape) < forward, 1.0, -1.0)
     hold = np.repeat(np.arange(shape[1] // 4 + 1), 4)[: shape[1]]
     return np.where(rng.random((shape[0], 1)) < 0.5, signs, signs[:, hold])
 
 
 def _bounded(steps: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Steps clipped so that their sum stays within low and high."""
+    """Return steps clipped so that their sum stays within low and high."""
     position, kept = np.zeros(steps.shape[0]), np.empty_like(steps)
     for k in range(steps.shape[1]):
         kept[:, k] = np.clip(position + steps[:, k], low, high) - position
@@ -154,7 +154,7 @@ def _bounded(steps: np.ndarray, low: float, high: float) -> np.ndarray:
 def run_batch(
     seed: int, batch: int, count: int, tally: Tally, *, space: bool = False, adapted: bool = False
 ) -> None:
-    """One scenario, `count` sequences; failures are counted, not raised."""
+    """Run `count` sequences of one scenario; failures are counted, not raised."""
     rng = np.random.default_rng((seed, batch))
     scenario = draw_scenario(rng)
     controls = (draw_controls_in_space if space else draw_controls)(scenario, BATCH, rng)[:count]
@@ -181,7 +181,7 @@ def run_batch(
 
 
 def _repeat_by_step(simulator: Simulator, rows: np.ndarray, roll: float, tally: Tally) -> None:
-    """One sequence step by step, for residual and iterations, which a rollout does not report."""
+    """Run one sequence step by step, for residual and iterations, which a rollout does not report."""
     state = simulator.start(roll)
     for row in rows:
         state = simulator.step(state, Control.of(row))
@@ -194,7 +194,7 @@ def _repeat_by_step(simulator: Simulator, rows: np.ndarray, roll: float, tally: 
 
 
 def summary(tally: Tally, seed: int, seconds: float) -> str:
-    """The JSON summary."""
+    """Return the JSON summary."""
     result = asdict(tally) | {
         "failures": tally.failures[:SHOWN],
         "seed": seed,

@@ -24,7 +24,7 @@ Target = tuple[float, float, float]
 
 
 def draw(scenario: Scenario, seed: int) -> Iterator[tuple[Target, Target, Target]]:
-    """A target for each driver: guide in two axes, in one with free rolls, in one with half turns (x, y, z, mm)."""
+    """Yield a target (x, y, z, mm) for each driver: guide in two axes, one axis, one axis and half turns."""
     rng = np.random.default_rng(seed)
     for _ in range(COUNT):
         depth = float(rng.uniform(*DEPTHS_MM))

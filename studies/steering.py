@@ -31,12 +31,12 @@ PLANNED_MM, CLAIMED_MM = 0.1, 0.2
 
 
 def perfect(number: int) -> Scenario:
-    """A world with a plant without imperfections."""
+    """Return a world with a plant without imperfections."""
     return world(number, "perfect")
 
 
 def draw_target(scenario: Scenario, number: int) -> tuple[float, float]:
-    """A target (mm) at the depth of the world, uniform within 90 % of the bevel's reach and the apparatus limit."""
+    """Return a target (mm) at the depth of the world, uniform within 90 % of the bevel's reach and the limit."""
     depth, most = scenario.target.depth_mm, scenario.setup.max_lateral
     least, greatest = bevel_reach(scenario, depth, threads=1)
     middle, half = 0.5 * (least + greatest), 0.5 * SHARE_OF_REACH * (greatest - least)
@@ -65,7 +65,7 @@ def steer(number: int, scenario: Scenario | None = None) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown table: all worlds, with a guide, without a guide."""
+    """Return a Markdown table: all worlds, with a guide, without a guide."""
     groups = {
         "all": rows,
         "with a guide": [row for row in rows if row["guide"]],
@@ -82,7 +82,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def line(name: str, rows: Iterable[dict[str, Any]]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     planned, claim, flips, seconds = (
         np.array([row[key] for row in rows], dtype=float)
         for key in ("planned_error_mm", "claim_error_mm", "flips", "seconds")

@@ -58,7 +58,7 @@ class Range:
     whole: bool = False
 
     def at(self, fraction: float) -> float:
-        """The value at a fraction of the range, rounded to three digits as in the record."""
+        """Return the value at a fraction of the range, rounded to three digits as in the record."""
         ratio, width = self.high / self.low if self.log else 1.0, self.high - self.low
         value = self.low * ratio**fraction if self.log else self.low + fraction * width
         return round(value) if self.whole else float(f"{value:.3g}")
@@ -111,7 +111,7 @@ class Trial:
 
 
 def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) -> list[Settings]:
-    """The middle of the space, and others that cover each range evenly (a Latin hypercube)."""
+    """Return the middle of the space, and others that cover each range evenly (a Latin hypercube)."""
     strata = np.arange(count - 1) + 0.5
     parts = [np.append(0.5, rng.permutation(strata) / (count - 1)) for _ in space]
     return [
@@ -121,7 +121,7 @@ def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) ->
 
 
 def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executor) -> list[Trial]:
-    """All trials after the last round: those of the last round first, each round sorted by score."""
+    """Return all trials after the last round: the last round first, each round sorted by score."""
     out: list[Trial] = []
     first = spent = 0
     for settings, cases in ROUNDS:
@@ -143,7 +143,7 @@ def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executo
 
 
 def error_of(task: tuple[str, Settings, Plan, int]) -> float:
-    """True error (mm) of one insertion."""
+    """Return the true error (mm) of one insertion."""
     method, settings, plan, seed = task
     scenario = flexneedle.load_scenario("phantom").with_values(settings)
     done = flexneedle.insert(scenario, plan, seed, controller=method, force=True, threads=1)
@@ -151,12 +151,12 @@ def error_of(task: tuple[str, Settings, Plan, int]) -> float:
 
 
 def plan_for(target: tuple[float, float]) -> Plan:
-    """The plan for a target, the same for all settings."""
+    """Return the plan for a target, the same for all settings."""
     return flexneedle.plan(flexneedle.load_scenario("phantom"), target, seed=PLAN_SEED, threads=1)
 
 
 def result(method: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
-    """The record, best trial first."""
+    """Return the record, best trial first."""
     return {
         "method": method,
         "chosen": trials[0].settings,
@@ -186,7 +186,7 @@ def result(method: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """A Markdown table of the trials."""
+    """Return a Markdown table of the trials."""
     names = [key.split(".")[-1] for key in found["space"]]
     figures = ("cases", "score_mm", "mean_mm", "p95_mm", "max_mm")
     lines = [[*names, *figures], ["---:"] * (len(names) + len(figures))]
@@ -206,7 +206,7 @@ def counted(errors: Iterable[float], before: int) -> Iterator[float]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Tune, print the table, write the record."""
+    """Return tune, print the table, write the record."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument(
         "method", choices=sorted(SPACES), metavar="CONTROLLER", help=", ".join(sorted(SPACES))

@@ -2,7 +2,7 @@
 
     python studies/validation.py [--out DIR]
 
-The problems are those of tests/reference/validation.py; the tests assert the values of the document. Takes about a
+The problems are in tests/reference/validation.py; the tests assert the values of the document. Takes about a
 minute on one core. Repeated runs write the same bytes.
 """
 
@@ -137,7 +137,7 @@ def lost(found: problems.Found) -> float:
 
 
 def needle(found: problems.Found) -> list[str]:
-    """Section on the rod alone."""
+    """Return the section on the rod alone."""
     rows = [
         (
             f"{load:g}",
@@ -156,7 +156,7 @@ def needle(found: problems.Found) -> list[str]:
 
 
 def model(found: problems.Found) -> list[str]:
-    """Section on the controller's model."""
+    """Return the section on the controller's model."""
     one, two = found.gaps[1], found.gaps[2][0.125]
     rows = [
         (f"{a.angle:.4f}", small(a.lateral), f"{b.angle:.4f}", small(b.lateral))
@@ -181,7 +181,7 @@ def model(found: problems.Found) -> list[str]:
 
 
 def bevel(found: problems.Found) -> list[str]:
-    """Section on steady curvature."""
+    """Return the section on steady curvature."""
     rows = []
     for length, errors in found.curvature.items():
         expected = closed_forms.steady_curvature(0.01, length, FOUNDATION, EI)
@@ -204,7 +204,7 @@ def bevel(found: problems.Found) -> list[str]:
 
 
 def energy(found: problems.Found) -> list[str]:
-    """Section on energies."""
+    """Return the section on energies."""
     moved = largest_gap(found)
     rows = [
         (f"{step:g}", *(small(balances[k].gap) for balances in found.balances.values()))
@@ -224,7 +224,7 @@ def energy(found: problems.Found) -> list[str]:
 
 
 def solver(found: problems.Found) -> list[str]:
-    """Section on the second solver."""
+    """Return the section on the second solver."""
     rows = [
         (f"{h:g}", *(small(value) for value in gaps))
         for h, gaps in list(zip(problems.ELEMENTS.tolist(), found.second, strict=True))[::2]
@@ -244,7 +244,7 @@ def solver(found: problems.Found) -> list[str]:
 
 
 def refinement(found: problems.Found) -> list[str]:
-    """Section on element, step and spacing."""
+    """Return the section on element, step and spacing."""
     key = {"element": "element_mm", "step": "step_mm", "spacing": "contact_spacing_mm"}
     rows = []
     for name, errors in found.refined.items():
@@ -262,7 +262,7 @@ def refinement(found: problems.Found) -> list[str]:
 
 
 def space(found: in_space.Space) -> list[str]:
-    """Section on space."""
+    """Return the section on space."""
     gaps = np.max(found.solver, axis=0)
     rows = [
         ("rods", *(small(gap) for gap in gaps), power(1.0 / np.array(in_space.SEGMENTS), gaps)),

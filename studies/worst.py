@@ -82,7 +82,7 @@ class PhantomParameters:
 
 
 def parameters_of(scenario: Scenario, seed: int) -> PhantomParameters:
-    """Parameters of the phantom of an insertion."""
+    """Return parameters of the phantom of an insertion."""
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]))
     factors = [
         real.shear_modulus_kpa / layer.shear_modulus_kpa
@@ -118,7 +118,7 @@ class Ending:
     held: bool
 
 
-def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, sample: int = 0) -> Ending:
+def carry_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, sample: int = 0) -> Ending:
     """Carry out an insertion in a variant of its scenario.
 
     Sample 0 repeats its random numbers; other samples use others in the controller's searches.
@@ -153,7 +153,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_distribution(depth: np.ndarray, error: np.ndarray) -> None:
-    """True error, overall and by target depth."""
+    """Print true error, overall and by target depth."""
     head = ("depth", "n", "mean", "sd", "median", "95 %", "99 %", "99.9 %", "max", "> 0.5 mm", "> 1 mm")
     groups = [("all", error), *((f"{at:g} mm", error[depth == at]) for at in np.unique(depth))]
     rows = []
@@ -165,7 +165,7 @@ def print_distribution(depth: np.ndarray, error: np.ndarray) -> None:
 
 
 def print_worst(insertions: Sequence[StudyInsertion], endings: Sequence[Ending]) -> None:
-    """Errors of the worst insertions and the parameters of their phantoms."""
+    """Print errors of the worst insertions and the parameters of their phantoms."""
     head = ("index", "target, mm", "seed", "error", "depth error", "control error", "estimate error")
     head += ("guide", "stretch", "moduli ×", "last 10 mm ×", "bevel ×", "offset, mm", "slope, mrad")
     head += ("boundary, mm",)
@@ -194,7 +194,7 @@ def print_worst(insertions: Sequence[StudyInsertion], endings: Sequence[Ending])
 def print_variants(
     insertions: Sequence[StudyInsertion], endings: Sequence[Sequence[Sequence[Ending]]]
 ) -> None:
-    """Mean and largest true error of each insertion in each variant, over its samples (N, variants, samples).
+    """Print mean and largest true error of each insertion in each variant, over its samples (N, variants, samples).
 
     Held insertions are counted and left out of mean and maximum.
     """
@@ -207,7 +207,7 @@ def print_variants(
 
 
 def _mean(runs: Sequence[Ending], largest: bool = False) -> str:
-    """Mean true error (mm) of the insertions that were not held, the largest in brackets, and the number held."""
+    """Return mean and largest true error (mm) of insertions that were not held, and the number held."""
     errors = [run.error for run in runs if not run.held]
     mean = f"{np.mean(errors):.2f}" + (f" ({max(errors):.2f})" if largest else "") if errors else "–"
     held = len(runs) - len(errors)
@@ -215,7 +215,7 @@ def _mean(runs: Sequence[Ending], largest: bool = False) -> str:
 
 
 def plot_quantiles(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
-    """Median, 95 % and 99 % quantile of the error in twelve groups of equal size."""
+    """Draw median, 95 % and 99 % quantile of the error in twelve groups of equal size."""
     order = np.argsort(values, kind="stable")
     groups = np.array_split(order, 12)
     middle = [float(np.median(values[group])) for group in groups]
@@ -227,7 +227,7 @@ def plot_quantiles(axes: Axes, values: np.ndarray, error: np.ndarray, label: str
 
 
 def draw_figure(study: ExpandedStudy, index: np.ndarray, error: np.ndarray, folder: Path) -> None:
-    """The tail of the distribution, and the error against the phantom parameters."""
+    """Draw the tail of the distribution, and the error against the phantom parameters."""
     truths = [parameters_of((one := study.insertion(int(k))).point.scenario, one.seed) for k in index]
     depth = np.array([study.insertion(int(k)).point.scenario.target.depth_mm for k in index])
     panels = (
@@ -277,12 +277,12 @@ def of_folder(folder: Path, source: str | None) -> ExpandedStudy:
 def repeat_in_variants(
     pool: Executor, plans: StudyPlans, worst: Sequence[StudyInsertion], samples: int
 ) -> list[list[list[Ending]]]:
-    """Endings of the worst insertions in each variant with each sample (N, variants, samples)."""
+    """Return endings of the worst insertions in each variant with each sample (N, variants, samples)."""
     calls = [
         [
             [
                 pool.submit(
-                    carried_out, insertion, plans.plan(digest_plan_inputs(insertion.point)), variant, sample
+                    carry_out, insertion, plans.plan(digest_plan_inputs(insertion.point)), variant, sample
                 )
                 for sample in range(1, samples + 1)
             ]
@@ -321,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     order = np.argsort(-error, kind="stable")[: chosen.worst]
     worst = [study.insertion(int(k)) for k in index[order]]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
-        own = [pool.submit(carried_out, one, plans.plan(digest_plan_inputs(one.point))) for one in worst]
+        own = [pool.submit(carry_out, one, plans.plan(digest_plan_inputs(one.point))) for one in worst]
         endings = [call.result() for call in own]
         if not np.array_equal([end.error for end in endings], error[order]):
             parser.error(f"{chosen.folder}: not reproduced by this version: repeat the study")

@@ -158,7 +158,7 @@ def test_the_curve_counts_false_and_missed_holds(study):
 
 def test_a_run_is_held_only_with_a_plate(study):
     drawn = study.Approach(300_001, (25.0, 0.0), begins=4.0, speed=200.0)
-    clean, kept = study.carried_out(drawn, False, True), study.carried_out(drawn, True, True)
+    clean, kept = study.carry_out(drawn, False, True), study.carry_out(drawn, True, True)
     assert not clean.held.any()
     assert not clean.distortion.any()
     assert kept.distortion.max() > 1.0
