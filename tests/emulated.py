@@ -12,7 +12,7 @@ import numpy as np
 
 from flexneedle.lab.emulators.motion import sensor_pose
 
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import psutil
 
 from emulated import DEADLINE_S, until
 
-START_S = 60.0  # the first run compiles the kernels
+START_S = 300.0  # the first run compiles the kernels, perhaps on a busy machine
 
 
 def rig_file(folder, **replaced):
@@ -117,10 +117,17 @@ def started(*arguments):
 
 @contextmanager
 def emulated_rig(*arguments):
-    """Run `flexneedle emulate rig` with these arguments, to its good end."""
+    """Run `flexneedle emulate rig` with these arguments, to its good end after Ctrl-C; no process is left."""
     rig = started(*arguments)
+    children = rig.children
     try:
         yield rig
     finally:
         code, errors = rig.end()
     assert code == 0, errors
+    until(gone(children))
+
+
+def gone(processes):
+    """Return a function that returns whether all processes have ended."""
+    return lambda: not any(one.is_running() and one.status() != psutil.STATUS_ZOMBIE for one in processes)

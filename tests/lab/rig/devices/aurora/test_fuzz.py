@@ -54,7 +54,7 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
     assert all(abs(part) < fuzz_aurora.FARTHEST_MM for part in found.position or ())
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5
