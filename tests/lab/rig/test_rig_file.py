@@ -147,7 +147,7 @@ RULES = [
     ("rotation.range_deg", [180, -180], "must be [lowest, highest]"),
     ("rotation.backlash_deg", 200, "must be below 200, the width of range_deg"),
     ("rotation.tolerance_deg", 5.0, "must be below max_error_deg (5)"),
-    ("guide_y.channel", "A", "is that of insertion, too: each axis has its own"),
+    ("guide_y.channel", "A", "is also the channel of insertion"),
 ]
 
 

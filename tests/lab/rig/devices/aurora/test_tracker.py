@@ -196,7 +196,7 @@ def test_delayed_replies_give_correct_frames():
     [
         pytest.param("silence@0.3:1.5", "no reply", marks=pytest.mark.long),
         pytest.param("frozen@0.3:1.8", "does not increase", marks=pytest.mark.slow),
-        ("unplug@0.3:1", "the port does not exist: is the cable plugged in?"),
+        ("unplug@0.3:5", "the port does not exist: is the cable plugged in?"),
         pytest.param("error@0.3:1.2", "error 0D", marks=pytest.mark.slow),
         pytest.param(
             "system@0.3:1.2",
