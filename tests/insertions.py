@@ -86,8 +86,9 @@ class Stage:
         return Rig(self, self, self)
 
 
-def run(plan, rig, scenario=PHANTOM, seed=5, **options):
-    """Carry out a plan on the ports of a rig."""
+def run(plan, rig, scenario=PHANTOM, seed=5, controller="resolved-rate", **options):
+    """Carry out a plan on the ports of a rig, by default with the controller that takes the least time."""
+    options["controller"] = controller
     return carry_out(flexneedle.load_scenario(scenario), plan, rig, seed, **options)
 
 

@@ -50,7 +50,7 @@ def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan
     """The miss of the plan does not apply to the phantom's needle; the insertion itself predicts the miss."""
     assert CONTROLLERS[DEFAULT].predicts
     assert not any(method.predicts for name, method in CONTROLLERS.items() if name != DEFAULT)
-    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig())
+    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig(), controller=DEFAULT)
 
 
 class Stuck(Stage):

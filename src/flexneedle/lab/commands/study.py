@@ -69,7 +69,10 @@ def _study(args: argparse.Namespace) -> int:
     from flexneedle.lab.study.pools import check_address
     from flexneedle.lab.study.runner import run_study
 
-    require_extra("study", "pyarrow")
+    if args.scheduler is None:
+        require_extra("study", "pyarrow")
+    else:
+        require_extra("cluster", "pyarrow", "distributed")
     if args.resume and args.out is None:
         raise InputError("--resume needs the folder of the study: add --out DIR")
     if args.workers is not None and args.scheduler is not None:
