@@ -18,6 +18,7 @@ from insertions import (
     loop,
     lost,
     run,
+    run_quickly,
     spoilt_tape,
 )
 
@@ -59,7 +60,7 @@ def between(first, last, fault):
 @pytest.mark.parametrize("begin", [1.99, 8.01])  # in air, in tissue
 def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, fault, begin):
     tank = Tank(plan.roll, spoil=between(begin, begin + 0.6, fault))
-    done = run(plan, tank.rig(), controller="adaptive-mpc" if fault is jumping else "resolved-rate")
+    done = (run if fault is jumping else run_quickly)(plan, tank.rig())
     bad = [period for period in done.periods if str(period.verdict) != "ok"]
     first = bad[0].index
     assert [period.index for period in bad] == list(range(first, first + len(bad)))  # without interruption
@@ -89,7 +90,7 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, faul
 @pytest.mark.parametrize(("verdict", "fault"), FAULTS.items(), ids=FAULTS)
 def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault):
     tank = Tank(plan.roll, spoil=between(3.01, math.inf, fault))
-    done = run(plan, tank.rig())
+    done = run_quickly(plan, tank.rig())
     bad = [period for period in done.periods if str(period.verdict) != "ok"]
     assert done.outcome == "held"
     assert done.reason.startswith("held for 1.0")
@@ -106,7 +107,7 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
 @pytest.mark.parametrize("limit", [0.1, 0.5, 12.0])  # in 12 s there are more readings than periods in a run
 def test_the_hold_limit_is_that_of_the_scenario(plan, limit):
     scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
-    done = run(plan, Tank(plan.roll, spoil=between(1.0, math.inf, lost)).rig(), scenario)
+    done = run_quickly(plan, Tank(plan.roll, spoil=between(1.0, math.inf, lost)).rig(), scenario)
     bad = [period.time for period in done.periods if str(period.verdict) != "ok"]
     assert bad[-1] - bad[0] == pytest.approx(limit, abs=READING)
 
@@ -114,7 +115,7 @@ def test_the_hold_limit_is_that_of_the_scenario(plan, limit):
 def test_the_hold_limit_applies_to_each_hold(plan):
     """Two holds of 0.8 s with good readings in between: no abort."""
     first, second = between(3.0, 3.8, lost), between(5.0, 5.8, lost)
-    done = run(plan, Tank(plan.roll, spoil=lambda batch: second(first(batch))).rig())
+    done = run_quickly(plan, Tank(plan.roll, spoil=lambda batch: second(first(batch))).rig())
     assert done.outcome == "done"
 
 
@@ -125,13 +126,13 @@ def test_all_holds_together_have_a_limit(plan):
     def spoil(batch):
         return tuple(one for one in batch if one.time % 2.0 <= 1.6 or one.time < 2.0)
 
-    done = run(plan, Tank(plan.roll, spoil=spoil).rig(), scenario)
+    done = run_quickly(plan, Tank(plan.roll, spoil=spoil).rig(), scenario)
     assert done.outcome == "held"
     assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.5 s): missing")
     assert 0.5 - 1e-6 <= done.held_s <= 0.5 + READING + 1e-6
     held = [period.action == "hold" for period in done.periods]
     assert sum(one and not before for before, one in pairwise(held)) >= 3
-    assert run(plan, Tank(plan.roll, spoil=spoil).rig()).outcome == "done"
+    assert run_quickly(plan, Tank(plan.roll, spoil=spoil).rig()).outcome == "done"
 
 
 @pytest.mark.long
@@ -140,7 +141,7 @@ def test_the_limits_of_age_and_innovation_are_those_of_the_scenario(plan):
         return replace(measurement, time=measurement.time - 0.05, y=measurement.y + 1.2)
 
     def verdicts(scenario):
-        done = run(plan, Tank(plan.roll, spoil=between(8.0, 8.4, offset)).rig(), scenario)
+        done = run_quickly(plan, Tank(plan.roll, spoil=between(8.0, 8.4, offset)).rig(), scenario)
         return {str(period.verdict).split(":")[0] for period in done.periods}
 
     assert verdicts(PHANTOM) == {"ok"}
@@ -184,7 +185,7 @@ def test_a_frozen_sensor_holds_the_driven_needle_within_a_period(plan, begin):
         frozen_at.extend(measurement for measurement in batch if measurement.time >= begin)
         return tuple(replace(s, x=frozen_at[0].x, y=frozen_at[0].y) if s.time >= begin else s for s in batch)
 
-    done = run(plan, Tank(plan.roll, spoil=spoil).rig())
+    done = run_quickly(plan, Tank(plan.roll, spoil=spoil).rig())
     first = next(period for period in done.periods if str(period.verdict) != "ok")
     assert done.outcome == "held"
     assert str(first.verdict).startswith("frozen: ")

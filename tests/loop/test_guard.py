@@ -128,9 +128,9 @@ def test_a_model_that_does_not_converge_is_no_prediction(plan, monkeypatch):
 
 def test_a_refusal_takes_one_step_of_the_model(plan, monkeypatch):
     estimate, rows = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40)), []
-    carried_out = Simulator._carried_out
+    carry_out = Simulator._carry_out
     monkeypatch.setattr(
-        Simulator, "_carried_out", lambda *given: rows.append(len(given[2])) or carried_out(*given)
+        Simulator, "_carry_out", lambda *given: rows.append(len(given[2])) or carry_out(*given)
     )
     Guard.of(PHANTOM, plan).refusal(estimate, ASIDE)
     assert rows == [1]

@@ -10,7 +10,7 @@ from flexneedle.errors import CommandError, StoppedError
 from flexneedle.estimation.moves import Move, position_along
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion, Outcome
-from insertions import PHANTOM, Stage, Tank, run
+from insertions import PHANTOM, Stage, Tank, run, run_quickly
 
 THINKING_S = 0.1
 
@@ -79,7 +79,7 @@ class Stopped(Stage):
 def test_motors_are_stopped_after_an_interrupt_or_an_error(plan, error):
     stage = Stopped(error)
     with pytest.raises(type(error)):
-        run(plan, stage.rig(), force=True)
+        run_quickly(plan, stage.rig(), force=True)
     assert stage.stops == 1
 
 
@@ -87,7 +87,7 @@ def test_motors_are_stopped_at_the_end(plan):
     tank = Tank(plan.roll)
     stops = []
     tank.stop = lambda: stops.append(tank.phantom.now())
-    done = run(plan, tank.rig())
+    done = run_quickly(plan, tank.rig())
     assert stops == [done.periods[-1].time]
 
 
@@ -115,6 +115,6 @@ def test_beyond_its_range_the_needle_may_only_roll_back():
 
 def test_an_insertion_that_is_stopped_at_the_rig_is_interrupted(plan):
     stage = Stopped(StoppedError("stopped: the emergency button"))
-    done = run(plan, stage.rig(), force=True)
+    done = run_quickly(plan, stage.rig(), force=True)
     assert (done.outcome, done.reason) == (Outcome.INTERRUPTED, "stopped: the emergency button")
     assert stage.stops == 1
