@@ -9,5 +9,5 @@ def counted(arguments, made):
     def period(*_):
         made.value += 1
 
-    insert._InsertProgress.period = period  # in this process alone
+    insert._InsertProgress._show_period = period  # in this process alone
     main.main(arguments)

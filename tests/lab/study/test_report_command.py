@@ -63,24 +63,6 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert values["endings"][0]["reason"] == "plan misses the target"
 
 
-@pytest.mark.long
-def test_tuning_is_shown_from_a_folder(capsys, study, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    page = study / "report" / "report.html"
-
-    def shown(*argv):
-        run(capsys, "report", str(study), *argv)
-        return page.read_text(encoding="utf-8").partition("Tuning of the controllers")[2]
-
-    assert shown() == ""  # no controller of this study has a tuning record
-    record = {"method": OURS, "chosen": {}, "budget_insertions": 200, "phantom_seeds": [1000, 1063]}
-    Path("elsewhere").mkdir()
-    Path("elsewhere/a.json").write_text(json.dumps({**record, "note": "", "trials": [{"score_mm": 0.08}]}))
-    there = shown("--tuning", "elsewhere")
-    assert "1000 to 1063" in there
-    assert "0.080" in there
-
-
 def test_help_names_the_studies_that_can_be_reported(capsys):
     with pytest.raises(SystemExit):
         cli.main(["report", "--help"])
