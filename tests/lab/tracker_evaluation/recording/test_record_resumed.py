@@ -140,5 +140,5 @@ def test_a_killed_recording_loses_and_repeats_no_point(tmp_path, out):
         until(lambda: out.exists() and out.read_bytes().count(b"\n") > 20)
         process.send_signal(signal.SIGKILL)
         process.wait(DEADLINE_S)
-        subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        subprocess.run(command, check=True, capture_output=True)
     assert_complete(out, 4, [(1, n + 1) for n in range(count)], ("tip",))

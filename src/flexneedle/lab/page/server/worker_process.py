@@ -80,9 +80,10 @@ class WorkerProcess:
         finally:
             loop.remove_reader(child.channel.fileno())
         self._child, self.ready = None, False
-        status = await asyncio.to_thread(child.end, _END_S)
-        child.close()
-        return status
+        try:
+            return await asyncio.to_thread(child.end, _END_S)
+        finally:
+            child.close()
 
     def _receive(self, child: ChildProcess, ended: asyncio.Event) -> None:
         try:

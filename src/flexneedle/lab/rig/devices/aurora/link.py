@@ -67,6 +67,12 @@ def main(descriptor: int, path: str, may_break: bool) -> None:
     channel.flush(_FLUSH_S)
 
 
+def _report(channel: MessageChannel, *message: object, keep: bool = True) -> None:
+    """Send a message. Ends this process, which frees the port, if the process that reads it has ended."""
+    if not channel.send(message, keep=keep):
+        raise SystemExit
+
+
 def _stop(*_: object) -> NoReturn:
     raise SystemExit
 
@@ -105,7 +111,7 @@ def _read(device: AuroraDevice, channel: MessageChannel) -> None:
     replies = True
     try:
         command = _read_command(device)
-        channel.send(("ready", ports))
+        _report(channel, "ready", ports)
         replies = _poll(device, channel, command, [int(handle) for handle in ports])
     finally:
         if replies:
@@ -173,12 +179,12 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
         code = device.command(f"{read}:{_OPTIONS}")
         if code:
             kind, reason = _describe_error(device, code)
-            channel.send(("error", kind, reason))
+            _report(channel, "error", kind, reason)
             if code in LOST or (code == TIMEOUT and not device.synchronise(_SYNCHRONISE_S)):
                 break
         elif fault := _SYSTEM.get(_lowest_bit(device.system_status(read) & sum(_SYSTEM))):
             reason = f"the tracker reports: {fault}"
-            channel.send(("error", "system", reason))
+            _report(channel, "error", "system", reason)
         else:
             found = {handle: device.reading(read, handle) for handle in handles}
             number = max(frame for frame, *_ in found.values())
@@ -190,7 +196,7 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
                 reason = "all sensors are disabled" if disabled else "the frame number does not increase"
             else:
                 sensors = {h: (k, s, n, p) for h, (n, k, s, p) in found.items()}
-                channel.send(("frame", number, requested, sensors), keep=False)
+                _report(channel, "frame", number, requested, sensors, keep=False)
                 last_new = monotonic()
             last = number
         sleep(_POLL_S)
