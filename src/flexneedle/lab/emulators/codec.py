@@ -1,7 +1,7 @@
-"""Commands, replies and checksums of NDI's serial protocol (Combined API); without state or device.
+r"""Commands, replies and checksums of NDI's serial protocol (Combined API); without state or device.
 
-A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a checksum. A reply is text, checksum and
-`\\r`, or binary with a header (`BX`). The layouts are from ndicapi's sources.
+A command is ASCII, `NAME:argumentsCRC\r`, or `NAME arguments\r` without a checksum. A reply is text, checksum and
+`\r`, or binary with a header (`BX`). The layouts are from ndicapi's sources.
 """
 
 import struct
@@ -43,7 +43,7 @@ def crc16(data: bytes) -> int:
 
 
 def parse_command(line: bytes) -> AuroraCommand:
-    """Return the command in a line without its `\\r`; bytes outside ASCII are replaced."""
+    r"""Return the command in a line without its `\r`; bytes outside ASCII are replaced."""
     name = line[: _name_length(line)].decode("ascii", "replace")
     rest = line[len(name) :]
     if not rest.startswith(b":"):

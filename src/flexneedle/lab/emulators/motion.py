@@ -49,8 +49,10 @@ class TipSource(Protocol):
         ...
 
     def at(self, number: int) -> tuple[Point, Quaternion]:
-        """Return position (mm) and orientation of the tip's sensor in a frame up to the newest, in the tracker's
-        frame."""
+        """Return position (mm) and orientation of the tip's sensor in a frame, at most the newest.
+
+        Both are in the tracker's frame.
+        """
         ...
 
 
@@ -130,8 +132,10 @@ def is_missing(number: int, seed: int, noise: SensorNoise) -> bool:
 
 @lru_cache(maxsize=64)  # a frame is requested several times
 def _draw_noise(sensor: str, number: int, seed: int) -> Floats:
-    """Return standard normal numbers (7,) of a sensor in a frame: three of its position, one of its indicator, two of
-    its axis, one that decides whether it is missing."""
+    """Return standard normal numbers (7,) of a sensor in a frame.
+
+    Three are for its position, one for its indicator, two for its axis, and one decides whether it is missing.
+    """
     drawn = np.random.default_rng((seed, SENSORS.index(sensor), number)).standard_normal(7)
     drawn.setflags(write=False)
     return drawn

@@ -6,7 +6,10 @@ from flexneedle.scenario.problems import Problem, to_line
 
 
 def usable_rig(source: str) -> RigFile:
-    """The rig of a file or of a shipped name. Raises RigError, also for one that ROS arms or gives the target."""
+    """Return the rig of a file or of a shipped name.
+
+    Raises RigError, also for a rig that ROS arms or gives the target.
+    """
     rig = load_rig(source)
     for key in ("arm", "target"):
         if rig.ros is not None and getattr(rig.ros, key):

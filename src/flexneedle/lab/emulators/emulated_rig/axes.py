@@ -51,10 +51,10 @@ class Carriage:
 
 
 def carriages_of(axes: Axes, scenario: Scenario) -> Mapping[str, Carriage]:
-    """Return the carriages of a rig by name of the axis. They start where the scenario begins: axes that are homed
-    `here` at their home, the others at 0.
+    """Return the carriages of a rig by name of the axis.
 
-    Raises RigError if a channel is none of the controller's, or an axis starts beyond its soft limits.
+    They start where the scenario begins: axes that are homed `here` at their home, the others at 0. Raises RigError if
+    the controller has no such channel, or an axis starts beyond its soft limits.
     """
     return {name: _carriage(name, axis, scenario) for name, axis in axes.items()}
 

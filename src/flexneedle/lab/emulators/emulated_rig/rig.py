@@ -42,10 +42,9 @@ def split_fault(given: str) -> tuple[str, str]:
 
 
 def check_free(rig: RigFile) -> None:
-    """Check that the controller's address and the tracker's path are free, before the phantom is made, which takes
-    long.
+    """Check that the controller's address and the tracker's path are free, before the phantom is made.
 
-    Raises InputError if one of them cannot be used, RigError if one of them is invalid.
+    Making the phantom takes long. Raises InputError if one of them cannot be used, RigError if one is invalid.
     """
     with galil.TcpServer(*address_of(rig)), SerialPort(Path(port_of(rig))):
         pass

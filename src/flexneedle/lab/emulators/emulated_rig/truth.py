@@ -110,8 +110,10 @@ class TruthRecord:
     lag: Floats
 
     def tip_at(self, times: Floats | float) -> Floats:
-        """Return the poses (…, 5) of the tip at times (s), linear between rows. Raises InputError for times outside
-        of them."""
+        """Return the poses (…, 5) of the tip at times (s), linear between rows.
+
+        Raises InputError for times outside of the record.
+        """
         wanted = np.asarray(times, dtype=float)
         if wanted.size and not (self.time[0] <= wanted.min() and wanted.max() <= self.time[-1]):
             raise InputError(f"times must be from {self.time[0]:.3f} to {self.time[-1]:.3f} s")

@@ -328,8 +328,10 @@ _ACTIONS: dict[str, Callable[[MotorAxis], MotorAxis]] = {
 
 
 def _status_bits(axis: MotorAxis) -> float:
-    """Return the bits of TS: 7 in motion, 6 position error beyond its limit, 5 motor off, 3 and 2 forward and reverse
-    limit not active."""
+    """Return the bits of TS.
+
+    7: in motion; 6: position error beyond its limit; 5: motor off; 3, 2: forward, reverse limit not active.
+    """
     reverse, forward = axis.at_switches
     bits = (
         (7, axis.running),

@@ -115,8 +115,10 @@ def slow_down(axis: MotorAxis, why: int) -> MotorAxis:
 
 
 def switch_off(axis: MotorAxis, why: int | None = None) -> MotorAxis:
-    """Return the axis with its motor off: the commanded position follows the encoder. why: stop code if it was in
-    motion."""
+    """Return the axis with its motor off: the commanded position follows the encoder.
+
+    why: stop code if it was in motion.
+    """
     stop = why if why is not None and axis.running else axis.stop
     profile = halt(replace(axis.profile, position=axis.encoder))
     return replace(
