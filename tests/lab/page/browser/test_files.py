@@ -69,6 +69,9 @@ def test_it_asks_before_changes_are_lost(files, server):
     page = files()
     server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
     until(page, "flexneedle.store.get('session').changed.length")
+    page.evaluate(
+        "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )  # presets chosen
 
     def begin(way):
         if way == "preset":

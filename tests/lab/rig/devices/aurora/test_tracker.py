@@ -38,12 +38,16 @@ def in_order(*wanted, name="tip"):
 
 def process_of(word):
     """Return the child process with `word` in its command line."""
-    (found,) = [
-        child
-        for child in psutil.Process().children(recursive=True)
-        if any(word in part for part in child.cmdline())
-    ]
+    (found,) = [child for child in psutil.Process().children(recursive=True) if word in command_of(child)]
     return found
+
+
+def command_of(process):
+    """Return the command line of a process, "" once it has ended."""
+    try:
+        return " ".join(process.cmdline())
+    except psutil.NoSuchProcess:  # a zombie is one, too
+        return ""
 
 
 def assert_times_of_measurement(frames):
