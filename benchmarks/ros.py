@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from flexneedle.lab.ros.client import NodeClient, open_node
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, TopicProfile, load_profile
 from flexneedle.lab.ros.records import RosStop
-from flexneedle.types import Period, Plan, Shape
+from flexneedle.results import Period, Plan
+from flexneedle.types import Shape
 from synthetic import make_periods, make_plan
 
 LOOPBACK = (

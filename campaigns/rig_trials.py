@@ -23,7 +23,7 @@ import psutil
 
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord, read_truth
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
-from flexneedle.types import Insertion
+from flexneedle.results import Insertion
 
 START_S, END_S, _ABORT_S = 300.0, 60.0, 5.0
 _STALL_S = 0.005

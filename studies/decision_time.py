@@ -32,7 +32,7 @@ from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.ports import Clock
-from flexneedle.types import Insertion, Outcome, Plan
+from flexneedle.results import Insertion, Outcome, Plan
 
 TARGETS = tuple(product((25.0, 30.0, 35.0, 40.0, 45.0), (-5.0, 0.0, 5.0)))
 MOST_GROWTH_MM, MOST_INNOVATION_MM = 0.04, 0.02

@@ -31,7 +31,7 @@ from flexneedle.loop.insert import insert
 from flexneedle.loop.virtual import Seeds, virtual_rig, virtual_room
 from flexneedle.phantom.plants import DEFAULT_PLANT
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.types import Plan
+from flexneedle.results import Plan
 
 FIRST_SEED = 300_000
 FAR_MM, NEAR_MM = 400.0, 30.0

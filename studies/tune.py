@@ -32,7 +32,7 @@ import numpy as np
 import flexneedle
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import to_text
-from flexneedle.types import Plan
+from flexneedle.results import Plan
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
 STRIDE = 4  # through the targets, so that successive cases mix depths and sides

@@ -43,8 +43,8 @@ from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import draw
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import STUDY_FILE
+from flexneedle.results import Outcome, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Outcome, Plan
 
 LAST_MM = 10.0  # tissue before the target
 NOTHING, OTHER_PLAN = "nothing", "other plans"

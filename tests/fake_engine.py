@@ -10,7 +10,7 @@ import numpy as np
 
 from flexneedle.errors import RunError
 from flexneedle.loop.events import PeriodEnded
-from flexneedle.types import Insertion, Outcome
+from flexneedle.results import Insertion, Outcome
 from synthetic import make_periods, make_plan
 
 

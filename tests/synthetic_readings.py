@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from flexneedle.record.fields import parse_verdict
-from flexneedle.types import Action, CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.results import Action, CheckedMeasurement
+from flexneedle.types import Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 FRAMES = 8  # in a period of 0.2 s

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flexneedle import load_scenario
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.results import CheckedMeasurement
+from flexneedle.types import Frame, Measurement, SensorReading
 from synthetic import make_periods, make_plan
 
 _SCRIPT = Path(__file__).parents[1] / "studies" / "monitor.py"

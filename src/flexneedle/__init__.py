@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from flexneedle.record.frame import to_dataframe
     from flexneedle.record.loading import load
     from flexneedle.record.saving import save
+    from flexneedle.results import Insertion, Plan
     from flexneedle.scenario.files import load_scenario
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
@@ -62,10 +63,8 @@ if TYPE_CHECKING:
         SPIN,
         THETA,
         Control,
-        Insertion,
         Measurement,
         Motion,
-        Plan,
         Pose,
         X,
         Y,

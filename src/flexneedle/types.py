@@ -1,24 +1,19 @@
-"""Frozen records shared by all layers: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s.
+"""Frozen records shared by all layers: poses, commands and measurements. Units are mm, N, mJ, rad, s.
 
 Positions are x along the insertion axis and y, z across it; a needle in the plane has z = 0. Poses and commands are
 rows of columns, in arrays, too.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
-from itertools import pairwise
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.arguments import check_covariance, make_refusal, read_numbers, read_rows
-
-if TYPE_CHECKING:
-    from flexneedle.scenario.model import Scenario
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -117,7 +112,7 @@ COLUMNS: tuple[str, ...] = _Columns._fields
 
 
 class Control(_Columns):
-    """One control step, a row of nine columns.
+    """One control step, a row of nine columns. `flip=True` adds half a turn to `roll`.
 
     Args:
         db_x: Motion of the base along x (mm).
@@ -129,7 +124,6 @@ class Control(_Columns):
         dg_z: Motion of the guide along z (mm).
         roll: Roll of the needle before the step (rad).
         spin: Even roll during the step (rad).
-        flip: Whether half a turn is added to `roll`.
 
     Raises:
         InputError: A value is not a number.
@@ -204,9 +198,6 @@ class Motion(NamedTuple):
 
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z from the sensor's to the tracker's frame; the sensor's z axis is the needle's."""
-
-_MAKE_ONE = "make one with flexneedle.plan or flexneedle.insert"
-_GIVE_ONE = "give one with dataclasses.replace(record, scenario=scenario)"
 
 VISIBLE = "ok"
 """Status of a sensor that the tracker measures, and of a tracker that sends frames."""
@@ -286,325 +277,3 @@ class Measurement:
         for name, size in (("covariance", 3), ("direction_covariance", 2)):
             if (matrix := getattr(self, name)) is not None:
                 object.__setattr__(self, name, check_covariance(name, matrix, size))
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A planned insertion of m steps.
-
-    Attributes:
-        strategy: "manipulation" or "steering".
-        target: x, y, z (mm).
-        seed: Seed of the search.
-        roll: Angle of the needle before the first step (rad).
-        controls: Columns of `Control` (m, 9).
-        tips: Planned tip poses (m + 1, 5), the start first.
-        strain_energy: Weighted tissue energy (m + 1,), mJ.
-        guide: Guide position y, z (m + 1, 2), mm.
-        shapes: Poses at the nodes of the needle (m + 1, n, 5).
-        cost: Cost.
-        terms: Cost by name.
-        iterations: Iterations of the search.
-        converged: Whether the search converged.
-        history: One dict per iteration of the planner.
-        limit: Limit that binds if the target is out of reach, else "".
-        seconds: Wall-clock time (s) of the search.
-        scenario: Scenario of the plan, None if unknown.
-    """
-
-    strategy: str
-    target: Point
-    seed: int
-    roll: float
-    controls: Floats
-    tips: Floats
-    strain_energy: Floats
-    guide: Floats
-    shapes: Floats
-    cost: float
-    terms: dict[str, float]
-    iterations: int
-    converged: bool
-    history: tuple[dict[str, Any], ...]
-    limit: str  # which limit binds if the target is out of reach, else ""
-    seconds: float = field(default=0.0, compare=False)  # wall clock
-    scenario: "Scenario | None" = None
-
-    @property
-    def tip_mm(self) -> Point:
-        """Position of the planned tip at the end."""
-        return Pose.of(self.tips[-1]).point
-
-    @property
-    def error_mm(self) -> float:
-        """Distance from the planned tip to the target (mm)."""
-        return math.dist(self.tip_mm, self.target)
-
-    @property
-    def strain_energy_mj(self) -> float:
-        """Weighted tissue energy at the end."""
-        return float(self.strain_energy[-1])
-
-    @property
-    def reached(self) -> bool:
-        """Whether the plan ends within 1 mm of the target, the radius of the paper's target circles."""
-        return self.error_mm <= 1.0
-
-    @property
-    def entry_angle(self) -> float:
-        """Slope dy/dx (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
-        return self.entry_angles[0]
-
-    @property
-    def entry_angles(self) -> Lateral:
-        """Slopes dy/dx and dz/dx (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
-        depth = self.tips[:, X]
-        inside = np.flatnonzero(depth >= 0.0)
-        if len(inside) == 0:
-            return math.nan, math.nan
-        after = max(int(inside[0]), 1)
-        ends = slice(after - 1, after + 1)
-        theta, psi = (float(np.interp(0.0, depth[ends], self.tips[ends, slope])) for slope in (THETA, PSI))
-        return theta, psi
-
-    @property
-    def summary(self) -> str:
-        """One line: distance of the plan's end from the target, and the limit that binds if it misses."""
-        binding = f", limited by {self.limit}" if self.limit else ""
-        if self.reached:
-            return f"reaches the target to {self.error_mm:.3f} mm{binding}"
-        return f"MISSES the target: best distance {self.error_mm:.3f} mm, more than 1 mm{binding}"
-
-    @property
-    def flips(self) -> int:
-        """Number of rolls of the bevel (flips, in the plane) during the insertion, without the roll at the start."""
-        return int(np.count_nonzero(self.controls[:, ROLL]))
-
-    def __repr__(self) -> str:
-        to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
-        ends = f"ends {self.error_mm:.3f} mm off, {self.strain_energy_mj:.3g} mJ"
-        return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
-
-
-class VerdictKind(StrEnum):
-    """Result of a check of a measurement, or of the field in which it was taken."""
-
-    OK = "ok"
-    MISSING = "missing"
-    NOT_A_NUMBER = "not a number"
-    STALE = "stale"
-    INNOVATION = "innovation"
-    OUT_OF_PLANE = "out of plane"
-    JUMP = "jump"
-    FROZEN = "frozen"
-    FIELD_UNKNOWN = "field not known"
-    FIELD_DISTORTED = "field distorted"
-    FIELD_IN_DOUBT = "field in doubt"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Result of a check, and its reason: the value and its limit; no reason for kind OK."""
-
-    kind: VerdictKind = VerdictKind.OK
-    reason: str = ""
-
-    @property
-    def ok(self) -> bool:
-        """Whether the check passed."""
-        return self.kind is VerdictKind.OK
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.reason}" if self.reason else str(self.kind)
-
-
-OK = Verdict()
-
-
-class Action(StrEnum):
-    """Action of the needle in a control period."""
-
-    MEASURE = "measure"  # wait for the first readings
-    MOVE = "move"
-    REST = "rest"  # wait at rest for late readings
-    HOLD = "hold"  # held: readings rejected, or no path to the target
-
-
-class Outcome(StrEnum):
-    """Outcome of an insertion."""
-
-    REFUSED = "refused"  # before the needle moved
-    DONE = "done"
-    HELD = "held"  # bad readings, or no path to the target
-    FAILED = "failed"
-    INTERRUPTED = "interrupted"
-
-
-@dataclass(frozen=True)
-class CheckedMeasurement:
-    """A tracker reading and its verdict: "ok", or the reason for the rejection."""
-
-    measurement: Measurement
-    verdict: Verdict
-
-
-@dataclass(frozen=True, eq=False)
-class Period:
-    """One control period. `true_*`: state of the virtual phantom, unknown to the controller; None on a rig."""
-
-    index: int
-    time: float  # end of the period (s), simulated time or clock of the rig
-    command: Control
-    applied: Control
-    measurement: Measurement  # the newest reading, or the last good one while none arrives
-    verdict: Verdict  # of the measurement, or of the field
-    innovation: Point  # measurement minus prediction (mm); 0, 0, 0 without a usable measurement
-    estimate: Pose
-    shape: Floats  # (n, 5) poses at the nodes of the estimated needle
-    base: Pose
-    guide: Lateral  # position (mm)
-    roll: float  # of the needle (rad)
-    strain_energy: float  # of the estimate (mJ)
-    tip_load: Lateral  # force at the tip (N) added by the observer
-    path: Pose  # planned pose at the estimated tip's depth
-    cost: float  # predicted cost of the chosen command
-    spread: float  # final standard deviation of the first guide step (mm)
-    action: Action
-    decision: (
-        str  # reason why the bevel was rolled or kept, or the needle held; "late: …" with the time it took
-    )
-    true_tip: Pose | None
-    true_strain_energy: float | None
-    durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
-    converged: bool = True  # solves of the model in this period, and of the virtual phantom up to it
-    true_stretch: float | None = None  # minimum stretch λ of the true tissue so far
-    miss: Lateral = UNKNOWN  # predicted lateral miss y, z at the target (mm); NaN: not predicted
-    miss_sd: float = math.nan  # its standard deviation on an axis (mm)
-    warning: str = ""  # warning of a likely miss, or ""
-    predicted: Shape | None = None  # shape at the target; None: not predicted
-    true_shape: Floats | None = None  # points x, y, z (n, 3) at equal distances along the needle (mm)
-    readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
-    late: bool = False  # whether the decision came after the deadline, so that the needle rested
-
-    def __repr__(self) -> str:
-        at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
-        true = "" if self.true_tip is None else f", true tip {_mm(self.true_tip)}"
-        return f"<Period {self.index} at {at}{true}, measurement {self.verdict}>"
-
-
-@dataclass(frozen=True, eq=False)
-class Insertion:
-    """A complete insertion, from the start to its outcome."""
-
-    plan: Plan
-    seed: int
-    periods: tuple[Period, ...]
-    outcome: Outcome
-    reason: str  # one line; "" if done within 1 mm of the target, or with unknown error
-    controller: str = ""  # name
-    phantom: str = ""  # formulation of the virtual phantom, "" on a rig
-    tracker: str = ""  # name, "" on a rig
-    scenario: "Scenario | None" = None  # of the insertion
-    rig: str = ""  # name of the rig, "" on a virtual one
-    ticks: Mapping[str, Any] = field(default_factory=dict, compare=False)  # of the rig: number, times, states
-    dry_run: bool = False  # the rig did not move: the needle was the virtual phantom's
-    disturbed: str = (
-        ""  # what a person disturbed and when; with it the seed does not give this insertion again
-    )
-
-    @property
-    def target(self) -> Point:
-        """Target x, y, z in mm."""
-        return self.plan.target
-
-    @property
-    def true_error_mm(self) -> float:
-        """Distance from the true tip to the target at the last period; NaN if unknown."""
-        truth = self.periods[-1].true_tip if self.periods else None
-        return math.nan if truth is None else math.dist(truth.point, self.target)
-
-    @property
-    def residual_mm(self) -> float:
-        """Distance from the last accepted reading to the target, as in the paper; NaN without a reading.
-
-        A reading without z counts in the plane.
-        """
-        good = [period.measurement for period in self.periods if period.verdict.ok]
-        if not good or good[-1].x is None or good[-1].y is None:
-            return math.nan
-        x, y, z = self.target
-        return math.dist((good[-1].x, good[-1].y, z if good[-1].z is None else good[-1].z), (x, y, z))
-
-    @property
-    def flips(self) -> int:
-        """Number of applied rolls of the bevel (bevel flips, in the plane)."""
-        return sum(period.applied.rolls for period in self.periods)
-
-    @property
-    def warning(self) -> str:
-        """The first warning of the insertion, or ""."""
-        return next((period.warning for period in self.periods if period.warning), "")
-
-    @property
-    def late(self) -> int:
-        """Number of decisions that came after the deadline."""
-        return sum(period.late for period in self.periods)
-
-    @property
-    def held_s(self) -> float:
-        """Total time (s) for which the needle was held."""
-        ends = [0.0, *(period.time for period in self.periods)]
-        spans = zip(self.periods, pairwise(ends), strict=True)
-        return sum((end - begin for period, (begin, end) in spans if period.action is Action.HOLD), 0.0)
-
-    @property
-    def error_mm(self) -> float:
-        """`true_error_mm`; where the truth is not recorded, as on a rig, `residual_mm`."""
-        return self.true_error_mm if self._has_truth else self.residual_mm
-
-    @property
-    def _has_truth(self) -> bool:
-        return bool(self.periods) and self.periods[-1].true_tip is not None
-
-    @property
-    def reached(self) -> bool:
-        """Whether the outcome is done and the tip ended within 1 mm of the target, by `error_mm`."""
-        return self.outcome is Outcome.DONE and self.error_mm <= 1.0
-
-    @property
-    def summary(self) -> str:
-        """Outcome of the insertion in one line, which begins with "dry run" for one and ends with disturbances."""
-        disturbed = f"; disturbed: {self.disturbed}" if self.disturbed else ""
-        return f"{'dry run: ' if self.dry_run else ''}{self._ending}{disturbed}"
-
-    @property
-    def _ending(self) -> str:
-        if self.outcome is not Outcome.DONE:
-            after = f"{self.outcome} after {len(self.periods)} periods"
-            return f"{after}: {self.reason}" if self.reason else after
-        if math.isnan(self.error_mm):
-            return "done: neither the true tip nor a reading of it is known"
-        by = "" if self._has_truth else " by the tracker"
-        if self.reached:
-            return f"reached: the tip ended {self.error_mm:.3f} mm from the target{by}"
-        return f"MISSED: the tip ended {self.error_mm:.3f} mm from the target{by}, more than 1 mm"
-
-    def __repr__(self) -> str:
-        to = f"to {_mm(self.target)}, {len(self.periods)} periods, seed {self.seed}"
-        return f"<Insertion {to}{self.controller and f', {self.controller}'}; {self.summary}>"
-
-
-def scenario_of(record: Plan | Insertion) -> "Scenario":
-    """Return the scenario of a plan or an insertion. Raises InputError if it has none, and for other types."""
-    if not isinstance(record, Plan | Insertion):
-        raise make_refusal("record", record, "must be a Plan or an Insertion", _MAKE_ONE)
-    scenario = record.scenario or (record.plan.scenario if isinstance(record, Insertion) else None)
-    if scenario is None:
-        raise make_refusal("scenario", None, f"must be known: {record!r} has none", _GIVE_ONE)
-    return scenario
-
-
-def _mm(position: Sequence[float]) -> str:
-    """Return a position as text, without z in the plane."""
-    x, y, *out = position[:3]
-    return f"({', '.join(f'{value:.4g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"

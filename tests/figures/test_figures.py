@@ -15,9 +15,10 @@ from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import NEEDLE, save
 from flexneedle.record.fields import parse_verdict
+from flexneedle.results import CheckedMeasurement, Insertion, Outcome
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import ROLL, THETA, CheckedMeasurement, Insertion, Measurement, Outcome
+from flexneedle.types import ROLL, THETA, Measurement
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings
 

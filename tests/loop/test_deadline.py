@@ -10,7 +10,8 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import InputError
 from flexneedle.loop.loop_state import LateDecision
 from flexneedle.record.fields import from_row, to_row
-from flexneedle.types import STILL, Action, Outcome
+from flexneedle.results import Action, Outcome
+from flexneedle.types import STILL
 from insertions import READING, Tank, blind, run
 from tanks import STRAIGHT
 

@@ -3,7 +3,7 @@
 import pytest
 
 from flexneedle.errors import CommandError, DriverError, RefusedError, RunError
-from flexneedle.types import Outcome
+from flexneedle.results import Outcome
 from insertions import Tank, facts, first_periods, run
 
 LOST = DriverError("galil 10.0.0.5:23: no reply within 0.1 s")

@@ -19,7 +19,7 @@ from flexneedle.loop import insert as insertion
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.plants import PLANTS
-from flexneedle.types import Insertion, Outcome
+from flexneedle.results import Insertion, Outcome
 from insertions import (
     PHANTOM,
     READING,

@@ -10,11 +10,12 @@ import pytest
 from flexneedle.control.controllers import DEFAULT
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.loop.guard import Guard, bending_strain
+from flexneedle.results import Action, Outcome
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import STILL, Action, Control, Outcome
+from flexneedle.types import STILL, Control
 from insertions import PHANTOM, Tank, run
 from observed import begun, in_tissue
 

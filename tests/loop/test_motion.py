@@ -8,8 +8,9 @@ import pytest
 from flexneedle.control.interface import Controller, Decision, travel_left
 from flexneedle.errors import CommandError, StoppedError
 from flexneedle.estimation.moves import Move, position_along
+from flexneedle.results import Outcome
 from flexneedle.simulator.control import Limits, controls
-from flexneedle.types import STILL, Control, Motion, Outcome
+from flexneedle.types import STILL, Control, Motion
 from insertions import PHANTOM, Stage, Tank, run, run_quickly
 
 THINKING_S = 0.1

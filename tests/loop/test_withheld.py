@@ -2,7 +2,8 @@
 
 import pytest
 
-from flexneedle.types import STILL, Motion, Outcome
+from flexneedle.results import Outcome
+from flexneedle.types import STILL, Motion
 from insertions import PHANTOM, Tank, run, run_quickly
 
 WHY = "frozen: 4 identical readings while the tip travelled 0.31 mm"

@@ -10,9 +10,10 @@ import flexneedle
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.planning import planner
 from flexneedle.planning.planner import bevel_reach
+from flexneedle.results import Plan
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control, Plan
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
 from reference.cases import MIRROR
 
 PHANTOM = flexneedle.load_scenario("phantom")

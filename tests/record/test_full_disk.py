@@ -19,8 +19,8 @@ from flexneedle.record import saving
 from flexneedle.record.folder import Folder
 from flexneedle.record.reader import read_trace
 from flexneedle.record.writer import TraceWriter
+from flexneedle.results import Outcome, Plan
 from flexneedle.scenario.files import dump_scenario
-from flexneedle.types import Outcome, Plan
 from synthetic import make_periods, make_plan
 
 QUICK = {

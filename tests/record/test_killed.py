@@ -14,8 +14,8 @@ from counted_command import counted
 from flexneedle.cli import main as cli
 from flexneedle.record.fields import to_row
 from flexneedle.record.reader import read_trace
+from flexneedle.results import Outcome
 from flexneedle.scenario.files import dump_scenario
-from flexneedle.types import Outcome
 
 TIMINGS = 4
 LONGEST_S = 60.0

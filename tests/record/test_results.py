@@ -8,7 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.record.results import insertion_result, insertion_row, insertion_timing
-from flexneedle.types import UNKNOWN, Insertion, Outcome, Shape
+from flexneedle.results import Insertion, Outcome
+from flexneedle.types import UNKNOWN, Shape
 from synthetic import blind, make_insertion, make_plan
 from synthetic_space import in_space
 

@@ -1,20 +1,22 @@
-"""Report constructions that the house style bans, in docs, docstrings, messages and the page's scripts.
+"""Report constructions that the house style bans, in docs, docstrings, comments, messages and the page's scripts.
 
-python tools/lint/words.py              # check README.md, docs and src; exit status 1 for a finding
+python tools/lint/words.py              # check docs and code; exit status 1 for a finding
 python tools/lint/words.py src docs     # check other files and folders
 python tools/lint/words.py --count src  # count the findings of each construction, also per 1,000 words
 """
 
 import argparse
 import ast
+import io
 import re
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-CHECKED = ("README.md", "docs", "src")
+CHECKED = ("README.md", "docs", "src", "tests", "campaigns", "studies", "benchmarks", "tools")
 # Construction, pattern (a space matches any white space), what to write.
 SENTENCES = (
     ("that of", r"(that|those) of", "repeat the noun"),
@@ -63,7 +65,10 @@ def markdown(source: str) -> Iterator[Text]:
 
 
 def python(source: str) -> Iterator[Text]:
-    """Yield the docstrings of modules, classes, functions and attributes, and the strings with a space."""
+    """Yield docstrings of modules, classes, functions and attributes, strings with a space, and comments."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], "message", re.sub(r"`[^`\n]+`", "·", token.string)
     waiting: list[tuple[ast.AST, str]] = [(ast.parse(source), "module")]
     while waiting:
         node, kind = waiting.pop()

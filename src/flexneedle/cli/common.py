@@ -15,8 +15,8 @@ from flexneedle.errors import InputError, RunError
 if TYPE_CHECKING:
     from flexneedle.control.interface import Controller
     from flexneedle.record.folder import Folder
+    from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
-    from flexneedle.types import Plan
 
 SWITCHED_ON = (
     "The motors of all axes are switched on first. One that rests away from its commanded position is switched off "

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from flexneedle.loop.events import Event, Gate, Listener
     from flexneedle.loop.rig import RigSource
     from flexneedle.record.folder import Folder
+    from flexneedle.results import Insertion, Period
     from flexneedle.scenario.model import Scenario
-    from flexneedle.types import Insertion, Period
 
 
 class Connection:
@@ -169,7 +169,7 @@ def _execute(
 ) -> Insertion:
     from flexneedle.cli.progress import Progress
     from flexneedle.record.recording import record_insertion
-    from flexneedle.types import Outcome
+    from flexneedle.results import Outcome
 
     connection.add_record(folder)
     with Progress() as progress:

@@ -10,15 +10,15 @@ from flexneedle.cli.common import entry_rows, print_json, print_table, target_ro
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from flexneedle.results import Insertion
     from flexneedle.scenario.model import Scenario
-    from flexneedle.types import Insertion
 
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     """Print how an insertion ended and the folder of its record; return the exit status."""
     from flexneedle.record.recording import BY_USER
     from flexneedle.record.results import insertion_result, insertion_timing
-    from flexneedle.types import Outcome
+    from flexneedle.results import Outcome
 
     if insertion.outcome is Outcome.INTERRUPTED:
         why = "" if insertion.reason == BY_USER else f": {insertion.reason}"

@@ -24,8 +24,8 @@ from flexneedle.cli.common import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
-    from flexneedle.types import Plan
 
 
 def add_parser(commands: Commands) -> None:

@@ -14,11 +14,12 @@ from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.planning.horizon import Samples
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.state import State
-from flexneedle.types import COLUMNS, Control, Plan, Shape, X
+from flexneedle.types import COLUMNS, Control, Shape, X
 
 _CORRECTED_MODEL = StateCorrection()
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")

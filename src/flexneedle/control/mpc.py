@@ -11,6 +11,7 @@ from flexneedle.costs.table import Trajectories
 from flexneedle.costs.terms import CE_MPC
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Samples, Variables, find_best
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
@@ -18,7 +19,7 @@ from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.simulator.control import MOVES, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, Plan, X
+from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, X
 
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 

@@ -16,10 +16,11 @@ from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.control.rotation import limit_roll, shorten_roll
 from flexneedle.estimation.task import Task
 from flexneedle.planning.insertion import LEAST_ROLL
+from flexneedle.results import Plan
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, Plan, X
+from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, X
 
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""

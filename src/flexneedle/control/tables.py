@@ -13,11 +13,11 @@ from pydantic import create_model
 from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError
 from flexneedle.estimation.task import Task
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Plan
 
 
 @cache

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Plan
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,9 @@ from flexneedle.figures.layout import COLUMNS, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, styled, tone
+from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Insertion, X
+from flexneedle.types import Floats, X
 
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 _LONG = 0.5  # mm; shorter paths would be hidden below their ends

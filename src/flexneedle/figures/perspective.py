@@ -37,8 +37,9 @@ from flexneedle.figures.style import (
     signed,
     styled,
 )
+from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Insertion, Shape, X, Y, Z
+from flexneedle.types import Floats, Shape, X, Y, Z
 
 _HEIGHT = 3.9  # inches
 _LINE = 100  # characters of a line of the verdict

@@ -14,8 +14,9 @@ from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import BAD, INK, PLAN, STRATEGIES, TARGET, signed, styled, tone
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Plan, X, Y
+from flexneedle.types import Floats, X, Y
 
 _LINES = {1: 100, 2: 66}  # characters of a line above a plan, by the number of lateral axes
 _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the skin

@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
-from flexneedle.types import Insertion, Plan, scenario_of
+from flexneedle.results import Insertion, Plan, scenario_of
 
 
 def plot(record: Plan | Insertion) -> Figure:

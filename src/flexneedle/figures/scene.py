@@ -13,9 +13,10 @@ from matplotlib.patches import Circle, Rectangle
 from flexneedle.figures.curves import Roll, start_roll
 from flexneedle.figures.layout import UPRIGHT
 from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, signed
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
-from flexneedle.types import THETA, Floats, Plan, Point, X, Y, Z
+from flexneedle.types import THETA, Floats, Point, X, Y, Z
 
 View = tuple[int, int]
 """Columns of a point that are drawn to the right and upwards."""

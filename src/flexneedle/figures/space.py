@@ -14,8 +14,9 @@ from flexneedle.figures.curves import Roll, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
 from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, signed
+from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Period, Plan, Point, Shape, X, Y, Z
+from flexneedle.types import Floats, Point, Shape, X, Y, Z
 
 COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
 """Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""

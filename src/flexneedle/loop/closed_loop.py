@@ -21,17 +21,10 @@ from flexneedle.loop.period import make_period
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
+from flexneedle.results import Action, Insertion, Outcome, Period
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.pace import ROUNDING_S, travel_time
-from flexneedle.types import (
-    STILL,
-    Action,
-    Insertion,
-    Motion,
-    Outcome,
-    Period,
-    X,
-)
+from flexneedle.types import STILL, Motion, X
 
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
 _Ending = tuple[Outcome, str]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # the command line imports this module for each help text
     from flexneedle.control.interface import Decision
     from flexneedle.estimation.estimate import Estimate
-    from flexneedle.types import Insertion, Period, Plan
+    from flexneedle.results import Insertion, Period, Plan
 
 
 class Event:

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.estimation.estimate import Estimate, carry_out
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.state import State
-from flexneedle.types import Control, Floats, Plan, X
+from flexneedle.types import Control, Floats, X
 
 _SHARE_OF_LAW = 0.95  # of the compression at which a law ends
 _ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest

@@ -18,10 +18,10 @@ from flexneedle.loop.rig import RigSource
 from flexneedle.loop.step import Steering
 from flexneedle.loop.virtual import Seeds
 from flexneedle.planning.origin import check_origin, with_planned_entry
+from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Insertion, Plan
 
 
 def insert(

@@ -8,7 +8,8 @@ import numpy as np
 from flexneedle.control.interface import Decision
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.measuring import Observation
-from flexneedle.types import Floats, Outcome, Shape, Z
+from flexneedle.results import Outcome
+from flexneedle.types import Floats, Shape, Z
 
 _CHANGED_SDS = 3.0  # standard deviations of an estimate beyond which a decision on it is made anew
 

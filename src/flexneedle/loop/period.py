@@ -7,7 +7,8 @@ import numpy as np
 from flexneedle.loop.measuring import Observation
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Step
-from flexneedle.types import UNKNOWN, Control, Lateral, Period, Plan, Pose, X
+from flexneedle.results import Period, Plan
+from flexneedle.types import UNKNOWN, Control, Lateral, Pose, X
 
 
 def make_period(

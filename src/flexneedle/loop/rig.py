@@ -11,8 +11,9 @@ from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.events import Stream
 from flexneedle.phantom.phantom import Condition
 from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Control, Plan
+from flexneedle.types import Control
 
 
 class RigSource(Protocol):

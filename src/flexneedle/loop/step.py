@@ -16,7 +16,8 @@ from flexneedle.loop.events import Decided, Stream
 from flexneedle.loop.guard import Guard
 from flexneedle.loop.loop_state import LateDecision, LoopState
 from flexneedle.loop.rig import Rig
-from flexneedle.types import STILL, Action
+from flexneedle.results import Action
+from flexneedle.types import STILL
 
 
 @dataclass(frozen=True)

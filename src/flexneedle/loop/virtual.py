@@ -24,9 +24,10 @@ from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage, tilt_of
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import TipTracker
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import Lateral, Plan, Point
+from flexneedle.types import Lateral, Point
 
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 

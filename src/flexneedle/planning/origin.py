@@ -1,9 +1,9 @@
 """The scenario of a plan, and the check that a plan may be carried out in another."""
 
 from flexneedle.errors import InputError
+from flexneedle.results import Plan
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Plan
 
 PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "plan")
 """Sections of a scenario that a plan depends on. It may be carried out with any other controller, tracker, monitor or

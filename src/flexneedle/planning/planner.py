@@ -16,6 +16,7 @@ from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import OnIteration, count_iterations
 from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, search_primitives, widen_search
 from flexneedle.planning.steering import MOST_ROLLS, radius, reach, search_rolls
+from flexneedle.results import Plan
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
@@ -33,7 +34,6 @@ from flexneedle.types import (
     Control,
     Floats,
     Laterals,
-    Plan,
     Point,
     X,
     Z,

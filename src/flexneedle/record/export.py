@@ -6,7 +6,7 @@ from typing import IO, Any
 
 from flexneedle.record.fields import COLUMNS, to_row
 from flexneedle.record.readings import OPTIONAL, to_values
-from flexneedle.types import Insertion, Period
+from flexneedle.results import Insertion, Period
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")

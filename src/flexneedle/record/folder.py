@@ -20,8 +20,8 @@ from typing import Any
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.files import create_folder, replace_file
 from flexneedle.record.plain import plan_from_values, plan_values, to_text
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Plan
 
 RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
 _PACKAGE = Path(__file__).parents[1]

@@ -6,7 +6,7 @@ from flexneedle.arguments import check_instance
 from flexneedle.errors import InputError
 from flexneedle.record.export import mark_columns
 from flexneedle.record.fields import COLUMNS, to_values
-from flexneedle.types import Insertion
+from flexneedle.results import Insertion
 
 if TYPE_CHECKING:
     from pandas import DataFrame

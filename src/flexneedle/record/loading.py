@@ -7,7 +7,7 @@ from flexneedle.arguments import check_path
 from flexneedle.errors import InputError, RunError
 from flexneedle.record.folder import TRACE_FILE, RunFile, read_run
 from flexneedle.record.reader import read_trace
-from flexneedle.types import Insertion, Outcome, Plan
+from flexneedle.results import Insertion, Outcome, Plan
 
 _UNFINISHED = "no end is recorded: the run was killed, its disk was full, or it is still running"
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.types import COLUMNS, Plan
+from flexneedle.results import Plan
+from flexneedle.types import COLUMNS
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
 _STORED_ELSEWHERE = ("seconds", "scenario")

@@ -6,7 +6,8 @@ Points and matrices are one text: numbers separated by spaces, rows by semicolon
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from flexneedle.types import CheckedMeasurement, Frame, Matrix, Measurement, SensorReading, Verdict
+from flexneedle.results import CheckedMeasurement, Verdict
+from flexneedle.types import Frame, Matrix, Measurement, SensorReading
 
 _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 _DIRECTION = ("direction_theta_rad", "direction_psi_rad")

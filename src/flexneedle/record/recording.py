@@ -21,8 +21,8 @@ from flexneedle.record.saving import (
     open_trace,
 )
 from flexneedle.record.writer import TraceWriter
+from flexneedle.results import Insertion, Outcome, Period, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Outcome, Period, Plan
 
 BY_USER = "stopped by the user"
 """Reason of an insertion that was interrupted by Ctrl-C."""

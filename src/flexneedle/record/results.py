@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from flexneedle.record.plain import plain
-from flexneedle.types import Insertion, Outcome, Period, Plan, X
+from flexneedle.results import Insertion, Outcome, Period, Plan
+from flexneedle.types import X
 
 RESULT_KEYS = (
     *(

@@ -12,8 +12,8 @@ from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE, Folder, versions
 from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.record.writer import TraceWriter
+from flexneedle.results import Insertion, Plan, scenario_of
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Plan, scenario_of
 
 PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
 """Fields of `Insertion` that name its parts, in `run.json` and `trace.mcap`."""

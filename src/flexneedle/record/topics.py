@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from flexneedle.record.fields import FIELDS, to_row
 from flexneedle.record.messages import Check, Message, diagnostics, nanoseconds, path, statuses
 from flexneedle.record.readings import to_values
-from flexneedle.types import Floats, Period
+from flexneedle.results import Period
+from flexneedle.types import Floats
 
 PLAN, STATUS, TIMING, READINGS = "/plan/path", "/control/status", "/timing", "/tracker/readings"
 _STATUS = "diagnostic_msgs/msg/DiagnosticArray"

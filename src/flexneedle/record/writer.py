@@ -19,7 +19,7 @@ from flexneedle.errors import RecordError
 from flexneedle.interrupts import uninterrupted
 from flexneedle.record.messages import STORE
 from flexneedle.record.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
-from flexneedle.types import Period, Plan
+from flexneedle.results import Period, Plan
 
 # A period has about 10 kB; a chunk or buffer that fills up within a period would split it.
 _CHUNK_SIZE = 1 << 24

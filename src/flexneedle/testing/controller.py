@@ -17,10 +17,11 @@ from flexneedle.estimation.task import Task
 from flexneedle.loop.insert import insert
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.planning.planner import plan
+from flexneedle.results import Insertion, Outcome, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import MOVES, Limits
 from flexneedle.testing.checks import require, require_finite, short_scenario
-from flexneedle.types import Insertion, Outcome, Plan, X
+from flexneedle.types import X
 
 _ARRAYS = ("controls", "tips", "guide", "strain_energy", "shapes")
 _MOST_CALLS = 300

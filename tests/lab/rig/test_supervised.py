@@ -27,9 +27,10 @@ from flexneedle.loop.closed_loop import _carry_out
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
 from flexneedle.record.topics import READINGS
+from flexneedle.results import Action
 from flexneedle.simulator.pace import travel_time
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Action, Control
+from flexneedle.types import Control
 from stages import RIG, Bench
 from synthetic import make_plan
 from traces import contents

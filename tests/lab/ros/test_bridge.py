@@ -26,7 +26,7 @@ from flexneedle.lab.ros.records import NodeLoss, RosArm, RosRefusal, RosState, R
 from flexneedle.loop.events import Ended, Iterated, PeriodEnded, Planned, Stream
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import READINGS
-from flexneedle.types import Period
+from flexneedle.results import Period
 from ros_peers import Bool, Peer, target
 from ros_rig import quick_scenario, started
 from stages import RIG

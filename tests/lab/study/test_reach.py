@@ -17,8 +17,8 @@ from flexneedle.lab.study.reach import (
 )
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.plants import ModelPlant
+from flexneedle.results import Insertion, Outcome
 from flexneedle.scenario.worlds import world
-from flexneedle.types import Insertion, Outcome
 
 COARSE = {"phantom.step_mm": 1.0, "phantom.element_mm": 1.0, "phantom.contact_spacing_mm": 1.0}
 FREE = world(15, "perfect").with_values(COARSE)

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.loop.monitor.monitor import Monitor
+from flexneedle.results import Verdict, VerdictKind
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
+from flexneedle.types import Frame, Measurement, SensorReading
 
 RATE = 40.0
 SETTINGS = MonitorSettings()

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.loop.monitor import rules as monitor_rules
-from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
+from flexneedle.results import Verdict, VerdictKind
+from flexneedle.types import Frame, Measurement, SensorReading
 
 OK = "ok"
 

@@ -17,9 +17,10 @@ from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
-from flexneedle.types import DB_X, DG_Y, Control, Floats, Plan, X
+from flexneedle.types import DB_X, DG_Y, Control, Floats, X
 
 _LEAST_INSERTION_MM = 0.5  # between two updates: in a shorter one the tracker's noise dominates
 _RIDGE = 1e-9  # mm² per squared millimetre of the guide: a unique solution where the guide has no effect

@@ -20,12 +20,13 @@ from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_Y, DG_Y, ROLL, STILL, Control, Floats, Plan, X, Y, Z
+from flexneedle.types import DB_Y, DG_Y, ROLL, STILL, Control, Floats, X, Y, Z
 
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm over which the tissue stiffens
 

@@ -13,7 +13,7 @@ from flexneedle.cli.view import draw, print_note
 from flexneedle.errors import InputError
 
 if TYPE_CHECKING:
-    from flexneedle.types import Insertion
+    from flexneedle.results import Insertion
 
 _REPLAY, _STDOUT = "replay.html", "-"
 _FIGURES = (".png", ".svg")

@@ -29,24 +29,11 @@ from flexneedle.loop.events import Event, Stream
 from flexneedle.loop.measuring import innovation_limit
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import MOVES, Limits, limit_half_turn
 from flexneedle.simulator.pace import ROUNDING_S, roll_time, travel_time
-from flexneedle.types import (
-    DB_X,
-    DB_Y,
-    DB_Z,
-    DG_Y,
-    DG_Z,
-    ROLL,
-    SPIN,
-    STILL,
-    Control,
-    Motion,
-    Plan,
-    Pose,
-    Z,
-)
+from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN, STILL, Control, Motion, Pose, Z
 
 _MOST_TICKS = 200_000  # an hour and more
 _MOST_KEPT = 10_000

@@ -21,8 +21,9 @@ from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import TopicProfile, load_profile
 from flexneedle.lab.ros.records import NodeLoss, Received, RosArm, RosRefusal, RosState, RosStop, RosTarget
 from flexneedle.loop.events import Ended, Event, Gate, PeriodEnded, Planned
+from flexneedle.results import Period
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.types import Period, Point
+from flexneedle.types import Point
 
 POLL_S = 0.01
 """Longest time between two checks for a stop."""

@@ -19,7 +19,8 @@ from flexneedle.lab.ros.records import (
     RosState,
     RosTarget,
 )
-from flexneedle.types import VISIBLE, Period, Plan
+from flexneedle.results import Period, Plan
+from flexneedle.types import VISIBLE
 
 _START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
 

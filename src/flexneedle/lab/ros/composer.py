@@ -30,7 +30,8 @@ from flexneedle.record.messages import (
     statuses,
 )
 from flexneedle.record.topics import READINGS, STATUS, TIMING, plan_message, status_messages
-from flexneedle.types import Floats, Measurement, Period, Plan, Pose, X, Z
+from flexneedle.results import Period, Plan
+from flexneedle.types import Floats, Measurement, Pose, X, Z
 
 PoseArray = ros.geometry_msgs__msg__PoseArray
 PoseWithCovariance = ros.geometry_msgs__msg__PoseWithCovariance

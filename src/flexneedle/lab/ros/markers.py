@@ -10,7 +10,8 @@ import rosbags.typesys.stores.ros2_humble as ros
 
 from flexneedle.lab.ros.frames import FrameMap
 from flexneedle.record.messages import Header, PointMessage, PoseMessage, Time, Vector3
-from flexneedle.types import Plan, Point
+from flexneedle.results import Plan
+from flexneedle.types import Point
 
 Marker = ros.visualization_msgs__msg__Marker
 MarkerArray = ros.visualization_msgs__msg__MarkerArray

@@ -18,7 +18,7 @@ from flexneedle.planning.planner import plan
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain, plan_values
 from flexneedle.record.results import RESULT_COLUMNS, insertion_row, plan_row
-from flexneedle.types import Insertion, Plan
+from flexneedle.results import Insertion, Plan
 
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""

@@ -11,7 +11,7 @@ from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.jobs import PlanResult
 from flexneedle.planning.origin import PLANNER_INPUTS
 from flexneedle.record.plain import plan_from_values, to_text
-from flexneedle.types import Plan
+from flexneedle.results import Plan
 
 
 def digest_plan_inputs(point: StudyPoint) -> str:

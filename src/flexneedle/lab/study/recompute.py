@@ -13,7 +13,7 @@ from flexneedle.loop.events import Event, PeriodEnded
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain
 from flexneedle.record.results import insertion_row
-from flexneedle.types import Insertion
+from flexneedle.results import Insertion
 
 WITHOUT = ("refused", "error")
 """Outcomes of rows that have no insertion."""

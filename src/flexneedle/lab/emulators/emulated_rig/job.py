@@ -7,8 +7,8 @@ from flexneedle.errors import InputError, RigError
 from flexneedle.lab.emulators.emulated_rig.axes import carriages_of
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.planning.origin import check_origin, with_planned_entry
+from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Plan
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import ExactPlant
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import TipTracker
+from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
-from flexneedle.types import Frame, Measurement, Plan, SensorReading
+from flexneedle.types import Frame, Measurement, SensorReading
 
 _MISSING = "missing"
 _METAL = "noisy"

@@ -14,7 +14,7 @@ from flexneedle.loop.events import Event, Iterated, PeriodEnded
 from flexneedle.loop.insert import insert
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.types import Insertion
+from flexneedle.results import Insertion
 
 _AT_ONCE_S = 1e-6
 

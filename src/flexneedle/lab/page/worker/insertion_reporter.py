@@ -13,7 +13,7 @@ from flexneedle.lab.page.worker.plan_jobs import samples_of, shapes_of
 from flexneedle.lab.page.worker.recordings import channel_of, frames_of, row_of
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.loop.events import Decided, Event, Iterated, PeriodEnded, Planned
-from flexneedle.types import Insertion, Outcome, Period, Plan
+from flexneedle.results import Insertion, Outcome, Period, Plan
 
 _ENDED = (Outcome.DONE, Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
 """Outcomes after which the needle remains in the tissue on a rig."""

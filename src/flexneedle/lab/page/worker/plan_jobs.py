@@ -13,10 +13,10 @@ from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.planning.horizon import Samples
 from flexneedle.planning.planner import STRATEGIES, sketch
 from flexneedle.planning.planner import plan as make_plan
+from flexneedle.results import Plan
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Plan
 
 _ESTIMATE = (24, 4)
 """Samples and iterations of an estimate."""

@@ -24,8 +24,9 @@ from flexneedle.loop.monitor.rules import has_indicator
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save
+from flexneedle.results import Insertion, Period, Plan, scenario_of
 from flexneedle.simulator.state import Contacts
-from flexneedle.types import Floats, Insertion, Period, Plan, Shape, X, scenario_of
+from flexneedle.types import Floats, Shape, X
 
 _SOURCES: dict[Recording, FrameSource] = {"first": FrameSource.FIRST, "second": FrameSource.SECOND}
 

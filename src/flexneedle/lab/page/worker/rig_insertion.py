@@ -32,8 +32,8 @@ from flexneedle.loop.events import AllGates, Event, Gate, Listener
 from flexneedle.loop.insert import check_choices
 from flexneedle.record.folder import Folder
 from flexneedle.record.recording import record_insertion
+from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion
 
 _CHECKED_S = 2.0
 """Time for which frames of the tracker are counted, as by `flexneedle rig check`."""

@@ -13,7 +13,7 @@ from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.lab.study.folder import read_folder
 from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.recompute import WITHOUT, recompute
-from flexneedle.types import Insertion
+from flexneedle.results import Insertion
 
 MOST_ROWS = 200
 _LONGEST_REASON = 300

@@ -14,7 +14,8 @@ from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.rig.devices.aurora.incoming import LinkReceiver
 from flexneedle.lab.rig.devices.aurora.messages import parse
 from flexneedle.lab.rig.supervisor.watch import TipWatch
-from flexneedle.types import OK, VISIBLE, Frame, SensorReading
+from flexneedle.results import OK
+from flexneedle.types import VISIBLE, Frame, SensorReading
 
 sys.path.append(str(Path(__file__).parents[5] / "campaigns"))  # behind the tests: both have an `emulated`
 import fuzz_aurora
