@@ -15,14 +15,13 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
 INTRODUCTION = """# Commands
 
 Results are written to stdout, progress and messages to stderr. The exit status is 0 on success, 1 after a failure or an
-insertion that ended more than 1 mm from its target, 2 for bad input and 130 after Ctrl-C. `--help` prints the usage,
-too.
-
-This page is generated from the commands (`make docs`).
+insertion that ended more than 1 mm from its target, 2 for bad input and 130 after Ctrl-C. `--help` adds the usage and
+examples of a command; this page is generated from it (`make docs`).
 """
 _COLUMNS = "90"
 _USAGE_AND_HELP = re.compile(r"\Ausage: .*?\n\n|^  -h, --help [^\n]*\n", re.MULTILINE | re.DOTALL)
 _NOTHING_ELSE = re.compile(r"^options:\n\n", re.MULTILINE)
+_EXAMPLES = re.compile(r"^examples:\n.*", re.MULTILINE | re.DOTALL)
 
 
 def page() -> str:
@@ -49,7 +48,8 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 def _section(parser: argparse.ArgumentParser) -> str:
     level = "#" * min(3, 1 + len(parser.prog.split()))
     text = _NOTHING_ELSE.sub("", _USAGE_AND_HELP.sub("", parser.format_help()))
-    return f"{level} {parser.prog}\n\n```text\n{text.rstrip()}\n```\n"
+    text = _EXAMPLES.sub("", text).rstrip()
+    return f"{level} {parser.prog}\n" + (f"\n```text\n{text}\n```\n" if text else "")
 
 
 if __name__ == "__main__":

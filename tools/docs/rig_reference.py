@@ -10,7 +10,7 @@ from typing import Any
 
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.scenario.sections.axes import LINEAR_AXES
-from scenario_reference import Table, heading, section, tables
+from scenario_reference import Table, heading, section, tables, wrap
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "rig" / "file.md"
@@ -22,7 +22,7 @@ _ELSEWHERE = ("axes.rotation", "registration")  # keys are described with the li
 def page() -> str:
     """Return the page, Markdown."""
     sections = "\n".join(section(table, heading(table), ADVICE) for table in all_tables())
-    return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
+    return wrap(ADVICE["introduction"], sections)
 
 
 def all_tables() -> Iterator[Table]:

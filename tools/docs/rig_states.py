@@ -13,11 +13,11 @@ BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
 
 def table() -> str:
     """Return the table in Markdown: the state after each event, empty if it is refused."""
-    heads = " | ".join(str(event) for event in RigEvent)
-    lines = [f"| state | {heads} |", "|---" * (1 + len(RigEvent)) + "|"]
+    heads = "|".join(str(event) for event in RigEvent)
+    lines = [f"|state|{heads}|", "|---" * (1 + len(RigEvent)) + "|"]
     for state in SupervisorState:
-        cells = " | ".join(str(next_state(state, event) or "") for event in RigEvent)
-        lines.append(f"| {f'**{state}**' if state in MOVING else state} | {cells} |")
+        cells = "|".join(str(next_state(state, event) or "") for event in RigEvent)
+        lines.append(f"|{f'**{state}**' if state in MOVING else state}|{cells}|")
     return "\n".join(lines) + "\n"
 
 

@@ -53,15 +53,20 @@ def tables(root: dict[str, Any]) -> Iterator[Table]:
 
 
 def unit(name: str) -> str:
-    """Return the unit of a key by its ending."""
-    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "–")
+    """Return the unit of a key by its ending, "" for none."""
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
 
 
 def page() -> str:
     """Return the page, Markdown."""
     shown = (table._replace(keys=()) if _repeats(table) else table for table in tables(schema()))
     sections = "\n".join(section(table, heading(table), ADVICE) for table in shown)
-    return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
+    return wrap(ADVICE["introduction"], sections)
+
+
+def wrap(introduction: str, sections: str) -> str:
+    """Return a page whose sections have the style of scenario tables."""
+    return f'{introduction}\n<div class="scenario" markdown>\n\n{sections.rstrip()}\n\n</div>\n'
 
 
 def heading(table: Table) -> str:
@@ -103,10 +108,8 @@ def section(table: Table, title: str, advice: dict[str, Any]) -> str:
     text = f"{_about(table)} {advice['sections'].get(table.name, '')}"
     lines = [f"{title}\n", *(f"{' '.join(line.split())}\n" for line in [text] if line.strip())]
     if table.keys:
-        lines.append('<div class="scenario" markdown>\n')
-        lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
-        lines += [_row(key, advice) for key in table.keys]
-        lines.append("\n</div>\n")
+        lines += ["|key|default|allowed|meaning|", "|---|---|---|---|"]
+        lines += [*(_row(key, advice) for key in table.keys), ""]
     return "\n".join(lines)
 
 
@@ -126,15 +129,17 @@ def _row(key: Key, advice: dict[str, Any]) -> str:
     if choose := key.schema.get("choose") or advice["keys"].get(key.name):
         text += f" *Choose:* {choose}"
     short = key.name.rsplit(".", 1)[-1]
-    cells = (f"`{short}`", key.schema.get("unit") or unit(key.name), _default(key), allowed(key.schema), text)
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    cells = (f"`{short}`", _default(key), allowed(key.schema), text)
+    return f"|{'|'.join(cell.replace('|', chr(92) + '|') for cell in cells)}|"
 
 
 def _default(key: Key) -> str:
-    if key.required:
-        return "required"
     value = key.schema.get("default")
-    return "not set" if value is None else f"`{_toml(value)}`"
+    if key.required or value is None:
+        return "required" if key.required else "–"
+    text = _toml(value)
+    text = text if isinstance(value, int | float) and not isinstance(value, bool) else f"`{text}`"
+    return f"{text} {key.schema.get('unit') or unit(key.name)}".rstrip()
 
 
 def _toml(value: Any) -> str:
@@ -146,19 +151,19 @@ def _toml(value: Any) -> str:
 
 
 def allowed(node: dict[str, Any]) -> str:
-    """Return the allowed values of a schema in a few words."""
+    """Return the allowed values of a schema, in symbols."""
     node = next((one for one in node.get("anyOf", [node]) if one.get("type") != "null"), node)
     if "enum" in node:
         return ", ".join(f"`{name}`" for name in node["enum"])
     match node.get("type"):
         case "array" if "prefixItems" in node:
-            return f"{len(node['prefixItems'])} numbers, {allowed(node['prefixItems'][0])}"
+            return f"{len(node['prefixItems'])} numbers {_bounds(node['prefixItems'][0])}".rstrip()
         case "array":
-            return f"a list, at least {node.get('minItems', 1)} items"
+            return f"list, ≥ {node.get('minItems', 1)} items"
         case "boolean":
             return "`true`, `false`"
         case "string":
-            return "text in one line"
+            return "text"
         case "integer":
             return f"whole, {_bounds(node)}"
         case _:
@@ -171,12 +176,12 @@ def _bounds(node: dict[str, Any]) -> str:
     if high is not None and high >= _LARGEST:
         high = None
     if low is not None and high is not None:
-        return f"{low:g} to {high:,.12g}"
-    least = f"at least {low:g}" if low is not None and low > -_LARGEST else ""
-    least = f"above {above:g}" if above is not None else least
-    most = f"at most {high:,.12g}" if high is not None else ""
-    most = f"below {below:g}" if below is not None else most
-    return ", ".join(filter(None, (least, most))) or "any number"
+        return f"{low:g}…{high:,.12g}"
+    least = f"≥ {low:g}" if low is not None and low > -_LARGEST else ""
+    least = f"> {above:g}" if above is not None else least
+    most = f"≤ {high:,.12g}" if high is not None else ""
+    most = f"< {below:g}" if below is not None else most
+    return ", ".join(filter(None, (least, most)))
 
 
 if __name__ == "__main__":

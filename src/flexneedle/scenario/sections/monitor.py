@@ -8,7 +8,7 @@ from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, 
 
 
 class MonitorSettings(Section):
-    """Section `monitor`: limits beyond which the needle is held (the first of them from paper section IV-B)."""
+    """Section `monitor`: limits beyond which the needle is held. The first is from paper section IV-B."""
 
     enabled: bool = True
     """Whether the checks of this section run. Missing, stale and improbable readings are always rejected."""

@@ -20,7 +20,7 @@ from flexneedle.scenario.sections.weights import with_weights
 
 
 class Target(Section):
-    """Section `target`: the position that the tip is to reach."""
+    """Section `target`: position of the target of the tip."""
 
     depth_mm: Positive = 40.0
     """x of the target: depth below the skin."""
@@ -69,11 +69,9 @@ class PlanSettings(Section):
 
 
 class ControlSettings(Section):
-    """Section `control`: settings of all controllers. Each table below it has the settings of one controller.
+    """Section `control`: settings of all controllers. Each table below it has the settings of one controller."""
 
-    The tables are kept unchecked here; the controllers check them (`flexneedle.control.tables`).
-    """
-
+    # The controllers check their tables (`flexneedle.control.tables`).
     model_config = ConfigDict(extra="allow")
 
     load_gain: Fraction = 0.3
