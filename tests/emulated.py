@@ -1,4 +1,4 @@
-"""An emulated Aurora in a process of its own, and waiting for what a real line brings."""
+"""An emulated device in a separate process, and waiting for what a real line brings."""
 
 import signal
 import subprocess
@@ -13,19 +13,22 @@ import numpy as np
 from flexneedle.lab.emulators.motion import sensor_pose
 
 DEADLINE_S = 60.0
+CABLE = ("unplugged", "listens again", "plugged in again")
 
 
 @contextmanager
 def emulator(*arguments, end=signal.SIGINT, device="aurora"):
     """Run `flexneedle emulate` with a device and these arguments; give the path or address of the device and a function
-    that writes a line to the emulator and returns what it says to that."""
+    that writes a line to the emulator and returns its answer."""
     command = [sys.executable, "-m", "flexneedle", "emulate", device, *arguments]
     process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
 
     def tell(line):
         process.stdin.write(f"{line}\n")
         process.stdin.flush()
-        return process.stderr.readline().strip()
+        while (answer := process.stderr.readline().strip()).startswith(CABLE):
+            pass
+        return answer
 
     try:
         yield process.stdout.readline().strip(), tell

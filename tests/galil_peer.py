@@ -5,6 +5,7 @@ import threading
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from emulated import until
 from flexneedle.lab.emulators.galil.controller import ControllerState, advance_controller, reply
 
 CLOSE = object()
@@ -25,6 +26,18 @@ class Peer:
         self.lines.append(line)
         self.device, true = reply(advance_controller(self.device, 5), line)
         return true.encode() if self.damage is None else self.damage(line, true.encode())
+
+
+def settled(motors):
+    """The states once all channels rest."""
+    found = {}
+
+    def rest():
+        found.update(motors.read())
+        return not any(state.moving for state in found.values())
+
+    until(rest)
+    return found
 
 
 @contextmanager

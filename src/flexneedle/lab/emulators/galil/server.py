@@ -18,9 +18,9 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, is_order
 from flexneedle.lab.emulators.galil import motor_axis as one
+from flexneedle.lab.emulators.galil.axis_commands import ERRORS
 from flexneedle.lab.emulators.galil.controller import (
     AXES,
-    ERRORS,
     SAMPLES_HZ,
     ControllerState,
     advance_controller,

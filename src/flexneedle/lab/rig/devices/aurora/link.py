@@ -13,6 +13,7 @@ It is a process because the C library blocks while a device does not reply, beca
 it, and because a planner that holds Python's lock for a frame or two would lose these.
 """
 
+import json
 import signal
 import sys
 from time import monotonic, sleep
@@ -20,7 +21,6 @@ from typing import NoReturn
 
 from flexneedle.lab.process import MessageChannel, open_channel
 from flexneedle.lab.rig.devices.aurora.library import CHECKSUM, DISABLED, LOST, TIMEOUT, AuroraDevice
-from flexneedle.lab.rig.devices.aurora.messages import to_json
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
 GIVE_UP_S = 1.0
@@ -54,7 +54,7 @@ def main(descriptor: int, path: str, may_break: bool) -> None:
     """Connect, and poll until stopped (SIGTERM) or until no new frames arrive."""
     signal.signal(signal.SIGTERM, _stop)
     set_realtime_priority()
-    channel = open_channel(descriptor, encode=to_json)
+    channel = open_channel(descriptor, encode=lambda message: json.dumps(message).encode())
     try:
         device = AuroraDevice(path)
         try:

@@ -1,8 +1,7 @@
 """Messages of the link, as JSON: checked before anything is done with them."""
 
-import json
 import socket
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -31,11 +30,6 @@ _MESSAGE: TypeAdapter[Message] = TypeAdapter(Message, config=ConfigDict(strict=T
 def message_channel(end: socket.socket) -> MessageChannel:
     """Return the tracker's end of the channel to a link."""
     return MessageChannel(end, longest=LONGEST, decode=parse)
-
-
-def to_json(message: Any) -> bytes:
-    """Return the bytes of a message."""
-    return json.dumps(message).encode()
 
 
 def parse(data: bytes) -> Message:
