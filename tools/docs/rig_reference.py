@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from flexneedle.lab.rig.rig_axes import LINEAR_AXES
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.scenario.sections.axes import LINEAR_AXES
 from scenario_reference import Table, heading, section, tables, wrap
 
 HERE = Path(__file__).parent

@@ -11,9 +11,9 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 
 from flexneedle.errors import RigError
+from flexneedle.lab.rig.rig_axes import Axes, Axis
 from flexneedle.scenario.library import Library
 from flexneedle.scenario.problems import Problem, describe, refuse
-from flexneedle.scenario.sections.axes import Axes, Axis
 from flexneedle.scenario.sections.fields import Positive, Section, Title, one_line
 from flexneedle.scenario.sections.registration import Registration
 

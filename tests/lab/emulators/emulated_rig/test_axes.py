@@ -18,9 +18,9 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
     positions_after,
     start_positions,
 )
+from flexneedle.lab.rig.rig_axes import Axes
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.sections.axes import Axes
 from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 PHANTOM = load_scenario("phantom")

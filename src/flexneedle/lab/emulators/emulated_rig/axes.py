@@ -11,8 +11,8 @@ import numpy as np
 
 from flexneedle.errors import RigError
 from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS
+from flexneedle.lab.rig.rig_axes import Axes, Axis, RotaryAxis
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.axes import Axes, Axis, RotaryAxis
 from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN, Floats
 
 NAMES = tuple(Axes.model_fields)

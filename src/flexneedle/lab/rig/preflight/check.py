@@ -12,13 +12,13 @@ from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tr
 from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, room_problems
 from flexneedle.lab.rig.preflight.moves import describe_uncertainty
 from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.axes import Axis
 from flexneedle.types import VISIBLE, Frame, is_reference
 
 _PAUSE_S = 0.01

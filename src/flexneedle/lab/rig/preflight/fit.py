@@ -10,11 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from flexneedle.errors import RigError
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
 from flexneedle.loop.measuring import innovation_limit
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.scenario.sections.axes import Axis
 from flexneedle.types import Point
 
 _ROUNDING = 1e-9

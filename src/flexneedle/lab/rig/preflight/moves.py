@@ -7,11 +7,11 @@ from math import isfinite
 
 from flexneedle.arguments import shorten as text_of
 from flexneedle.errors import InputError, RefusedError
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import STILL
 from flexneedle.lab.rig.supervisor.drives import homing_reach, homing_speed, position_after_homing
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.axes import Axis
 
 _SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
 

@@ -3,12 +3,12 @@
 import math
 from collections.abc import Iterator
 
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.lab.rig.supervisor.trajectory import plan_trajectory, shortest_duration
 from flexneedle.ports import MotorPaces
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.scenario.sections.axes import Axis
 
 _ROUNDING = 1e-9
 _SHOWN = 1e6  # digits of a limit in a message

@@ -15,11 +15,11 @@ from flexneedle.geometry.registration import identity
 from flexneedle.interrupts import uninterrupted
 from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.signals import SignalLine
-from flexneedle.scenario.sections.axes import Axis
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Measurement, Point
 

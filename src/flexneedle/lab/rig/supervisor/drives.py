@@ -8,8 +8,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.ports import MotorState
-from flexneedle.scenario.sections.axes import Axis
 
 
 @dataclass(frozen=True)

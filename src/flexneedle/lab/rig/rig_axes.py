@@ -3,7 +3,6 @@
 Lengths are in mm, angles in degrees; counts are the encoder counts of the motor.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from math import radians
 from typing import Annotated, ClassVar, Literal, Self
@@ -35,7 +34,7 @@ Range = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 Home = Literal["here", "reverse-limit", "forward-limit", "absolute"]
 
 
-class Axis(Section, ABC):
+class Axis(Section):
     """An axis and its motor. `scale`, `limits` and the other properties are in counts, mm or rad, and s.
 
     unit: of the file, "mm" or "deg"; size: of that unit in mm or rad; usual_error and usual_tolerances: if the file has
@@ -55,44 +54,44 @@ class Axis(Section, ABC):
     """Home for `rig home`: the present position, a limit switch, or none (absolute encoder)."""
 
     @property
-    @abstractmethod
     def scale(self) -> float:
         """Signed counts per mm or rad."""
+        return self.direction * self._setting("counts_per_{}") / self.size
 
     @property
-    @abstractmethod
     def limits(self) -> tuple[float, float]:
         """Lowest and highest position, mm or rad."""
+        low, high = getattr(self, f"range_{self.unit}")
+        return self.size * low, self.size * high
 
     @property
-    @abstractmethod
     def speed(self) -> float:
         """Largest speed, mm/s or rad/s."""
+        return self.size * self._setting("speed_{}_s")
 
     @property
-    @abstractmethod
     def acceleration(self) -> float:
         """Acceleration, mm/s² or rad/s²."""
+        return self.size * self._setting("acceleration_{}_s2")
 
     @property
-    @abstractmethod
     def at_home(self) -> float:
         """Position of the axis at its home, mm or rad."""
+        return self.size * self._setting("home_{}")
 
     @property
-    @abstractmethod
     def backlash(self) -> float:
         """Lost motion on reversal, mm or rad."""
+        return self.size * self._setting("backlash_{}")
 
-    @property
-    @abstractmethod
-    def _errors(self) -> tuple[float | None, float | None]:
-        """The largest error and the tolerance of the file, in its unit; None: not set."""
+    def _setting(self, key: str) -> float:
+        """Return a setting in the unit of the file; 0 if it is not set."""
+        return float(getattr(self, key.format(self.unit)) or 0.0)
 
     @property
     def tolerance(self) -> float:
         """Largest distance from the goal of a motion that has ended, mm or rad."""
-        return self._usual_tolerance if self._errors[1] is None else self.size * self._errors[1]
+        return self.size * self._setting("tolerance_{}") or self._usual_tolerance
 
     @property
     def uncertainty(self) -> float:
@@ -105,10 +104,8 @@ class Axis(Section, ABC):
     @property
     def max_error(self) -> float:
         """Largest difference of commanded and measured position, mm or rad."""
-        if self._errors[0] is not None:
-            return self.size * self._errors[0]
         usual = min(self.size * self.usual_error, _LAG_S * self.speed)
-        return max(usual, _TOLERANCES * self._usual_tolerance)
+        return self.size * self._setting("max_error_{}") or max(usual, _TOLERANCES * self._usual_tolerance)
 
     @property
     def _usual_tolerance(self) -> float:
@@ -157,40 +154,6 @@ class LinearAxis(Axis):
     tolerance_mm: Positive | None = None
     """Distance from the goal within which a motion has arrived. Not set: 3 counts, 0.02 to 0.1 mm."""
 
-    @property
-    def scale(self) -> float:
-        """Signed counts per mm."""
-        return self.direction * self.counts_per_mm
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest position, mm."""
-        return self.range_mm
-
-    @property
-    def speed(self) -> float:
-        """Largest speed, mm/s."""
-        return self.speed_mm_s
-
-    @property
-    def acceleration(self) -> float:
-        """Acceleration, mm/s²."""
-        return self.acceleration_mm_s2
-
-    @property
-    def at_home(self) -> float:
-        """Position of the axis at its home, mm."""
-        return self.home_mm
-
-    @property
-    def backlash(self) -> float:
-        """Lost motion on reversal, mm."""
-        return self.backlash_mm
-
-    @property
-    def _errors(self) -> tuple[float | None, float | None]:
-        return self.max_error_mm, self.tolerance_mm
-
 
 class RotaryAxis(Axis):
     """Section `axes.rotation`: the roll of the needle about its axis."""
@@ -217,41 +180,6 @@ class RotaryAxis(Axis):
     `speed_deg_s`, at most 5°, at least four default tolerances."""
     tolerance_deg: Positive | None = None
     """Angle from the goal within which a roll has arrived. Not set: 3 counts, 1° to 2°."""
-
-    @property
-    def scale(self) -> float:
-        """Signed counts per rad."""
-        return self.direction * self.counts_per_deg / self.size
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest angle, rad."""
-        low, high = self.range_deg
-        return radians(low), radians(high)
-
-    @property
-    def speed(self) -> float:
-        """Largest speed, rad/s."""
-        return radians(self.speed_deg_s)
-
-    @property
-    def acceleration(self) -> float:
-        """Acceleration, rad/s²."""
-        return radians(self.acceleration_deg_s2)
-
-    @property
-    def at_home(self) -> float:
-        """Angle of the axis at its home, rad."""
-        return radians(self.home_deg)
-
-    @property
-    def backlash(self) -> float:
-        """Lost motion on reversal, rad."""
-        return radians(self.backlash_deg)
-
-    @property
-    def _errors(self) -> tuple[float | None, float | None]:
-        return self.max_error_deg, self.tolerance_deg
 
 
 def _problems_of(axis: Axis) -> Iterator[Problem]:
