@@ -3,6 +3,7 @@
 A block of `python` is executed, one of `sh` or `bash` is run by the shell; a block of `text` that follows at once is
 what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the
 line above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
+A line `--8<-- "NAME"` stands for the file docs/examples/NAME, as on the site.
 
     python tests/markdown_examples.py docs/tutorial.md      # writes the outputs that its examples print into the page
 """
@@ -22,6 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
+EXAMPLES = ROOT / "docs" / "examples"
 SHELL = ("sh", "bash")
 
 _BLOCK = re.compile(
@@ -29,6 +31,7 @@ _BLOCK = re.compile(
     r"|^<!-- run: (?P<command>[^\n]+) -->$",
     re.MULTILINE | re.DOTALL,
 )
+_INCLUDED = re.compile(r'^--8<-- "(.+)"\n', re.MULTILINE)
 _TITLE = re.compile(r'title="([^"]+)"')
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _RELATIVE, _ABSOLUTE = 0.01, 0.002
@@ -65,9 +68,8 @@ def blocks(page: str) -> list[Block]:
             result.append(Block("sh", match["command"] + "\n", line))
             continue
         title = _TITLE.search(match["info"])
-        block = Block(
-            match["language"], match["code"], line, title[1] if title else "", match["reason"] or ""
-        )
+        code = _INCLUDED.sub(lambda found: (EXAMPLES / found[1]).read_text(encoding="utf-8"), match["code"])
+        block = Block(match["language"], code, line, title[1] if title else "", match["reason"] or "")
         if after and after["language"] == "text" and not page[match.end() : after.start()].strip():
             block = replace(block, output=after["code"], span=after.span("code"))
         result.append(block)

@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -12,9 +11,12 @@ import pytest
 import flexneedle
 from flexneedle.scenario.files import dump_scenario
 from kits import run_kits
+from markdown_examples import ROOT, blocks
 
-DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
-MODULES = dict(re.findall(r"^```python title=\"(\w+)\.py\"\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
+DOCS = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+MODULES = {
+    block.title.removesuffix(".py"): block.code for block in blocks(DOCS) if block.title.endswith(".py")
+}
 PARTS = {"controller": "follow_path:CONTROLLER", "phantom": "unicycle:Unicycle", "tracker": "camera:Camera"}
 QUICK = {
     "plan.samples": 16, "plan.iterations": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0,

@@ -1,0 +1,20 @@
+from camera import Camera
+from follow_path import CONTROLLER
+from unicycle import Unicycle
+
+from flexneedle.testing import ControllerConformance, PlantConformance, TipTrackerConformance
+
+
+class TestFollowPath(ControllerConformance):
+    def make(self):
+        return CONTROLLER
+
+
+class TestUnicycle(PlantConformance):
+    def make(self, truth, roll):
+        return Unicycle(truth, roll)
+
+
+class TestCamera(TipTrackerConformance):
+    def make(self, scenario, phantom, rng):
+        return Camera(scenario, phantom, rng)
