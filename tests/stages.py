@@ -291,34 +291,35 @@ class Moves(Stage):
         super().stop()
 
 
-class Crooked(Stage):
-    """Motors in memory that are not held where they are when they are switched on."""
+class Noted(Stage):
+    """Motors in memory that write each command to a file, with the state of garbage collection and the scheduler."""
 
-    def power(self, channel, on):
-        self._called("power", channel, on)
+    def __init__(self, file, channels):
+        self._file = Path(file)
+        super().__init__(WallClock(), channels)
+
+    def _called(self, *call):
+        if call[0] != "read":
+            with self._file.open("a") as file:
+                file.write(f"{call[0]} {gc.isenabled()} {os.sched_getscheduler(0)}\n")
+        super()._called(*call)
 
 
 def real_motors(settings, channels):
-    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time.
+    """Motors in memory and in real time: the driver `stages:real_motors` of a rig file.
 
-    position: of all (counts); off: how far they are from where their controller has them (counts), which stays so.
+    notes: file of their commands; address: of the motors; suspended: file that, once it exists, makes the computer
+    appear to have been suspended for an hour.
     """
-    stage = (Crooked if "off" in settings else Stage)(WallClock(), channels)
-    for motor in stage.motors.values():
-        motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
-        motor.position += float(settings.get("off", 0.0))
-    return stage
-
-
-def suspended_motors(settings, channels):
-    """A driver of a rig file, `stages:suspended_motors`: the computer seems to be suspended for an hour on the way."""
-    stage = real_motors(settings, channels)
-    clock.suspended_s = lambda: 3600.0 if stage.motors["A"].position > 300.0 else 0.0
+    print("the stage is opened")
+    stage = Noted(settings["notes"], channels)
+    stage.address = settings["address"]
+    clock.suspended_s = lambda: 3600.0 * Path(settings["suspended"]).exists()
     return stage
 
 
 class Still:
-    """A tracker of a rig file, `stages:Still`: 40 frames a second of a tip at rest, with a little noise."""
+    """Tracker that reports 40 frames a second of a tip at rest, with a little noise: `stages:Still`."""
 
     status = "ok"
 
@@ -336,63 +337,3 @@ class Still:
 
     def close(self):
         pass
-
-
-class Blind(Still):
-    """A tracker of a rig file, `stages:Blind`: frames without the tip."""
-
-    def read(self):
-        unseen = {"tip": SensorReading(None, status="missing")}
-        return tuple(replace(frame, readings=unseen) for frame in super().read())
-
-
-class Noting(Stage):
-    """Motors in memory that note each call that commands them in a file."""
-
-    def __init__(self, file, channels):
-        self.file = Path(file)
-        super().__init__(WallClock(), channels)
-
-    def _called(self, *call):
-        if call[0] != "read":
-            with self.file.open("a") as file:
-                file.write(f"{call[0]}\n")
-        super()._called(*call)
-
-
-class Printing(Stage):
-    """Motors in memory, of somebody who prints."""
-
-    def read(self):
-        print("position of the stage:")
-        return super().read()
-
-
-def printing_motors(_settings, channels):
-    """A driver of a rig file, `stages:printing_motors`."""
-    print("opens the stage")
-    return Printing(WallClock(), channels)
-
-
-def noting_motors(settings, channels):
-    """A driver of a rig file, `stages:noting_motors`; file: path of its notes; address: of its motors."""
-    made = Noting(settings["file"], channels)
-    made.address = settings.get("address", Stage.address)
-    return made
-
-
-class Reporting(Stage):
-    """Motors that note in a file how their process runs: whether garbage is collected, and its scheduling."""
-
-    def __init__(self, clock, channels, notes):
-        super().__init__(clock, channels)
-        self._notes = Path(notes)
-
-    def read(self):
-        self._notes.write_text(f"{gc.isenabled()} {os.sched_getscheduler(0)}")
-        return super().read()
-
-
-def reporting_motors(settings, channels):
-    """A driver of a rig file, `stages:reporting_motors`: those; notes: the file."""
-    return Reporting(WallClock(), channels, settings["notes"])

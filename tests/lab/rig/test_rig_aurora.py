@@ -1,12 +1,16 @@
 """The closed loop in real time with an emulated Aurora in a separate process, which stops replying."""
 
+import json
 import re
 from importlib.resources import files
 
 import numpy as np
 import pytest
+import tomli_w
 
+import bench_rig
 import flexneedle
+from commands import run
 from emulated import emulated, read_until, until
 from flexneedle.lab.rig.devices.aurora.tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
@@ -75,13 +79,24 @@ fiducials_mm = [[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 80.0, 0.0]]
 """
 
 
-def test_a_registered_tracker_measures_the_tip_in_the_stages_frame(tmp_path):
+def test_an_emulated_aurora_is_checked_over_its_port_and_measures_in_the_frame_of_the_stage(capsys, tmp_path):
     preset = files("flexneedle.scenario").joinpath("presets/phantom.toml").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(preset + REGISTERED, encoding="utf-8")
     settings = flexneedle.load_scenario(tmp_path / "mine.toml").tracker
-    with emulated("--still") as path, Aurora(path, WallClock()) as tracker:
-        tip = OnStage(tracker, to_stage(settings.registration), settings.tip_offset_mm)
-        samples = []
-        until(lambda: samples.extend(tip.read()) or samples)
-    sample = samples[0]
-    np.testing.assert_allclose((sample.x, sample.y, sample.z), (1.0, 202.0, 3.0), atol=1.0)
+    with emulated("--still") as path:
+        tracker = {"kind": "flexneedle.lab.rig.devices.trackers:aurora", "port": path}
+        rig = bench_rig.values({"driver.kind": "bench_rig:drivers", "tracker": tracker})
+        (tmp_path / "rig.toml").write_text(tomli_w.dumps(rig))
+        words = ("--seconds", "1", "--json", "--scenario", "phantom")
+        status, out, _ = run(capsys, "rig", "check", str(tmp_path / "rig.toml"), *words)
+        with Aurora(path, WallClock()) as opened:
+            tip = OnStage(opened, to_stage(settings.registration), settings.tip_offset_mm)
+            samples = []
+            until(lambda: samples.extend(tip.read()) or samples)
+    findings = {
+        one["item"]: one["problem"] for one in json.loads(out)["findings"] if one["part"] == "tracker"
+    }
+    assert status == 0
+    assert set(findings) >= {"sensor tip", "sensor ref1", "sensor ref2", "sensor ref3", "frames", "status"}
+    assert set(findings.values()) == {None}
+    np.testing.assert_allclose((samples[0].x, samples[0].y, samples[0].z), (1.0, 202.0, 3.0), atol=1.0)

@@ -105,78 +105,72 @@ def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
 # On the emulated controller
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def controller():
     """Address of an emulated controller, and a function that gives it an order."""
     with emulator(device="galil") as given:
         yield given
 
 
-def supervised(address):
-    driver = DeviceSection(kind="galil", address=address, reply_timeout_ms=1000.0)
-    return SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver}))
-
-
-def set_up(address, line):
+def configure(address, line):
     host, port = address.split(":")
     with socket.create_connection((host, int(port))) as connection:
         connection.sendall(f"{line}\r".encode())
         assert connection.recv(100) == b":" * (1 + line.count(";"))
 
 
-def stall(supervisor, order, why):
-    supervisor.arm()
-    order("fault stall=A")
-    with pytest.raises(DriverError, match=why):
-        supervisor.move_to("insertion", supervisor.positions["insertion"] + 5.0)
-    supervisor.stop()
-    supervisor.reset()
-
-
-def assert_moves(supervisor):
-    at = supervisor.positions["insertion"]
-    supervisor.move_to("insertion", at + 2.0)
-    assert supervisor.positions["insertion"] == pytest.approx(at + 2.0, abs=0.02)
-
-
-def test_an_axis_that_was_blocked_moves_again_after_reset_and_arm(controller):
+@pytest.mark.parametrize(
+    ("setup", "why", "note"),
+    [
+        ("OEA=0", "insertion: the motor does not follow: 0.", HELD),
+        ("OEA=1;ERA=100", "insertion: the motor is off", "^$"),
+    ],
+)
+def test_an_axis_that_was_blocked_or_switched_off_moves_again_after_reset_and_arm(
+    controller, setup, why, note
+):
     address, order = controller
-    with supervised(address) as supervisor:
-        stall(supervisor, order, "insertion: the motor does not follow: 0.")
+    configure(address, setup)
+    driver = DeviceSection(kind="galil", address=address, reply_timeout_ms=1000.0)
+    with SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver})) as supervisor:
+        supervisor.arm()
+        order("fault stall=A")
+        at = supervisor.positions["insertion"]
+        with pytest.raises(DriverError, match=why):
+            supervisor.move_to("insertion", at + 5.0)
+        supervisor.stop()
+        supervisor.reset()
+        assert re.match(note, supervisor.arm())
         motor = supervisor.report.axes["insertion"].motor
-        assert abs(motor.commanded - motor.position) > 200
-        note = supervisor.arm()
-        motor = supervisor.report.axes["insertion"].motor
-        assert motor.commanded == motor.position
-        assert re.match(HELD, note), note
+        assert (motor.on, motor.commanded) == (True, motor.position)
         order("clear")
-        assert_moves(supervisor)
+        supervisor.move_to("insertion", at + 2.0)
+        assert supervisor.positions["insertion"] == pytest.approx(at + 2.0, abs=0.02)
 
 
-def test_a_motor_that_the_controller_has_switched_off_moves_again_after_reset_and_arm(controller):
+def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, capsys, tmp_path):
     address, order = controller
-    set_up(address, "OEA=1;ERA=100")
-    with supervised(address) as supervisor:
-        stall(supervisor, order, "insertion: the motor is off")
-        assert not supervisor.report.axes["insertion"].motor.on
-        order("clear")
-        assert supervisor.arm() == ""
-        assert_moves(supervisor)
-
-
-def test_commands_go_on_after_a_fault_and_motors_are_switched_off(controller, capsys, tmp_path):
-    address, order = controller
+    configure(address, "OEA=0")
     file = tmp_path / "rig.toml"
     file.write_text(tomli_w.dumps(bench_rig.values() | {"driver": {"kind": "galil", "address": address}}))
-    order("fault stall=A")
-    for printed in ("", "insertion: was 0."):  # the second one begins with the position error of the first
-        status, _, err = run(capsys, "rig", "jog", str(file), "insertion", "5", "--yes")
-        assert status == 1
-        assert printed in err
-        assert "the motors have not arrived: insertion 5.000 mm from the goal" in err
-    status, _, err = run(capsys, "rig", "off", str(file), "--yes")
-    assert (status, err.splitlines()[-1]) == (0, "done")
-    with factory({"address": address}, ["A", "B", "C"]) as motors:
-        assert [state.on for state in motors.read().values()] == [False, False, False]
+
+    def command(name, *words):
+        status, _, err = run(capsys, "rig", name, str(file), *words, "--yes")
+        return status, err.splitlines()[-1]
+
+    def read():
+        with factory({"address": address}, ["A", "B", "C"]) as motors:
+            return motors.read()
+
+    order("fault stall=C")
+    status, error = command("jog", "guide_y", "5")
+    assert status == 1
+    assert "the motors have not arrived: guide_y 5.000 mm from the goal" in error
+    assert command("off") == (0, "done")
+    assert [state.on for state in read().values()] == [False, False, False]
     order("clear")
-    assert run(capsys, "rig", "jog", str(file), "insertion", "2", "--yes")[0] == 0
+    begun = read()["C"].position
+    assert command("jog", "guide_y", "-1.5mm") == (0, "done")
+    assert read()["C"].position == pytest.approx(begun + 750.0, abs=5.0)  # counts, 500 a mm backwards
+    assert command("retract", "--to", "1") == (0, "done")
+    assert read()["A"].position == pytest.approx(1000.0, abs=10.0)
