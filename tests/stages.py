@@ -250,7 +250,7 @@ class Bench:
             self.core.tick()
             self.reports.append(self.core.report(0.0, 0.0, 0))
 
-    def until(self, number, most=4000):
+    def until(self, number, most=20_000):
         """Tick until the motion of this number has ended; return its message."""
         for _ in range(most):
             found = [one for one in self.sent if getattr(one, "number", None) == number]
@@ -263,6 +263,53 @@ class Bench:
         """The same, armed."""
         self.core.request(protocol.ArmCommand(deepest))
         return self
+
+    def step(self, number=1, roll=0.0, duration=0.2, expected=None, **travel):
+        """Request a step, with an advance of 1 mm if no travel is given."""
+        travel = travel or {"insertion": 1.0}
+        self.core.request(protocol.StepCommand(number, roll, travel, duration, expected))
+
+    def move(self, axis, position, speed=5.0, number=1, **options):
+        """Request a motion of one axis."""
+        self.core.request(protocol.MoveCommand(number, axis, position, speed, **options))
+
+    def home(self, axis, number=1):
+        """Request the search of a home."""
+        self.core.request(protocol.HomeCommand(number, axis))
+
+    def stop(self, who="the test"):
+        """Request a stop."""
+        self.core.request(protocol.StopCommand(who))
+
+    def reset(self):
+        """Request a reset."""
+        self.core.request(protocol.ResetCommand())
+
+    @property
+    def state(self):
+        """State of the rig."""
+        return self.core.state
+
+    @property
+    def why(self):
+        """Reason of the state."""
+        return self.core.why
+
+    @property
+    def refusal(self):
+        """Reason of the last refusal."""
+        assert isinstance(self.sent[-1], protocol.RequestRefused)
+        return self.sent[-1].why
+
+    def calls(self, name):
+        """Arguments of the calls of the motors with this name."""
+        return [call[1:] for call in self.stage.calls if call[0] == name]
+
+    def place(self, channel, counts):
+        """Let a motor rest at a position."""
+        motor = self.stage.motors[channel]
+        motor.position = motor.commanded = motor.target = counts
+        return motor
 
     def position(self, name):
         """Measured position of an axis (mm or rad)."""
