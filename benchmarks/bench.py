@@ -82,7 +82,7 @@ def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Upper band (4, n) and right-hand side (n,) of the last Newton iteration, and the state's own y, θ (n,).
 
     Two unknowns per node, y and θ, from the first node to the tip; none for the clamped base. The y of the guide is
-    given: its row is that of the identity.
+    given: its row is a row of the identity.
     """
     needle, model, count = state.needle, state.model, state.mesh.size
     base, tip, nodes = needle.boundary.base, needle.solution.tip, model.nodes[:count]
@@ -139,7 +139,7 @@ def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], inserti
 def measure_step(repeats: int = 41) -> dict[str, Any]:
     """One thread, all Newton iterations and the tissue law, interleaved with dpbsv on the final matrix."""
     simulator, controls = Simulator(SCENARIO, threads=1), insertions(SEQUENCES)
-    # The matrix is that of a tip that is not moved from where it was solved.
+    # A tip that stays at its solved position has this matrix.
     exact = Simulator(SCENARIO, threads=1, constants=simulator._model._replace(slide=1e-9))
     start, state = simulator.start(), after(exact, controls[0])
     band, load, known = last_system(state)
@@ -277,11 +277,12 @@ PARTS = {
 
 
 def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Name, value and remark of each measurement."""
-    step, depth, start = found["step"], found["depth"], found["start"]
-    period, times = found["period"]["period_ms"], dict(zip(DEPTHS_MM, depth["step_us"], strict=True))
-    a, b = depth["fit_us"]
-    plans = found["plan"]
+    """Return name, value and remark of each measurement."""
+    return [*step_rows(found["step"]), *depth_rows(found["depth"]), *process_rows(found)]
+
+
+def step_rows(step: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the rows of a step and of one solve by LAPACK."""
     return [
         (
             "rollout step",
@@ -303,7 +304,17 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
             f"{step['step_in_space_over_dpbsv']:.2f}",
             f"{step['step_in_space_us']:.2f} µs, planar controls, within {step['space_differs_from_plane_mm']:.0e} mm",
         ),
-        *((f"step at {mm} mm", f"{us:.2f} µs", "") for mm, us in times.items()),
+    ]
+
+
+def depth_rows(depth: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the rows of the step time by depth."""
+    a, b = depth["fit_us"]
+    return [
+        *(
+            (f"step at {mm} mm", f"{us:.2f} µs", "")
+            for mm, us in zip(DEPTHS_MM, depth["step_us"], strict=True)
+        ),
         ("growth with depth", f"d^{depth['exponent']:.2f}", "exponent 1: linear"),
         ("linear fit", f"{a:.2f} + {b:.3f} d µs", f"largest deviation {depth['fit_residual_us']:.2f} µs"),
         (
@@ -311,6 +322,13 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
             f"{depth['slope_deep_over_shallow']:.2f}",
             "1: linear, above 1: faster",
         ),
+    ]
+
+
+def process_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the rows of threads, plan, control period and start."""
+    start, plans, period = found["start"], found["plan"], found["period"]["period_ms"]
+    return [
         (
             "2 threads / 1",
             f"{found['threads']['speedup']:.2f} ×",

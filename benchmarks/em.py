@@ -101,7 +101,7 @@ def main() -> None:
         folder = Path(name)
         with ProcessPoolExecutor(
             1, get_context("spawn")
-        ) as writer:  # the resident memory of a child initially includes that of its parent
+        ) as writer:  # a child starts with the resident memory of its parent
             paths = writer.submit(write, folder, args.rows, args.all_columns).result()
         found = [measure(path, folder / f"{path.name}-{k}") for k in range(args.times) for path in paths]
     if args.json:

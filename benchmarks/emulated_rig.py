@@ -61,7 +61,7 @@ def measure(scenario: str, depth: float) -> dict[str, float]:
 
 
 def rig_in(folder: Path) -> str:
-    """Write the emulated rig of the package with a free port and a link of its own; return its path."""
+    """Write the emulated rig of the package with a free port and a separate link; return its path."""
     text = (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text(encoding="utf-8")
     path = folder / "rig.toml"
     path.write_text(
@@ -136,7 +136,7 @@ def busy(processes: dict[str, psutil.Process]) -> dict[str, float]:
 
 
 def steal() -> float:
-    """Processor time (s) that the host took so far."""
+    """Processor time (s) that the host has taken until now."""
     return float(getattr(psutil.cpu_times(), "steal", 0.0))
 
 

@@ -1,11 +1,11 @@
 """Time from command to reply of the motors on an emulated Galil: python benchmarks/galil.py [--calls N] [--json].
 
-Loopback, the emulated controller in a process of its own, four axes. `read()` and `follow()` are alternated at the rate
+Loopback, the emulated controller in a separate process, four axes. `read()` and `follow()` are alternated at the rate
 at which they come (without a pause), while two axes move; between them an echo of as many bytes as a reading has, by a
 plain TCP server in a third process: what the machine needs for a round trip alone. Median, 99 % and largest time of
 each, and the ratio to the echo. To judge the machine: processor time taken by the host (Linux in a virtual machine).
-Exit status 1 if the 99 % of read() or follow() are above 2 ms; 2 if those of the echo are above 1 ms: the machine is
-busy, and the times are not those of the driver.
+Exit status 1 if the 99 % of read() or follow() are above 2 ms; 2 if the 99 % of the echo are above 1 ms: the
+machine is busy, and the times do not describe the driver.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def measure(calls: int) -> dict[str, float]:
-    """Return the times of so many calls of each kind."""
+    """Return the times of `calls` calls of each kind."""
     stolen = getattr(psutil.cpu_times(), "steal", 0.0)
     with emulated() as address, echo() as line, connected(address) as motors:
         prepare(motors)

@@ -52,7 +52,7 @@ WARM_S = 60.0
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured: visits, drags of each scenario, seconds of each insertion, random worlds."""
+    """Amount of measurements: visits, drags of each scenario, seconds of each insertion, random worlds."""
 
     visits: int
     drags: int
@@ -103,7 +103,7 @@ class Server:
     process: psutil.Process
 
     def busy(self) -> tuple[float, float]:
-        """Processor time (s) so far of the server, and of its workers."""
+        """Processor time (s) of the server and of its workers until now."""
         workers = sum(busy(worker) for worker in self.process.children())
         return busy(self.process), workers
 
@@ -119,7 +119,7 @@ def busy(process: psutil.Process) -> float:
 
 
 def steal() -> float:
-    """Processor time (s) that the host took so far."""
+    """Processor time (s) that the host has taken until now."""
     return float(getattr(psutil.cpu_times(), "steal", 0.0))
 
 

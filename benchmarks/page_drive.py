@@ -1,4 +1,4 @@
-"""What benchmarks/page.py does on the page, as a person would: by pointer."""
+"""Actions of benchmarks/page.py on the page, by pointer like a person."""
 
 import time
 from pathlib import Path
@@ -20,11 +20,11 @@ MODIFIED = {"control.adaptive_mpc.samples": 64}
 """So that 64 paths are sampled in each period."""
 SECTION, STATUS = "[data-panel=section]", "[data-panel=status]"
 VIEWS = {"section": SECTION, "plots": "[data-panel=plots]"}
-"""What is in view while an insertion plays; the scene in space is drawn beside it."""
+"""Panels in view while an insertion plays; the scene in space is drawn beside them."""
 
 
 def new_page(browser: Browser, address: str) -> Page:
-    """A page in a browser window of its own, when it has its first picture."""
+    """Return a page in a new browser window, after its first picture."""
     context = browser.new_context(viewport=VIEWPORT)
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
@@ -35,7 +35,7 @@ def new_page(browser: Browser, address: str) -> Page:
 
 
 def until(page: Page, condition: str) -> None:
-    """Wait until a condition in JavaScript holds; it is looked at every 50 ms."""
+    """Wait until a condition in JavaScript holds; it is checked every 50 ms."""
     page.evaluate(
         f"""() => new Promise((resolve, reject) => {{
           const deadline = performance.now() + {PATIENCE_MS};

@@ -111,7 +111,7 @@ def refusals(name: str, logs: Sequence[Log]) -> Figure:
 def processor_times(trace: Mapping[str, Any]) -> list[float]:
     """Processor time (ms) of the script before each paint that drew, of a browser's trace (category devtools.timeline).
 
-    Its clock stands still while other processes have the processor. The probe itself has one callback in each animation
+    Its clock stops while other processes have the processor. The probe itself has one callback in each animation
     frame, so one that drew has more.
     """
     events = trace["traceEvents"]
@@ -139,13 +139,13 @@ def _thread(event: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _painted(shown: Sequence[Log], revision: int | None) -> float:
-    """When (ms) a revision was first painted; infinite if it never was, or is unknown."""
+    """Return the time (ms) of the first painting of a revision; infinite if it was never painted or is unknown."""
     known = [] if revision is None else [one["time"] for one in shown if one["revision"] >= revision]
     return min(known, default=float("inf"))
 
 
 def _most(values: Sequence[float]) -> float:
-    """What 95 % do not exceed: the smallest of the values for which that holds."""
+    """Return the smallest value that 95 % of the values do not exceed."""
     return float(np.quantile(values, 0.95, method="higher")) if len(values) else float("nan")
 
 

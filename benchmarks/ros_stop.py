@@ -1,6 +1,6 @@
 """Time from a stop on a ROS topic to the stop of the motors: python benchmarks/ros_stop.py [--stops N] [--json].
 
-A ROS node in a process of its own publishes a stop while an axis of a rig in memory moves. Between them are the node of
+A ROS node in a separate process publishes a stop while an axis of a rig in memory moves. Between them are the node of
 the insertion, the controller's process, which forwards the stop, and the supervisor. Measured is the time from the
 publication to the call that stops the motors, while the controller waits, and while it plans on all cores, and how far
 the axis then moved. DDS is kept on the loopback interface.
@@ -145,7 +145,7 @@ def _planning() -> Iterator[None]:
 
 
 def publish() -> int:
-    """Publish as each line KEY VALUE SECONDS of the standard input says, such as `stop true 0.2`; print when.
+    """Publish for each line KEY VALUE SECONDS of the standard input, such as `stop true 0.2`; print when.
 
     KEY: stop or arm; VALUE: true or false; SECONDS: to wait before. Times are in s on the monotonic clock.
     """

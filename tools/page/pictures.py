@@ -79,7 +79,7 @@ def _inserted(page: Page, pace: str = "20") -> None:
 
 
 def _shown(page: Page, share: float) -> None:
-    """Show the period at a share of the insertion, from the top of the page, and let it be painted."""
+    """Show the period at a share of the insertion, from the top of the page, and wait for its painting."""
     page.evaluate(
         """share => {
             flexneedle.store.set('view period', Math.round(share * flexneedle.store.get('rows live').length));
