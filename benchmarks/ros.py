@@ -2,8 +2,9 @@
 
 Periods are published at 40 Hz, faster than in an insertion, to four subscribers of all topics in separate processes,
 one of which reads nothing for seconds. The command prints the time that the rig's process spends in `publish` and
-`poll`, the processor time of the node for a period, and the time from a stop that a ROS node publishes to its arrival in
-the rig, which polls every 25 ms and, to measure the node alone, without pause. DDS is kept on the loopback interface.
+`poll`, the processor time of the node for a period, and the time from a stop that a ROS node publishes to its arrival
+in the rig, which polls every 25 ms and, to measure the node alone, without pause. DDS stays on the
+loopback interface.
 """
 
 import argparse
