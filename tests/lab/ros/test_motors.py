@@ -60,11 +60,9 @@ def motors(connected, joints):  # noqa: ARG001  at their start
     return RosMotors(CHANNELS, lambda: connected[1])
 
 
-@pytest.fixture
-def reconnecting(joints):  # noqa: ARG001
-    """Motors with a node of their own."""
-    with RosMotors(CHANNELS, lambda: JointLink(PROFILE, CHANNELS, STALE_S)) as motors:
-        yield motors
+def borrowed(part):
+    """A part that several objects use, none of which closes it."""
+    return MagicMock(wraps=part, close=lambda: None)
 
 
 def follow_until(motors, condition):
@@ -217,24 +215,25 @@ def test_old_states_are_an_error_and_a_stop_is_sent_all_the_same(connected, moto
     assert len({goal["insertion"] for _, goal in joints.targets[-3:]}) == 1
 
 
-# Connecting anew
+# Reconnecting
 
 
-def test_a_connection_anew_takes_up_no_motion(reconnecting, joints):
-    advance(reconnecting)
-    reconnect(reconnecting)
-    assert not reconnecting.read()["insertion"].moving
-    assert reconnecting.read()["insertion"].commanded == joints.positions["insertion"]
+def test_a_new_connection_takes_up_no_motion(connected, joints):
+    motors = RosMotors(CHANNELS, lambda: borrowed(connected[1]))
+    advance(motors)
+    reconnect(motors)
+    until(lambda: motors.read()["insertion"].commanded == joints.positions["insertion"])
+    assert not motors.read()["insertion"].moving
 
 
-def test_connecting_anew_keeps_no_tick_waiting(connected):
-    """A tick calls it again and again; only the thread waits for the node, the end of the old one included."""
+def test_reconnecting_keeps_no_tick_waiting(connected):
+    """A tick calls it repeatedly; only the thread waits for the end of the old node and for the new one."""
     open_now, calls = Event(), []
 
     def connect():
         calls.append(1)
         assert len(calls) == 1 or open_now.wait(20.0)
-        return MagicMock(wraps=connected[1], close=lambda: None)
+        return borrowed(connected[1])
 
     motors = RosMotors(CHANNELS, connect)
     for _ in range(3):
@@ -248,7 +247,7 @@ def test_connecting_anew_keeps_no_tick_waiting(connected):
     assert len(calls) == 2
 
 
-def test_why_a_connection_anew_fails_is_reported_and_the_next_call_tries_again():
+def test_a_failed_reconnection_is_reported_and_the_next_call_tries_again():
     found = iter([MagicMock(), RunError("no node"), DriverError("no states"), MagicMock()])
 
     def connect():
@@ -273,8 +272,8 @@ def test_the_end_does_not_wait_for_a_connection_and_leaves_none():
     until(lambda: link.close.called)
 
 
-def test_a_connection_anew_has_no_priority_over_the_ticks(monkeypatch):
-    """The node starts with the priority of its thread, which would else be the supervisor's."""
+def test_a_new_connection_has_no_priority_over_the_ticks(monkeypatch):
+    """The node starts with the priority of its thread, which would otherwise be the supervisor's."""
     order = []
     monkeypatch.setattr(module, "set_normal_priority", lambda: order.append(current_thread().name))
     connect_in_thread(lambda: order.append("connected")).result(20.0)
@@ -298,7 +297,8 @@ def test_what_is_refused(motors, joints):
     assert joints.targets == []
 
 
-def test_joints_that_are_not_reported_are_named(monkeypatch, joints):
+def test_joints_that_are_not_reported_are_named(monkeypatch, connected, joints):
+    monkeypatch.setattr(module, "NodeClient", lambda *_, **__: borrowed(connected[1]._node))
     with pytest.raises(DriverError, match="no joint elbow; joints: insertion, roll, other"):
         make_motors({}, ("insertion", "elbow"))
     monkeypatch.setattr(module, "_CONNECT_S", 0.3)

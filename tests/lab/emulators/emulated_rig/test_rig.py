@@ -80,13 +80,13 @@ def taken(truth, numbers, times, positions):
     ("scenario", "turn"), [("phantom", 18_000), pytest.param("phantom3d", 7_000, marks=pytest.mark.slow)]
 )
 def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_path):
-    """Through 50 mm with the guide in two axes, and a roll; what is left between reading and truth is jitter."""
+    """Through 35 mm with the guide in two axes, and a roll; what is left between reading and truth is jitter."""
     path, truth_path = rig_file(tmp_path), tmp_path / "truth.csv"
     with emulated_rig(path, scenario, "--seed", 3, "--truth", truth_path) as rig:
         prepared(rig)
         with Aurora(rig.ready["ready"]["aurora"], Monotonic()) as aurora:
             frames, _ = read_until(aurora, lambda found: len(found) > 40)
-            assert rig.ask("PR 80000,,2400,-1200;BGACD") == "::"
+            assert rig.ask("PR 50000,,2400,-1200;BGACD") == "::"
             rig.at_rest("ACD")
             assert rig.ask(f"PRB={turn};BGB") == "::"
             rig.at_rest("B")
@@ -101,18 +101,18 @@ def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_
     assert error.std() == pytest.approx(JITTER_MM, rel=0.12)
     assert np.abs(error).max() < 5.5 * JITTER_MM
     moving = np.linalg.norm(moved_by(truth, times), axis=1) > 5.0
-    assert np.count_nonzero(moving) > 150
+    assert np.count_nonzero(moving) > 100
     for part in (error, error[moving]):
         np.testing.assert_allclose(part.mean(axis=0), 0.0, atol=5.0 * JITTER_MM / math.sqrt(len(part)))
     assert np.abs(np.median(stamps - times)) < 0.015
     end = {name: float(place[-1]) for name, place in truth.positions.items()}
-    wanted = {"insertion": 50.0, "rotation": math.radians(turn / 100.0), "guide_y": 1.2, "guide_z": -0.6}
+    wanted = {"insertion": 35.0, "rotation": math.radians(turn / 100.0), "guide_y": 1.2, "guide_z": -0.6}
     assert end == pytest.approx(wanted, abs=1e-5)
-    assert truth.tips[-1, 0] - truth.tips[0, 0] == pytest.approx(50.0, abs=0.2)
+    assert truth.tips[-1, 0] - truth.tips[0, 0] == pytest.approx(35.0, abs=0.2)
     assert (truth.converged == 1.0).all()
     assert_written_often(truth)
     ended = rig.message("ended", device="phantom")["ended"]
-    assert ended["steps"] > 500
+    assert ended["steps"] > 350
 
 
 def assert_written_often(truth):
@@ -126,7 +126,9 @@ def assert_written_often(truth):
 
 def test_faults_are_injected_on_command_with_their_time(tmp_path):
     path, truth_path = rig_file(tmp_path), tmp_path / "truth.csv"
-    with emulated_rig(path, "phantom", "--truth", truth_path, "--fault", "galil:off=D@0") as rig:
+    rig = started(path, "phantom", "--truth", truth_path, "--fault", "galil:off=D@0")
+    children = rig.children
+    try:
         prepared(rig)
         assert rig.order("fault galil:stal=A")["reason"].startswith("fault stal=A: unknown kind")
         assert "DEVICE aurora or galil" in rig.order("fault stall=A")["reason"]
@@ -141,7 +143,9 @@ def test_faults_are_injected_on_command_with_their_time(tmp_path):
             read_until(aurora, lambda found: found and found[-1].time > cleared["time_s"] + 0.1)
             clean, _ = read_until(aurora, lambda found: len(found) > 5)
         assert rig.ask("MG _MOD") == " 1.0000\r\n:", "the scheduled fault of the first motion"
-        rig.ask("STA")
+    finally:  # also if the process that has started them is killed, and cannot end them
+        assert rig.end(signal.SIGKILL)[0] == -signal.SIGKILL
+        until(gone(children))
     assert not (tmp_path / "aurora").is_symlink()
     assert (stalled["device"], stalled["done"]) == ("galil", "stall=A")
     assert rig.message("event", device="galil")["event"] == "first motion"
@@ -168,19 +172,8 @@ def assert_off_between(begun, ended, frames):
     assert all(abs(value) > 25.0 for value in during)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_no_process_and_no_link_is_left(how, tmp_path):
-    """Also where the process that has started them is killed, and cannot end them. `emulated_rig` checks SIGINT."""
-    rig = started(rig_file(tmp_path), "phantom")
-    children = rig.children
-    assert all(child.is_running() for child in children)
-    code, _ = rig.end(how)
-    assert code == (-signal.SIGKILL if how == signal.SIGKILL else 0)
-    until(gone(children))
-    assert not (tmp_path / "aurora").is_symlink()
-
-
-def test_where_a_process_is_lost_all_end(tmp_path):
+@pytest.mark.long
+def test_if_one_process_ends_all_end(tmp_path):
     rig = started(rig_file(tmp_path), "phantom")
     children = rig.children
     psutil.Process(rig.ready["pids"]["phantom"]).kill()
@@ -225,7 +218,7 @@ def test_an_address_that_is_taken_is_found_out_before_anything_is_started(tmp_pa
     assert rig._parts == {}
 
 
-def test_a_device_that_cannot_begin_is_said_in_one_line(tmp_path):
+def test_a_device_that_cannot_begin_is_reported_in_one_line(tmp_path):
     path = rig_file(tmp_path)
     (tmp_path / "aurora").write_text("taken")
     rig = started(path, "phantom")
