@@ -1,26 +1,20 @@
 """Measure the exact plant: python benchmarks/plant.py. A JSON summary, times of one run, no thresholds.
 
 Insertions of drawn phantoms of the preset to 45 mm, in steps of 0.25 mm, with random guide motion: in the plane with
-flips, interleaved with the planar kernel of before (tests/reference/planar_rod.py), and in space with rolls by any
-angle.
+flips, and in space with rolls by any angle.
 """
 
 import json
-import sys
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
 import flexneedle
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.plants import ExactPlant
-from reference import planar_rod
 
 DEPTH_MM, STEP_MM, PHANTOMS = 45.0, 0.25, 12
 
@@ -57,24 +51,19 @@ def iterations(plant: ExactPlant, rows: np.ndarray) -> float:
 
 
 def summary() -> dict[str, Any]:
-    """Times of the kernels and their ratio, medians over phantoms."""
+    """Times of the kernel, medians over phantoms."""
     begun = time.perf_counter()
-    plant, _ = phantom(1, 0)
+    phantom(1, 0)
     first = time.perf_counter() - begun
-    planar_rod.Needle(plant)  # compiled
-    plane, before, space = [], [], []
+    plane, space = [], []
     for seed in range(PHANTOMS):
         plant, rows = phantom(1, seed)
-        old = planar_rod.Needle(plant)
         plane.append(seconds(plant, rows) / len(rows))
-        before.append(seconds(old, rows) / len(rows))
         plant, rows = phantom(2, seed)
         space.append(seconds(plant, rows) / len(rows))
     return {
         "first_plant_s": round(first, 2),
         "plane_us_per_step": round(1e6 * median(plane), 1),
-        "planar_kernel_of_before_us_per_step": round(1e6 * median(before), 1),
-        "plane_over_before": round(median(np.divide(plane, before).tolist()), 2),
         "space_us_per_step": round(1e6 * median(space), 1),
         "plane_iterations": round(median(iterations(*phantom(1, seed)) for seed in range(PHANTOMS)), 2),
         "space_iterations": round(median(iterations(*phantom(2, seed)) for seed in range(PHANTOMS)), 2),

@@ -1,4 +1,4 @@
-"""What a figure shows: its texts, lines and axes, and the texts that overlap."""
+"""Contents of a figure: its texts, lines and axes, and the texts that overlap."""
 
 from itertools import combinations
 

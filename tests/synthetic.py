@@ -1,4 +1,4 @@
-"""A plan and an insertion made up by hand: plausible to look at, quick to make, the same on every machine."""
+"""A synthetic plan and insertion: plausible, quick, and the same on every machine."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -14,14 +14,14 @@ TURN_AT = 45  # the step that turns the bevel
 
 
 def tip_path(depth, target=(40.0, 5.0), entry=-2.0):
-    """Poses (m, 5) of the tip at depths (m,): from the axis over `entry` at the skin to the target."""
+    """Return poses (m, 5) of the tip at depths (m,): from the axis over `entry` at the skin to the target."""
     known = (START, -18.0, 0.0, target[0] / 2, target[0])
     curve = np.polynomial.Polynomial.fit(known, (0.0, 0.1 * entry, entry, 0.2 * entry, target[1]), 4)
     return _poses(depth, curve)
 
 
 def needle_shape(path, base, guide, nodes=61):
-    """Nodes (n, 5) from the base over the guide along the path of the tip (m, 5) to its last pose."""
+    """Return nodes (n, 5) from the base over the guide along the path of the tip (m, 5) to its last pose."""
     tip = path[-1]
     x = np.linspace(base, tip[0], nodes)
     known_x = np.concatenate([[base], [GUIDE_X], path[path[:, 0] > -5.0, 0] if tip[0] > 0 else [tip[0]]])
@@ -31,7 +31,7 @@ def needle_shape(path, base, guide, nodes=61):
 
 
 def _poses(x, curve):
-    """Poses (n, 5) along a curve y(x)."""
+    """Return poses (n, 5) along a curve y(x)."""
     rows = np.zeros((len(x), 5))
     rows[:, X], rows[:, Y], rows[:, THETA] = x, curve(x), np.arctan(curve.deriv()(x))
     return rows
@@ -94,13 +94,13 @@ def make_periods(plan, miss=0.06, seed=0):
 
 
 def make_insertion(plan=None, miss=0.06, seed=0, outcome="done", reason="", periods=None):
-    """Return an insertion along the plan; `periods` keeps only so many."""
+    """Return an insertion along the plan; `periods`: number of periods to keep (default: all)."""
     plan = plan or make_plan(seed=seed)
     return Insertion(plan, seed, tuple(make_periods(plan, miss, seed))[:periods], Outcome(outcome), reason)
 
 
 def blind(period):
-    """Return the period as it is when the tracker saw nothing and there is no phantom to ask."""
+    """Return the period without a measurement and without a true state."""
     measurement = Measurement(period.measurement.time, None, None)
     return replace(
         period,

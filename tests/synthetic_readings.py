@@ -1,4 +1,4 @@
-"""Readings of a tracker with a tip and references, made up for a made-up insertion."""
+"""Synthetic readings of a tracker with a tip and references."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ FRAMES = 8  # in a period of 0.2 s
 
 
 def frame_of(number, time, indicators, place=(1.0, 2.0, 3.0)):
-    """Return a frame with the tip at `place` and references with these indicators by name, None where unseen."""
+    """Return a frame with the tip at `place` and references with these indicators by name, None where not measured."""
     tip = SensorReading(place, UPRIGHT) if place else SensorReading(None, status="out of volume")
     references = {
         name: SensorReading(None, status="missing")
@@ -41,5 +41,5 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
 
 
 def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):
-    """Return the period as one in which the needle was held."""
+    """Return the period with the needle held."""
     return replace(period, action=Action.HOLD, decision="held", verdict=parse_verdict(reason))

@@ -1,4 +1,4 @@
-"""A plan and an insertion in space, made up by hand: those in the plane, turned about the insertion axis."""
+"""A synthetic plan and insertion in space: the ones in the plane, turned about the insertion axis."""
 
 import cmath
 from dataclasses import replace

@@ -19,16 +19,37 @@ from synthetic_space import in_space
 SPACE = load_scenario("phantom3d")
 NO_GUIDE = SPACE.with_values({"setup.guide_to_skin_mm": None})
 ANGLE = 0.6  # rad
+INSERTION = in_space(make_insertion(), ANGLE)
+
+
+def held():
+    """Return an insertion with the longest reason that the default controller gives."""
+    reason = (
+        "no path to the target found: predicted miss -12.96 ± 10.59 mm is beyond control.miss_limit_mm = 2 with a "
+        "probability of 0.958 (limit 0.95); to insert anyway: flexneedle insert --force"
+    )
+    made = in_space(make_insertion(make_plan(target=(45.0, 3.0)), outcome="held"), -2.0)
+    return replace(made, reason=reason)
+
+
+def without_truth():
+    return replace(INSERTION, periods=tuple(replace(blind(p), predicted=None) for p in INSERTION.periods))
+
+
+CASES = {
+    "reached": lambda: (SPACE, INSERTION),
+    "downwards": lambda: (SPACE, in_space(make_insertion(miss=1.4), -2.5)),
+    "deep": lambda: (SPACE, in_space(make_insertion(make_plan(target=(80.0, 12.0))), 2.0)),
+    "shallow": lambda: (NO_GUIDE, in_space(make_insertion(make_plan(target=(20.0, -12.0))), 1.0)),
+    "held": lambda: (NO_GUIDE, held()),
+    "no truth": lambda: (SPACE, without_truth()),
+    "after one period": lambda: (SPACE, in_space(make_insertion(periods=1, outcome="interrupted"), ANGLE)),
+}
 
 
 @pytest.fixture(scope="module")
-def insertion():
-    return in_space(make_insertion(), ANGLE)
-
-
-@pytest.fixture(scope="module")
-def figure(insertion):
-    return perspective_figure(SPACE, insertion)
+def figure():
+    return perspective_figure(SPACE, INSERTION)
 
 
 def drawn(figure, gid):
@@ -56,10 +77,10 @@ def test_all_axes_have_one_scale(figure):
     np.testing.assert_allclose(ax._box_aspect / ax._box_aspect[0], np.array(spans) / spans[0])
 
 
-def test_needle_and_target_have_their_size_and_place(figure, insertion):
+def test_needle_and_target_have_their_size_and_place(figure):
     target = drawn(figure, "target")
-    np.testing.assert_allclose(np.linalg.norm(target - insertion.target, axis=1), 1.0)
-    needle, shape = drawn(figure, "needle"), insertion.periods[-1].shape
+    np.testing.assert_allclose(np.linalg.norm(target - INSERTION.target, axis=1), 1.0)
+    needle, shape = drawn(figure, "needle"), INSERTION.periods[-1].shape
     middle = np.column_stack([np.interp(needle[:, 0], shape[:, 0], shape[:, k]) for k in (1, 2)])
     np.testing.assert_allclose(np.hypot(*(needle[:, 1:] - middle).T), 0.5 * 0.819, rtol=1e-6)
     assert needle[:, 0].max() == pytest.approx(shape[-1, 0])
@@ -72,13 +93,13 @@ def test_the_tube_of_the_prediction_is_as_wide_as_two_standard_deviations(figure
     np.testing.assert_allclose(np.ptp(end[:, 1:], axis=0), [0.8, 1.6], rtol=1e-9)
 
 
-def test_arrows_are_the_directions_of_the_bevel(figure, insertion):
+def test_arrows_are_the_directions_of_the_bevel(figure):
     (ax,) = figure.axes
     found = [patch.points for patch in ax.findobj(FancyArrowPatch) if patch.get_gid() == "bevel"]
-    angles = [ANGLE, *(period.roll for period in insertion.periods if period.applied.rolls)]
+    angles = [ANGLE, *(period.roll for period in INSERTION.periods if period.applied.rolls)]
     expected = [[0.0, np.cos(angle), np.sin(angle)] for angle in angles]
     np.testing.assert_allclose(np.diff(found, axis=1)[:, 0] / 5.0, expected, atol=1e-12)
-    np.testing.assert_allclose(found[0][0], insertion.plan.tips[0, :3])
+    np.testing.assert_allclose(found[0][0], INSERTION.plan.tips[0, :3])
 
 
 def test_titles_are_those_of_the_insertion_and_the_legend_names_what_is_drawn(figure):
@@ -95,32 +116,6 @@ def test_titles_are_those_of_the_insertion_and_the_legend_names_what_is_drawn(fi
     ]
 
 
-def held():
-    """With the longest reason that the default controller gives."""
-    reason = (
-        "no path to the target found: predicted miss -12.96 ± 10.59 mm is beyond control.miss_limit_mm = 2 with a "
-        "probability of 0.958 (limit 0.95); to insert anyway: flexneedle insert --force"
-    )
-    made = in_space(make_insertion(make_plan(target=(45.0, 3.0)), outcome="held"), -2.0)
-    return replace(made, reason=reason)
-
-
-def without_truth():
-    made = in_space(make_insertion(), ANGLE)
-    return replace(made, periods=tuple(replace(blind(p), predicted=None) for p in made.periods))
-
-
-CASES = {
-    "reached": lambda: (SPACE, in_space(make_insertion(), ANGLE)),
-    "downwards": lambda: (SPACE, in_space(make_insertion(miss=1.4), -2.5)),
-    "deep": lambda: (SPACE, in_space(make_insertion(make_plan(target=(80.0, 12.0))), 2.0)),
-    "shallow": lambda: (NO_GUIDE, in_space(make_insertion(make_plan(target=(20.0, -12.0))), 1.0)),
-    "held": lambda: (NO_GUIDE, held()),
-    "no truth": lambda: (SPACE, without_truth()),
-    "after one period": lambda: (SPACE, in_space(make_insertion(periods=1, outcome="interrupted"), ANGLE)),
-}
-
-
 @pytest.mark.parametrize("make", CASES.values(), ids=CASES)
 def test_texts_neither_overlap_nor_leave_the_figure(make):
     figure = perspective_figure(*make())
@@ -130,17 +125,16 @@ def test_texts_neither_overlap_nor_leave_the_figure(make):
     assert [(a, b) for k, (a, one) in enumerate(boxes) for b, two in boxes[:k] if one.overlaps(two)] == []
 
 
-def test_the_same_data_give_the_same_bytes(tmp_path, insertion):
-    one = [path.read_bytes() for path in save(perspective_figure(SPACE, insertion), tmp_path, "one")]
-    two = [path.read_bytes() for path in save(perspective_figure(SPACE, insertion), tmp_path, "two")]
+def test_the_same_data_give_the_same_bytes(tmp_path):
+    one, two = (
+        [path.read_bytes() for path in save(perspective_figure(SPACE, INSERTION), tmp_path, name)]
+        for name in ("one", "two")
+    )
     assert one == two
 
 
-def test_an_insertion_in_space_is_drawn_in_perspective_too(tmp_path, insertion):
-    folder = save_run(replace(insertion, scenario=SPACE), tmp_path / "run")
-    assert [path.name for path in draw_run(folder)] == [
-        "insertion.png",
-        "insertion.svg",
-        "perspective.png",
-        "perspective.svg",
-    ]
+@pytest.mark.usefixtures("empty_figures")
+def test_an_insertion_in_space_is_drawn_in_perspective_too(tmp_path):
+    folder = save_run(replace(INSERTION, scenario=SPACE), tmp_path / "run")
+    names = [f"{name}.{kind}" for name in ("insertion", "perspective") for kind in ("png", "svg")]
+    assert [path.name for path in draw_run(folder)] == names

@@ -21,13 +21,13 @@ def twice(x: float) -> float:
 
 
 def compiled(home):
-    """Whether kernels of the sources in a folder are in the cache."""
+    """Return whether kernels of the sources in a folder are in the cache."""
     return any(Path(compiling.cache_folder(home)).rglob("*.nbi"))
 
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache of its own."""
+    """An empty cache."""
     folder = tmp_path / "cache"
     folder.mkdir()
     monkeypatch.setattr(config, "CACHE_DIR", str(folder))
@@ -36,10 +36,9 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def package(tmp_path, cache, monkeypatch):
-    """Write kernels into a folder of their own, and import them. Their cache is empty at first."""
-    monkeypatch.setattr(
-        sys, "dont_write_bytecode", True
-    )  # Python would take a second edit in a second for the first
+    """Return a function that writes kernels into a separate folder and imports them."""
+    # Python would mistake a second edit within a second for the first.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     home = tmp_path / "kernels"
     home.mkdir()
     assert cache.exists()
@@ -56,40 +55,27 @@ def package(tmp_path, cache, monkeypatch):
     return write
 
 
-def test_a_package_is_compiled_once_its_kernels_lie_in_the_cache(cache, package):
+def test_kernels_are_compiled_once_for_each_version_of_their_sources(cache, package):
     module = package(2.0)
     assert not compiled(package.home)
     assert module.twice(4.0) == 8.0
     assert compiled(package.home)
-    assert list(cache.rglob("*.nbi"))
-    assert str(cache) == config.CACHE_DIR  # decorating leaves Numba's own setting as it was
-
-
-def test_an_edit_of_the_package_asks_for_its_kernels_anew(package):
-    assert package(2.0).twice(4.0) == 8.0
+    assert str(cache) == config.CACHE_DIR  # decorating leaves Numba's own setting unchanged
     edited = package(3.0)
     assert not compiled(package.home)
     assert edited.twice(4.0) == 12.0
-    assert compiled(package.home)
 
 
-def test_other_columns_ask_for_the_kernels_anew(package, monkeypatch):
+def test_other_columns_need_other_kernels(package, monkeypatch):
     """They are constants in the kernels, but defined above them."""
     before = compiling.cache_folder(package.home)
     monkeypatch.setattr(types, "DB_Y", types.DB_Z)
     assert compiling.cache_folder(package.home) != before
 
 
-def test_packages_have_folders_of_their_own(package):
-    """Compiled kernels of one are none of another; all depend on the shared sources."""
+def test_packages_have_separate_folders_and_depend_on_the_shared_sources(package, tmp_path, monkeypatch):
     package(2.0).twice(4.0)
     assert not compiled(compiling.HERE)
-    assert not compiled(Path(compiling.__file__).parent)
-    assert compiling.cache_folder(package.home) != compiling.cache_folder(compiling.HERE)
-
-
-def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_path, monkeypatch):
-    package(2.0).twice(4.0)
     shared = tmp_path / "shared"
     shared.mkdir()
     for source in compiling.HERE.glob("*.py"):
@@ -101,7 +87,7 @@ def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_pa
     assert not compiled(package.home)
 
 
-def test_without_a_set_folder_the_cache_lies_beside_the_code_or_with_the_user(package, monkeypatch, tmp_path):
+def test_the_cache_is_beside_the_code_or_with_the_user(package, monkeypatch, tmp_path):
     monkeypatch.setattr(config, "CACHE_DIR", "")
     assert Path(compiling.cache_folder(package.home)).parent == package.home / "__pycache__"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))

@@ -7,13 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.mechanics.law import CELLS, response, stored_energy, tables
+from flexneedle.mechanics import law as laws
+from flexneedle.mechanics.law import CELLS, tables
 from flexneedle.scenario.tissue.laws import LAWS
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.scenario.tissue.linear import Linear
 from flexneedle.scenario.tissue.ogden import Ogden
 from reference.insertion import Tissue, ogden
+from reference.interpreted import interpreted
 
+PLAIN = interpreted(laws)
+response, stored_energy = PLAIN.response, PLAIN.stored_energy
 MU, ALPHA, HEIGHT, WIDTH = 1.82e-3, 8.74, 20.0, 5.2  # the phantom's first layer
 SIZE = {"shear_modulus_kpa": 1e3 * MU, "compression_length_mm": HEIGHT, "engaged_width_mm": WIDTH}
 LIMIT = Ogden.limit
@@ -28,31 +32,31 @@ compressions = st.floats(1e-9, LIMIT * (1 - 1e-9))
 
 
 def layer(alpha=ALPHA):
-    """A layer of Ogden tissue."""
+    """Return a layer of Ogden tissue."""
     return Ogden(alpha=alpha, **SIZE)
 
 
 def of(law, e):
-    """Energy, force and stiffness of a law at one relative compression."""
+    """Return energy, force and stiffness of a law at one relative compression."""
     return tuple(float(each(np.array([e]))[0]) for each in (law.energy, law.force, law.stiffness))
 
 
 def tabled(law, e):
-    """The same of its table."""
+    """Return the same values of its table."""
     table = tables([law])[0]
     secant, tangent, _ = response(table, e)
     return stored_energy(table, e), secant * e, tangent
 
 
 def contact(alpha, u):
-    """Energy (mJ), force (N) and stiffness (N/mm) that 1 mm of needle gets from the table at a compression u (mm)."""
+    """Return energy (mJ), force (N) and stiffness (N/mm) of a table for 1 mm of needle, compressed by u (mm)."""
     k = 3.0 * MU * WIDTH / HEIGHT
     energy, force, stiffness = tabled(layer(alpha), abs(u) / HEIGHT)
     return k * HEIGHT**2 * energy, -math.copysign(k * HEIGHT * force, u), k * stiffness
 
 
 def energy_written_out(alpha, e):
-    """Equation 1 unchanged, per volume."""
+    """Return equation 1 unchanged, per volume."""
     stretch = 1 - e
     return 2 * MU / alpha**2 * (2 * stretch ** (-alpha / 2) + stretch**alpha - 3)
 
@@ -64,8 +68,8 @@ def test_all_laws_are_tested():
     assert set(OWN) == set(LAWS)
 
 
-@pytest.mark.parametrize("alpha", [-20.0, -2.0, 1.0, ALPHA, 30.0])
-@pytest.mark.parametrize("e", [0.05, 0.15, 0.45, 0.695])
+@pytest.mark.parametrize("alpha", [-100.0, -20.0, -2.0, 1.0, ALPHA, 30.0, 100.0])
+@pytest.mark.parametrize("e", [0.1, 0.45, LIMIT])
 def test_energy_is_equation_1(alpha, e):
     """No factor lost between the equation and its scaled form: k h² = 3μ w h, and w h is the volume of 1 mm."""
     assert 3 * MU * of(layer(alpha), e)[0] == pytest.approx(energy_written_out(alpha, e), rel=1e-9)
@@ -81,10 +85,10 @@ def test_force_is_the_nominal_stress_times_the_area(stretch, stress_kpa):
     assert contact(ALPHA, HEIGHT * e)[1] == pytest.approx(1e-3 * stress_kpa * WIDTH, rel=2e-3)
 
 
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(law=layers)
 def test_every_law_has_the_stiffness_1_at_no_compression(law):
-    """Energy e²/2, force e: the modulus of a layer is that of its law."""
+    """Energy e²/2, force e: the modulus of a layer is the modulus of its law."""
     assert of(law, 0.0) == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
     energy, force, _ = of(law, 1e-6)
     assert force == pytest.approx(1e-6, rel=1e-4)
@@ -92,7 +96,7 @@ def test_every_law_has_the_stiffness_1_at_no_compression(law):
     assert law.modulus == 3 * law.shear_modulus
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(law=layers, e=st.floats(1e-3, LIMIT - 1e-4))
 def test_force_and_stiffness_are_derivatives_of_the_energy(law, e):
     """Central differences, which lose the 1e-16 of each value over 2h."""
@@ -102,7 +106,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(law, e):
     assert stiffness == pytest.approx((f2 - f1) / (2 * h), rel=1e-6, abs=1e-15 * force / h)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(law=layers, e=compressions)
 def test_a_law_is_convex_and_finite(law, e):
     """Stiffness positive wherever a point may be; force and energy positive, finite."""
@@ -111,17 +115,10 @@ def test_a_law_is_convex_and_finite(law, e):
     assert all(map(math.isfinite, values))
 
 
-@pytest.mark.parametrize("alpha", [-100.0, -60.0, 100.0])
-def test_the_energy_of_a_steep_law_is_equation_1(alpha):
-    """Where λ^(−α/2) is 1e-26, and where λ^α is."""
-    for e in (0.1, 0.4, LIMIT):
-        assert 3 * MU * of(layer(alpha), e)[0] == pytest.approx(energy_written_out(alpha, e), rel=1e-9)
-
-
 # ---- their tables
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(law=layers, e=compressions)
 def test_a_table_is_its_law(law, e):
     """Force and energy to 1e-9. The stiffness, by which a solve only finds its way, to 1e-8, and 1e-7 for α < −18."""
@@ -195,7 +192,7 @@ def test_beyond_its_limit_a_table_continues_linearly(law, beyond):
 @settings(max_examples=100)
 @given(law=layers, e=st.floats(1e-3, LIMIT - 1e-3))
 def test_the_sharpness_bounds_the_change_of_the_stiffness(law, e):
-    """|w‴|/w″ by central differences; the mean of a cell stands for it, which is a hundredth less at a minimum."""
+    """|w‴|/w″ by central differences; the table has the mean of a cell, a hundredth less at a minimum."""
     h = 1e-5
     third = abs(of(law, e + h)[2] - of(law, e - h)[2]) / (2 * h)
     bound = response(tables([law])[0], e).sharpness

@@ -1,4 +1,4 @@
-"""The needle in space: that of the plane where everything is in one, whichever plane; rolls, spins, work and energy."""
+"""The needle in space: equal to the needle of the plane in any one plane; rolls, spins, clearance, work and energy."""
 
 import cmath
 import math
@@ -16,7 +16,17 @@ from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics import spring
 from reference.cases import long_beam, numbers
 from reference.draws import draw_controls, draw_scenario
-from reference.space import Imposed, carried_out, commands, forces, lateral, slopes, start, turned_commands
+from reference.space import (
+    Imposed,
+    carried_out,
+    commands,
+    forces,
+    lateral,
+    model_of,
+    slopes,
+    start,
+    turned_commands,
+)
 
 PHANTOM = load_scenario("phantom")
 seeds = st.integers(0, 10**6)
@@ -25,27 +35,24 @@ GUIDE_X = PHANTOM.setup.guide_x
 
 
 def drawn(seed, steps=60):
-    """A random scenario, and random commands in one plane with flips."""
+    """Return a random scenario, and random commands in one plane with flips."""
     rng = np.random.default_rng(seed)
     scenario = draw_scenario(rng)
-    rows = draw_controls(scenario, steps, rng)
-    return scenario, rows
+    return scenario, draw_controls(scenario, steps, rng)
 
 
 def random_in_space(seed, steps=60):
-    """A random scenario, imposed conditions and commands, nothing of it in one plane."""
+    """Return a random scenario, imposed conditions and commands that lie in no common plane."""
     scenario, rows = drawn(seed, steps)
-    rng = np.random.default_rng((seed, 1))
+    guided, rng = scenario.setup.has_guide, np.random.default_rng((seed, 1))
     bevel, base, slope, guide, load = np.exp(1j * rng.uniform(-np.pi, np.pi, 5)) * [1.0, 0.3, 2e-3, 0.4, 2e-3]
-    if not scenario.setup.has_guide:
-        guide, base = 0.0, 0.2 * base
-    other = drawn(seed + 1, steps)[1] if scenario.setup.has_guide else rows
+    other = drawn(seed + 1, steps)[1] if guided else 0.5 * rows
     for y, z in ((1, 2), (3, 4), (5, 6)):
-        rows[:, z] = other[::-1, y] if scenario.setup.has_guide else 0.5 * rows[::-1, y]
+        rows[:, z] = other[::-1, y]
+    if not guided:
+        guide, base, rows[:, 5:7] = 0.0, 0.2 * base, 0.0
     rows[:, 7] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-4.0, 4.0, steps)
     rows[:, 8] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-9.0, 9.0, steps)
-    if not scenario.setup.has_guide:
-        rows[:, 5:7] = 0.0
     return scenario, Imposed(bevel, base, slope, guide, load), rows
 
 
@@ -87,12 +94,12 @@ def test_products_and_sizes_are_those_of_vectors(a, b):
 @pytest.mark.parametrize("spin", [0.0, 0.4, -2.0, 12.0])
 def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
     """ℓ q′ = b e^{iφ} − q along a step of 2.3 mm, with the bevel turning evenly and ending at its direction."""
-    model = start(PHANTOM).model
+    model = model_of(PHANTOM)
     length, offset, step = model.bevel_length, model.bevel_offset, 2.3
     bevel, q0 = cmath.exp(0.7j), 0.3 - 1.1j
     tip, channel = nd.NodePose(10.0, 0j, 0j), nd.CutChannel(10.0, q0)
     cut = nd.Cut(tip, channel, spin)
-    found, slope = spring.spring_rest(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
+    found, slope = spring.spring_rest.py_func(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
 
     def rate(x, q):
         return (offset * bevel * np.exp(1j * spin * (x / step - 1.0)) - q) / length
@@ -105,10 +112,10 @@ def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
 # ---- one plane, and any other
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
-    """Random insertions, to 1e-9 mm, and out of that plane exactly nothing."""
+    """Random insertions, to 1e-9 mm, with no motion at all out of that plane."""
     scenario, rows = drawn(seed)
     imposed = Imposed(1.0, 0.2, 1e-3, 0.1 if scenario.setup.has_guide else 0.0, 1e-3)
     (plane, tips), (space, there) = (
@@ -123,7 +130,7 @@ def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
     assert space.converged
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(seed=seeds, angle=angles)
 def test_turning_all_inputs_turns_the_needle(seed, angle):
     """Base, guide, bevel, load and every command, in random insertions with rolls and spins."""
@@ -140,10 +147,10 @@ def test_turning_all_inputs_turns_the_needle(seed, angle):
     assert other.energy == pytest.approx(one.energy, rel=1e-7)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(seed=seeds)
 def test_mirrored_inputs_mirror_the_needle(seed):
-    """z → −z with rolls and spins the other way: to the last bit."""
+    """z → −z with rolls and spins the other way."""
     scenario, imposed, rows = random_in_space(seed)
     mirrored = rows.copy()
     mirrored[:, [2, 4, 6, 7, 8]] *= -1.0
@@ -169,7 +176,7 @@ def test_a_bent_needle_with_clearance_turns_as_well(angle, bend):
 
 
 def test_a_roll_by_half_a_turn_is_the_flip():
-    """To the last bit: π, −π, 3π, or the bevel's direction reversed by hand, as in the plane."""
+    """To the last bit: π, −π, 3π, or the bevel's direction reversed by hand; four quarters are none."""
     before, _ = carried_out(start(PHANTOM), commands(48, 1.0, guide=0.03))
     boundary = before.needle.boundary
     reversed_ = before.needle._replace(boundary=boundary._replace(bevel=-boundary.bevel))
@@ -188,12 +195,7 @@ def test_a_roll_by_half_a_turn_is_the_flip():
         np.testing.assert_array_equal(tips, expected)
         assert not tips[:, [2, 4]].any()
         np.testing.assert_allclose(tips, planar[48:], atol=1e-9)
-
-
-def test_four_quarter_rolls_are_none():
-    state, _ = carried_out(start(PHANTOM), commands(45, 1.0))
-    rolled, _ = carried_out(state, commands(4, roll=0.5 * math.pi))
-    still, _ = carried_out(state, commands(4))
+    rolled, still = (carried_out(before, commands(4, roll=roll))[0] for roll in (0.5 * math.pi, 0.0))
     np.testing.assert_array_equal(numbers(rolled), numbers(still))
 
 
@@ -208,16 +210,16 @@ def test_a_quarter_roll_bends_the_path_out_of_the_plane():
 
 
 def pushed(steps, depth=45.0, turns=0.0, scenario=PHANTOM):
-    """Tips of an insertion to a depth (mm) in even steps, with an even spin of some turns from the start."""
+    """Return the tips of an insertion to a depth (mm) in even steps, with an even spin of some turns from the start."""
     way = depth - scenario.setup.start_tip_x
     rows = commands(steps, way / steps, spin=2.0 * math.pi * turns / steps)
     return carried_out(start(scenario), rows)[1]
 
 
-@pytest.mark.parametrize("turns", [0.5, 3.0, -7.0])
+@pytest.mark.parametrize("turns", [0.5, -7.0])
 def test_a_spin_does_not_depend_on_the_steps(turns):
-    """The same total spin in 37, 148 and 592 steps: the tip to 5 µm."""
-    ends = [lateral(pushed(steps, turns=turns))[-1] for steps in (37, 148, 592)]
+    """The same total spin in 37, 148 and 444 steps: the tip to 5 µm."""
+    ends = [lateral(pushed(steps, turns=turns))[-1] for steps in (37, 148, 444)]
     assert np.abs(np.subtract(ends, ends[-1])).max() < 5e-3
     assert abs(ends[-1]) > 5e-3
 
@@ -229,7 +231,7 @@ def test_a_fast_spin_goes_straight_in_inverse_proportion_to_its_speed():
     np.testing.assert_allclose(np.divide(spun[:-1], spun[1:]), 2.0, rtol=0.02)
 
 
-@pytest.mark.parametrize("spinning", [1, 2, 3])
+@pytest.mark.parametrize("spinning", [1, 2])
 def test_a_duty_cycle_bends_the_path_in_proportion(spinning):
     """Of four steps of ¼ mm some turn three times: the share of the others is left, half of it for half a cycle.
 
@@ -250,10 +252,9 @@ def test_a_duty_cycle_bends_the_path_in_proportion(spinning):
     assert np.mean(shares) == pytest.approx(1.0 - spinning / 4, abs=1e-3)
 
 
-@pytest.mark.parametrize("rate", [2 * math.pi / 60.0, -2 * math.pi / 40.0])
-def test_a_steady_spin_is_a_helix(rate):
+def test_a_steady_spin_is_a_helix():
     """Its curvature turns at the rate of the spin, and keeps its size; 1/β is 10 mm."""
-    depth, step = 250.0, 1.0
+    depth, step, rate = 250.0, 1.0, -2 * math.pi / 40.0
     scenario = long_beam(depth, spacing=1.0, bevel=0.01, bevel_length=3.0)
     turns = rate * (depth - scenario.setup.start_tip_x) / (2 * math.pi)
     tips = pushed(int(depth - scenario.setup.start_tip_x), depth, turns, scenario)
@@ -270,7 +271,7 @@ def test_a_steady_spin_is_a_helix(rate):
 # ---- the guide's clearance
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(seed=seeds, clearance=st.floats(1e-2, 0.4))
 def test_the_circle_of_a_guide_pushes_towards_its_middle(seed, clearance):
     """No needle is beyond it, and none that does not touch it is pushed; a push has no part along the circle."""
@@ -299,7 +300,7 @@ def test_the_circle_of_a_guide_pushes_towards_its_middle(seed, clearance):
 
 
 def withdrawn():
-    """A needle bent out of every plane, then drawn back: its tip is out of the bevel's spring and past whole points."""
+    """Return a needle bent out of every plane, then drawn back: its tip is past whole points, without its spring."""
     rows = commands(58, 1.0, guide=0.02 - 0.03j)
     rows[45, 7] = 1.1
     state, _ = carried_out(start(PHANTOM), rows)
@@ -330,8 +331,7 @@ def test_work_of_base_and_guide_is_the_energy_stored(name):
     assert work == pytest.approx(state.energy - energy, rel=1e-5)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.8, 2.1])
-@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize(("index", "angle"), [(0, 0.8), (1, 2.1), (2, 0.0), (2, 2.1)])
 def test_the_gradient_of_the_energy_is_the_reaction(index, angle):
     """Central differences in any direction across the axis."""
     state, _ = carried_out(withdrawn(), commands(5, base=0.1, slope=1e-3j, guide=-0.1 + 0.2j))
@@ -366,8 +366,7 @@ def test_a_contact_pushes_against_its_compression():
     np.testing.assert_allclose(force[whole], expected[whole], rtol=1e-7, atol=1e-12)
 
 
-@pytest.mark.parametrize("alpha", [-47.0, 80.0])
-@pytest.mark.parametrize("modulus_kpa", [2.0, 100.0])
+@pytest.mark.parametrize(("alpha", "modulus_kpa"), [(-47.0, 2.0), (80.0, 100.0)])
 def test_steep_laws_converge_in_every_direction(alpha, modulus_kpa):
     """A bevel of 13 mm that spins, with the guide going round: to the usual tolerance, and turned with all inputs."""
     layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}

@@ -10,18 +10,17 @@ from flexneedle import Control
 from flexneedle.errors import CommandError
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import PLANTS
 from flexneedle.types import PSI, THETA, Y, Z
 from reference.rods import IDEAL, planar
-from tanks import AHEAD, COARSE, PHANTOM, SKIN, STRAIGHT, TURN, alone, both_plants, driven, tank, tip
+from tanks import AHEAD, COARSE, PHANTOM, STRAIGHT, TURN, alone, both_plants, driven, tank, tip
 
 
 def free(scenario=IDEAL):
-    """The same needle, held only by its clamp."""
+    """Return the scenario without its guide: the needle is held only by its clamp."""
     return scenario.with_values({"setup.guide_to_skin_mm": None})
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_initial_bend_is_the_deflection_of_the_free_tip(seed):
     """0.5 mm over 150 mm, to the drawn side; it is mirrored when the bevel rolls."""
     scenario = free().with_values({"phantom.initial_bend_mm": 0.5})
@@ -33,7 +32,7 @@ def test_the_initial_bend_is_the_deflection_of_the_free_tip(seed):
 
 
 @both_plants
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_tip_moves_by_the_run_out_when_the_bevel_rolls(kind, seed):
     """0.2 mm, normal to the tip, at once; and back with the next roll."""
     phantom = alone(seed, kind, run_out_mm=0.2)
@@ -56,26 +55,6 @@ def test_the_run_out_is_normal_to_the_needle(kind):
     assert tip(off)[THETA] == tip(plain)[THETA]
 
 
-def test_within_its_clearance_the_guide_does_not_move_the_needle():
-    """Beyond it the needle is 0.05 mm behind the guide, on both sides; a guide without clearance moves it at once."""
-    reach = tip(driven(tank(), Control(dg_y=0.1)))[1]
-    assert reach > 0.1
-    for side in (1.0, -1.0):
-        phantom = driven(alone(guide_clearance_mm=0.05), Control(dg_y=0.05 * side))
-        assert tip(phantom)[1] == 0.0
-        driven(phantom, Control(dg_y=0.1 * side))
-        assert tip(phantom)[1] == pytest.approx(side * reach, rel=1e-6)
-
-
-@pytest.mark.parametrize("friction", [5.0, 10.0])
-def test_the_friction_at_the_base_is_proportional_to_the_inserted_length(friction):
-    blunt = IDEAL.with_values({"needle.bevel.offset_mm": 0.0, "phantom.friction_mn_per_mm": friction})
-    phantom = driven(tank(blunt), STRAIGHT, times=SKIN + 19)
-    depth = tip(phantom)[0]
-    assert depth == pytest.approx(19.5)
-    assert phantom._plant.state["base_force"][0] == pytest.approx(1e-3 * friction * depth)
-
-
 def test_friction_increases_the_deflection_of_a_bent_needle():
     """An axial force on a bent needle: twice the friction gives a larger deflection."""
     tips = [
@@ -90,7 +69,7 @@ def test_friction_increases_the_deflection_of_a_bent_needle():
 def test_layer_boundaries_are_at_their_drawn_depths():
     """Displaced by 1.5 mm (sd) around 20 mm: the stiffness of the cells changes there, within one cell."""
     steps = []
-    for seed in range(150):
+    for seed in range(60):
         phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
         rod = phantom._plant.rod
         k = rod.foundation
@@ -99,26 +78,19 @@ def test_layer_boundaries_are_at_their_drawn_depths():
         drawn = phantom._truth.scenario.layer_tops[1]
         assert (jump + 1) * rod.cell == pytest.approx(drawn, abs=0.5 * rod.cell + 1e-9)
         steps.append(drawn)
-    assert np.mean(steps) == pytest.approx(20.0, abs=4.0 * 1.5 / math.sqrt(150))
-    assert np.std(steps) == pytest.approx(1.5, rel=0.2)
+    assert np.mean(steps) == pytest.approx(20.0, abs=4.0 * 1.5 / math.sqrt(60))
+    assert np.std(steps) == pytest.approx(1.5, rel=0.3)
 
 
-def test_stiffness_varies_along_the_depth_with_its_size_and_correlation():
-    """20 % (sd) with a correlation of 1/e over 10 mm in the cells along the needle; higher over 5 mm."""
-    for length in (10.0, 5.0):
-        cells = []
-        for seed in range(200):
-            rod = alone(
-                seed, shear_modulus_variation=0.2, variation_length_mm=length, element_mm=30.0
-            )._plant.rod
-            plain = np.where((np.arange(rod.law.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
-            cells.append(rod.foundation / plain)
-        factor = np.array(cells) / np.mean(cells)
-        assert factor.std() == pytest.approx(0.2, rel=0.08)
-        lag = round(10.0 / 0.25)
-        level = np.log(factor)
-        found = np.corrcoef(level[:, :-lag].ravel(), level[:, lag:].ravel())[0, 1]
-        assert found == pytest.approx(math.exp(-10.0 / length), abs=0.06)
+def test_stiffness_varies_along_the_depth_as_drawn():
+    """Factors on the modulus of each cell; test_draw.py tests their size and correlation."""
+    phantom = alone(3, shear_modulus_variation=0.2, element_mm=30.0)
+    rod = phantom._plant.rod
+    plain = np.where((np.arange(rod.law.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
+    factor = rod.foundation / plain
+    drawn = np.array(phantom._truth.variation)[: rod.law.size]
+    np.testing.assert_allclose(factor / factor[0], drawn / drawn[0])
+    assert factor.std() > 0.05 * factor.mean()
 
 
 @both_plants
@@ -134,10 +106,9 @@ def test_factors_of_tissue_and_bevel_equal_a_changed_scenario(kind):
 
 
 @both_plants
-@pytest.mark.parametrize("seed", range(3))
-def test_start_offset_and_slope_move_the_clamp(kind, seed):
+def test_start_offset_and_slope_move_the_clamp(kind):
     """The tip of a free needle moves by the offset, and by 150 mm times the slope."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     offset = draw(free().with_values({"phantom.start_offset_sd_mm": 0.5}), rng)
     slope = draw(free().with_values({"phantom.start_angle_sd_mrad": 3.0}), rng)
     np.testing.assert_allclose(planar(tip(Phantom(offset, 0.0, kind)))[1:], [offset.base_y, 0.0], atol=1e-9)
@@ -147,11 +118,10 @@ def test_start_offset_and_slope_move_the_clamp(kind, seed):
     assert offset.base_y != 0.0 != slope.base_turn
 
 
-@pytest.mark.parametrize("kind", ["exact"])
 @pytest.mark.parametrize("angle", [0.5, -1.2])
-def test_a_bend_out_of_the_bevels_plane_rolls_with_the_needle(kind, angle):
+def test_a_bend_out_of_the_bevels_plane_rolls_with_the_needle(angle):
     """The free tip is 0.5 mm off in the direction of the bevel turned by the angle."""
-    tips = [tip(tank(free(), kind, roll=roll, bend=0.5, bend_angle=angle)) for roll in (0.0, math.pi)]
+    tips = [tip(tank(free(), roll=roll, bend=0.5, bend_angle=angle)) for roll in (0.0, math.pi)]
     for at, sign in zip(tips, (1.0, -1.0), strict=True):
         expected = sign * 0.5 * np.array([math.cos(angle), math.sin(angle)])
         np.testing.assert_allclose(at[[Y, Z]], expected, rtol=1e-4)
@@ -196,10 +166,9 @@ def test_a_true_load_deflects_the_free_tip(kind):
 
 
 @both_plants
-@pytest.mark.parametrize("seed", range(3))
-def test_an_axial_start_error_moves_base_and_tip_and_keeps_the_stroke(kind, seed):
+def test_an_axial_start_error_moves_base_and_tip_and_keeps_the_stroke(kind):
     scenario = IDEAL.with_values({**COARSE, "phantom.start_axial_sd_mm": 3.0})
-    truth = draw(scenario, np.random.default_rng(seed))
+    truth = draw(scenario, np.random.default_rng(1))
     error = scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
     assert error != 0.0
     phantom = Phantom(truth, 0.0, kind)
@@ -226,28 +195,17 @@ def test_a_modulus_factor_of_the_needle_equals_a_changed_scenario(kind):
     assert found[1] != tip(driven(tank(kind=kind), AHEAD, times=40))[1]
 
 
-def rough_truth(**changes):
-    """A drawn phantom with all default imperfections except motors, and these changes."""
-    scenario = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0, **changes})
-    return draw(scenario, np.random.default_rng(11))
-
-
-@pytest.mark.parametrize(
-    "key",
-    [
-        "initial_bend_mm",
-        "guide_clearance_mm",
-        "friction_mn_per_mm",
-        "shear_modulus_variation",
-        "layer_shift_sd_mm",
-        "run_out_mm",
-    ],
-)
-def test_the_model_plant_lacks_its_documented_imperfections_and_the_exact_one_has_all(key):
+@both_plants
+def test_the_model_plant_lacks_its_documented_imperfections_and_the_exact_one_has_all(kind):
+    """With all other imperfections, but for the motors."""
+    rough = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0})
     only_exact = {"initial_bend_mm", "guide_clearance_mm", "friction_mn_per_mm", "shear_modulus_variation"}
-    for kind in PLANTS:
-        ends = [
-            tip(driven(Phantom(rough_truth(**{f"phantom.{key}": value}), 0.0, kind), AHEAD, times=55))[1]
-            for value in (0.0, getattr(PHANTOM.phantom, key))
-        ]
-        assert (ends[0] == ends[1]) == (kind == "model" and key in only_exact)
+
+    def end(scenario):
+        truth = draw(scenario, np.random.default_rng(11))
+        return tip(driven(Phantom(truth, 0.0, kind), AHEAD, times=55))[1]
+
+    whole = end(rough)
+    for key in sorted(only_exact | {"layer_shift_sd_mm", "run_out_mm"}):
+        same = end(rough.with_values({f"phantom.{key}": 0.0})) == whole
+        assert same == (kind == "model" and key in only_exact), key

@@ -1,5 +1,6 @@
-"""The kernels are compiled ahead of their first call, and never later."""
+"""The kernels are compiled ahead of their first call, and no further kernel later."""
 
+import fcntl
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -55,56 +56,45 @@ def test_plans_and_insertions_compile_no_further_kernel(preset, axes):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache of its own."""
+    """An empty cache, and no kernels of the model and the plants to compile into it."""
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the second process
+    monkeypatch.setattr(kernels, "Simulator", lambda _scenario, threads: Compiled())  # noqa: ARG005
+    monkeypatch.setattr(kernels, "PLANTS", ())
     return tmp_path
 
 
 @pytest.fixture
-def nothing_to_compile(monkeypatch):
-    """Let the kernels of model and plants be none."""
-    monkeypatch.setattr(kernels, "Simulator", lambda _scenario, threads: Compiled())  # noqa: ARG005
-    monkeypatch.setattr(kernels, "PLANTS", ())
-
-
-@pytest.fixture
-def no_second_process(monkeypatch):
+def _one_process(monkeypatch):
     """Start no process that compiles the exact plant."""
     monkeypatch.setattr(kernels, "_compiling_exact_plant", nullcontext)
 
 
-@pytest.mark.usefixtures("cache", "nothing_to_compile", "no_second_process")
-def test_kernels_of_the_plane_are_not_those_of_space():
+@pytest.mark.usefixtures("_one_process")
+def test_kernels_are_compiled_for_their_sources_and_axes(cache, monkeypatch):
+    """Kernels of the plane are not those in space."""
     assert not all_compiled(1)
     compile_kernels(1)
-    assert all_compiled(1)
-    assert not all_compiled(2)
-
-
-@pytest.mark.usefixtures("nothing_to_compile", "no_second_process")
-def test_those_of_other_sources_are_not_these(cache, monkeypatch):
-    compile_kernels(1)
+    assert (all_compiled(1), all_compiled(2)) == (True, False)
     monkeypatch.setattr(kernels, "cache_folder", lambda home: str(cache / home.name))
     assert not all_compiled(1)
 
 
-@pytest.mark.usefixtures("nothing_to_compile", "no_second_process")
+@pytest.mark.usefixtures("_one_process")
 def test_one_process_compiles_at_a_time(cache, monkeypatch):
     held = []
 
     def simulator(_scenario, threads):
-        held.append((threads, locked(cache)))
+        held.append((threads, is_locked(cache)))
         return Compiled()
 
     monkeypatch.setattr(kernels, "Simulator", simulator)
     compile_kernels(2)
     assert held == [(1, True)]
-    assert not locked(cache)
+    assert not is_locked(cache)
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("nothing_to_compile")
 def test_a_second_process_compiles_the_exact_plant(cache):
     compile_kernels(1)
     assert list(cache.rglob("equilibrium.step-*.nbc"))
@@ -117,8 +107,12 @@ class Compiled:
         """Do nothing."""
 
 
-def locked(cache):
-    """Whether another process cannot take the lock."""
+def is_locked(cache):
+    """Return whether another opening of the file cannot take the lock."""
     (path,) = cache.rglob("lock")
-    command = f"import fcntl; fcntl.flock(open({str(path)!r}), fcntl.LOCK_EX | fcntl.LOCK_NB)"
-    return subprocess.run([sys.executable, "-c", command], capture_output=True, check=False).returncode != 0
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False

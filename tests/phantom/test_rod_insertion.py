@@ -1,4 +1,4 @@
-"""Insertions of the exact plant: compared with the controller's model and closed forms; the channel."""
+"""Insertions of the exact plant: against the controller's model, a second solver and closed forms; the channel."""
 
 import math
 from itertools import pairwise
@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flexneedle.types import THETA
 from reference.rods import IDEAL, Bench, move, plant
 from reference.validation import (
     FINE,
@@ -30,6 +29,16 @@ AHEAD, BACK = 0.25, -0.25
 START = 114  # steps of 0.25 mm to the skin
 
 
+def inserted(needle, scale, depth):
+    """Insert with the commands of the validation; return the plant."""
+    for row in commands(scale, depth, AHEAD):
+        needle.step(row)
+    return needle
+
+
+# ---- accuracy
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("layers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
@@ -45,10 +54,9 @@ def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
     assert abs(gaps[-1].energy) < 2e-4
 
 
-@pytest.mark.parametrize("layers", [1, 2])
-def test_the_difference_decreases_with_the_mesh(layers):
+def test_the_distance_from_the_controllers_model_decreases_with_the_mesh():
     """At 0.01 rad: 0.3 µm per mm of deflection on the default mesh, less on a finer one."""
-    coarse, fine = model_gap(0.25, layers, **SHIPPED), model_gap(0.25, layers, **SMALL)
+    coarse, fine = model_gap(0.25, 2, **SHIPPED), model_gap(0.25, 2, **SMALL)
     assert coarse.lateral < 5e-4
     assert fine.lateral < coarse.lateral / 3.0
 
@@ -67,7 +75,7 @@ def test_a_second_solver_finds_the_same_insertion():
 
 
 def test_a_second_solver_finds_the_same_friction():
-    """Its direction is that of the needle before a step: an error linear in the step."""
+    """Its direction is the direction of the needle before a step: an error linear in the step."""
     rubbed = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
     ends = [shot(rubbed, push(parts))[-1] for parts in (1, 2)]
     gaps = [abs(stepped(rubbed, push(k), 0.25)[-1, 1] - end[1]) for k, end in zip((1, 2), ends, strict=True)]
@@ -79,11 +87,10 @@ def test_a_second_solver_finds_the_same_friction():
 @pytest.mark.parametrize("bevel_length", [1.0, 3.0])
 def test_steady_curvature_converges_to_its_closed_form(bevel_length):
     """docs/theory.md eq. 10, at a depth of several 1/β and small strain."""
-    error = [curvature_error(resolution, bevel_length) for resolution in (1.0, 0.5, 0.25)]
-    assert abs(error[0]) < 0.012
-    assert abs(error[1]) < 0.004
-    assert abs(error[2]) < 0.002
-    assert abs(error[2]) < abs(error[0]) / 4.0
+    coarse, fine = (abs(curvature_error(resolution, bevel_length)) for resolution in (1.0, 0.5))
+    assert coarse < 0.012
+    assert fine < 0.004
+    assert fine < coarse / 2.5
 
 
 def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
@@ -92,35 +99,29 @@ def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
     assert path_curvature(1.0, 3.0, bevel=0.02) == pytest.approx(2.0 * path_curvature(1.0, 3.0), rel=2e-3)
 
 
-def test_an_insertion_converges_at_second_order_in_the_segment():
-    """Compared with sixteen times as many segments; on the default mesh of 0.5 mm the error is below 0.1 mm."""
-    counts = np.array([75, 150, 300, 600])
-    tips = np.array([inserted_tip(element=150.0 / n)[:2] for n in counts])
-    errors = np.hypot(*(tips - inserted_tip(element=150.0 / 2400)[:2]).T)
-    assert order(1.0 / counts, errors) == pytest.approx(2.0, abs=0.5)
-    assert errors[2] < 1e-4
-
-
-def test_an_insertion_does_not_depend_on_its_step():
-    """Steps of 1/2 mm to 1/16 mm: within 0.1 %, with decreasing differences."""
-    tips = np.array([inserted_tip(step=step)[:2] for step in (0.5, 0.25, 0.125, 0.0625)])
+@pytest.mark.parametrize(
+    ("name", "sizes", "limits", "cell"),
+    [
+        ("step", (0.5, 0.25, 0.125, 0.0625), (1e-3, 3e-4, 1e-4), {}),
+        ("spacing", (1.0, 0.5, 0.25, 0.125), (5e-3, 2e-3, 1e-3), {"cell": 0.125}),
+    ],
+)
+def test_an_insertion_hardly_depends_on_step_and_spacing(name, sizes, limits, cell):
+    """Within 0.1 % and 0.5 % of the path's lateral motion (mm), with decreasing differences."""
+    tips = np.array([inserted_tip(**{name: size}, **cell)[:2] for size in sizes])
     apart = np.hypot(*(tips[:-1] - tips[-1]).T)
-    assert (apart < [1e-3, 3e-4, 1e-4]).all()
+    assert (apart < limits).all()
     assert (np.diff(apart) < 0.0).all()
 
 
-def test_contact_spacing_has_a_small_effect():
-    tips = np.array([inserted_tip(spacing=spacing, cell=0.125)[:2] for spacing in (1.0, 0.5, 0.25, 0.125)])
-    apart = np.hypot(*(tips[:-1] - tips[-1]).T)
-    assert (apart < [5e-3, 2e-3, 1e-3]).all()
+# ---- entry and exit
 
 
 def test_the_spring_enters_the_skin_fully_compressed():
     """docs/theory.md section 4, q = 0: the bevel deflects the tip with its full offset from the first cut on."""
     needle = move(plant(), AHEAD, times=START + 1)
     assert needle.tip[0] == pytest.approx(0.25, abs=1e-3)
-    ratio = 0.25 / 3.0
-    drift = needle.tip[1]
+    ratio, drift = 0.25 / 3.0, needle.tip[1]
     expected = 4.0 - drift * (1.0 - math.exp(-ratio)) / ratio
     assert needle.state["offset"] @ needle.segments["tangent"][-2] == pytest.approx(0.0, abs=1e-12)
     assert np.hypot(*needle.state["offset"][:2]) == pytest.approx(expected, rel=1e-3)
@@ -128,36 +129,14 @@ def test_the_spring_enters_the_skin_fully_compressed():
 
 
 def test_a_step_across_the_skin_may_be_long_or_short():
-    tips = [move(plant(), 0.5, times=57).tip]
-    for parts in (2, 8):
-        needle = move(plant(), 0.5, times=56)
-        tips.append(move(needle, 0.5 / parts, times=parts).tip)
-    assert tips[0][0] == pytest.approx(0.0, abs=1e-6)
-    deeper = [
-        move(move(plant(), 0.5, times=56), step, times=round(2.0 / step)).tip for step in (2.0, 0.5, 0.0625)
+    before = [move(plant(), 0.5, times=56) for _ in range(3)]
+    ends = [
+        move(needle, step, times=round(2.0 / step)).tip
+        for needle, step in zip(before, (2.0, 0.5, 0.0625), strict=True)
     ]
-    assert deeper[-1][1] > 0.01
-    np.testing.assert_allclose([tip[1] for tip in deeper], deeper[-1][1], atol=3e-3)
-    np.testing.assert_allclose([tip[1] for tip in deeper[1:]], deeper[-1][1], atol=1e-3)
-
-
-def test_the_channel_is_on_the_path_of_the_tip():
-    """A point for every 0.5 mm of cut, with the layer at its depth."""
-    needle, way, cut = plant(), [], []
-    for row in commands(1.5, 44.5, AHEAD):
-        needle.step(row)
-        way.append(needle.tip[:2])
-        cut.append(needle.state["cut"])
-    points = needle.channel["place"][: needle.count, :2].T
-    at = 0.5 * (np.arange(needle.count) + 0.5)
-    assert at[-1] <= cut[-1] < at[-1] + 0.5
-    expected = [np.interp(at, cut, along) for along in np.transpose(way)]
-    np.testing.assert_allclose(points[:, 1:], np.array(expected)[:, 1:], atol=1e-9)
-    np.testing.assert_allclose(points[:, 0], np.array(expected)[:, 0], atol=0.02)  # from air into the skin
-    assert cut[-1] == pytest.approx(way[-1][0], rel=0.01)
-    force, deep = needle.channel["stiffness"][: needle.count], points[0] > 20.0
-    assert np.unique(force[~deep]).size == np.unique(force[deep]).size == 1
-    assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
+    assert ends[-1][1] > 0.01
+    np.testing.assert_allclose([tip[1] for tip in ends], ends[-1][1], atol=3e-3)
+    np.testing.assert_allclose(ends[1][1], ends[-1][1], atol=1e-3)
 
 
 def test_an_inclined_needle_cuts_along_its_axis_from_the_skin_on():
@@ -171,54 +150,6 @@ def test_an_inclined_needle_cuts_along_its_axis_from_the_skin_on():
     np.testing.assert_allclose(bench.channel["place"][:4, 0], along * math.cos(turn), atol=1e-9)
     np.testing.assert_allclose(bench.channel["place"][:4, 1], entry + along * math.sin(turn), atol=1e-9)
     assert bench.s["cut"] == pytest.approx(depth / math.cos(turn), rel=1e-12)
-
-
-def test_a_flip_without_insertion_changes_only_the_bevel():
-    """At rest, during retraction, and twice before a push; for a straight needle."""
-    needle = move(plant(), AHEAD, times=START + 80)
-    tip = needle.tip
-    np.testing.assert_allclose(move(needle, flip=True).tip, tip, atol=1e-9)
-    assert needle.roll == math.pi
-    move(needle, flip=True)
-    one, other = (move(plant(), AHEAD, times=START + 80) for _ in range(2))
-    np.testing.assert_allclose(move(one, BACK).tip, move(other, BACK, flip=True).tip, atol=1e-9)
-    assert move(needle, AHEAD, times=20).tip[1] == pytest.approx(
-        move(plant(), AHEAD, times=START + 100).tip[1], abs=1e-6
-    )
-
-
-def test_flip_bends_the_path_to_the_other_side():
-    on, turned = (move(plant(), AHEAD, times=START + 80) for _ in range(2))
-    move(on, AHEAD, times=60)
-    move(turned, AHEAD, flip=True)
-    move(turned, AHEAD, times=59)
-    assert turned.tip[THETA] < 0.0 < on.tip[THETA]
-    assert turned.tip[1] < on.tip[1] - 0.3
-
-
-def test_a_retracted_needle_follows_its_channel_and_returns_to_the_same_position():
-    needle = plant()
-    for row in commands(1.0, 30.0, AHEAD):
-        needle.step(row)
-    before, cut, count = needle.tip, needle.state["cut"], needle.count
-    for _ in range(40):
-        move(needle, BACK)
-    assert (needle.state["cut"], needle.count) == (cut, count)
-    move(needle, AHEAD, times=40)
-    np.testing.assert_allclose(needle.tip, before, atol=1e-3)
-
-
-def test_the_bevels_spring_vanishes_as_the_tip_is_retracted():
-    """Over its length: 3 mm behind the front its force and energy are zero."""
-    needle = move(plant(), AHEAD, times=START + 120)
-    parts = []
-    for _ in range(16):
-        parts.append(np.linalg.norm(needle.segments["force"][-1]))
-        move(needle, BACK)
-    force = np.array(parts)
-    assert (np.diff(force[:13]) < 0.0).all()
-    assert force[0] > 1e-3
-    assert not force[13:].any()
 
 
 def test_out_of_the_skin_the_channel_is_closed():
@@ -235,15 +166,58 @@ def test_out_of_the_skin_the_channel_is_closed():
     assert entry > 1.0
 
 
-def test_softer_tissue_deflects_the_needle_in_proportion():
-    """At small strain, for a needle much stiffer than the tissue."""
+# ---- the channel
 
-    def deflection(factor):
-        values = {f"tissue.{k}.shear_modulus_kpa": 1e-3 * factor for k in (0, 1)}
-        return move(plant(IDEAL.with_values(values)), AHEAD, times=START + 120).tip[1]
 
-    assert deflection(2.0) == pytest.approx(2.0 * deflection(1.0), rel=2e-3)
-    assert deflection(1.0) > 1e-5
+def test_the_channel_is_on_the_path_of_the_tip():
+    """A point for every 0.5 mm of cut, with the layer at its depth."""
+    needle, way, cut = plant(), [], []
+    for row in commands(1.5, 44.5, AHEAD):
+        needle.step(row)
+        way.append(needle.tip[:2])
+        cut.append(needle.state["cut"])
+    points = needle.channel["place"][: needle.count, :2].T
+    at = 0.5 * (np.arange(needle.count) + 0.5)
+    assert at[-1] <= cut[-1] < at[-1] + 0.5
+    expected = np.array([np.interp(at, cut, along) for along in np.transpose(way)])
+    np.testing.assert_allclose(points[:, 1:], expected[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(points[:, 0], expected[:, 0], atol=0.02)  # from air into the skin
+    assert cut[-1] == pytest.approx(way[-1][0], rel=0.01)
+    force, deep = needle.channel["stiffness"][: needle.count], points[0] > 20.0
+    assert np.unique(force[~deep]).size == np.unique(force[deep]).size == 1
+    assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
+
+
+def test_a_flip_without_insertion_changes_only_the_bevel():
+    """At rest, during retraction, and twice before a push; for a straight needle."""
+    needle, one, other = (move(plant(), AHEAD, times=START + 80) for _ in range(3))
+    tip = needle.tip
+    np.testing.assert_allclose(move(needle, flip=True).tip, tip, atol=1e-9)
+    assert needle.roll == math.pi
+    move(needle, flip=True)
+    np.testing.assert_allclose(move(one, BACK).tip, move(other, BACK, flip=True).tip, atol=1e-9)
+    after = move(plant(), AHEAD, times=START + 100).tip[1]
+    assert move(needle, AHEAD, times=20).tip[1] == pytest.approx(after, abs=1e-6)
+
+
+def test_a_retracted_needle_follows_its_channel_and_returns_to_the_same_position():
+    needle = inserted(plant(), 1.0, 30.0)
+    before, cut, count = needle.tip, needle.state["cut"], needle.count
+    move(needle, BACK, times=40)
+    assert (needle.state["cut"], needle.count) == (cut, count)
+    np.testing.assert_allclose(move(needle, AHEAD, times=40).tip, before, atol=1e-3)
+
+
+def test_the_bevels_spring_vanishes_as_the_tip_is_retracted():
+    """Over its length: 3 mm behind the front its force is zero."""
+    needle, parts = move(plant(), AHEAD, times=START + 120), []
+    for _ in range(16):
+        parts.append(np.linalg.norm(needle.segments["force"][-1]))
+        move(needle, BACK)
+    force = np.array(parts)
+    assert (np.diff(force[:13]) < 0.0).all()
+    assert force[0] > 1e-3
+    assert not force[13:].any()
 
 
 def test_stiffness_varies_with_the_depth_as_in_the_true_phantom():
@@ -251,10 +225,9 @@ def test_stiffness_varies_with_the_depth_as_in_the_true_phantom():
     variation = tuple(1.0 + 0.5 * (k % 2) for k in range(400))  # 0.25 mm each
     needle = move(plant(IDEAL, variation=variation, cell=0.25), AHEAD, times=START + 60)
     plain = move(plant(IDEAL), AHEAD, times=START + 60)
-    points = needle.count
-    x = needle.channel["place"][:points, 0]
+    x = needle.channel["place"][: needle.count, 0]
     expected = np.where((x / 0.25).astype(int) % 2 == 1, 1.5, 1.0)
-    ratio = needle.channel["stiffness"][:points] / plain.channel["stiffness"][:points]
+    ratio = needle.channel["stiffness"][: needle.count] / plain.channel["stiffness"][: needle.count]
     np.testing.assert_allclose(ratio, expected)
     stiffer = move(plant(IDEAL, variation=(1.5,), cell=0.25), AHEAD, times=START + 4)
     firm = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
@@ -265,27 +238,45 @@ def test_strain_energy_is_weighted_by_layer_and_counts_contact_points():
     """Without a bevel all energy outside the needle is in them; a weight of 3 on both layers triples the result."""
     weights = {f"tissue.{k}.energy_weight": 3.0 for k in (0, 1)}
     blunt = scaled(0.0, 2, 0.5, 0.5).with_values({"needle.bevel.length_mm": 1e-6})
-    one, three = (plant(scenario) for scenario in (blunt, blunt.with_values(weights)))
-    for row in commands(1.0, 30.0, AHEAD):
-        one.step(row)
-        three.step(row)
+    one, three = (inserted(plant(each), 1.0, 30.0) for each in (blunt, blunt.with_values(weights)))
     assert one.strain_energy > 1e-3
     assert three.strain_energy == pytest.approx(3.0 * one.strain_energy, rel=1e-12)
     np.testing.assert_array_equal(three.tip, one.tip)
-    bend = 0.5 * (one.segments["moment"][:-1] ** 2).sum() * one.rod.segment / one.rod.stiffness
-    bend -= (
-        0.25 * one.segments["moment"][0, 2] ** 2 * one.rod.segment / one.rod.stiffness
-    )  # the first is half as long
+    spans = np.full(len(one.segments) - 1, one.rod.segment)
+    spans[0] *= 0.5  # the first is half as long
+    bend = (0.5 * (one.segments["moment"][:-1] ** 2).sum(axis=1) * spans).sum() / one.rod.stiffness
     guide = 0.5 * one.state["guide_force"][0] ** 2 / one.rod.guide_stiffness
     assert one.state["energy"] == pytest.approx(one.strain_energy + bend + guide, rel=1e-6)
 
 
-def test_least_stretch_is_that_of_the_most_compressed_point():
-    needle = plant()
-    for row in commands(1.5, 40.0, AHEAD):
-        needle.step(row)
+def test_the_least_stretch_is_at_the_most_compressed_point():
+    needle = inserted(plant(), 1.5, 40.0)
     x, y, _ = needle.nodes.T
     points = needle.channel["place"][: needle.count]
     apart = np.abs(np.interp(points[:, 0], x, y) - points[:, 1])
     assert needle.least_stretch == pytest.approx(1.0 - apart.max() / 20.0, abs=1e-3)
     assert needle.least_stretch < 0.99
+
+
+# ---- limits of the record
+
+
+def test_a_full_channel_ends_the_cut_and_is_reported():
+    """10 mm need twenty points: with fewer the tissue would be incomplete."""
+    for room, converged in ((5, False), (40, True)):
+        bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0), points=room)
+        for _ in range(10):
+            bench.step(db_x=1.0)
+        assert bench.converged == converged
+        assert bench.count == min(room, 20)
+
+
+def test_beyond_the_last_cell_the_tissue_is_that_in_the_last_cell():
+    """Cells end 2 mm beyond the stroke; a contact point beyond uses the last cell."""
+    needle = plant()
+    depth = needle.rod.law.size * needle.rod.cell
+    assert depth >= IDEAL.setup.max_depth + 2.0
+    needle.state["base"][0] += depth + 27.0
+    move(needle, 0.25, times=20)
+    assert needle.tip[0] > depth
+    assert needle.channel["stiffness"][needle.count - 1] > 0.0

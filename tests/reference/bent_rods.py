@@ -1,19 +1,27 @@
-"""Rods bent and twisted in space by any amount, with their energy and its gradient: what the sweep is compared with."""
+"""Rods bent and twisted in space by any amount, with their energy and its gradient, for comparison with the sweep."""
 
 import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flexneedle.mechanics.law import tables
-from flexneedle.phantom import equilibrium, loads
-from flexneedle.phantom.rod import move_nodes
+from flexneedle.mechanics import law
+from flexneedle.phantom import equilibrium, hinges, loads, rod, space, sweep
 from flexneedle.scenario.tissue.ogden import Ogden
+from reference.interpreted import Record, interpreted
 from reference.rods import Bench
 
-SEGMENTS, POINTS = 10, 12
+PLAIN = interpreted(law, space, rod, hinges, loads, sweep, equilibrium)
+
+
+def parts(bench):
+    """Return constants, state and segments of a bench for the plain kernels."""
+    return bench.rod, Record(bench.s), [Record(row) for row in bench.segments]
+
+
+SEGMENTS, POINTS = 8, 9
 TISSUE = {
-    "laws": tables(
+    "laws": law.tables(
         [
             Ogden(alpha=alpha, shear_modulus_kpa=1.0, compression_length_mm=20.0, engaged_width_mm=1.0)
             for alpha in (6.0, 8.74, -5.0, 8.0)
@@ -28,7 +36,7 @@ TISSUE = {
 
 
 def crooked(seed, *, guide=True, channel=True, load=(0.3, -0.2, 0.25)):
-    """A rod bent and twisted by up to 1 rad, channel offsets of up to 6 mm, a guide 3 mm aside, the tip drawn back."""
+    """Return a rod bent by up to 1 rad, in a channel up to 6 mm off and a guide 3 mm off it, its tip drawn back."""
     rng = np.random.default_rng(seed)
     bench = Bench(
         length=60.0,
@@ -49,7 +57,7 @@ def crooked(seed, *, guide=True, channel=True, load=(0.3, -0.2, 0.25)):
     frames = Rotation.from_rotvec(np.cumsum(bend, axis=0) + np.array([0.0, -0.1, 0.2]))
     bench.segments["frame"][:-1] = frames.as_quat(scalar_first=True)
     bench.s["guide"], bench.s["load"] = (2.0, -1.5), load
-    move_nodes(bench.rod, bench.s, bench.segments)
+    PLAIN.move_nodes(*parts(bench))
     nodes, tip = bench.segments["node"], bench.s["tip"]
     if channel:
         x = np.linspace(0.3, tip[0] - 4.0, POINTS)
@@ -68,21 +76,21 @@ def crooked(seed, *, guide=True, channel=True, load=(0.3, -0.2, 0.25)):
 
 
 def before(bench):
-    """A step that begins where the bench is."""
+    """Return a step that begins where the bench is."""
     s = bench.s
     return loads.Before(tuple(s["tip"]), tuple(s["tangent"]), float(s["twist"]), 0.0, 0.0)
 
 
-def assemble(bench, curved=1.0):
-    """Nodes, forces and Hessians of the bench as it is."""
-    move_nodes(bench.rod, bench.s, bench.segments)
-    equilibrium.assemble(
-        bench.rod, bench.s, bench.segments, bench.channel, bench.count, before(bench), curved
-    )
+def assemble(bench, curved=1.0, begun=None):
+    """Fill in nodes, forces and Hessians of the bench in its present shape."""
+    constants, s, w = parts(bench)
+    PLAIN.move_nodes(constants, s, w)
+    channel = [Record(point) for point in bench.channel[: bench.count]]
+    PLAIN.assemble(constants, s, w, channel, bench.count, begun or before(bench), curved)
 
 
 def assembled(bench, frames, rotations):
-    """Energy (mJ) minus the work of the load with frames turned by vectors (N, 3), and its gradient in these."""
+    """Return energy (mJ) minus the work of the load with frames turned by vectors (N, 3), and its gradient in these."""
     turned = Rotation.from_rotvec(rotations) * Rotation.from_quat(frames, scalar_first=True)
     w, s = bench.segments, bench.s
     w["frame"][:-1] = turned.as_quat(scalar_first=True)
@@ -95,18 +103,18 @@ def assembled(bench, frames, rotations):
 
 
 def differences(function, size, step=1e-6):
-    """Central differences of a function of `size` numbers at zero, one row per number."""
+    """Return central differences of a function of `size` numbers at zero, one row per number."""
     shifts = step * np.eye(size)
     return np.array([(function(e) - function(-e)) / (2 * step) for e in shifts])
 
 
 def gradient_and_hessian(bench):
-    """Of the energy in rotation vectors (3N,), the second from differences of the first; the bench is as before."""
+    """Return derivatives of the energy by rotation vectors (3N,); the second are differences of the first."""
     frames = bench.segments["frame"][:-1].copy()
 
     def gradient(vectors):
         return assembled(bench, frames, vectors.reshape(-1, 3))[1]
 
     hessian = differences(gradient, frames.shape[0] * 3)
-    # Each row's gradient is that at turned frames: half the commutator of two rotations of a frame cancels in the sum.
+    # Each row is a gradient at turned frames: half the commutator of two rotations of a frame cancels in the sum.
     return gradient(np.zeros(frames.shape[0] * 3)), 0.5 * (hessian + hessian.T)

@@ -1,4 +1,4 @@
-"""Scenarios and insertions that several tests use."""
+"""Scenarios, simulators and insertions that several tests share."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ FOUNDATION = 4 * EI / LENGTH_MM**4  # its k₀ = 3μw/h, N/mm²
 
 
 def long_beam(depth: float, *, spacing: float, bevel: float = 0.0, bevel_length: float = 1e-6) -> Scenario:
-    """A thin needle in one layer with 1/β = 10 mm; α = 6 makes Ogden's law linear to second order."""
+    """Return a thin needle in one layer with 1/β = 10 mm; α = 6 makes Ogden's law linear to second order."""
     height, width = 20.0, 5.0
     return Scenario.from_values(
         {
@@ -39,8 +39,14 @@ def long_beam(depth: float, *, spacing: float, bevel: float = 0.0, bevel_length:
     )
 
 
+def tight(scenario: Scenario, threads: int | None = 1, *, slide: float = 1e-7) -> Simulator:
+    """Return a simulator whose solves end only when the shortening changes by less than `slide` (mm)."""
+    constants = Simulator(scenario, threads)._model._replace(slide=slide)
+    return Simulator(scenario, threads, constants=constants)
+
+
 def repeat(simulator: Simulator, state: State, control: Control, times: int) -> list[State]:
-    """The states of `times` equal steps, `state` first."""
+    """Return the states of `times` equal steps, `state` first."""
     states = [state]
     for _ in range(times):
         states.append(simulator.step(states[-1], control))
@@ -48,19 +54,19 @@ def repeat(simulator: Simulator, state: State, control: Control, times: int) -> 
 
 
 def insert_to(simulator: Simulator, depth: float, *, step: float = 1.0, roll: float = 0.0) -> State:
-    """A straight push until an unbent needle would be at `depth`."""
+    """Push straight until an unbent needle would be at `depth`; return the state."""
     way = depth + simulator.scenario.setup.tip_to_skin_mm
     steps = int(np.ceil(way / step - 1e-9))
     return repeat(simulator, simulator.start(roll), Control(db_x=way / steps), steps)[-1]
 
 
 def numbers(state: State) -> np.ndarray:
-    """All numbers of a needle as one array, by their places in its nested records."""
+    """Return all numbers of a needle as one array, in the order of its nested records."""
     return np.array(list(_leaves(state.needle)))
 
 
 def with_number(state: State, place: int, value: float) -> State:
-    """The state with one of those numbers replaced."""
+    """Return the state with the number at a place in `numbers` replaced."""
     values = list(_leaves(state.needle))
     values[place] = value
     return replace(state, needle=_refilled(state.needle, iter(values)))
@@ -78,6 +84,6 @@ def _refilled(like, values):
 
 
 def assert_same_curve(one: State, other: State, tolerance: float) -> None:
-    """Nodes within `tolerance` mm, slopes within as many mm on 10 mm."""
+    """Assert that nodes agree within `tolerance` mm, and slopes within that on 10 mm."""
     gap = np.abs(one.nodes - other.nodes) * [1.0, 1.0, 1.0, 10.0, 10.0]
     assert gap.max() < tolerance

@@ -1,5 +1,6 @@
-"""How far flexneedle is from the reference: states side by side."""
+"""Differences between flexneedle and the reference: states side by side."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,8 @@ import numpy as np
 from flexneedle import Control, Scenario
 from flexneedle.simulator.state import State
 from flexneedle.types import THETA, X, Y, across
+from reference.cases import tight
 from reference.insertion import Pose, Reference
-from reference.tight import tight
 
 TOLERANCE = 1e-6  # mm, mJ, N
 ANGLE_TOLERANCE_MRAD = 1e-5
@@ -22,12 +23,12 @@ _AT_THE_FRONT = 1  # points that rounding puts on either side of it
 
 
 def too_far(worst: dict[str, float], factor: float = 1.0) -> dict[str, float]:
-    """The gaps that are too large."""
+    """Return the gaps that are too large."""
     return {name: gap for name, gap in worst.items() if not gap <= factor * _LIMITS.get(name, TOLERANCE)}
 
 
 def gaps(reference: Reference, state: State, pose: Pose) -> dict[str, float]:
-    """Largest differences: lengths in mm, angles in mrad, energies in mJ, forces in N, moments in N·mm."""
+    """Return the largest differences: lengths in mm, angles in mrad, energies in mJ, forces in N, moments in N·mm."""
     contacts, count = state.contacts, pose.y.size
     formed = min(contacts.x.size, int((reference.x < pose.after.front).sum()))
     if abs(formed - contacts.x.size) > _AT_THE_FRONT or contacts.active.sum() != count:
@@ -59,7 +60,7 @@ def _tip_gap(state: State, pose: Pose) -> float:
 
 
 def _node_gaps(reference: Reference, state: State, pose: Pose) -> dict[str, float]:
-    """The nodes against the curve: lateral positions, slopes, and places at equal arc lengths."""
+    """Compare the nodes with the curve: lateral positions, slopes, and equal arc lengths."""
     nodes = state.nodes
     x = nodes[:, X]
     there, turn_there, arc = reference.curve(pose, x)
@@ -74,7 +75,7 @@ def _node_gaps(reference: Reference, state: State, pose: Pose) -> dict[str, floa
 def worst_gaps(
     scenario: Scenario, controls: np.ndarray, *, roll: float = 0.0, every: int = 1
 ) -> dict[str, float]:
-    """Largest gaps over an insertion; the tip after every step, all else after each `every`-th and the last."""
+    """Return the largest gaps: of the tip after every step, of all else after each `every`-th step and the last."""
     pair, worst = Pair(scenario, roll), {}
     for k, row in enumerate(controls, start=1):
         pair.move(Control.of(row))
@@ -92,25 +93,29 @@ class Pair:
         self.simulator, self.reference = tight(scenario), Reference(scenario)
         self.state, self.pose = self.simulator.start(roll), self.reference.start(roll)
 
+    def copy(self) -> "Pair":
+        """Return a pair that begins here; states and poses are values."""
+        return copy(self)
+
     def move(self, control: Control):
-        """A step of both."""
+        """Step both."""
         self.state = self.simulator.step(self.state, control)
         self.pose = self.reference.step(self.pose, control)
 
     def step(self, times=1, **control):
-        """Equal steps of both; fails at the first gap of the tip."""
+        """Take equal steps of both; fail at the first gap of the tip."""
         for _ in range(times):
             self.move(Control(**control))
             np.testing.assert_allclose(self.state.tip, self.pose.tip.row, rtol=0, atol=5 * TOLERANCE)
 
     def hold(self, tip, points=()):
-        """Assimilate in both; returns the innovation."""
+        """Assimilate in both; return the innovation."""
         self.state, innovation = self.simulator.assimilate(self.state, tip, points)
         self.pose = self.reference.hold(self.pose, tip, points)
         return innovation
 
     def correct(self, *, base=None, slope=None, tip_load=None):
-        """Base and load (y, z) corrected in both."""
+        """Correct base and load (y, z) in both."""
         given = {"base": base, "slope": slope, "tip_load": tip_load}
         self.state = self.state.with_estimate(**{name: pair for name, pair in given.items() if pair})
         here = self.pose.base
@@ -123,5 +128,5 @@ class Pair:
         )
 
     def too_far(self):
-        """Gaps now, with room for what the steps before left."""
+        """Return the gaps now, with room for the error that earlier steps left."""
         return too_far(gaps(self.reference, self.state, self.pose), factor=5.0)

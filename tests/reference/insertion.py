@@ -32,7 +32,7 @@ class Tissue(NamedTuple):
     volume: np.ndarray
 
     def take(self, which) -> "Tissue":
-        """The chosen entries."""
+        """Return the chosen entries."""
         return Tissue(*(values[which] for values in self))
 
 
@@ -46,7 +46,7 @@ class Response(NamedTuple):
 
 
 def ogden(tissue: Tissue, u) -> Response:
-    """The response to the compression u (mm), y or y + iz: equations 1 to 3, with the floor."""
+    """Return the response to the compression u (mm), y or y + iz: equations 1 to 3, with the floor."""
     mu, alpha, h, volume = tissue
     size = np.abs(u)
     stretch = 1.0 - size / h
@@ -88,7 +88,7 @@ class Loads(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """What a step starts from: tip, front of the channel, rest positions of contacts and of the tip spring.
+    """Start of a step: tip, front of the channel, rest positions of contacts and of the tip spring.
 
     spin: angle (rad) by which the bevel turns in the step.
     """
@@ -102,7 +102,7 @@ class Cut(NamedTuple):
 
 @dataclass(frozen=True)
 class Pose:
-    """The insertion after a step; `cut` is what the step started from, `after` what the next one starts from."""
+    """The insertion after a step; `cut` is its start, `after` the start of the next step."""
 
     base: End
     guide: complex
@@ -119,7 +119,7 @@ class Pose:
 
     @property
     def tip(self) -> End:
-        """Where the next step starts."""
+        """The tip after the step, from which the next one starts."""
         return self.after.tip
 
 
@@ -162,7 +162,7 @@ class Reference:
         self.weight = np.array([layer.energy_weight for layer in layers])[kind]
 
     def start(self, roll: float = 0.0) -> Pose:
-        """The straight needle in air, on the line of its entry, rolled (rad)."""
+        """Return the straight needle in air, on the line of its entry, rolled (rad)."""
         setup, entry = self.scenario.setup, self.scenario.entry
         offset = entry.lateral_mm + 1j * entry.lateral_z_mm
         slope = 1e-3 * (entry.slope_mrad + 1j * entry.slope_z_mrad)
@@ -178,7 +178,7 @@ class Reference:
         return self._solve(pose, cut)
 
     def step(self, pose: Pose, control: Control) -> Pose:
-        """One control step, in parts that end where the tip is due at multiples of Δ/4 down to 3Δ."""
+        """Take a control step, in parts that end where the tip is due at multiples of Δ/4 down to 3Δ."""
         part, left = self.scenario.contact.spacing_mm / 4, 1.0
         while left > 0.0:
             x, share = pose.tip.x, left
@@ -207,11 +207,11 @@ class Reference:
         return self._solve(moved, pose.after._replace(spin=control.spin))
 
     def hold(self, pose: Pose, tip: Sequence[float], points: Sequence[Sequence[float]] = ()) -> Pose:
-        """The last step again, with the tip held at x, y (, z), of which x is ignored, and the needle at others."""
+        """Solve the last step again, with the tip held at y (, z) of a point, and the needle at others."""
         return self._solve(pose, pose.cut, held=complex(*tip[1:]), points=points)
 
     def curve(self, pose: Pose, x):
-        """Lateral position, slope, and arc length from the base at places x (mm) along the needle."""
+        """Return lateral position, slope, and arc length from the base at positions x (mm) along the needle."""
         y, turn = self._shape(pose.base, pose.loads, np.asarray(x, dtype=float))
         return (
             y,
@@ -290,19 +290,19 @@ class Reference:
         )
 
     def _influence(self, base, x, of):
-        """Deflection at x of unit forces at `of`."""
+        """Return the deflection at x of unit forces at `of`."""
         a, b = x[:, None] - base.x, of[None, :] - base.x
         return np.where(a < b, a**2 * (3 * b - a), b**2 * (3 * a - b)) / (6 * self.stiffness)
 
     def _shape(self, base, loads: Loads, x):
-        """Lateral position and slope at x."""
+        """Return lateral position and slope at x."""
         s, b = (x - base.x)[:, None], (loads.x - base.x)[None, :]
         y = base.y + base.turn * (x - base.x) + self._influence(base, x, loads.x) @ loads.force
         turn = np.where(s < b, s * (2 * b - s), b**2) / (2 * self.stiffness)
         return y, base.turn + turn @ loads.force
 
     def _integrals(self, base, loads: Loads, end: float):
-        """½∫|y'|² dx and ½∫|M|²/EI dx from the base to `end`, or to the last force."""
+        """Return ½∫|y'|² dx and ½∫|M|²/EI dx from the base to `end`, or to the last force."""
         breaks = np.unique(np.concatenate([[base.x], loads.x, [] if np.isinf(end) else [end]]))
         breaks = breaks[breaks <= end]
         left, half = breaks[:-1, None], np.diff(breaks)[:, None] / 2
@@ -343,13 +343,13 @@ class _Touch:
         self.compressing[-1, -1] = 1 - self.follow
 
     def forces(self, y):
-        """Compressions (of contacts and tip) and forces."""
+        """Return compressions of contacts and tip, and forces."""
         u = self.compressing @ y - np.append(self.rest, self.bevel_rest)
         force, tip_force = ogden(self.tissue, u[:-1]).force, ogden(self.pieces, u[-1]).force
         return u, np.append(self.ramp * force, tip_force.sum() + self.load)
 
     def slope(self, u):
-        """Derivatives of the forces by y, and z, of the places: −(c_t I + (c_r − c_t) n nᵀ) of each compression."""
+        """Return derivatives of the forces by y and z: −(c_t I + (c_r − c_t) n nᵀ) of each compression."""
         contacts, tip = ogden(self.tissue, u[:-1]), ogden(self.pieces, u[-1])
         along = np.append(self.ramp * contacts.along, tip.along.sum())
         across = np.append(self.ramp * contacts.across, tip.across.sum())
@@ -359,14 +359,14 @@ class _Touch:
         return -tangents @ _on_both(self.compressing)
 
     def largest_share(self, u, y, change) -> float:
-        """How much of a change takes at most half of any remaining stretch."""
+        """Return the share of a change that takes at most half of any remaining stretch."""
         heights = np.append(self.tissue.h, self.pieces.h.min(initial=np.inf))
         after = self.forces(y + change)[0]
         room = np.maximum(1.0 - np.abs(u) / heights, 0.1) * heights / 2
         return float(min(1.0, (room / np.maximum(np.abs(after - u), 1e-300)).min()))
 
     def result(self, y, x, fixed_x, reactions) -> _Trial:
-        """Collect what equilibrium at y means."""
+        """Return the equilibrium at y."""
         u, force = self.forces(y)
         return _Trial(
             y[:-1],
@@ -386,7 +386,7 @@ def _law_per_mm(layer):
 
 
 def _interval_edges(scenario: Scenario, ends):
-    """Edges of the intervals of length Δ, shorter below the skin, divided where a layer ends."""
+    """Return the edges of the intervals of length Δ, shorter below the skin, divided where a layer ends."""
     spacing = scenario.contact.spacing_mm
     depth = scenario.setup.stroke_mm - scenario.setup.tip_to_skin_mm
     count = max(int(np.ceil(max(depth, 0.0) / spacing)), 3) + 2
@@ -396,7 +396,7 @@ def _interval_edges(scenario: Scenario, ends):
 
 
 def _essential(guide_x, guide_y, points, tip_x, held):
-    """Places and values that are prescribed: guide first, held tip last."""
+    """Return prescribed positions and values: guide first, held tip last."""
     pairs = [(guide_x, guide_y)] if guide_x is not None and guide_x < tip_x else []
     pairs += [(point[0], complex(*point[1:])) for point in points]
     pairs += [] if held is None else [(tip_x, held)]
@@ -405,14 +405,14 @@ def _essential(guide_x, guide_y, points, tip_x, held):
 
 
 def _spring(reference: Reference, start: float, end: float) -> Tissue:
-    """The tip spring: the length of each layer between `start` and `end`."""
+    """Return the tip spring: the length of each layer between `start` and `end`."""
     tops = np.append(0.0, reference.ends[:-1])
     length = np.clip(np.minimum(reference.ends, end) - np.maximum(tops, start), 0.0, None)
     return reference.laws._replace(volume=reference.laws.volume * length)
 
 
 def _offsets(end: complex, rate: float, length: float, cuts: float):
-    """The steady offset of the spring where a cut begins, and what the cut adds to it; `end`: the bevel's at its end.
+    """Return the steady offset of the spring at the start of a cut with the bevel `end` at its end, and its increase.
 
     The bevel turns by `rate` (rad/mm). The spring forgets with the relaxation length, so the cut adds an integral over
     its way back from the end.
@@ -424,16 +424,16 @@ def _offsets(end: complex, rate: float, length: float, cuts: float):
 
 
 def _parts(values):
-    """The y of lateral numbers, then their z."""
+    """Return the y of lateral numbers, then their z."""
     return np.concatenate([values.real, values.imag])
 
 
 def _joined(parts):
-    """Lateral numbers from their y, then their z."""
+    """Return lateral numbers from their y, then their z."""
     y, z = np.split(parts, 2)
     return y + 1j * z
 
 
 def _on_both(matrix):
-    """A matrix that acts on y and z alike."""
+    """Return a matrix that acts on y and z alike."""
     return np.kron(np.eye(2), matrix)

@@ -25,11 +25,14 @@ class Clamped(NamedTuple):
     load: np.ndarray
 
 
+def frame_of(tilt, roll: float) -> Rotation:
+    """Return the frame of a base along x, rolled and then tilted (rad)."""
+    return Rotation.from_rotvec([0.0, -tilt[1], tilt[0]]) * Rotation.from_rotvec([roll, 0.0, 0.0])
+
+
 def tip(rod: Clamped, parts: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """Position and axes (3, 3), in columns, of the tip; the load is applied in parts."""
-    theta, psi = rod.tilt
-    frame = Rotation.from_rotvec([0.0, -psi, theta]) * Rotation.from_rotvec([rod.roll, 0.0, 0.0])
-    moment = np.zeros(3)
+    """Return position and axes (3, 3), in columns, of the tip; the load is applied in parts."""
+    frame, moment = frame_of(rod.tilt, rod.roll), np.zeros(3)
     for part in range(1, parts + 1):
         load = rod.load * part / parts
         found = root(lambda m, load=load: _integrated(rod, frame, load, m)[12:], moment, tol=1e-12)
@@ -41,7 +44,7 @@ def tip(rod: Clamped, parts: int = 6) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _integrated(rod, frame, load, moment):
-    """Position, axes and moment (15,) at the tip, from the moment at the base."""
+    """Return position, axes and moment (15,) at the tip, from the moment at the base."""
     compliance = np.array([1.0 / rod.torsion, 1.0 / rod.stiffness, 1.0 / rod.stiffness])
 
     def slopes(_, state):
@@ -55,10 +58,10 @@ def _integrated(rod, frame, load, moment):
 
 
 def helix(radius: float, pitch: float, twist: float, length: float, segments: int):
-    """Axes (N, 3, 3) in columns of segments at their middles on a helix, first along its tangent, and (κ, τ, axis).
+    """Return axes (N, 3, 3) of segments at their middles on a helix, in columns, the first its tangent; κ, τ, axis.
 
     The material turns about the tangent by `twist` (rad/mm), torsion included. The helix begins along x at the base,
-    half a segment before the first of them; its axis is a unit vector.
+    half a segment before the first segment; its axis is a unit vector.
     """
     size = math.hypot(radius, pitch / (2.0 * math.pi))
     bend, torsion = radius / size**2, pitch / (2.0 * math.pi) / size**2

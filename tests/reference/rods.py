@@ -1,4 +1,4 @@
-"""Rods for the tests of `phantom.rod`: on a bench, the plant of a scenario, and that plant worked out otherwise."""
+"""Rods for the tests of `phantom.rod`: on a bench, the plant of a scenario, and a second solver of that plant."""
 
 import math
 
@@ -35,7 +35,7 @@ PERFECT = {
     "phantom.bevel_factor": [1.0, 1.0],
     **{f"phantom.{key}": 0.0 for key in ZEROS},
 }
-"""Changes that leave a rig without any imperfection."""
+"""Changes that remove all imperfections of a rig."""
 
 GUIDE_N_PER_MM = 1e3
 
@@ -66,13 +66,22 @@ _ON_A_BENCH = {
 
 
 class Bench:
-    """A rod of EI = 1000 N·mm² far from any tissue, every part of which a test may reach; steps in place."""
+    """A rod of EI = 1000 N·mm² far from tissue, with all its parts accessible; it steps in place."""
 
-    def __init__(self, length=100.0, segments=64, base=(-1000.0, 0.0, 0.0), roll=0.0, tilt=None, **constants):
+    def __init__(
+        self,
+        length=100.0,
+        segments=64,
+        base=(-1000.0, 0.0, 0.0),
+        roll=0.0,
+        tilt=None,
+        points=400,
+        **constants,
+    ):
         self.rod = rd.Rod(**{**_ON_A_BENCH, "segment": length / segments, **constants})
         x, y, turn = base
         self.s, self.segments = rd.start((x, y, 0.0), tilt or (turn, 0.0), length, segments, roll)
-        self.channel, self.count = np.zeros(400, rd.POINT), 0
+        self.channel, self.count = np.zeros(points, rd.POINT), 0
 
     def step(self, **columns):
         """Move and settle."""
@@ -81,7 +90,7 @@ class Bench:
         return self
 
     def loaded(self, x=0.0, y=0.0, z=0.0):
-        """The same under a dead load (N) at the tip."""
+        """Apply a dead load (N) at the tip, and settle."""
         self.s["load"] = x, y, z
         return self.step()
 
@@ -108,13 +117,13 @@ class Bench:
 
 
 def plant(scenario=IDEAL, *, roll=0.0, cell=None, **truth):
-    """The exact plant of a scenario; `truth` are fields of `Truth`."""
+    """Return the exact plant of a scenario; `truth` are fields of `Truth`."""
     cell = 0.5 * scenario.phantom.contact_spacing_mm if cell is None else cell
     return ExactPlant(Truth(scenario, cell_mm=cell, **truth), roll)
 
 
 def move(plant, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0, flip=False, times=1):
-    """Step a plant, `times` alike; a step that finds no equilibrium is an error of the test."""
+    """Step a plant `times` times; a step without equilibrium is an error of the test."""
     for _ in range(times):
         plant.step(np.array(Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y, flip=flip)))
     if not plant.converged:
@@ -123,16 +132,16 @@ def move(plant, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0, flip=False, times=1)
 
 
 def planar(pose):
-    """x, y, θ of a pose."""
+    """Return x, y, θ of a pose."""
     return pose[[X, Y, THETA]]
 
 
 class Shooting:
     """Section 11 of docs/theory.md the plain way: the continuous rod, integrated from its tip to its base.
 
-    Forces in balance take the place of a minimum of energy, Runge and Kutta's rule that of segments, and the pose of
-    the tip is searched for that brings the far end to the clamp. Nothing is shared with `rig.phantom.rod` but what
-    the section states of a step; `points` are those of the channel, [x, y] in the order in which they were cut.
+    Forces in balance replace a minimum of energy, and the rule of Runge and Kutta the segments; a search for the pose
+    of the tip brings the far end to the clamp. Nothing is shared with `phantom.rod` but the section's definition of a
+    step. `points`: of the channel, [x, y] in the order of cutting.
     """
 
     def __init__(self, truth: Truth, bevel=1):
@@ -140,7 +149,7 @@ class Shooting:
         self.truth, self.scenario, self.bevel = truth, scenario, bevel
         needle = scenario.needle
         self.stiffness = needle.youngs_modulus * np.pi * needle.outer_diameter**4 / 64
-        self.curvature = 2.0 * truth.bend / needle.length_mm**2  # an arc of so much deflection
+        self.curvature = 2.0 * truth.bend / needle.length_mm**2  # an arc with this deflection
         self.base = np.array([scenario.start_base_x, truth.base_y, truth.base_turn])
         self.guide, self.slide, self.eta, self.cut = 0.0, 0.0, 0.0, 0.0
         self.points, self.front = [], np.zeros(3)
@@ -163,7 +172,7 @@ class Shooting:
         return self
 
     def _settled(self, z):
-        """Pose of the tip and force of the guide (4,): Newton's method with differences, at most 1 at a time."""
+        """Return pose of the tip and force of the guide (4,): Newton's method with differences, at most 1 at a time."""
         for _ in range(60):
             miss = self._shoot(z)
             if np.abs(miss).max() < 1e-10:
@@ -174,7 +183,7 @@ class Shooting:
         raise ArithmeticError(f"no equilibrium found: off by {miss}")
 
     def _shoot(self, z):
-        """How far the far end of a needle with this tip is off the clamp (x, y, θ), and the needle off its guide."""
+        """Return the distance of the far end from the clamp (x, y, θ), and of the needle from its guide."""
         tip, force, at_guide = z[:3], z[3], z[3]
         setup, needle = self.scenario.setup, self.scenario.needle
         pull = self.scenario.phantom.friction * self.slide
@@ -196,7 +205,7 @@ class Shooting:
         return np.array([*(end.x, end.y, end.turn) - self.base, at_guide])
 
     def _guide_miss(self, off, force):
-        """0 where the needle is free within the clearance, or beyond it by force/stiffness (mm)."""
+        """Return 0 where the needle is free within the clearance, or beyond it by force/stiffness (mm)."""
         clearance, reach = self.scenario.phantom.guide_clearance_mm, off + force / GUIDE_N_PER_MM
         return reach - np.clip(reach - 0.1 * force, -clearance, clearance)
 
@@ -205,7 +214,7 @@ class Shooting:
         return self.scenario.phantom.contact_spacing_mm
 
     def _force(self, depth, length, u):
-        """dW/du (N) of so many mm of needle at this depth: docs/theory.md eq. 2 and its line below λ = 0.3."""
+        """Return dW/du (N) of a length (mm) of needle at a depth: docs/theory.md eq. 2, and its line below λ = 0.3."""
         cell = int(depth / self.truth.cell_mm)
         middle = (cell + 0.5) * self.truth.cell_mm
         tops = self.scenario.layer_tops
@@ -220,13 +229,13 @@ class Shooting:
         return math.copysign(push, u)
 
     def _progress(self, tip):
-        """Length cut by a step that ends with this tip (mm), negative if pulled back."""
+        """Return the length cut by a step that ends with this tip (mm), negative if pulled back."""
         if not self.cut:
             return tip[0] / math.cos(tip[2])
         return float((tip - self.front)[:2] @ [math.cos(self.front[2]), math.sin(self.front[2])])
 
     def _new_eta(self, tip):
-        """Offset of the bevel's rest point from the tip, across it; docs/theory.md eq. 14."""
+        """Return the offset of the bevel's rest point from the tip, across it; docs/theory.md eq. 14."""
         turn = 0.5 * (self.tip[2] + tip[2])
         drift = float((tip - self.tip)[:2] @ [-math.sin(turn), math.cos(turn)])
         way, bevel = self._progress(tip), self.scenario.needle.bevel
@@ -240,7 +249,7 @@ class Shooting:
         return steady + (eta - steady) * math.exp(-way / bevel.length_mm)
 
     def _bevel_force(self, tip):
-        """Force on the tip (2,)."""
+        """Return the force on the tip (2,)."""
         if tip[0] <= 0.0:
             return np.zeros(2)
         turn, cell, u = tip[2], self.truth.cell_mm, -self._new_eta(tip)
@@ -255,7 +264,7 @@ class Shooting:
         return -force * np.array([-math.sin(turn), math.cos(turn)])
 
     def _lay(self, tip):
-        """Points of the channel, evenly along the path, from the front (at first: the skin) to the tip."""
+        """Add points to the channel, evenly along the path, from the front (at first: the skin) to the tip."""
         way = self._progress(tip)
         if tip[0] <= 0.0:
             self.points, self.cut, self.eta = [], 0.0, 0.0
@@ -269,7 +278,7 @@ class Shooting:
 
 
 class _End:
-    """The cut end of a needle: place, slope, and the force and moment that all beyond it puts on it."""
+    """The cut end of a needle: position, slope, and the force and moment of all beyond it."""
 
     def __init__(self, tip, force, stiffness, curvature):
         self.x, self.y, self.turn = map(float, tip)
@@ -277,11 +286,11 @@ class _End:
         self.stiffness, self.curvature, self.moment, self.passed = stiffness, curvature, 0.0, 0.0
 
     def along(self, point):
-        """How far it is ahead of a point, along itself."""
+        """Return the distance ahead of a point, along the needle."""
         return (self.x - point[0]) * math.cos(self.turn) + (self.y - point[1]) * math.sin(self.turn)
 
     def across(self, point):
-        """How far it is to the left of a point."""
+        """Return the distance to the left of a point."""
         return (self.y - point[1]) * math.cos(self.turn) - (self.x - point[0]) * math.sin(self.turn)
 
     def push(self, force):
@@ -290,7 +299,7 @@ class _End:
         self.fy += force * math.cos(self.turn)
 
     def back_to(self, left, pull):
-        """Go back until `left` of this end is no more; on the way friction pulls at each mm."""
+        """Go back until `left` of this end is 0, with friction at each mm."""
         for _ in range(60):
             way = left(self)
             if abs(way) < 1e-12:
@@ -299,7 +308,7 @@ class _End:
         raise ArithmeticError(f"{left(self)} mm left")
 
     def _back(self, way, pull):
-        """Runge and Kutta's rule for dx = cos θ ds, dy = sin θ ds, dθ = (κ₀ + M/EI) ds, dM = −τ × F ds."""
+        """Apply the rule of Runge and Kutta to dx = cos θ ds, dy = sin θ ds, dθ = (κ₀ + M/EI) ds, dM = −τ × F ds."""
 
         def slopes(x, y, turn, moment):
             fx, fy = self.fx - pull * (self.x - x), self.fy - pull * (self.y - y)

@@ -1,7 +1,7 @@
 """The kernels of the mechanics driven directly: a needle in space, or in the plane, by the type of its arrays.
 
-Laterally, numbers are y + iz. A state is that of the simulator, its arrays complex; `reactions` of it are planar, so
-`forces` here.
+Laterally, numbers are y + iz. A state is a state of the simulator with complex arrays; its `reactions` are planar,
+hence `forces` here.
 """
 
 import math
@@ -28,7 +28,7 @@ EXACT = {"slide": 1e-10, "tolerance": 1e-11}
 
 
 class Imposed(NamedTuple):
-    """What holds and loads the needle at the start: lateral numbers in mm, rad and N."""
+    """Boundary conditions and load of the needle at the start: lateral numbers in mm, rad and N."""
 
     bevel: complex = 1.0
     base: complex = 0.0
@@ -37,7 +37,7 @@ class Imposed(NamedTuple):
     load: complex = 0.0
 
     def turned(self, angle: float) -> "Imposed":
-        """The same turned about the axis (rad)."""
+        """Return the conditions turned about the axis (rad)."""
         return Imposed(*(np.exp(1j * angle) * part for part in self))
 
 
@@ -45,13 +45,14 @@ UNLOADED = Imposed()
 
 
 def model_of(scenario: Scenario, **constants) -> Model:
-    """The constants of a scenario, solved nearer to equilibrium than usual."""
+    """Return the constants of a scenario, for solves nearer to equilibrium than usual."""
     return Simulator(scenario, threads=1)._model._replace(**{**EXACT, **constants})
 
 
 def start(scenario: Scenario, imposed: Imposed = UNLOADED, across: type = complex, **constants) -> State:
-    """The needle in air, solved; `across` is complex, or float for the kernels of the plane."""
+    """Return the needle in air, solved; `across` is complex, or float for the kernels of the plane."""
     model, none = model_of(scenario, **constants), across(0.0)
+    model = model._replace(curvature=across(model.curvature))  # of the state's type: no further kernel is compiled
     bevel, base, slope, guide, load = (across(part) for part in imposed)
     tip = nd.NodePose(scenario.setup.start_tip_x, none, none)
     needle = nd.start(nd.NodePose(scenario.start_base_x, base, slope), tip, bevel, guide)
@@ -65,7 +66,7 @@ def start(scenario: Scenario, imposed: Imposed = UNLOADED, across: type = comple
 
 
 def carried_out(state: State, commands: np.ndarray) -> tuple[State, np.ndarray]:
-    """The state after commands (m, 9), and the tips (m, 5) on the way: x, y, z, θ, ψ."""
+    """Return the state after commands (m, 9), and the tips (m, 5) on the way: x, y, z, θ, ψ."""
     work = state.rest.copy(), state.compression.copy(), nd.work_array(state.rest)
     start, rows = (state.needle, state.rest, state.compression), np.ascontiguousarray(commands)[None]
     out = insertion.outputs(1, len(commands))
@@ -76,7 +77,7 @@ def carried_out(state: State, commands: np.ndarray) -> tuple[State, np.ndarray]:
 
 
 def commands(count: int, advance=0.0, *, base=0.0, slope=0.0, guide=0.0, roll=0.0, spin=0.0) -> np.ndarray:
-    """Commands (count, 9) of numbers, or of arrays (count,); base, slope and guide y + iz."""
+    """Return commands (count, 9) of numbers, or of arrays (count,); base, slope and guide y + iz."""
     rows = np.zeros((count, insertion.COMMAND_SIZE))
     rows[:, ADVANCE], rows[:, ROLL], rows[:, SPIN] = advance, roll, spin
     for (y, z), value in ((BASE, base), (SLOPE, slope), (GUIDE, guide)):
@@ -85,7 +86,7 @@ def commands(count: int, advance=0.0, *, base=0.0, slope=0.0, guide=0.0, roll=0.
 
 
 def turned_commands(rows: np.ndarray, angle: float) -> np.ndarray:
-    """The same lateral motions turned about the axis (rad)."""
+    """Return commands with their lateral motions turned about the axis (rad)."""
     changed = rows.copy()
     for y, z in (BASE, SLOPE, GUIDE):
         value = np.exp(1j * angle) * (rows[:, y] + 1j * rows[:, z])
@@ -94,17 +95,17 @@ def turned_commands(rows: np.ndarray, angle: float) -> np.ndarray:
 
 
 def lateral(tips: np.ndarray) -> np.ndarray:
-    """y + iz (m,) of tips."""
+    """Return y + iz (m,) of tips."""
     return tips[:, 1] + 1j * tips[:, 2]
 
 
 def slopes(tips: np.ndarray) -> np.ndarray:
-    """θ + iψ (m,) of tips."""
+    """Return θ + iψ (m,) of tips."""
     return tips[:, 3] + 1j * tips[:, 4]
 
 
 def forces(state: State) -> np.ndarray:
-    """Forces (N) and moment (N·mm) that hold the needle, the conjugates of base, base slope and guide: y + iz, (3,)."""
+    """Return the forces (N) and the moment (N·mm), y + iz (3,), that hold base, base slope and guide."""
     loads = state.needle.solution.loads
     guide = state.mesh["force"][state.mesh["x"] == state.scenario.setup.guide_x].sum()
     return np.array([-loads.shear, -loads.moment, guide])

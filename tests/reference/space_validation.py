@@ -1,4 +1,4 @@
-"""Problems in space that validate the exact plant; like those of `reference.validation`, for tests and the page."""
+"""Problems in space that validate the exact plant, for tests and the page (in a plane: `reference.validation`)."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ EULER = 4.0 * math.pi**2 * EI / LENGTH**2
 
 @dataclass(frozen=True)
 class Space:
-    """All that is computed in space."""
+    """All results in space."""
 
     solver: list[np.ndarray]  # distances of the tips (mm) from the second solver, by rod and SEGMENTS
     helix: list[float]  # unbalanced moment per mm over EI κ², by HELIX_SEGMENTS
@@ -34,7 +34,7 @@ SHARES = (0.0, 0.5)
 
 
 def compute() -> Space:
-    """Everything."""
+    """Compute all results."""
     rods = [drawn(seed) for seed in range(3)]
     return Space(
         [np.array([solver_gap(rod, segments)[0] for segments in SEGMENTS]) for rod in rods],
@@ -45,7 +45,7 @@ def compute() -> Space:
 
 
 def drawn(seed):
-    """A rod with natural bend, tilted and rolled, under a force in any direction that bends it by about a radian."""
+    """Return a rod with natural bend, tilted and rolled, bent by about a radian by a force in any direction."""
     rng = np.random.default_rng(seed)
     load = rng.normal(0.0, 1.0, 3)
     load *= rng.uniform(1.0, 2.5) * EI / LENGTH**2 / np.linalg.norm(load)
@@ -55,7 +55,7 @@ def drawn(seed):
 
 
 def loaded(rod, segments):
-    """That rod, its load applied in parts."""
+    """Return a bench with that rod, its load applied in parts."""
     bench = Bench(
         length=rod.length,
         segments=segments,
@@ -71,7 +71,7 @@ def loaded(rod, segments):
 
 
 def solver_gap(rod, segments) -> tuple[float, float]:
-    """Distance of the tip (mm) and largest difference of its axes from those of the second solver."""
+    """Return the distance of the tip (mm) and the largest difference of its axes from the second solver."""
     position, frame = kirchhoff.tip(rod)
     bench = loaded(rod, segments)
     axes = Rotation.from_quat(bench.segments["frame"][-2], scalar_first=True).as_matrix()
@@ -79,7 +79,7 @@ def solver_gap(rod, segments) -> tuple[float, float]:
 
 
 def helix_residual(segments) -> float:
-    """Moment per mm (over EI κ²) that is not balanced within a helix under its wrench.
+    """Return the moment per mm (over EI κ²) that is not balanced within a helix under its wrench.
 
     Kirchhoff: with the twist T the force is (GJ T − EI τ) √(κ² + τ²) along its axis; the ends would need a couple.
     """
@@ -96,7 +96,7 @@ def helix_residual(segments) -> float:
 
 
 def held(push=0.0):
-    """A rod between a clamp at its base and stiff tissue that holds the direction and the roll of its last 6 mm."""
+    """Return a rod between a clamp at its base and stiff tissue that holds direction and roll of its last 6 mm."""
     bench = Bench(
         length=LENGTH + 6.0,
         segments=106,
@@ -115,7 +115,7 @@ def held(push=0.0):
 
 
 def twisted(share, turn):
-    """That rod under a share of Euler's load, its base rolled by an angle in 40 steps; None where it has buckled."""
+    """Return that rod under a share of Euler's load, its base rolled in 40 steps; None if it has buckled."""
     bench = held(share * EULER)
     for _ in range(40):
         if not bench.step(roll=turn / 40).converged:
@@ -124,7 +124,7 @@ def twisted(share, turn):
 
 
 def buckling_twist(share) -> float:
-    """Greatest stable moment of a twisted rod over Greenhill's, by bisection of the roll of its base."""
+    """Return the greatest stable moment of a twisted rod over Greenhill's, by bisection of the roll of its base."""
     moment = elastica.twisted_buckling_moment(LENGTH, EI, share * EULER)
     low, high, found = 0.9 * moment * LENGTH / GJ, 1.1 * moment * LENGTH / GJ, math.nan
     for _ in range(10):
@@ -138,18 +138,18 @@ def buckling_twist(share) -> float:
 
 
 def inserted_straight(couple=20.0):
-    """A straight needle 40 mm deep, with this friction against rotation (mN)."""
+    """Return a straight needle 40 mm deep, with this friction against rotation (mN)."""
     straight = {"needle.bevel.offset_mm": 0.0, "phantom.rotation_friction_mn": couple}
     return Inserted(IDEAL.with_values(straight)).move(db_x=0.5, times=137)
 
 
 def largest_lag(needle, couple=0.02) -> float:
-    """c l²/2GJ in the tissue and c l over the free length (rad), for c in N."""
+    """Return c l²/2GJ in the tissue and c l over the free length (rad), for c in N."""
     inside, gj = needle.tip[0], needle.rod.torsion
     return couple * inside * (0.5 * inside + 150.0 - inside) / gj
 
 
 def lag_error() -> float:
-    """Relative error of the lag after a roll by 1.5 rad in parts."""
+    """Return the relative error of the lag after a roll by 1.5 rad in parts."""
     needle = inserted_straight().move(roll=0.075, times=20)
     return -float(needle.s["twist"]) / largest_lag(needle) - 1.0

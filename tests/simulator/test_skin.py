@@ -1,4 +1,4 @@
-"""Below the skin a free needle is held by little but its tip: what is cut there is resolved, whatever the step."""
+"""Below the skin a free needle is held by little but its tip: cuts there are resolved, whatever the step."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,7 @@ from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.mechanics import model
 from flexneedle.scenario.worlds import world
 from flexneedle.types import DG_Y, THETA, X, Y
-from reference.cases import numbers
-from reference.tight import tight
+from reference.cases import numbers, tight
 
 PHANTOM = load_scenario("phantom")
 # Thin needles, with and without a guide: worlds, and how far (mm) steps and spacings of 1 mm may be off.
@@ -43,7 +42,7 @@ def test_halving_steps_and_spacing_converges(number):
 
 @pytest.mark.parametrize("number", THIN)
 def test_even_intervals_and_whole_steps_would_be_far_off(number, monkeypatch):
-    """Several times as far as with what is resolved below the skin."""
+    """Several times as far as with the resolution below the skin."""
     scenario = world(number, "perfect")
     fine, resolved = refined(scenario, 0.125), refined(scenario, 1.0)
     monkeypatch.setattr(model, "_SKIN_EDGES", ())
@@ -66,7 +65,7 @@ def at(simulator, state, x):
 
 
 @pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("before", [-2.5, -0.6, -0.1, 0.0, 0.1, 0.6, 1.4, 2.6])
+@pytest.mark.parametrize("before", [-2.5, -0.1, 0.0, 0.6, 2.6])
 def test_the_state_is_continuous_in_the_command(before, flip):
     """From anywhere about the skin, under a side load, a command that is 1 µm longer each time, up to 1 mm.
 

@@ -24,7 +24,7 @@ PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "
 NEEDLE, GUIDE = "#8a8f98", "#4d535c"
 STRATEGIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
-# The colour of z in space, beside that of y.
+# The colour of z in space, beside the colour of y.
 _SECOND = {
     PLAN: "#8a8a8a",
     ESTIMATE: "#56B4E9",

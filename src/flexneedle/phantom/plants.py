@@ -11,7 +11,6 @@ from flexneedle.mechanics.law import tables
 from flexneedle.phantom import rod as rd
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.equilibrium import step
-from flexneedle.phantom.space import roll_about_x, tilt_of, turn, vector
 from flexneedle.plugins import find_part, function_rule, missing_parts, parts_of
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
@@ -150,12 +149,12 @@ class ExactPlant:
     @property
     def tip(self) -> Floats:
         """Pose x, y, z, θ, ψ (mm, rad) of the end of the needle's axis: its tilt from x by √(θ² + ψ²)."""
-        return np.array([*self.state["tip"], *tilt_of(vector(self.state["tangent"]))])
+        return np.array([*self.state["tip"], *rd.tip_angles(self.state)[:2]])
 
     @property
     def roll(self) -> float:
         """Roll of the bevel (rad) before its tilt, from −π to π: the base's roll less the twist of the shaft."""
-        return roll_about_x(turn(self.state["frame"]))
+        return rd.tip_angles(self.state)[2]
 
     @property
     def strain_energy(self) -> float:

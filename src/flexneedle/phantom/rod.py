@@ -10,16 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.compile import inner, kernel
 from flexneedle.phantom.space import (
     Floats,
+    Turn,
     Vector,
     after,
     first_axis,
     plus,
     put,
     put_turn,
+    roll_about_x,
     roll_turn,
+    tilt_of,
     tilt_turn,
     times,
     turn,
@@ -150,13 +153,26 @@ class Rod(NamedTuple):
     weight: Floats
 
 
+@kernel
+def _frames(theta: float, psi: float, roll: float) -> tuple[Turn, Turn, Vector]:
+    """Return the roll, the frame of a base that is rolled and then tilted (rad), and its first axis."""
+    half = roll_turn(roll)
+    turned = after(tilt_turn(theta, psi), half)
+    return half, turned, first_axis(turned)
+
+
+@kernel
+def tip_angles(s: State) -> tuple[float, float, float]:
+    """Return the tilt θ, ψ of the tip from x, by √(θ² + ψ²), and its roll before the tilt, from −π to π (rad)."""
+    theta, psi = tilt_of(vector(s.tangent))
+    return theta, psi, roll_about_x(turn(s.frame))
+
+
 def start(
     base: Vector, tilt: tuple[float, float], length: float, segments: int, roll: float = 0.0
 ) -> tuple[State, Records]:
     """Return state and segments of a straight needle at rest in air, by the pose of its base and its roll (mm, rad)."""
-    half = roll_turn(roll)
-    turned = after(tilt_turn(*tilt), half)
-    tangent = first_axis(turned)
+    half, turned, tangent = _frames(float(tilt[0]), float(tilt[1]), roll)
     s = np.zeros(1, STATE)[0]
     s["base"], s["tilt"], s["half_roll"], s["roll"] = base, tilt, half[:2], roll
     s["tip"], s["tangent"], s["frame"] = np.array(base) + length * np.array(tangent), tangent, turned

@@ -18,7 +18,7 @@ def rms(vectors):
     return np.sqrt(np.mean(np.sum(vectors**2, axis=-1)))
 
 
-def test_the_grid_is_that_of_the_paper():
+def test_the_grid_is_the_papers():
     assert GRID.shape == (125, 3)
     assert len(np.unique(GRID, axis=0)) == 125
     np.testing.assert_allclose(np.unique(GRID), [-50.0, -25.0, 0.0, 25.0, 50.0])
@@ -31,7 +31,7 @@ def test_the_grid_is_that_of_the_paper():
     shared=st.floats(0.0, 1.0),
     power=st.floats(0.0, 4.0),
 )
-@hypothesis_settings(max_examples=40)
+@hypothesis_settings(max_examples=20)
 def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, power):
     """RMS over the paper's grid, for each sensor, with and without a plate."""
     plate = ABOVE | {"tip_mm": 2 * size, "reference_mm": 3 * size, "decay_mm": length}
@@ -74,9 +74,9 @@ def test_sensors_share_the_environments_part_of_the_error():
         tracker = environment(tip={"bias_mm": 1.0}, reference={"bias_mm": 1.0}, shared=shared)
         product = [
             np.mean(np.sum(room.error("tip", GRID) * room.error("ref2", GRID), axis=-1))
-            for room in (Room(tracker, seed) for seed in range(150))
+            for room in (Room(tracker, seed) for seed in range(80))
         ]
-        assert np.mean(product) == pytest.approx(shared, abs=0.08)
+        assert np.mean(product) == pytest.approx(shared, abs=0.1)
 
 
 def test_errors_grow_with_the_distance_to_the_generator():
@@ -107,7 +107,7 @@ def test_the_distance_of_a_point_is_along_the_normal():
     np.testing.assert_allclose(beside, middle, rtol=1e-2)
 
 
-def test_behind_the_plate_the_distortion_is_that_at_the_plate():
+def test_behind_the_plate_the_distortion_is_as_at_the_plate():
     plate = ABOVE | {"tip_mm": 1.0, "decay_mm": 40.0}
     room = Room(environment(plate=plate, length_mm=EVEN), 2)
     at, behind = room.distortion("tip", np.array([[0.0, 0.0, -30.0], [0.0, 0.0, -45.0]]), 30.0)
@@ -115,7 +115,7 @@ def test_behind_the_plate_the_distortion_is_that_at_the_plate():
 
 
 @given(nearer=st.floats(1.0, 60.0), distance=st.floats(70.0, 300.0), seed=st.integers(0, 1000))
-@hypothesis_settings(max_examples=40)
+@hypothesis_settings(max_examples=20)
 def test_the_nearer_the_plate_the_larger_the_distortion_everywhere(nearer, distance, seed):
     room = Room(environment(plate=ABOVE | {"reference_mm": 1.0}), seed)
     far = np.linalg.norm(room.distortion("ref1", GRID, distance + nearer), axis=-1)
@@ -123,17 +123,11 @@ def test_the_nearer_the_plate_the_larger_the_distortion_everywhere(nearer, dista
     assert (near > far).all()
 
 
-def test_no_plate_no_distortion():
-    room = Room(environment(tip={"bias_mm": 1.0}), 1)
-    assert not room.distortion("tip", GRID).any()
-    assert not room.distortion("tip", GRID, 10.0).any()
-
-
 LENGTHS = st.sampled_from([1e-6, 1.0, 1e6])
 
 
 @given(length=LENGTHS, edge=LENGTHS, decay=LENGTHS, away=LENGTHS, power=st.sampled_from([0.0, 10.0]))
-@hypothesis_settings(max_examples=60)
+@hypothesis_settings(max_examples=20)
 def test_errors_are_finite_for_extreme_environments(length, edge, decay, away, power):
     plate = {"tip_mm": 1e6, "reference_mm": 1e-6, "coils_mm": 1.0, "decay_mm": decay, "coils_decay_mm": decay}
     tracker = environment(
@@ -154,6 +148,7 @@ def test_same_seed_same_room():
     one, same, other = (Room(tracker, seed).error("tip", GRID) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, same)
     assert np.abs(one - other).max() > 0.1
+    assert not Room(tracker, 5).distortion("tip", GRID, 10.0).any()  # there is no plate
 
 
 def test_a_plate_does_not_change_the_other_errors_of_the_room():

@@ -65,7 +65,7 @@ def noisy(environment: Environment, exact: Noiseless, rng: np.random.Generator) 
     count, coils = exact.coils.shape[:2]
     jitter = environment.tip.jitter_mm if coils == 1 else environment.reference.jitter_mm
     noise = rng.normal(0.0, 1.0, (count, coils + 1, 3))
-    # The jitter is that of the mean of k coils, with a third of its variance on each axis.
+    # The jitter is of the mean of k coils, with a third of its variance on each axis.
     coil_positions = exact.coils + jitter * sqrt(coils / 3.0) * noise[:, :coils]
     # Two of the three components of a rotation tilt the axis.
     rotation = _PER_MILLI * environment.tilt_jitter_mrad / sqrt(2.0) * noise[:, coils]
