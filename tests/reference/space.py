@@ -52,7 +52,9 @@ def model_of(scenario: Scenario, **constants) -> Model:
 def start(scenario: Scenario, imposed: Imposed = UNLOADED, across: type = complex, **constants) -> State:
     """Return the needle in air, solved; `across` is complex, or float for the kernels of the plane."""
     model, none = model_of(scenario, **constants), across(0.0)
-    model = model._replace(curvature=across(model.curvature))  # of the state's type: no further kernel is compiled
+    model = model._replace(
+        curvature=across(model.curvature)
+    )  # of the state's type: no further kernel is compiled
     bevel, base, slope, guide, load = (across(part) for part in imposed)
     tip = nd.NodePose(scenario.setup.start_tip_x, none, none)
     needle = nd.start(nd.NodePose(scenario.start_base_x, base, slope), tip, bevel, guide)

@@ -101,16 +101,13 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
 
 
 def _rolls(ax: Axes, scenario: Scenario, insertion: Insertion, view: View, length: float) -> None:
-    """Draw the bevel at the start and after rolls: its side in the plane, its direction in space."""
-    planned, applied = curves.planned_rolls(insertion.plan), curves.applied_rolls(insertion)
+    """Draw the bevel at the start and after planned and applied rolls."""
+    space.draw_planned(ax, scenario, insertion.plan, view, length)
+    applied = curves.applied_rolls(insertion)
     if scenario.setup.axes == 1:
-        scene.draw_start(ax, insertion.plan)
-        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
         scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel flip, applied")
-        return
-    space.draw_start(ax, insertion.plan, view, length)
-    space.draw_bevels(ax, planned, view, length, PLAN, solid=False, label=space.PLANNED)
-    space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=space.APPLIED)
+    else:
+        space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=space.APPLIED)
 
 
 def _prediction(ax: Axes, insertion: Insertion, view: View) -> None:

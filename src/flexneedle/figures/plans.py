@@ -13,7 +13,7 @@ from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, INK, PLAN, STRATEGIES, TARGET, signed, styled, tone
+from flexneedle.figures.style import BAD, INK, STRATEGIES, TARGET, signed, styled, tone
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, X, Y
@@ -76,23 +76,12 @@ def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View)
     scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter, "planned needle", view)
     how: dict[str, Any] = {"color": color, "linewidth": 1.4, "zorder": 5}
     ax.plot(*plan.tips[:, view].T, "--", label=f"planned path, {plan.strategy}", **how)
-    _draw_rolls(ax, scenario, plan, view, 4.0)
+    space.draw_planned(ax, scenario, plan, view, 4.0)
     scene.draw_target(ax, plan.target, view)
     if scenario.setup.guide_x is not None:
         travel = plan.guide[:, view[1] - Y]
         scene.draw_guide(ax, scenario.setup.guide_x, travel, float(travel[-1]))
     _draw_entry(ax, plan, view)
-
-
-def _draw_rolls(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: float) -> None:
-    """Draw the bevel at the start and after rolls: its side in the plane, its direction in space."""
-    planned = curves.planned_rolls(plan)
-    if scenario.setup.axes == 1:
-        scene.draw_start(ax, plan)
-        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
-    else:
-        space.draw_start(ax, plan, view, length)
-        space.draw_bevels(ax, planned, view, length, PLAN, solid=False, label=space.PLANNED)
 
 
 def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
@@ -102,7 +91,7 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
     if scenario.setup.has_guide:
         space.draw_guide_along(ax, plan.guide, plan.target)
     space.draw_along(ax, plan.tips)
-    _draw_rolls(ax, scenario, plan, scene.ALONG, space.arrow_along(ax))
+    space.draw_planned(ax, scenario, plan, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, plan.target, scene.ALONG)
 
 

@@ -10,10 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from flexneedle.figures.curves import Roll, start_roll
+from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
 from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, signed
-from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.types import THETA, Floats, Point, X, Y, Z
@@ -163,11 +162,6 @@ def draw_target(ax: Axes, target: Point, view: View = SIDE) -> None:
     ax.add_patch(circle)
     cross: dict[str, Any] = {"marker": "+", "markersize": 6, "markeredgewidth": 1.2, "linestyle": "none"}
     ax.plot(*centre, color=TARGET, zorder=6, label="target, circle of 1 mm radius", **cross)
-
-
-def draw_start(ax: Axes, plan: Plan) -> None:
-    """Show beside the start of the tip the side of the bevel at the start."""
-    draw_rolls(ax, [start_roll(plan)], QUIET, solid=True, label="bevel at the start")
 
 
 def draw_rolls(ax: Axes, rolls: Sequence[Roll], color: str, *, solid: bool, label: str) -> None:

@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Annulus
 
 from flexneedle.figures import scene
-from flexneedle.figures.curves import Roll, start_roll
+from flexneedle.figures.curves import Roll, planned_rolls, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
 from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, signed
@@ -20,7 +20,7 @@ from flexneedle.types import Floats, Point, Shape, X, Y, Z
 
 COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
 """Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""
-PLANNED, APPLIED = "bevel after a roll, planned", "bevel after a roll, applied"
+APPLIED = "bevel after a roll, applied"
 SDS = 2.0
 """Half width of the band about a predicted shape, in standard deviations."""
 DEPTHS = LinearSegmentedColormap.from_list("depth", ("#f8c9a4", TRUE, "#5c2600"))
@@ -52,9 +52,16 @@ def draw_bevels(
     arrows.set_gid(ARROW)
 
 
-def draw_start(ax: Axes, plan: Plan, view: View, length: float) -> None:
-    """Draw the direction of the bevel at the start."""
-    draw_bevels(ax, [start_roll(plan)], view, length, QUIET, solid=True, label="bevel at the start")
+def draw_planned(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: float) -> None:
+    """Draw the bevel at the start and after planned rolls: its side in the plane, its direction in space."""
+    planned = planned_rolls(plan)
+    if scenario.setup.axes == 1:
+        scene.draw_rolls(ax, [start_roll(plan)], QUIET, solid=True, label="bevel at the start")
+        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
+    else:
+        start = [start_roll(plan)]
+        draw_bevels(ax, start, view, length, QUIET, solid=True, label="bevel at the start")
+        draw_bevels(ax, planned, view, length, PLAN, solid=False, label="bevel after a roll, planned")
 
 
 def prediction_label(period: Period) -> str:

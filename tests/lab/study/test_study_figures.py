@@ -11,10 +11,11 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.figures.layout import Panel, look
+from flexneedle.figures.layout import look
 from flexneedle.figures.style import save
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
+from flexneedle.lab.study.figures.panels import Panel
 from flexneedle.lab.study.figures.samples import ErrorSample
 from flexneedle.lab.study.figures.shares import draw_shares
 from flexneedle.lab.study.figures.sweeps import draw_sweep

@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.figures.layout import FAINT, Look, Panel, legend, panels, short, ticks_of
+from flexneedle.figures.layout import Look, legend, short
 from flexneedle.figures.style import INK, QUIET, signed, styled
+from flexneedle.lab.study.figures.panels import FAINT, Panel, panels, ticks_of
 
 _WIDE = 10.0  # ratio of the largest value to the linear range above which the scale is symlog
 _SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"

@@ -8,18 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.figures.layout import (
-    LIMIT,
-    Panel,
-    decades,
-    legend,
-    limit_line,
-    panels,
-    scattered,
-    short,
-    ticks_of,
-)
+from flexneedle.figures.layout import legend, short
 from flexneedle.figures.style import INK, QUIET, styled
+from flexneedle.lab.study.figures.panels import LIMIT, Panel, decades, limit_line, panels, scattered, ticks_of
 from flexneedle.lab.study.figures.samples import LEAST, ErrorSample
 
 _GOLDEN = 0.6180339887

@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.figures.layout import FAINT, LIMIT, Panel, decades, legend, limit_line, panels, ticks_of
+from flexneedle.figures.layout import legend
 from flexneedle.figures.style import styled
+from flexneedle.lab.study.figures.panels import FAINT, LIMIT, Panel, decades, limit_line, panels, ticks_of
 from flexneedle.lab.study.figures.samples import ErrorSample
 
 

@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.figures.layout import FAINT, OVERLAID, Floats, Panel, decades, legend, panels, short
+from flexneedle.figures.layout import Floats, legend, short
 from flexneedle.figures.style import BAD, INK, styled
+from flexneedle.lab.study.figures.panels import FAINT, OVERLAID, Panel, decades, panels
 from flexneedle.lab.study.figures.samples import ErrorSample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)

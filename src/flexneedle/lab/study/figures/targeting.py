@@ -14,8 +14,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from flexneedle.figures.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
+from flexneedle.figures.layout import Floats, legend
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
+from flexneedle.lab.study.figures.panels import FAINT, Panel, columns_of, head, panels, scattered, sheet
 
 MAP = ("depth (mm)", "lateral (mm)")
 BEYOND = ("depth beyond the target (mm)", "lateral (mm)")

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexneedle.figures.layout import MOST_PANELS, Floats, Look, Panel, look
+from flexneedle.figures.layout import Floats, Look, look
 from flexneedle.figures.style import INK, save
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
+from flexneedle.lab.study.figures.panels import MOST_PANELS, Panel
 from flexneedle.lab.study.figures.samples import ErrorSample
 from flexneedle.lab.study.figures.shares import draw_shares
 from flexneedle.lab.study.figures.sweeps import draw_sweep
