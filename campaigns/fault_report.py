@@ -16,7 +16,7 @@ _BLUE, _RED = "#0072b2", "#d55e00"
 def table(faults: Sequence[Fault], rows: Sequence[Row]) -> str:
     """Markdown table, with a line below it on what the needle did when faults were injected."""
     lines = [
-        "| | fault | required | ended | detected within (limit) s | motion after it mm | roll after it ° |",
+        "||fault|required|ended|detected within (limit) s|motion after it mm|roll after it °|",
         "|---|---|---|---|---:|---:|---:|",
         *(_line(fault, mine) for fault in faults if (mine := rows_of(fault, rows))),
     ]
@@ -52,7 +52,7 @@ def _line(fault: Fault, rows: Sequence[Row]) -> str:
         _longest([row["motion_mm"] for row in rows]),
         _longest([row["rolled_deg"] for row in rows], 1),
     ]
-    return f"| {' | '.join(cells)} |"
+    return f"|{'|'.join(cells)}|"
 
 
 def _longest(values: Sequence[float | None], digits: int = 3) -> str:

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table; the first column is text, the others are numbers."""
     lines = [head, ("---", *["---:"] * (len(head) - 1)), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"|{'|'.join(line)}|" for line in lines)
 
 
 def small(value: float) -> str:
@@ -57,7 +57,7 @@ def document(found: problems.Found) -> str:
         *solver(found),
         *refinement(found),
         *space(found.space),
-        "## What this does not show",
+        "## Limits",
         LIMITS,
     ]
     return "\n\n".join(wrapped(part) for part in parts) + "\n"
@@ -167,8 +167,8 @@ def model(found: problems.Found) -> list[str]:
     return [
         "## The controller's model at small angles",
         "Both formulations carry out the same insertion to 44.5 mm with guide motion and a flip. Bevel offset and guide"
-        " motion are scaled together; segments are 0.125 mm, and the guide is as rigid as in the model. Largest slope"
-        " of the tip and largest distance between the tips:",
+        " motion are scaled together; segments are 0.125 mm, and the guide is as rigid as in the model. The table has"
+        " the largest slope of the tip and the largest distance between the tips:",
         table(
             ("slope (rad), one layer", "distance (mm)", "slope (rad), two layers", "distance (mm)"),
             rows,
@@ -214,8 +214,8 @@ def energy(found: problems.Found) -> list[str]:
     return [
         "## Energy",
         "Without cutting, energy is conserved: when base and guide move a bent needle at a depth of 28 mm without"
-        " insertion, their work (trapezoidal rule, 40 steps) differs from the change of the stored energy by at most"
-        f" {small(moved)} of it.",
+        " insertion, the relative difference of their work (trapezoidal rule, 40 steps) from the change of the stored"
+        f" energy is at most {small(moved)}.",
         "In an insertion to 40 mm with guide motion and a flip, the work of base, guide and the tissue on the bevel is"
         " compared with the stored energy and the energy dissipated by friction. The relative error decreases with the"
         f" step, without friction with the power {power(problems.STEPS, gaps)}:",
@@ -239,7 +239,7 @@ def solver(found: problems.Found) -> list[str]:
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
         "θ converges with first order: the slope of the last segment is the slope half a segment before the tip. With"
         f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm; with half the step they"
-        f" differ by {small(found.rubbed[1])} mm, since friction acts along the needle as it was before the step.",
+        f" differ by {small(found.rubbed[1])} mm, since friction acts along the shape of the needle before the step.",
     ]
 
 
@@ -254,8 +254,8 @@ def refinement(found: problems.Found) -> list[str]:
     finest = ", ".join(f"{problems.SIZES[name][-1]:g}" for name in problems.SIZES)
     return [
         "## Refinement of an insertion",
-        "Tip after 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance from the"
-        f" result with {finest} mm for element, step and spacing.",
+        "An insertion to 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance of"
+        f" the tip from the result with {finest} mm for element, step and spacing.",
         table(("key of `[phantom]`", "default (mm)", "distance (mm)", "order"), rows),
         "![Error over element, step and spacing; difference from the second solver](images/validation-insertion.png)",
     ]

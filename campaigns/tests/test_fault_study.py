@@ -349,11 +349,8 @@ def test_table_and_picture(tmp_path):
     bad = row("motor off", END, outcome="failed")
     rows = [row("motor off", OFF, outcome="failed"), bad, row("controller killed", outcome="running")]
     lines = table(FAULTS, rows).splitlines()
-    assert lines[2] == "| motors | motor off | fault (1 of 2) | failed | 0.020 (0.1) | 0.000 | 0.0 |"
-    assert (
-        lines[3]
-        == "| computer | controller killed | stop | no record | at rest: 0.000 (0.225) | 0.000 | 0.0 |"
-    )
+    assert lines[2] == "|motors|motor off|fault (1 of 2)|failed|0.020 (0.1)|0.000|0.0|"
+    assert lines[3] == "|computer|controller killed|stop|no record|at rest: 0.000 (0.225)|0.000|0.0|"
     assert lines[-1] == "3 faults, during: 0 an advance, 0 a roll, 3 a rest between two steps."
     draw(FAULTS, rows, tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000

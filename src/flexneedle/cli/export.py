@@ -24,9 +24,9 @@ _COLUMN_HELP = """
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame
-Unknown values are empty. A tracker without frames has no sensor columns. All
-rows of a dry run (insert --dry-run) have a last column dry_run, rows of an
-insertion that was disturbed on the page (serve) one called disturbed.
+Unknown values are empty. A tracker without frames has no sensor columns. A dry
+run adds a last column dry_run, an insertion disturbed on the page (serve) a
+column disturbed.
 
 """
 

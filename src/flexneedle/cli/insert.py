@@ -85,7 +85,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.set_defaults(connection=Connection)
     add_run_arguments(parser)
-    add_strategy(parser, "planning strategy: manipulation moves guide and bevel, steering only the bevel")
+    add_strategy(parser, "manipulation moves guide and bevel, steering only the bevel")
     parser.add_argument(
         "--plan-seed",
         type=seed,
@@ -111,8 +111,8 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--phantom",
         metavar="KIND",
-        help="plant: exact, a separate finer formulation with imperfections; model, the controller's "
-        "formulation with other parameters; or module:NAME (default: exact)",
+        help="plant: exact (finer, with imperfections), model (the controller's, with other parameters) or "
+        "module:NAME (default: exact)",
     )
     parser.add_argument(
         "--tracker",

@@ -32,8 +32,8 @@ def add_options(commands: Commands) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="path of a rig file, or emulated: insert with its motors and tracker, from the present motor "
-        "positions (default: virtual phantom)",
+        help="path of a rig file, or emulated: insert with its motors and tracker from the present positions "
+        "(default: virtual phantom)",
     )
     parser.add_argument(
         "--dry-run",
@@ -43,8 +43,7 @@ def add_options(commands: Commands) -> None:
     parser.add_argument(
         "--ros",
         metavar="PROFILE",
-        help="publish an insertion without --rig to ROS 2 and subscribe to its stop topic: name or path of "
-        "a profile (with --rig: section [ros] of the rig file)",
+        help="without --rig: publish to ROS 2 and subscribe to the stop topic; name or path of a profile",
     )
     parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
 
