@@ -1,15 +1,12 @@
 """The driver of the loop on a supervisor: columns and axes, rolls, limits; and whole insertions on the emulated rig."""
 
-import json
 import math
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,7 +28,7 @@ from flexneedle.results import Action
 from flexneedle.simulator.pace import travel_time
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control
-from stages import RIG, Bench
+from stages import Bench
 from synthetic import make_plan
 from traces import contents
 
@@ -79,28 +76,23 @@ class Axes:
         )
 
 
-def test_half_turns_go_to_and_fro_and_do_not_drift():
+def test_half_turns_alternate_and_do_not_drift():
     axes = Axes(0.003, -0.004, 0.002, 0.001)
     driver = SupervisedDriver(axes, PHANTOM, 0.0)
     done = [driver.apply(Control(db_x=0.5, flip=True), 0.2).control for _ in range(4)]
     assert [step[0] for step in axes.steps] == [math.pi, -math.pi, math.pi, -math.pi]
     assert [(row.roll, row.spin) for row in done] == [(roll, 0.0) for roll, *_ in axes.steps]
+    rolled = Axes()
+    SupervisedDriver(rolled, PHANTOM, math.pi).apply(Control(flip=True), 0.2)
+    assert rolled.steps[0][0] == -math.pi
 
 
-def test_a_needle_that_begins_rolled_over_rolls_back():
-    axes = Axes()
-    SupervisedDriver(axes, PHANTOM, math.pi).apply(Control(flip=True), 0.2)
-    assert axes.steps[0][0] == -math.pi
-
-
-def test_a_half_turn_that_was_interrupted_ends_the_insertion():
+def test_a_half_turn_that_was_interrupted_ends_the_insertion_unless_it_did_not_begin():
     driver = SupervisedDriver(Axes(-1.0), PHANTOM, 0.0)
     with pytest.raises(DriverError, match=r"interrupted at 122\.7° of 180°: the bevel is not known"):
         driver.apply(Control(flip=True), 0.2)
-
-
-def test_a_half_turn_that_did_not_begin_is_none():
-    assert SupervisedDriver(Axes(-math.pi), PHANTOM, 0.0).apply(Control(flip=True), 0.2).control.roll == 0.0
+    none = SupervisedDriver(Axes(-math.pi), PHANTOM, 0.0).apply(Control(flip=True), 0.2)
+    assert none.control.roll == 0.0
 
 
 @pytest.mark.parametrize(
@@ -170,7 +162,9 @@ class Resting:
     status = "ok"
 
     def __init__(self, tips=((-28.5, 0.0, 0.0),), **positions):
-        self.rig = load_rig("emulated")
+        emulated = load_rig("emulated")
+        quick = emulated.loop.model_copy(update={"decision_ms": 70.0})
+        self.rig = emulated.model_copy(update={"loop": quick})
         self.positions = {name: 0.0 for name, _ in self.rig.axes.items()} | positions
         self.tips, self.calls = list(tips), []
 
@@ -202,35 +196,24 @@ class Resting:
         return 0.0
 
 
-def opened_rig(rest, scenario, plan, dry_run=False, stream=None):
-    return SupervisedRig(rest.rig, dry_run=dry_run).open(scenario, plan, 0, stream or Stream())
-
-
 @pytest.fixture
 def opened(monkeypatch):
-    """Return a function that opens a rig at rest for a plan 40 mm deep; return what was done, asked included."""
+    """Return a function that opens a rig at rest for a plan 40 mm deep and returns the calls, "asked" included."""
 
     def open_rig(rest, dry=False, scenario=PHANTOM):
         monkeypatch.setattr("flexneedle.lab.rig.supervised.SupervisorClient", rest)
         plan, gate = make_plan("manipulation", (40.0, 5.0, 0.0), 0), Gate()
         gate.confirm = lambda _supervisor: rest.calls.append("asked")
-        with opened_rig(rest, scenario, plan, dry_run=dry, stream=Stream(gate=gate)):
-            pass
+        with SupervisedRig(rest.rig, dry_run=dry).open(scenario, plan, 0, Stream(gate=gate)) as ports:
+            if not dry:
+                assert ports.expect == ports.driver.expect
+            assert ports.deadline == (None if dry else pytest.approx(0.07))
         return rest.calls
 
     return open_rig
 
 
-def test_the_loop_has_the_time_of_a_decision_and_tells_where_the_tip_will_be(monkeypatch):
-    rest = Resting()
-    rest.rig = rest.rig.model_copy(update={"loop": rest.rig.loop.model_copy(update={"decision_ms": 70.0})})
-    monkeypatch.setattr("flexneedle.lab.rig.supervised.SupervisorClient", rest)
-    with opened_rig(rest, PHANTOM, make_plan("manipulation", (40.0, 5.0, 0.0), 0)) as ports:
-        assert ports.deadline == pytest.approx(0.07)
-        assert ports.expect == ports.driver.expect
-
-
-def test_the_tip_is_measured_anew_after_the_confirmation(opened):
+def test_the_tip_is_measured_again_after_the_confirmation(opened):
     rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
     assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]
 
@@ -247,44 +230,23 @@ def test_the_needle_rolls_at_the_scenarios_speed(opened):
 @pytest.mark.parametrize(
     ("rest", "line"),
     [
-        (
-            Resting(insertion=39.6),  # 110 mm less 40 mm + 2 mm + 28.5 mm are 39.5 mm
-            "insertion: at 39.6 mm, 70.4 mm to the high end of range_mm (110): the advance to guard.past_target_mm "
-            "= 2 past the target is 70.5 mm",
-        ),
-        (
-            Resting(insertion=39.0, tips=[(-29.3, 0.0, 0.0)]),  # the tip is further behind
-            "insertion: at 39 mm, 71 mm to the high end of range_mm (110): the advance to guard.past_target_mm "
-            "= 2 past the target is 71.3 mm",
-        ),
-        (
-            Resting(guide_y=-0.5),
-            "guide_y: at -0.5 mm, 14.5 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to "
-            "either side; jog it to 0 mm",
-        ),
-        (
-            Resting(rotation=math.radians(1090)),
-            "rotation: at 1090 deg: beyond the soft limits, -1080 to 1080 deg: jog it back",
-        ),
-        (
-            Resting(tips=[(-20.0, 0.0, 0.0)]),
-            "tip = -20.0, 0.0, 0.0 mm: must be within 5.6 mm of the scenario's start, -28.5, 0.0, 0.0 mm "
-            "(setup.tip_to_skin_mm): retract the needle, jog the guide, or check the registration",
-        ),
+        # 110 mm less 40 mm + 2 mm + 28.5 mm are 39.5 mm.
+        (Resting(insertion=39.6), "insertion: at 39.6 mm, 70.4 mm to the high end of range_mm (110)"),
+        (Resting(insertion=39.0, tips=[(-29.3, 0.0, 0.0)]), "insertion: at 39 mm, 71 mm to the high end"),
+        (Resting(guide_y=-0.5), "guide_y: at -0.5 mm, 14.5 mm to the low end of range_mm (-15)"),
+        (Resting(rotation=math.radians(1090)), "rotation: at 1090 deg: beyond the soft limits"),
+        (Resting(tips=[(-20.0, 0.0, 0.0)]), "tip = -20.0, 0.0, 0.0 mm: must be within 5.6 mm"),
     ],
 )
-def test_an_insertion_that_has_no_room_is_refused_before_anybody_is_asked(opened, rest, line):
+def test_an_insertion_without_room_is_refused_before_anybody_is_asked(opened, rest, line):
     with pytest.raises(RigError) as caught:
         opened(rest)
-    assert str(caught.value) == line
+    assert str(caught.value).startswith(line)
     assert rest.calls == ["read", "closed"]
 
 
-def test_an_insertion_that_just_has_room_begins(opened):
+def test_an_insertion_that_just_has_room_begins_unless_the_room_is_lost_during_the_question(opened):
     assert ("armed", 70.5) in opened(Resting(insertion=39.5))
-
-
-def test_room_that_is_lost_during_the_question_is_refused(opened):
     rest = Resting(insertion=39.5, tips=[(-28.5, 0.0, 0.0), (-29.0, 0.0, 0.0)])
     with pytest.raises(RigError, match=r"the target is 71 mm"):
         opened(rest)
@@ -376,18 +338,6 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     assert math.dist(found.tips[-1, :3], done.target) < 0.3
     assert done.periods[-1].true_tip is None
     assert np.mean([period.innovation[0] for period in done.periods]) == pytest.approx(0.0, abs=0.03)
-
-
-def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.chdir(Path(__file__).parents[2])  # where ros_rig is
-    path, notes = tmp_path / "rig.toml", tmp_path / "notes"
-    devices = {"driver": {"kind": "ros_rig:motors", "notes": str(notes)}, "tracker": {"kind": "ros_rig:Tip"}}
-    path.write_text(tomli_w.dumps(RIG | devices))
-    scenario = PHANTOM.with_values({"setup.tip_to_skin_mm": PHANTOM.setup.tip_to_skin_mm + 9.0})
-    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 4)
-    with pytest.raises(RigError, match=r"tip = -28\.\d.* must be within"):
-        flexneedle.insert(scenario, plan, 0, rig=SupervisedRig(path))
-    assert {json.loads(line)[0] for line in notes.read_text().splitlines()} <= {"stop", "close"}
 
 
 def test_a_listener_that_fails_keeps_no_event_from_the_others():

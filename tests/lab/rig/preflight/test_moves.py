@@ -1,4 +1,4 @@
-"""What an operator may command: within the soft limits, in the units of the axis."""
+"""Motions of an operator: within the soft limits, in the units of the axis."""
 
 import math
 
@@ -40,50 +40,42 @@ def test_a_jog_ends_at_the_distance_from_the_start(name, distance, position, goa
 @pytest.mark.parametrize(
     ("name", "distance", "position", "line"),
     [
-        (
-            "insertion",
-            "110.01",
-            10.0,
-            "insertion to 120.01 mm: beyond the soft limits, 0 to 120 mm; it is at 10 mm",
-        ),
+        ("insertion", "110.01", 10.0, "insertion to 120.01 mm: beyond the soft limits, 0 to 120 mm"),
         ("insertion", "-10.01", 10.0, "insertion to -0.01 mm: beyond the soft limits"),
-        ("insertion", "-1", -5.0, "insertion to -6 mm: beyond the soft limits, 0 to 120 mm; it is at -5 mm"),
+        ("insertion", "-1", -5.0, "insertion to -6 mm: beyond the soft limits"),
         ("insertion", "150", -5.0, "insertion to 145 mm: beyond the soft limits"),
         ("rotation", "191deg", 0.0, "rotation to 191 deg: beyond the soft limits, -10 to 190 deg"),
         ("insertion", "5deg", 0.0, "distance '5deg': the unit of insertion is mm"),
-        ("rotation", "5mm", 0.0, "distance '5mm': the unit of rotation is deg"),
         ("rotation", "1rad", 0.0, "distance '1rad': the unit of rotation is deg"),
-        ("insertion", "five", 0.0, "distance 'five': must be a number, such as 5 or -5mm"),
+        ("insertion", "five", 0.0, "distance 'five': must be a number"),
         ("insertion", "1e999", 0.0, "distance '1e999': must be a number"),
         ("insertion", "nan", 0.0, "distance 'nan': must be a number"),
-        ("insertion", "0", 0.0, "distance '0': must be at least one count of insertion"),
         ("insertion", "0.0009", 0.0, "distance '0.0009': must be at least one count of insertion"),
         ("guide_z", "1", 0.0, "axis 'guide_z': must be one of insertion, rotation, guide_y"),
         ("insertion", "1", math.nan, "insertion: its position is not a number"),
     ],
 )
-def test_another_jog_is_refused(name, distance, position, line):
+def test_a_jog_beyond_a_limit_or_in_another_unit_is_refused(name, distance, position, line):
     with pytest.raises(InputError) as caught:
         plan_jog(RIG, name, distance, position)
     assert str(caught.value).startswith(line)
 
 
-@pytest.mark.parametrize(
-    ("name", "speed", "taken"),
-    [("insertion", 10.0, 10.0), ("insertion", 0.5, 0.5), ("rotation", 90.0, math.pi / 2)],
-)
-def test_a_jog_is_as_fast_as_asked(name, speed, taken):
-    assert plan_jog(RIG, name, "5", 0.0, speed).speed == pytest.approx(taken)
-
-
-@pytest.mark.parametrize("speed", [10.01, 0.0, -1.0, math.nan])
-def test_a_jog_faster_than_the_axis_is_refused(speed):
-    with pytest.raises(InputError, match="must be above 0 and at most 10, speed_mm_s of insertion"):
-        plan_jog(RIG, "insertion", "5", 0.0, speed)
+def test_speeds_are_in_the_unit_of_the_axis_and_at_most_its_own():
+    for name, speed, expected in (("insertion", 10.0, 10.0), ("rotation", 90.0, math.pi / 2)):
+        assert plan_jog(RIG, name, "5", 0.0, speed).speed == pytest.approx(expected)
+    assert plan_retraction(RIG, 30.0, None, 0.5).speed == 0.5
+    for speed in (10.01, 0.0, -1.0, math.nan):
+        for plan in (
+            lambda speed: plan_jog(RIG, "insertion", "5", 0.0, speed),
+            lambda speed: plan_retraction(RIG, 30.0, None, speed),
+        ):
+            with pytest.raises(InputError, match="must be above 0 and at most 10, speed_mm_s of insertion"):
+                plan(speed)
 
 
 @given(st.floats(-200, 200), st.floats(-300, 300))
-def test_no_jog_goes_further_beyond_the_limits_than_it_is(position, distance):
+def test_no_jog_moves_further_beyond_the_limits(position, distance):
     try:
         move = plan_jog(RIG, "insertion", repr(distance), position)
     except InputError:
@@ -92,34 +84,24 @@ def test_no_jog_goes_further_beyond_the_limits_than_it_is(position, distance):
     assert outside[1] <= outside[0] + 1e-6
 
 
-@pytest.mark.parametrize(("to", "goal"), [(None, 2.4), (10.0, 10.0), (0.2, 0.2), (29.9, 29.9)])
-def test_a_retraction_goes_back_at_the_speed_of_a_jog(to, goal):
-    move = plan_retraction(RIG, 30.0, to)
-    assert (move.name, move.start, move.goal, move.speed) == ("insertion", 30.0, goal, 2.0)
-    assert move.speed == plan_jog(RIG, "insertion", "1", 30.0).speed
-    assert plan_retraction(RIG, 30.0, to, 0.5).speed == 0.5
-
-
-def test_a_retraction_faster_than_the_axis_is_refused():
-    with pytest.raises(InputError, match="speed 11: must be above 0 and at most 10, speed_mm_s of insertion"):
-        plan_retraction(RIG, 30.0, None, 11.0)
-
-
 @pytest.mark.parametrize(
-    ("changes", "goal"),
+    ("changes", "to", "goal"),
     [
-        ({}, 2.4),  # where homing leaves the base: 2 % of the range
-        ({"home_mm": -3.0}, 2.4),
-        ({"home": "here"}, 0.0),
-        ({"home": "absolute"}, 0.0),
-        ({"home": "forward-limit", "home_mm": 120.0}, 0.0),
-        ({"home": "forward-limit", "direction": -1}, 2.4),
+        ({}, None, 2.4),  # where homing leaves the base: 2 % of the range
+        ({}, 10.0, 10.0),
+        ({}, 0.2, 0.2),
+        ({"home_mm": -3.0}, None, 2.4),
+        ({"home": "here"}, None, 0.0),
+        ({"home": "absolute"}, None, 0.0),
+        ({"home": "forward-limit", "home_mm": 120.0}, None, 0.0),
+        ({"home": "forward-limit", "direction": -1}, None, 2.4),
     ],
-    ids=str,
 )
-def test_a_retraction_ends_off_the_switch_behind_the_base_or_at_its_lowest_position(changes, goal):
-    found = rig(**{f"axes__insertion__{key}": value for key, value in changes.items()})
-    assert plan_retraction(found, 30.0).goal == pytest.approx(goal)
+def test_a_retraction_ends_off_the_switch_behind_the_base_or_at_its_lowest_position(changes, to, goal):
+    made = rig(**{f"axes__insertion__{key}": value for key, value in changes.items()})
+    move = plan_retraction(made, 30.0, to)
+    assert (move.name, move.start, move.goal, move.speed) == ("insertion", 30.0, pytest.approx(goal), 2.0)
+    assert plan_retraction(made, goal, None) is None or to is not None
 
 
 @given(home=st.floats(-20.0, 0.0), most=st.none() | st.floats(0.1, 5.0), to=st.none() | st.floats(-1.0, 30.0))
@@ -137,62 +119,37 @@ def test_no_retraction_ends_where_the_base_may_be_at_the_switch(home, most, to):
     ("to", "line"),
     [
         (30.0, "to 30 mm: must be below 30 mm, where the insertion axis is: it only retracts"),
-        (31.0, "to 31 mm: must be below 30 mm, where the insertion axis is: it only retracts"),
-        (-1.0, "insertion to -1 mm: beyond the soft limits, 0 to 120 mm; it is at 30 mm"),
-        (
-            0.19,
-            "to 0.19 mm: must be at least 0.2 mm: the reverse limit switch is at 0 mm, and max_error_mm is 0.2",
-        ),
+        (31.0, "to 31 mm: must be below 30 mm"),
+        (-1.0, "insertion to -1 mm: beyond the soft limits"),
+        (0.19, "to 0.19 mm: must be at least 0.2 mm: the reverse limit switch is at 0 mm"),
         (math.inf, "insertion: its position is not a number"),
     ],
 )
-def test_a_retraction_never_goes_forwards_or_beyond(to, line):
+def test_a_retraction_never_moves_forwards_or_beyond_a_limit(to, line):
     with pytest.raises(InputError) as caught:
         plan_retraction(RIG, 30.0, to)
-    assert str(caught.value) == line
+    assert str(caught.value).startswith(line)
 
 
-def test_axes_are_homed_in_the_order_of_the_file():
-    assert [homing.name for homing in plan_homings(RIG, ["rotation", "insertion"])] == [
-        "insertion",
-        "rotation",
-    ]
-    assert [homing.name for homing in plan_homings(RIG, [])] == [
-        "insertion",
-        "rotation",
-    ]  # guide_y is absolute
-
-
-def test_an_absolute_encoder_is_not_homed():
-    with pytest.raises(InputError, match='axis guide_y: has home = "absolute": its encoder needs no homing'):
+def test_axes_without_absolute_encoders_are_homed_in_the_order_of_the_file():
+    for names in (["rotation", "insertion"], []):
+        assert [homing.name for homing in plan_homings(RIG, names)] == ["insertion", "rotation"]
+    with pytest.raises(InputError, match='axis guide_y: has home = "absolute"'):
         plan_homings(RIG, ["guide_y"])
     with pytest.raises(InputError, match="axis 'guide_x': must be one of insertion, rotation, guide_y"):
         plan_homings(RIG, ["guide_x"])
 
 
-def test_what_would_move_is_a_line():
+def test_a_motion_is_described_in_one_line_with_its_uncertainty():
     turned = rig(axes__insertion__direction=-1, axes__insertion__home_mm=121.5)
-    lines = [str(homing) for homing in (*plan_homings(RIG, []), *plan_homings(turned, ["insertion"]))]
-    assert lines == [
-        "insertion: in its negative direction to the reverse limit switch, by at most 132 mm at 1 mm/s; "
-        "the position there is called 0 mm; then in its positive direction by 2.4 mm at 1 mm/s, off the switch to "
-        "2.4 mm. If the switch is active now, first in its positive direction by 2.4 mm at 1 mm/s",
-        "rotation: stays where it is, and its position is called 0 deg",
+    assert str(plan_homings(turned, ["insertion"])[0]) == (
         "insertion: in its positive direction to the reverse limit switch, by at most 133.5 mm at 1 mm/s; "
         "the position there is called 121.5 mm; then in its negative direction by 3.9 mm at 1 mm/s, off the switch to "
-        "117.6 mm. If the switch is active now, first in its negative direction by 3.9 mm at 1 mm/s",
-    ]
-    assert (
-        str(plan_jog(RIG, "rotation", "90", 0.0))
-        == "rotation: from 0 to 90 deg (90 deg), at most at 72 deg/s"
+        "117.6 mm. If the switch is active now, first in its negative direction by 3.9 mm at 1 mm/s"
     )
-    assert plan_retraction(RIG, 2.4) is plan_retraction(RIG, 0.0) is plan_retraction(RIG, -0.5) is None, (
-        "it is there"
+    assert str(plan_homings(RIG, ["rotation"])[0]) == (
+        "rotation: stays where it is, and its position is called 0 deg"
     )
-    assert str(plan_retraction(RIG, 30.0)) == "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s"
-
-
-def test_a_start_that_is_uncertain_by_backlash_is_said_so():
     loose = rig(axes__insertion__backlash_mm=0.1, axes__rotation__backlash_deg=0.9)
     assert str(plan_jog(loose, "insertion", "5", 10.0)) == (
         "insertion: from 10 to 15 mm (5 mm), at most at 2 mm/s; the start is uncertain by 0.05 mm "
