@@ -71,7 +71,7 @@ class Hand:
 
 @dataclass
 class Motor:
-    """A motor with a trapezoid of its own, in steps of 1 ms. fault: what it does in place of its command."""
+    """A motor with its own trapezoid, in steps of 1 ms. fault: what it does instead of its command."""
 
     position: float = 0.0
     commanded: float = 0.0
@@ -99,7 +99,7 @@ class Motor:
         self.commanded += moved
         if self.lag:
             moved = (self.commanded - self.position) * -math.expm1(-seconds / self.lag)
-        if self.fault == "runaway":  # the controller's own profile goes on, and so does the motor
+        if self.fault == "runaway":  # the controller's own profile continues, and the motor with it
             self.target = self.commanded + 1e6
         self.position += {"stall": 0.0, "reversed": -moved, "overshoot": 1.2 * moved}.get(self.fault, moved)
         outwards = (self.position < self.low and moved < 0) or (self.position > self.high and moved > 0)

@@ -38,7 +38,7 @@ def test_the_page_has_its_files():
 
 
 def test_an_installed_package_is_used_by_the_names_of_the_page(folder, capsys, monkeypatch):
-    """Its entry points are those of the page's pyproject.toml."""
+    """Its entry points are in the pyproject.toml of the page."""
     project = tomllib.loads(FILES["pyproject.toml"])["project"]
     installed = folder / "site" / f"{project['name']}-{project['version']}.dist-info"
     installed.mkdir(parents=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import ARMS, add_strategy, confirm_motions, print_json
@@ -18,49 +18,14 @@ if TYPE_CHECKING:
     from flexneedle.lab.rig.preflight.check import Finding, IntendedInsertion
     from flexneedle.lab.rig.preflight.moves import AxisHoming, AxisMove
     from flexneedle.lab.rig.rig_file import RigFile
+    from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
 _SECONDS = 2.0
 _FALLS = "A vertical axis falls unless something holds it: support it first."
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
-class RigOperator(Protocol):
-    """The supervisor of a rig, for an operator's motions; each call returns when the motion has ended.
-
-    Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
-    """
-
-    def arm(self) -> str:
-        """Switch the motors on; return what else has changed, or ""."""
-        ...
-
-    @property
-    def positions(self) -> Mapping[str, float]:
-        """Positions of the axes (mm or rad) by name."""
-        ...
-
-    def move_to(self, axis: str, position: float, speed: float) -> object:
-        """Move an axis to a position (mm or rad), at most at a speed (mm/s or rad/s)."""
-        ...
-
-    def home(self, axis: str) -> object:
-        """Find the home of an axis."""
-        ...
-
-    def retract(self, position: float, speed: float) -> object:
-        """Withdraw the base to a position of the insertion axis (mm), at most at a speed (mm/s)."""
-        ...
-
-    def off(self) -> None:
-        """Switch the motors off."""
-        ...
-
-    def stop(self) -> None:
-        """Stop all axes."""
-        ...
-
-
-def open_supervisor(rig: RigFile) -> AbstractContextManager[RigOperator]:
+def open_supervisor(rig: RigFile) -> SupervisorClient:
     """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
@@ -287,7 +252,7 @@ def _home(args: argparse.Namespace) -> int:
         print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
         return 0
 
-    def home(operator: RigOperator) -> None:
+    def home(operator: SupervisorClient) -> None:
         for number, homing in enumerate(chosen):
             if number > 0:
                 _arm(operator)
@@ -348,7 +313,7 @@ def _confirm_and_move(
     rig: RigFile,
     moves: Sequence[AxisMove | AxisHoming],
     yes: bool,
-    command: Callable[[RigOperator], object],
+    command: Callable[[SupervisorClient], object],
     *notes: str,
 ) -> int:
     """Print the motions, command them once they are confirmed, and return the exit status."""
@@ -365,14 +330,14 @@ def _confirm_and_move(
     return 0
 
 
-def _arm(operator: RigOperator) -> None:
+def _arm(operator: SupervisorClient) -> None:
     """Switch the motors on, and print what else has changed."""
     if changed := operator.arm():
         print(f"flexneedle: {changed}", file=sys.stderr)
 
 
 @contextmanager
-def _stop_on_error(operator: RigOperator) -> Iterator[None]:
+def _stop_on_error(operator: SupervisorClient) -> Iterator[None]:
     """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
     from flexneedle.interrupts import uninterrupted
 

@@ -16,7 +16,7 @@ LINEAR_AXES = ("insertion", "guide_y", "guide_z", "base_y", "base_z")
 """Axes with a length: advance of the base, lateral offsets of guide and base."""
 
 _TOLERATED_COUNTS = 3.0
-_LAG_S = 0.04  # of an axis at its largest speed: several times that of a healthy servo
+_LAG_S = 0.04  # of an axis at its largest speed: several times the lag of a healthy servo
 _TOLERANCES = 4.0  # that the largest error has at least
 _ROUNDING = 1e-9
 _SWITCH = "the {} switch is at the {} end of range_{}, or beyond"

@@ -283,7 +283,7 @@ class SupervisedRig:
             stream.send(Tick(found))
 
         with SupervisorClient(task, report) as supervisor:
-            # What cannot begin is refused before anybody is asked.
+            # An insertion without room is refused before anybody is asked.
             check_room(supervisor, scenario, plan, dry=self.dry_run)
             stream.gate.confirm(supervisor)
             supervisor.arm(check_room(supervisor, scenario, plan, dry=self.dry_run))

@@ -1,4 +1,4 @@
-"""How fast axes are: what `rig check` prints is what the supervisor's motions do."""
+"""Speeds that `rig check` prints, compared with motions of the supervisor."""
 
 import pytest
 

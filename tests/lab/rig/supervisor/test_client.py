@@ -10,7 +10,7 @@ import pytest
 from flexneedle.errors import DriverError, RefusedError
 from flexneedle.geometry.registration import identity
 from flexneedle.lab.process import MessageChannel
-from flexneedle.lab.rig.supervisor import client, protocol
+from flexneedle.lab.rig.supervisor import connection, protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -78,8 +78,8 @@ class ScriptedProcess:
 
 @pytest.fixture(autouse=True)
 def scripted(monkeypatch):
-    monkeypatch.setattr(client, "ChildProcess", ScriptedProcess)
-    monkeypatch.setattr(client, "_SILENT_S", 600.0)  # it reports only when it is asked
+    monkeypatch.setattr(connection, "ChildProcess", ScriptedProcess)
+    monkeypatch.setattr(connection, "_SILENT_S", 600.0)  # it reports only when it is asked
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ def powered(bench):
 def test_arming_holds_a_motor_where_it_is_if_it_rests_away_from_its_commanded_position():
     bench = Bench()
     bench.stage.motors["C"].position = -200.0  # 0.4 mm, limit 0.2 mm
-    bench.stage.motors["A"].position = 39.0  # 0.039 mm: a servo may be off by that, and goes on holding
+    bench.stage.motors["A"].position = 39.0  # 0.039 mm: a servo may be off by that
     bench.tick(2)
     bench.armed()
     assert powered(bench) == [("A", True), ("B", True), ("C", False), ("C", True)]

@@ -18,7 +18,7 @@ def bench():
 
 
 def test_a_step_moves_all_axes_together_within_its_time_and_reports_the_travel(bench):
-    """Begin and end are those of the motion at constant speed between the ramps, not of ticks."""
+    """Begin and end are of the motion at constant speed between the ramps, not of ticks."""
     bench.step(insertion=1.0, guide_y=-0.3)
     done = bench.until(1)
     assert (done.why, done.state) == ("", SupervisorState.INSERTING)

@@ -43,6 +43,7 @@ def replace_motor(channel, **changes):
         (replace_motor("C", position=200.0), "guide_y: the motor does not follow: 0.400 mm"),
         (replace_motor("C", position=math.nan), "guide_y: the motor controller reports position nan"),
         (lambda stage: stage.define("A", 0.0), "insertion: the position went back by 0."),
+        (lambda stage: stage.define("C", 2000.0), "guide_y: the position jumped by 4.000 mm in 0.025 s"),
         (lambda stage: setattr(stage, "refuses", True), "PAA=5: ? 22 Begin not possible"),
         (lambda stage: setattr(stage, "lost", True), "no reply within 100 ms"),
         (lambda stage: stage.motors.pop("C"), "the driver reports no state of channel C"),
@@ -97,12 +98,15 @@ def test_a_motor_that_runs_past_its_target_with_its_controller_is_a_fault(bench)
 
 
 def test_a_motor_beyond_its_range_is_a_fault():
-    bench = Bench().armed(deepest=1e6)
-    bench.move("insertion", 110.0, 10.0)
-    bench.tick(100)
-    bench.stage.motors["A"].commanded = bench.stage.motors["A"].position = 110_250.0
+    bench = Bench()
+    bench.place("A", 109_900.0)
+    bench.tick()
+    bench.armed().move("insertion", 110.0)
+    bench.tick()
+    bench.place("A", 110_250.0)
     bench.tick()
     assert bench.state is SupervisorState.FAULT
+    assert bench.why.startswith("insertion: at 110.250 mm, beyond its range")
 
 
 def test_an_axis_that_moves_without_a_command_is_a_fault(bench):

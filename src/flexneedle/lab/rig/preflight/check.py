@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
-from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, room_problems
+from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, limits_problem, room_problems
 from flexneedle.lab.rig.preflight.moves import describe_uncertainty
 from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
 from flexneedle.lab.rig.rig_axes import Axis
@@ -217,12 +217,8 @@ def _format_position(axis: Axis, counts: float) -> str:
 
 
 def _limit_problem(axis: Axis, counts: float) -> str:
-    position, (low, high) = counts / axis.scale, axis.limits
-    if not isfinite(position):
-        return "is not a number"
-    if low - axis.uncertainty <= position <= high + axis.uncertainty:
-        return ""
-    return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+    position = counts / axis.scale
+    return limits_problem(axis, position) if isfinite(position) else "is not a number"
 
 
 def _format_switches(state: MotorState) -> str:

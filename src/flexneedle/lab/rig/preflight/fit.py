@@ -92,9 +92,13 @@ def start_problems(
 
     Such an axis is beyond its soft limits (positions: mm or rad), or has no room.
     """
-    outside = [(name, _outside_problem(axis, positions[name])) for name, axis in rig.axes.items()]
+    outside = [
+        (name, f"at {axis.shown(positions[name])} {axis.unit}: {problem}: jog it back")
+        for name, axis in rig.axes.items()
+        if (problem := limits_problem(axis, positions[name]))
+    ]
     found = [*outside, *_room_problems(rig, axis_needs(scenario, strategy, advance), positions)]
-    return [f"{name}: {line}" for name, line in found if line]
+    return [f"{name}: {line}" for name, line in found]
 
 
 def _room_problems(
@@ -109,12 +113,12 @@ def _room_problems(
     ]
 
 
-def _outside_problem(axis: Axis, position: float) -> str:
+def limits_problem(axis: Axis, position: float) -> str:
+    """Return the problem of a position (mm or rad) beyond the soft limits of an axis, or ""."""
     low, high = axis.limits
     if low - axis.uncertainty <= position <= high + axis.uncertainty:
         return ""
-    limits = f"{axis.shown(low)} to {axis.shown(high)} {axis.unit}"
-    return f"at {axis.shown(position)} {axis.unit}: beyond the soft limits, {limits}: jog it back"
+    return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
 
 
 def describe_queues(rig: RigFile) -> list[tuple[str, str]]:
@@ -268,8 +272,6 @@ def check_start(scenario: Scenario, tip: Point | None) -> Point:
     """Return the measured tip if it is at the scenario's start, so that nothing moves from an unexpected position.
 
     It may differ from the start by the limit of a first reading's innovation. Raises RigError.
-
-    It may be as far from there as the first reading may be from its prediction. Raises RigError.
     """
     control, x = scenario.control, scenario.setup.start_tip_x
     at = scenario.entry.lateral(x)
@@ -293,9 +295,8 @@ def _format_point(point: Point) -> str:
 def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> float:
     """Return the advance (mm) of the base at the deepest position that the guard allows, for a straight needle.
 
-    target: its depth (mm), which the needle may pass by guard.past_target_mm.
-
-    tip: its measured depth at the start (mm); None: three standard deviations behind the scenario's.
+    target: depth (mm) of the target, which the needle may pass by guard.past_target_mm; tip: measured depth of the tip
+    at the start (mm); None: three standard deviations behind the start of the scenario.
     """
     start = scenario.setup.start_tip_x - _SDS * scenario.control.start_axial_sd_mm if tip is None else tip
     return (target + scenario.guard.past_target_mm - start) * axis_stretch(scenario.entry.slope)

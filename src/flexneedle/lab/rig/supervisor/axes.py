@@ -8,6 +8,7 @@ from math import isfinite
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import (
+    Inspection,
     active_switches,
     is_at_home,
     is_at_rest,
@@ -15,7 +16,7 @@ from flexneedle.lab.rig.supervisor.checks import (
     is_misplaced,
 )
 from flexneedle.lab.rig.supervisor.drives import Drive, MotorReading
-from flexneedle.lab.rig.supervisor.motion import Leg, make_leg
+from flexneedle.lab.rig.supervisor.motion import CommandedMotion, Leg, make_leg
 from flexneedle.lab.rig.supervisor.protocol import AxisState
 from flexneedle.ports import Clock, MotorPaces, Motors, MotorState
 
@@ -63,7 +64,7 @@ class RigAxes:
     @property
     def positions(self) -> dict[str, float]:
         """Measured positions (mm or rad) by axis."""
-        return positions_of(self.drives, self.states)
+        return {name: drive.to_position(self.state(drive).position) for name, drive in self.drives.items()}
 
     @property
     def slowing(self) -> float:
@@ -89,6 +90,11 @@ class RigAxes:
     def is_at_switch(self, drive: Drive) -> bool:
         """Return whether the limit switch of an axis's home is active; the axis may not be at rest yet."""
         return is_at_switch(drive, self.state(drive))
+
+    def first_problem(self, motion: CommandedMotion | None, *, stopping: bool) -> str:
+        """Return the problem of the first axis that has one at this tick, or ""."""
+        inspection = Inspection(motion, self.goals, stopping, self.newest, self.before, self.switches)
+        return inspection.first_problem(self.drives)
 
     def goal(self, name: str) -> float:
         """Return the last goal of an axis, or its position when it was last stopped (mm or rad)."""
@@ -239,8 +245,3 @@ class RigAxes:
         except DriverError:
             self.lost = True
             raise
-
-
-def positions_of(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> dict[str, float]:
-    """Return the measured positions (mm or rad) by axis."""
-    return {name: drive.to_position(states[drive.axis.channel].position) for name, drive in drives.items()}

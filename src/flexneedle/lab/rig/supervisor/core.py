@@ -1,8 +1,8 @@
-"""The supervisor without its process: it acts on requests and ticks, with motors and tracker.
+"""The supervisor without its process: requests and ticks move the motors of a rig.
 
-Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Motors get targets at most
-the queue of `loop` ahead, so that they stop by themselves where ticks end. Nothing here waits but for replies of the
-devices, each at most its reply timeout.
+Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Targets are at most the
+queue of `loop` ahead, so that motors stop if the ticks end. Nothing waits, except for a reply of a device, at most its
+timeout.
 """
 
 from collections.abc import Callable
@@ -11,32 +11,21 @@ from typing import Any
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.axes import RigAxes
-from flexneedle.lab.rig.supervisor.checks import (
-    Inspection,
-    resting_switch_problem,
-    stuck_problem,
-    switch_problem,
-)
+from flexneedle.lab.rig.supervisor.checks import stuck_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
+from flexneedle.lab.rig.supervisor.homing import end_leaving_switch, leave_switch, make_homing
 from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
 from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
-from flexneedle.lab.rig.supervisor.requests import (
-    RequestRules,
-    back_off_leg,
-    make_homing,
-    make_move,
-    make_step,
-    range_problem,
-)
+from flexneedle.lab.rig.supervisor.requests import RequestRules, make_move, make_step, start_problem
 from flexneedle.lab.rig.supervisor.watch import TrackedTip
 from flexneedle.ports import Clock, Motors, Tracker
 
 HEARTBEAT_S = 0.5
 """Longest time (s) without a message of the client during a motion."""
 
-_STALL_S = 0.5  # without a tick, after which a motion under way is not taken up again
+_STALL_S = 0.5  # longest time without a tick after which a motion continues
 _UNCHECKED = frozenset({SupervisorState.IDLE, SupervisorState.STOPPED, SupervisorState.FAULT})
-"""States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
+"""States in which motors may be off, or have been stopped: only a motion is a problem."""
 
 
 class Supervisor:
@@ -123,16 +112,14 @@ class Supervisor:
         return RequestRules(drives, {name: self._axes.goal(name) for name in drives}, self._deepest)
 
     def _arm(self, deepest: float) -> None:
-        if not self._allow(RigEvent.ARM):
-            return
-        if not self._accept(self._start_problem):  # as it most often is, before any motor is switched on
+        if not self._allow(RigEvent.ARM) or not self._accept(self._start_problem):
             return
         try:
             changed = self._axes.power_on()
         except DriverError as error:
             self._handle_lost_motors(str(error))
             return
-        if not self._accept(self._start_problem):
+        if not self._accept(self._start_problem):  # once more: motors may have moved as they were switched on
             return
         self._axes.take_positions()
         self._deepest = self._axes.positions["insertion"] + deepest
@@ -140,13 +127,8 @@ class Supervisor:
 
     @property
     def _start_problem(self) -> str:
-        """A problem with where an axis rests as an insertion begins, or ""; an operator may move it back."""
-        if not self._task.tracked:
-            return ""
-        axes = self._axes
-        problems = [range_problem(axes.drives, list(axes.positions.items()), resting=True)]
-        problems += [resting_switch_problem(drive, axes.state(drive)) for drive in axes.drives.values()]
-        return next((f"arm: refused: {problem}" for problem in problems if problem), "")
+        """Problem of an insertion from where the axes rest, or ""; an operator may move them back."""
+        return start_problem(self._axes.drives, self._axes.states) if self._task.tracked else ""
 
     def _power_off(self) -> None:
         if not self._allow(RigEvent.OFF):
@@ -165,9 +147,9 @@ class Supervisor:
             return
         if not self._accept(self._rules.step_problem(step), step.number):
             return
-        if step.expected is not None:  # until the travel begins the tip is where it is
+        if step.expected is not None:  # until the travel begins the tip rests
             self._tip.expect_start(step.expected, self._clock.now())
-        if not self._tip.verdict.ok:  # still, or again: nothing moves
+        if not self._tip.verdict.ok:
             self._report_nothing_done(step.number)
             return
         self._begin(RigEvent.STEP, make_step(step))
@@ -265,9 +247,7 @@ class Supervisor:
         if self.state in _UNCHECKED:
             self._check_rest()
             return
-        stopping = self._stopping is not None
-        inspection = Inspection(self._motion, axes.goals, stopping, axes.newest, axes.before, axes.switches)
-        if problem := inspection.first_problem(axes.drives):
+        if problem := axes.first_problem(self._motion, stopping=self._stopping is not None):
             self._enter_fault(problem)
 
     def _check_rest(self) -> None:
@@ -348,15 +328,18 @@ class Supervisor:
         axes = self._axes
         leg.record_progress(axes.states, axes.newest.time)
         if motion.home is not None and axes.is_at_home(motion.home):
-            self._leave_switch(motion, motion.home)
+            axes.settle(motion.home)
+            leave_switch(motion, motion.home, axes.home_offset(motion.home))
             self._begin_next_leg(now)
         elif leg.has_arrived(axes.states, now) and self._can_define_home(motion):
             if motion.home is not None:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
             motion.spans.append(leg.span(now, done=True))
             axes.keep_goal(leg)
-            if motion.released is not None:
-                self._end_leaving_switch(motion, motion.released)
+            if (drive := motion.released) is not None and end_leaving_switch(
+                motion, drive, axes.state(drive)
+            ):
+                self._define_home(drive, motion.shift)
             self._begin_next_leg(now)
         elif leg.is_overdue(axes.states, now):
             restless = leg.has_arrived(axes.states, now) and motion.released
@@ -373,17 +356,11 @@ class Supervisor:
             self._tip.wait(now, leg.waited - waited)  # while the trajectory waits for its motors
 
     def _can_define_home(self, motion: CommandedMotion) -> bool:
-        """Return whether the position may be shifted after this leg: off its home an axis must rest.
-
-        Its servo must rest, too, otherwise the shift would be computed from an outdated position.
-        """
+        """Return whether an axis that has left its switch rests, its servo included, so that its position is known."""
         return motion.released is None or self._axes.is_at_rest(motion.released)
 
     def _handle_refused_target(self, motion: CommandedMotion, why: str) -> None:
-        """Enter the fault state after a refused target, except at the limit switch of the home.
-
-        The next tick reads that switch.
-        """
+        """Enter the fault state after a refused target, unless the axis is at the switch of its home."""
         if motion.home is not None:
             self._check_motors()
             if self._axes.is_at_switch(motion.home):
@@ -404,12 +381,6 @@ class Supervisor:
             protocol.MotionResult(motion.number, travelled, begun, ended, self.state, motion.why, turned)
         )
 
-    def _leave_switch(self, motion: CommandedMotion, drive: Drive) -> None:
-        """Record the position of the switch that was searched, and begin to move off it."""
-        motion.shift = self._axes.home_offset(drive)
-        self._axes.settle(drive)
-        motion.home, motion.released, motion.legs = None, drive, [back_off_leg(drive)]
-
     def _define_home_here(self, motion: CommandedMotion, drive: Drive, now: float) -> None:
         """Define the present position of an axis as its home, once the axis rests."""
         if self._axes.is_at_rest(drive):
@@ -417,19 +388,6 @@ class Supervisor:
             self._finish_motion(now)
         elif now > motion.until:
             self._enter_fault(f"{drive.name}: does not rest")
-
-    def _end_leaving_switch(self, motion: CommandedMotion, drive: Drive) -> None:
-        """Search the home, or define it, once the axis has left the switch, which must be released by now.
-
-        A switch that is stuck shows no home, and positions are left unchanged.
-        """
-        motion.why = switch_problem(drive, self._axes.state(drive))
-        if motion.why:
-            motion.legs = []
-        elif motion.legs:
-            motion.home, motion.released = drive, None
-        else:
-            self._define_home(drive, motion.shift)
 
     def _define_home(self, drive: Drive, shift: float) -> None:
         """Shift the positions of an axis (counts), so that its home is at its position in the rig file."""

@@ -76,17 +76,14 @@ def position_after_homing(axis: Axis) -> float:
 def is_near_switch(axis: Axis, position: float) -> bool:
     """Return whether the switch of the home may be active at a position (mm or rad).
 
-    It may nearer to the switch than the middle between it and the position after homing.
+    It may be active nearer to the switch than midway between it and the position after homing.
     """
     return axis.to_home * (position - 0.5 * (axis.at_home + position_after_homing(axis))) > 0.0
 
 
 @dataclass(frozen=True)
 class MotorReading:
-    """States of the motors by channel, and the times of the request and of the reply (s).
-
-    The states are of a time between.
-    """
+    """States of the motors by channel, at a time between the request and the reply (s)."""
 
     states: Mapping[str, MotorState]
     asked: float

@@ -13,7 +13,7 @@ class SupervisorState(StrEnum):
     INSERTING = "inserting"  # steps are carried out; between two of them the needle rests
     HOLDING = "holding"  # the needle is held during an insertion: a reading or the field was rejected
     RETRACTING = "retracting"  # the base is withdrawn
-    STOPPED = "stopped"  # by the operator, or since the controller is gone; needs a reset
+    STOPPED = "stopped"  # by the operator, or after the end of the controller; needs a reset
     FAULT = "fault"  # by a device; needs a reset
 
 
@@ -43,7 +43,7 @@ TABLE: dict[tuple[SupervisorState, RigEvent], SupervisorState] = {
     (
         SupervisorState.HOMING,
         RigEvent.ARRIVED,
-    ): SupervisorState.IDLE,  # positions are others now, and with them what armed has taken
+    ): SupervisorState.IDLE,  # positions have changed: the rig must be armed again
     (SupervisorState.JOGGING, RigEvent.ARRIVED): SupervisorState.ARMED,
     (SupervisorState.RETRACTING, RigEvent.ARRIVED): SupervisorState.ARMED,
     (SupervisorState.INSERTING, RigEvent.STEP): SupervisorState.INSERTING,
@@ -62,12 +62,12 @@ TABLE: dict[tuple[SupervisorState, RigEvent], SupervisorState] = {
     **{(state, RigEvent.FAULT): SupervisorState.FAULT for state in SupervisorState},
     (SupervisorState.FAULT, RigEvent.STOP): SupervisorState.FAULT,
 }
-"""The state after an event. What is not listed is refused, and changes nothing."""
+"""State after an event. An event that is not listed is refused, and changes nothing."""
 
 MOVING = frozenset(
     {SupervisorState.HOMING, SupervisorState.JOGGING, SupervisorState.INSERTING, SupervisorState.RETRACTING}
 )
-"""The states in which motors may move."""
+"""States in which motors may move."""
 
 
 def next_state(state: SupervisorState, event: RigEvent) -> SupervisorState | None:

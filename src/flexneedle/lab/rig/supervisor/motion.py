@@ -18,10 +18,12 @@ _MOST_WAITED = 10.0  # times its duration: slower motors do not do what they are
 
 @dataclass
 class Leg:
-    """Motors that move together. drives: by channel, as they are in this direction; begun: s on the run's clock.
+    """Motors that move together.
 
-    waited: how long (s) the trajectory has waited for its motors; sent: the last targets (counts by channel); share: of
-    the way, there; marked: tolerances that the motors had gone in all at the time (s) when they last had gone on.
+    drives: by channel, with the side of this direction; begun: start, s on the run's clock; samples: measured shares of
+    the way as (time, share); waited: time (s) for which the trajectory has waited for its motors; sent: last targets
+    (counts by channel); share: their share of the way; marked: distance of all motors (tolerances) and time (s) at the
+    last progress.
     """
 
     drives: Mapping[str, Drive]
@@ -135,12 +137,10 @@ class Leg:
 class CommandedMotion:
     """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
 
-    expected: of the tip; roll: whether the first leg is a roll alone; spans: begin and end of each leg that is done;
-    here: the axis whose home is where it is, or None; until: when it must rest (s); home: the axis whose home is
-    searched, or None; released: the axis that leaves the switch of its home, or None; shift: of its positions, so that
-    the home is where that was found (counts);
-    unlimited: positions count from nowhere yet, or the axis comes from its home beyond its range; why: why it ends
-    before its goal, or "".
+    expected: expected motion of the tip; roll: whether the first leg is a roll alone; spans: begin and end (s) of each
+    completed leg; here: axis whose home is its present position; until: time (s) at which that axis must rest; home:
+    axis whose home is searched; released: axis that leaves the switch of its home; shift: correction of its positions
+    (counts); unlimited: soft limits have no meaning during homing; why: reason for an end before the goal, or "".
     """
 
     number: int
@@ -184,9 +184,7 @@ def make_leg(
 ) -> Leg | None:
     """Return the leg of a travel (mm or rad by axis) from the present goals, None if nothing moves.
 
-    drives: by axis, as they are before; goals: counts by channel.
-
-    drives: by axis, as they are before. Positions are absolute, so that rounding does not add up.
+    drives: by axis, before the leg; goals: counts by channel. Positions are absolute, so that rounding does not add up.
     """
     moved = {name: drives[name].in_direction(way) for name, way in travel.items() if way != 0.0}
     if not moved:
@@ -203,7 +201,7 @@ def make_leg(
 
 
 _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
-_RESTING_S = 0.5  # longest time from the first stop, besides that of slowing down, until motors must rest
+_RESTING_S = 0.5  # longest time from the first stop, in addition to the deceleration, until motors must rest
 
 
 @dataclass(frozen=True)

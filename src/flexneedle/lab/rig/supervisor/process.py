@@ -29,7 +29,7 @@ from flexneedle.types import Frame
 _MOST_WAITING = 400  # messages that a client has not taken: 10 s of reports
 _REST_S = 2.0  # longest wait for motors to rest before the end
 _FLUSH_S = 1.0  # longest wait for a client that does not read, at the end
-_LONGEST_SUSPENSION_S = 0.5  # after a longer one no motion continues, as after ticks that were late
+_LONGEST_SUSPENSION_S = 0.5  # after which motions continue
 _CLOSED = "closed"
 
 
@@ -67,7 +67,7 @@ def _serve(channel: MessageChannel, task: protocol.SupervisorTask, signals: sock
     """Open the devices, tick until the end, and return its reason."""
     clock = WallClock(start=task.started)
     with closing(open_motors(task.rig)) as connected, ExitStack() as stack:
-        if not task.dry:  # before anything is sent, and before the tracker, which who has the rig uses
+        if not task.dry:  # before a command is sent or the tracker is opened, which the other program uses
             stack.enter_context(hold_motors(address_of(task.rig.driver, connected), task.client))
         tracked = open_tracker(task.rig, clock) if task.tracked else NoTracker()
         tracker = stack.enter_context(closing(tracked))
@@ -101,9 +101,8 @@ def _tick(
     while ending is None or (monotonic() < ending and not core.at_rest):
         sources: list[Any] = [signals] if ending is not None else [signals, channel]
         ready: list[Any] = wait(sources, max(0.0, due - monotonic()))
-        if (
-            seconds := suspension.since()
-        ) > _LONGEST_SUSPENSION_S:  # before anything that was requested is done
+        # Before any request is acted on.
+        if (seconds := suspension.since()) > _LONGEST_SUSPENSION_S:
             core.stop(f"the computer was suspended for {seconds:.1f} s")
         if signals in ready and (names := name_signals(signals.recv(64))):
             core.stop(f"signal {names}")

@@ -1,12 +1,14 @@
-"""Requests: the rules that they must keep, and the motions that they make. Pure functions."""
+"""Requests: their rules, and the motions of steps and jogs. Pure functions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from flexneedle.lab.rig.supervisor.drives import Drive, homing_reach, homing_speed, position_after_homing
+from flexneedle.lab.rig.supervisor.checks import resting_switch_problem
+from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.lab.rig.supervisor.motion import CommandedMotion
 from flexneedle.lab.rig.supervisor.protocol import HomeCommand, MoveCommand, StepCommand
 from flexneedle.lab.rig.supervisor.trajectory import shortest_duration
+from flexneedle.ports import MotorState
 
 _ROUNDING = 1e-9
 
@@ -93,31 +95,6 @@ def make_move(go: MoveCommand, drive: Drive, at: float) -> CommandedMotion:
     )
 
 
-def make_homing(number: int, drive: Drive, *, at_switch: bool) -> CommandedMotion:
-    """Return the search of a home: `home` is the axis, or `here` for an axis whose home is its present position.
-
-    From an active switch the axis first moves away, and is `released` then: a switch that is stuck is no home.
-    """
-    if not drive.axis.to_home:
-        return CommandedMotion(number, [], here=drive, unlimited=True)
-    search = _homing_leg(drive, homing_reach(drive.axis))
-    if at_switch:
-        return CommandedMotion(number, [back_off_leg(drive), search], released=drive, unlimited=True)
-    return CommandedMotion(number, [search], home=drive, unlimited=True)
-
-
-def back_off_leg(drive: Drive) -> tuple[Mapping[str, float], float]:
-    """Return the leg from the limit switch of the home into the range, as (travel by axis, duration)."""
-    return _homing_leg(drive, position_after_homing(drive.axis) - drive.axis.at_home)
-
-
-def _homing_leg(drive: Drive, travel: float) -> tuple[Mapping[str, float], float]:
-    """Return the leg of a travel (mm or rad) at the speed of homing."""
-    return {drive.name: travel}, shortest_duration(
-        abs(travel), homing_speed(drive.axis), drive.axis.acceleration
-    )
-
-
 def range_problem(
     drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]], *, resting: bool = False
 ) -> str:
@@ -133,3 +110,15 @@ def range_problem(
             shown = drives[name].shown
             return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
     return ""
+
+
+def start_problem(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> str:
+    """Return the problem of an insertion from where axes rest (states by channel), or "".
+
+    An axis is outside its range, or at a limit switch that is not its home.
+    """
+    resting = [(drive, states[drive.axis.channel]) for drive in drives.values()]
+    positions = [(drive.name, drive.to_position(state.position)) for drive, state in resting]
+    problems = [range_problem(drives, positions, resting=True)]
+    problems += [resting_switch_problem(drive, state) for drive, state in resting]
+    return next((f"arm: refused: {problem}" for problem in problems if problem), "")
