@@ -27,8 +27,7 @@ GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1)
 
 
 def parts(rows: int, rng: np.random.Generator, all_columns: bool) -> Iterator[pa.Table]:
-    """Yield tables of a million rows in random order, a metre from the origin; all_columns: including the optional
-    ones (orientation and distance)."""
+    """Yield tables of a million rows in random order, a metre from the origin; all_columns: also orientations."""
     bias = rng.normal(0.0, 0.35, (2, 2, *GRID.shape))
     for start in range(0, rows, PART):
         count = min(PART, rows - start)
@@ -44,15 +43,15 @@ def parts(rows: int, rng: np.random.Generator, all_columns: bool) -> Iterator[pa
                 "environment": np.array(["ideal", "noisy"])[noisy],
             }
         )
-        yield _with_optional(table, GRID[point], rng) if all_columns else table
+        yield _with_orientations(table, rng) if all_columns else table
 
 
-def _with_optional(table: pa.Table, places: np.ndarray, rng: np.random.Generator) -> pa.Table:
-    turns = np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0.0, 0.01, (len(places), 4))
+def _with_orientations(table: pa.Table, rng: np.random.Generator) -> pa.Table:
+    turns = np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0.0, 0.01, (len(table), 4))
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     for k, name in enumerate(("qw", "qx", "qy", "qz")):
         table = table.append_column(name, [turns[:, k]])
-    return table.append_column("distance_mm", [np.linalg.norm(places + 100.0, axis=1)])
+    return table
 
 
 def write(folder: Path, rows: int, all_columns: bool) -> list[Path]:
@@ -94,7 +93,7 @@ def main() -> None:
     )
     parser.add_argument("--rows", type=int, default=ROWS)
     parser.add_argument("--times", type=int, default=2, help="runs of each (default: 2)")
-    parser.add_argument("--all-columns", action="store_true", help="also orientations and distances")
+    parser.add_argument("--all-columns", action="store_true", help="also orientations")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flexneedle import load_scenario
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, structural, world, world_name
+from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, structural, world
 
 PRESET = load_scenario("phantom").values()
 NUMBERS = st.integers(0, LARGEST_WORLD)
@@ -143,16 +143,11 @@ def test_each_kind_of_structural_mismatch_is_as_likely():
 @given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
 @many_worlds
 def test_a_world_is_found_by_its_name(number, case):
-    assert load_scenario(world_name(number, case)) == world(number, case)
+    assert load_scenario(f"world:{number}:{case}") == world(number, case)
 
 
-def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
-    assert [world_name(100012, case) for case in CASES] == [
-        "world:100012:perfect",
-        "world:100012",
-        "world:100012:structure",
-    ]
-    assert load_scenario("world:100012:real") == world(100012)
+def test_the_name_of_a_real_world_needs_no_case():
+    assert load_scenario("world:100012") == load_scenario("world:100012:real") == world(100012)
 
 
 @pytest.mark.parametrize(
@@ -237,12 +232,11 @@ def test_every_driver_has_the_same_target_and_directions_are_uniform():
 @many_worlds
 def test_a_world_in_space_is_found_by_its_name(number, case):
     for rig in rigs(number):
-        assert load_scenario(world_name(number, case, rig)) == world(number, case, rig)
+        assert load_scenario(f"world:{number}:{case}:{rig}") == world(number, case, rig)
 
 
 def test_names_of_worlds_in_space():
-    assert world_name(3, "real", "one-axis") == "world:3:one-axis"
-    assert world_name(3, "perfect", "two-axes-half-turns") == "world:3:perfect:two-axes-half-turns"
+    assert load_scenario("world:3:one-axis") == world(3, "real", "one-axis")
     assert world(3, "real", PLANE) == world(3)
     assert load_scenario("world:3:plane") == world(3)
     assert RIGS[0] == PLANE

@@ -141,12 +141,6 @@ def _in_plane(number: int, case: str) -> Scenario:
     return scenario.with_values(structural(number, scenario))
 
 
-def world_name(number: int, case: str = REAL, rig: str = PLANE) -> str:
-    """Return the name by which `load_scenario` finds a world, such as `world:100012:structure:two-axes`."""
-    parts = [*([] if case == REAL else [case]), *([] if rig == PLANE else [rig])]
-    return ":".join([f"{WORLD}{number}", *parts])
-
-
 def named_world(name: str) -> Scenario:
     """Return the world of a name. Raises ScenarioError."""
     found = _NAMED.fullmatch(name)

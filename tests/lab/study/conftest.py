@@ -1,4 +1,4 @@
-"""A quick study: 2 targets, 2 cases, both plants, 2 repeats; an insertion takes about 50 ms."""
+"""A quick study: 2 targets, 2 cases, both plants, 2 repeats, with a controller without computations."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ first_seed = 7
 
 [values]
 plan = { samples = 16, iterations = 2 }
-control.ce_mpc = { samples = 8, iterations = 1, horizon = 2 }
+controller = "open-loop"
 setup.tip_to_skin_mm = 4.0
 phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
 

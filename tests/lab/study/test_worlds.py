@@ -8,11 +8,11 @@ import pytest
 from flexneedle.control.controllers import check_tables
 from flexneedle.errors import InputError
 from flexneedle.lab.study import jobs
+from flexneedle.lab.study.findings.worlds import is_failure
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.jobs import InsertionJob, run_job
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
 from flexneedle.lab.study.runner import _find_reach_points
-from flexneedle.lab.study.summary import is_failure
 from flexneedle.lab.study.tables import write_tables
 from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.scenario.worlds import CASES, world

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.rules import POSITIONS, require_text
+from flexneedle.lab.tables.rules import POSITIONS, require_numbers, require_text
 from flexneedle.lab.tables.table import open_table
 from flexneedle.lab.tables.write import write_table
 
@@ -55,7 +55,7 @@ def written(tmp_path):
         (SEMICOLONS + "a;1.5;2\n", [("a", 1.5, 2.0)]),
         (SEMICOLONS + '"a;b";"1,5";2\n', [("a;b", 1.5, 2.0)]),
         ("sensor\tx_mm\ty_mm\na\t,5\t2\n", [("a", 0.5, 2.0)]),
-        (COMMAS + "a,,NaN\na,na, \na,null,None\na,N/A,#N/A\na,MISSING,-nan\n", [("a", None, None)] * 5),
+        (COMMAS + "a,,NaN\na,na,nan\na,null,None\na,N/A,#N/A\na,MISSING, \n", [("a", None, None)] * 5),
     ],
 )
 def test_a_csv_file_is_read(written, text, rows):
@@ -67,8 +67,6 @@ def test_a_csv_file_is_read(written, text, rows):
     [
         (COMMAS + "a,1\n", "line 2"),
         (COMMAS + "a,1,2,3\n", "line 2"),
-        (COMMAS + "a,1,2,\n", "line 2"),
-        (COMMAS + "a,1,2\na,1,2,,\n", "line 3"),
         (COMMAS + "a,1,5,2\n", "line 2"),
         (COMMAS + "a,1,2\n# end\n", "line 3"),
         (COMMAS + "a,1,2\n   \n", "line 3"),
@@ -79,14 +77,11 @@ def test_a_csv_file_is_read(written, text, rows):
         (COMMAS + "a,0x10,2\n", "line 2: x_mm"),
         (COMMAS + "a,−1,2\n", "line 2: x_mm"),
         (COMMAS + "a,1__0,2\n", "line 2: x_mm"),
-        (COMMAS + "a,inf,2\n", "line 2: x_mm: 'inf'"),
-        (COMMAS + "a,1,1e400\n", "line 2: y_mm: '1e400'"),
         (SEMICOLONS + "a;1,5;2.5\n", "line 2: y_mm: '2.5'"),
         (SEMICOLONS + "a;1.5;2\nb;2,5;1\n", "line 3: x_mm: '2,5'"),
         (SEMICOLONS + "a;1.000,5;2\n", "line 2: x_mm: '1.000,5'"),
         (COMMAS + 'a,1,"2\nb,1,2\n', "line 2"),
-        (COMMAS + '"a\nb",1,2\n', "line 2"),
-        (COMMAS + "a,1,2\r\nb,1,2\n", "line 2"),
+        (COMMAS + "a,1,2\r\nb,1,2\n", "lines end in LF and in CRLF"),
         (COMMAS.encode() + b"a,1,2\n\xff,1,2\n", "line 3"),
         ("sensor,x_mm\na,2\n", "no column y_mm"),
         ("sensor,x_mm,y_mm,x_mm\na,1,2,3\n", "'x_mm'"),
@@ -106,11 +101,12 @@ def test_a_malformed_file_is_refused_in_one_line_with_its_place(written, text, p
 
 
 def test_the_first_row_that_violates_a_rule_is_named(written):
-    path = written(SEMICOLONS + "a;1;2\n\nnan;1;2\na;x;2\n")
+    path = written(SEMICOLONS + "a;1;2\n\nnan;1;2\na;inf;1e400\n")
     with pytest.raises(InputError, match="line 4: sensor is empty"):
         read(path, require_text("sensor"))
-    with pytest.raises(InputError, match="line 5: x_mm"):
-        read(path)
+    for column in ("x_mm", "y_mm"):
+        with pytest.raises(InputError, match=f"line 5: {column}: must be a finite number"):
+            read(path, require_numbers(column))
 
 
 def test_a_malformed_row_is_refused_also_if_it_is_not_chosen(written):
@@ -129,7 +125,7 @@ def test_parquet_rows_follow_the_same_rules(tmp_path):
     assert read(path) == [("a", 1.0, 2.0), ("", None, None)]
     pq.write_table(pa.table(table | {"x_mm": [1.0, float("inf")]}), path)
     with pytest.raises(InputError, match="row 2: x_mm"):
-        read(path)
+        read(path, require_numbers("x_mm"))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -7,7 +7,6 @@ from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, draw_distance
 from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, draw_field
 from flexneedle.lab.tracker_evaluation.figures.indicator import (
     IndicatorPanel,
@@ -146,29 +145,3 @@ def test_a_threshold_beyond_all_indicators_is_shown():
 )
 def test_an_environment_or_a_fit_may_be_missing(changes):
     assert "reference" in words(draw_indicator([panel(**changes), panel()]))
-
-
-def test_the_figure_of_distances_shows_rmse_limit_and_note():
-    far, rmse = np.array([500.0, 600.0, 700.0]), np.array([1.2, 0.8, 0.5])
-    lines = [DistanceLine("tip, ideal", far, rmse, 0.7, "within 0.7 mm from 700 mm")]
-    figure = draw_distance([*lines, DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")])
-    assert "limit 0.7" in words(figure)
-    assert "within 0.7 mm from 700 mm" in words(figure)
-    assert_allclose(figure.axes[0].lines[0].get_xydata(), np.stack([far, rmse], axis=1))
-
-
-@pytest.mark.parametrize("count", [1, 7])
-def test_legends_stay_inside_the_figure_and_off_the_axes(count):
-    names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
-    values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)
-    note = "within 1.4 mm up to 700 mm, and the first bin beyond is too far off"
-    distance = draw_distance([DistanceLine(name, *values, 0.7, note) for name in names])
-    for figure in (distance,):
-        figure.draw_without_rendering()
-        legends = [legend for part in (figure, *figure.subfigs) for legend in part.legends]
-        assert legends
-        for legend in legends:
-            box = legend.get_window_extent()
-            assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
-            assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
-            assert not any(box.overlaps(other.get_window_extent()) for other in figure.axes)

@@ -59,22 +59,13 @@ def test_the_tip_sensor_points_along_x_and_the_reference_along_z():
         np.testing.assert_allclose(measured, np.tile(axis, (len(measured), 1)), atol=1e-12)
 
 
-def test_the_distance_is_that_to_the_field_generator():
-    table = measure_grid([environment(generator_mm=[0.0, 700.0, 0.0])], SMALL)
-    positions = np.stack([column(table, f"true_{axis}_mm") for axis in "xyz"], axis=1)
-    assert set(positions[:, 1]) == {-50.0, 50.0}
-    distance = np.linalg.norm(positions - (0.0, 700.0, 0.0), axis=1)
-    np.testing.assert_allclose(column(table, "distance_mm"), distance)
-
-
 def test_a_missing_sample_has_no_position_indicator_or_orientation():
     table = measure_grid([environment(missing_fraction=0.3)], Experiment(points=3, samples=50))
     lost = np.isnan(table["x_mm"])
     assert lost.mean() == pytest.approx(0.3, rel=0.05)
     for name in ("y_mm", "z_mm", "indicator", "qw", "qx", "qy", "qz"):
         assert np.isnan(table[name][lost]).all()
-    for name in ("true_x_mm", "distance_mm"):
-        assert not np.isnan(table[name]).any()
+    assert not np.isnan(table["true_x_mm"]).any()
     assert not np.isnan(table["qw"][~lost]).any()
 
 

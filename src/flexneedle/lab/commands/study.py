@@ -7,15 +7,17 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import compile_first, print_json
 
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
-    from flexneedle.lab.study.grid import ExpandedStudy
+    from flexneedle.lab.study.findings.findings import Findings
+    from flexneedle.lab.study.findings.groups import SettingGroup
     from flexneedle.lab.study.runner import StudyProgress
 
 
@@ -101,7 +103,7 @@ def _study(args: argparse.Namespace) -> int:
         return 130
     except RunError as error:
         raise RunError(f"{error}: {_command(args, folder, '--resume')}") from error
-    return _report(study, folder, args.json, time.monotonic() - begun)
+    return _report(folder, args.json, time.monotonic() - begun)
 
 
 def _command(args: argparse.Namespace, folder: Path, *options: str) -> str:
@@ -162,25 +164,27 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _report(study: ExpandedStudy, folder: Path, as_json: bool, seconds: float) -> int:
+def _report(folder: Path, as_json: bool, seconds: float) -> int:
     from flexneedle.errors import make_printable
-    from flexneedle.lab.study.summary import summarize_study
+    from flexneedle.lab.study.findings.findings import compute_findings
+    from flexneedle.lab.study.findings.reading import read_study_folder
+    from flexneedle.lab.study.tables import sum_times
 
-    summary = summarize_study(folder, study)
-    summary["time"]["wall_s"] = seconds
+    found = compute_findings(read_study_folder(folder))
+    spent = {**sum_times(folder), "wall_s": seconds}
     if as_json:
-        print_json(summary)
+        print_json({"folder": str(folder), **found.values(), "time": spent})
     else:
-        _table(summary)
-    if "done" in summary["outcomes"]:
+        _print_table(found, spent)
+    if found.finished:
         return 0
-    if summary["first_failure"] is not None:
-        message = make_printable(summary["first_failure"])
-        print(f"flexneedle: no insertion finished; the first failure: {message}", file=sys.stderr)
+    first = found.endings[0]
+    message = make_printable(f"{first.outcome}: {first.reason}".removesuffix(": "))
+    print(f"flexneedle: no insertion finished; most frequent failure: {message}", file=sys.stderr)
     return 1
 
 
-def _table(summary: Mapping[str, Any]) -> None:
+def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -191,19 +195,19 @@ def _table(summary: Mapping[str, Any]) -> None:
     table = Table(box=box.SIMPLE, show_edge=False)
     heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
     for number, head in enumerate(heads):
-        table.add_column(head, justify="right" if number else "left")
-    for name, part in ((_label(group["settings"]), group) for group in summary["groups"]):
-        table.add_row(*map(Text, (name, *_cells(part))))
-    table.add_row(*map(Text, ("all", *_cells(summary))))
-    spent, unconverged = summary["time"], summary["unconverged_periods"]
-    console.print(Text(summary["title"], style="bold"), table, sep="\n\n")
+        table.add_column(head, justify="right" if number else "left", no_wrap=True)
+    varied = [factor.key for factor in found.design.factors if factor.varies]
+    pooled = found.whole if len(found.groups) > len(found.whole) else ()
+    rows = [(_label(group.levels, varied) or group.name, group) for group in found.groups]
+    rows += [(f"{group.name}, all", group) for group in pooled]
+    for name, group in rows:
+        table.add_row(*map(Text, (name, *_format_cells(group))))
+    unconverged = sum(group.unconverged_periods for group in found.whole)
+    console.print(Text(found.study.title, style="bold"), table, sep="\n\n")
     console.print(
         "\nFinished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
         "periods, relative to the plan."
     )
-    if summary["coverage"]["tip"]["half"] is not None:
-        shares = "; ".join(f"{part} {_format_shares(of)}" for part, of in summary["coverage"].items())
-        console.print(f"Within ±1.96 sd of the prediction at ¼, ½ and ¾ of the depth: {shares}.")
     if unconverged:
         console.print(
             f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet."
@@ -212,31 +216,24 @@ def _table(summary: Mapping[str, Any]) -> None:
         f"Time, all workers: planning {spent['plan_s']:.1f} s, control {spent['control_s']:.1f} s, "
         f"plant {spent['plant_s']:.1f} s, other {spent['rest_s']:.1f} s; wall-clock time {spent['wall_s']:.1f} s"
     )
-    console.print(Text(f"Tables: {summary['folder']}"))
+    console.print(Text(f"Tables: {found.study.folder}"))
 
 
-def _label(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} {value}" if "." in key else str(value) for key, value in settings.items())
+def _label(levels: Mapping[str, str], varied: Sequence[str]) -> str:
+    return ", ".join(f"{key} {levels[key]}" if "." in key else levels[key] for key in varied)
 
 
-def _cells(part: Mapping[str, Any]) -> Sequence[str]:
-    error, periods = part["true_error_mm"], part["period_ratio"]
-    done = part["outcomes"].get("done", 0)
+def _format_cells(group: SettingGroup) -> Sequence[str]:
+    value = {name: estimate.value for name, estimate in group.estimates.items()}
     return (
-        f"{done} of {part['insertions']}",
-        f"{_number(error['mean'])} ± {_number(error['sd'])}",
-        *(_number(error[name]) for name in ("median", "p95", "max")),
-        f"{_number(part['flips'], 1)} ({_number(part['planned_flips'], 1)})",
-        _number(part["energy_ratio"], 2),
-        _number(periods["max"], 2),
+        f"{group.finished} of {group.count}",
+        f"{_number(value['mean_mm'])} ± {_number(value['sd_mm'])}",
+        *map(_number, (value["median_mm"], value["p95_mm"], group.largest_mm)),
+        f"{_number(value['flips'], 1)} ({_number(value['planned_flips'], 1)})",
+        _number(value["energy_ratio"], 2),
+        _number(group.largest_period_ratio, 2),
     )
 
 
-def _format_shares(shares: Mapping[str, float | None]) -> str:
-    """Return shares as text in one unit, "–" for unknown ones."""
-    texts = ("–" if share is None else f"{100.0 * share:.0f}" for share in shares.values())
-    return f"{', '.join(texts)} %"
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def _number(value: float, digits: int = 3) -> str:
+    return "–" if isnan(value) else f"{value:.{digits}f}"

@@ -4,14 +4,13 @@
 """
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError, describe_error, make_printable, one_line
-from flexneedle.files import RUNS, create_folder, replace_file
+from flexneedle.files import replace_file
 from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion, restore_study
 from flexneedle.lab.study.journal import StudyJournal, read_rows
 from flexneedle.record.folder import STUDY_FILE, versions
@@ -60,37 +59,6 @@ def read_folder(path: Path) -> RecordedStudy:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path / STUDY_FILE}: damaged: {describe_error(error)}") from None
     return RecordedStudy(path, study, *made_by, read_rows(path / JOURNAL_FILE, len(study)))
-
-
-@contextmanager
-def make_study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
-    """Yield the folder `out`, or a new one in `runs/`, and whether it contains no study yet.
-
-    If the block fails, folders that are new and empty are removed.
-    """
-    outer = RUNS if out is None else out
-    missing = [path for path in (outer, *outer.parents) if not _exists(path)]
-    folder = create_folder("study", name) if out is None else out
-    try:
-        yield folder, not _exists(folder / STUDY_FILE)
-    except BaseException:
-        with suppress(OSError):  # until the first that is not empty
-            for path in missing if out else (folder, *missing):
-                path.rmdir()
-        raise
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # such as a name that is too long, which `open_folder` rejects
-        return False
-
-
-def remove_unused(path: Path) -> None:
-    """Remove the files of a study that has neither plans nor rows."""
-    for name in (STUDY_FILE, JOURNAL_FILE):
-        (path / name).unlink()
 
 
 def open_folder(path: Path, study: ExpandedStudy, resume: bool, command: str = "") -> StudyJournal:

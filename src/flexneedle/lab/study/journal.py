@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -11,14 +10,11 @@ from typing import Any, Self
 
 from flexneedle.errors import InputError
 from flexneedle.interrupts import uninterrupted
-from flexneedle.lab.study.jobs import TIMES
 from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.scenario.problems import Problem, to_line
 
-_KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
 _READ = ("true_error_mm", "outcome", "reason")
 """Columns that every reader of rows needs; rows of another version may lack others."""
-_LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # in a column
 
 
 class StudyJournal:
@@ -111,21 +107,7 @@ def _find_fault(row: Any, size: int, needed: Sequence[str]) -> str | None:
     if not isinstance(row, dict):
         return "not a row in JSON"
     index = row.get("index")
-    if not (isinstance(index, int) and _has_kind(index, int) and 0 <= index < size):
+    if type(index) is not int or not 0 <= index < size:
         return to_line(Problem("index", index, f"must be a whole number from 0 to {size - 1}"))
     missing = next((name for name in needed if name not in row), None)
-    if missing is not None:
-        return f"{missing}: missing"
-    known = ((name, kind) for name, kind in _KINDS.items() if name in row)
-    wrong = next((name for name, kind in known if not _has_kind(row[name], kind)), None)
-    return None if wrong is None else to_line(Problem(wrong, row[wrong], "wrong type, or too large"))
-
-
-def _has_kind(value: Any, kind: type) -> bool:
-    """Return whether a value fits a column of this kind; numbers may be None."""
-    if kind is str:
-        return isinstance(value, str)
-    if value is None:
-        return True
-    numbers = (int, float) if kind is float else (int,)
-    return isinstance(value, numbers) and not isinstance(value, bool) and abs(value) <= _LARGEST[kind]
+    return None if missing is None else f"{missing}: missing"

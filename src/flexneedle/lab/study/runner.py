@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Container, Iterator, Mapping
 from concurrent.futures import Executor, Future
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,9 @@ from typing import Any
 
 from flexneedle.arguments import check_path, check_whole, require_extra
 from flexneedle.errors import InputError, RunError
+from flexneedle.files import create_folder
 from flexneedle.lab.study import pools
-from flexneedle.lab.study.folder import PLANS_FOLDER, make_study_folder, open_folder, remove_unused
+from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder
 from flexneedle.lab.study.grid import ExpandedStudy, StudyPoint, load_study
 from flexneedle.lab.study.jobs import InsertionJob, JobRows, PlanResult, make_plan, run_job
 from flexneedle.lab.study.journal import StudyJournal
@@ -51,10 +52,9 @@ def run_study(
 
     It runs on `workers` processes (default: one per core), or on the Dask cluster at the address `scheduler`;
     `on_no_workers` is called if the cluster has no workers yet, and the study waits for them. `resume` continues
-    the study in `out`. If the study ends early, the finished rows are kept; if it has no plan and no row yet, its files
-    are removed. `runs.parquet` is identical to the bit for any number of workers and interruptions. `command` is
-    recorded in `study.json`. A script that calls this needs an `if __name__ == "__main__"` guard, since workers import
-    it.
+    the study in `out`. If the study ends early, the finished rows are kept. `runs.parquet` is identical to the bit for
+    any number of workers and interruptions. `command` is recorded in `study.json`. A script that calls this needs an
+    `if __name__ == "__main__"` guard, since workers import it.
 
     Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker
     dies or has other package versions than this process; KeyboardInterrupt, after the
@@ -72,33 +72,23 @@ def run_study(
         workers = check_whole("workers", workers, 1, "omit it for one per core")
     given = None if out is None else check_path("out", out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
-    # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
-    # script.
-    with (
-        _open_pool(workers, scheduler, on_no_workers) as pool,
-        make_study_folder(given, study.name) as (folder, is_new),
-        open_folder(folder, study, resume, command) as journal,
-    ):
-        engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
-        try:
-            if len(journal.rows) < len(study):
-                for axes in study.axes:
-                    compile_kernels(axes)  # before the workers, which would wait for each other
-                engine.run(pool, chunk)
-        finally:
-            if is_new and not journal.rows and not (folder / PLANS_FOLDER).exists():
-                remove_unused(folder)
-            else:
-                write_tables(folder, study, journal.rows, engine.plans)
-    return folder
-
-
-def _open_pool(
-    workers: int | None, scheduler: str | None, on_no_workers: Callable[[], None]
-) -> AbstractContextManager[Executor]:
-    return (
+    opened = (
         pools.open_processes(workers) if scheduler is None else pools.open_cluster(scheduler, on_no_workers)
     )
+    # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
+    # script.
+    with opened as pool:
+        folder = create_folder("study", study.name) if given is None else given
+        with open_folder(folder, study, resume, command) as journal:
+            engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
+            try:
+                if len(journal.rows) < len(study):
+                    for axes in study.axes:
+                        compile_kernels(axes)  # before the workers, which would wait for each other
+                    engine.run(pool, chunk)
+            finally:
+                write_tables(folder, study, journal.rows, engine.plans)
+    return folder
 
 
 class _Engine:

@@ -56,6 +56,19 @@ def write_tables(
     _write(folder / TIMING_FILE, pa.table(_make_columns(timing, _TIMING)))
 
 
+def sum_times(folder: Path) -> dict[str, float]:
+    """Return the times (s) of planning, control, plant and the rest, summed over all workers; a plan counts once."""
+    rows = pq.read_table(folder / TIMING_FILE).to_pylist()
+    plans = {row["plan"]: row["plan_s"] or 0.0 for row in rows}
+    parts = {name: sum(row[f"{name}_s"] or 0.0 for row in rows) for name in ("control", "plant", "total")}
+    return {
+        "plan_s": sum(plans.values()),
+        "control_s": parts["control"],
+        "plant_s": parts["plant"],
+        "rest_s": parts["total"] - parts["control"] - parts["plant"],
+    }
+
+
 def _add_reach(
     insertions: Sequence[StudyInsertion], results: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:

@@ -2,9 +2,9 @@
 
 import csv
 import re
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 
 from flexneedle.errors import InputError
@@ -64,26 +64,11 @@ def has_decimal_commas(path: Path, layout: CsvLayout, columns: Container[str]) -
         return next(marks, ".") == ","
 
 
-def find_line(path: Path, layout: CsvLayout, row: int) -> tuple[int, str]:
-    """Return number and text of the line with a row; rows count from 1, and blank lines are no rows."""
-    for count, (number, text) in enumerate(_rows(path, layout), 1):
-        if count == row:
-            return number, text
-    raise ValueError(f"{path}: no row {row}")
-
-
-def find_other_line_end(path: Path) -> int | None:
-    """Return the number of the first line with another line end than the line before, None if there is none."""
+def find_line(path: Path, layout: CsvLayout, row: int) -> int:
+    """Return the number of the line with a row; rows count from 1, and blank lines are no rows."""
     with path.open("rb") as file:
-        ends = (line.endswith(b"\r\n") for line in file if line.endswith(b"\n"))
-        return next((number for number, (one, other) in enumerate(pairwise(ends), 2) if one != other), None)
-
-
-def _rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, str]]:
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if number > layout.skipped + 1 and line.rstrip("\r\n"):
-                yield number, line.strip()[:SHOWN]
+        rows = (k for k, line in enumerate(file, 1) if k > layout.skipped + 1 and line.rstrip(b"\r\n"))
+        return next(islice(rows, row - 1, None))
 
 
 def _split_line(text: str, separator: str) -> Sequence[str]:

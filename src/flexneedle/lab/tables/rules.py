@@ -17,8 +17,8 @@ def require_text(*columns: str) -> tuple[Rule, ...]:
 
 
 def require_numbers(*columns: str) -> tuple[Rule, ...]:
-    """Return the rules that columns of numbers have values."""
-    return tuple((f"{name} IS NULL", f"{name} is empty") for name in columns)
+    """Return the rules that columns of numbers have finite values."""
+    return tuple((f"{name} IS NULL OR isinf({name})", f"{name}: must be a finite number") for name in columns)
 
 
 def _count_absent(columns: str) -> str:
@@ -34,11 +34,6 @@ def _at_most(columns: str) -> Rule:
     )
 
 
-def _from_zero(column: str) -> tuple[Rule]:
-    rule = f"{column}: must be from 0 to {LARGEST:g}, or empty"
-    return ((f"{column} < 0 OR {column} > {LARGEST}", rule),)
-
-
 POSITIONS: tuple[Rule, ...] = (
     (
         f"{_count_absent(_MEASURED)} IN (1, 2)",
@@ -50,8 +45,9 @@ TRUE_POSITIONS: tuple[Rule, ...] = (
     (f"{_count_absent(_TRUE)} > 0", f"{_TRUE}: must have values"),
     _at_most(_TRUE),
 )
-INDICATORS: tuple[Rule, ...] = _from_zero("indicator")
-DISTANCES: tuple[Rule, ...] = _from_zero("distance_mm")
+INDICATORS: tuple[Rule, ...] = (
+    (f"indicator < 0 OR indicator > {LARGEST}", f"indicator: must be from 0 to {LARGEST:g}, or empty"),
+)
 ORIENTATIONS: tuple[Rule, ...] = (
     (f"{_count_absent(_QUATERNION)} IN (1, 2, 3)", f"{_QUATERNION}: must all have values, or all be empty"),
     (

@@ -206,7 +206,7 @@ def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
 
 def _check_label(table: SampleTable, name: str, label: str | None) -> None:
     query = f"SELECT DISTINCT {name} AS label FROM samples WHERE {name} <> '' ORDER BY label"
-    present = table.arrays(query)["label"].tolist() if name in table.columns else []
+    present = table.arrays(query)["label"].tolist() if name in table.fields else []
     if label is None and len(present) > 1:
         raise InputError(f"has several values of {name}: choose one with --{name}: {', '.join(present)}")
     if label is not None and label not in present:

@@ -70,14 +70,12 @@ def _measure_sensor(environment: Environment, sensor: str, experiment: Experimen
     rng = np.random.default_rng([experiment.seed, int(is_tip), *environment.name.encode()])
     readings = noisy(environment, Noiseless(exact.coils[order], exact.orientations[order]), rng)
     missing = rng.random(len(order)) < environment.missing_fraction
-    distance = np.linalg.norm(positions - np.array(environment.generator_mm), axis=-1)
     columns = {
         "point_id": order,
         **_split(("true_x_mm", "true_y_mm", "true_z_mm"), positions[order]),
         **_report(readings, missing, is_tip),
         "sensor": np.full(len(order), sensor),
         "environment": np.full(len(order), environment.name),
-        "distance_mm": distance[order],
     }
     return {name: columns[name] for name in COLUMNS}
 

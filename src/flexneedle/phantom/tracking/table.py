@@ -18,8 +18,8 @@ REQUIRED = (
 """Required columns: grid point and true position of the sensor (from the stage), measured position and indicator, name
 of the sensor and of the environment. The indicator may be empty or omitted for sensors without one."""
 
-OPTIONAL = ("qw", "qx", "qy", "qz", "distance_mm")
-"""Optional columns: orientation as a unit quaternion, distance from sensor to field generator."""
+OPTIONAL = ("qw", "qx", "qy", "qz")
+"""Optional columns: orientation as a unit quaternion."""
 
 COLUMNS = REQUIRED + OPTIONAL
 

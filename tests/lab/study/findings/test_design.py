@@ -19,7 +19,7 @@ def design(tmp_path):
 
     def read(rows, **asked):
         study = read_study_folder(write_study(tmp_path / "study", rows, **asked))
-        return find_design(study.rows, study.definition)
+        return find_design(study)
 
     return read
 

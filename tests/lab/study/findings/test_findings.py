@@ -26,10 +26,6 @@ def read(tmp_path):
     return lambda rows, **more: read_study_folder(write_study(tmp_path / "study", rows, **more))
 
 
-def designed(study):
-    return find_design(study.rows, study.definition)
-
-
 def doubled(*names):
     """Return cases: the base, and each entry of [phantom] doubled."""
     cases = {f"{name} doubled": {f"phantom.{name}": 2 * BASE[f"phantom.{name}"]} for name in names}
@@ -49,7 +45,7 @@ def test_the_statistics_of_a_group_agree_with_hand_values(read):
         }
     rows[0]["periods"], rows[1]["unconverged_periods"] = 75, 3
     found = read(rows)
-    (group,) = group_rows(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, find_design(found).factors)
     value = {name: estimate.value for name, estimate in group.estimates.items()}
     assert (group.name, group.count, group.finished, group.known, group.missed) == (OURS, 5, 5, 5, 1)
     assert (group.unconverged, group.largest_mm, group.largest_period_ratio) == (1, 2.0, 1.5)
@@ -69,7 +65,7 @@ def test_unfinished_insertions_are_counted_and_not_averaged(read):
     rows.append(unfinished({**rows[0], "index": 4, "seed": 99, "repeat": 4}, "error", "ValueError: x"))
     rows[3]["unconverged_periods"] = 7
     found = read(rows)
-    (group,) = group_rows(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, find_design(found).factors)
     assert (group.count, group.finished, group.missed, group.unconverged) == (5, 3, 0, 1)
     assert group.estimates["mean_mm"].value == pytest.approx(0.2)
     assert group.largest_mm == 0.3
@@ -80,7 +76,7 @@ def test_a_finished_insertion_with_unknown_error_is_counted(read):
     rows[0]["true_error_mm"] = None
     rows[1]["true_error_mm"] = float("nan")
     found = read(rows)
-    (group,) = group_rows(found.rows, designed(found).factors)
+    (group,) = group_rows(found.rows, find_design(found).factors)
     assert (group.finished, group.known) == (3, 1)
 
 
@@ -88,7 +84,7 @@ def test_groups_are_every_level_of_every_factor(read):
     axes = {"contact.spacing_mm": [1.0, 0.5]}
     rows = make_rows((OURS, "open-loop"), axes=axes, targets=TARGETS, repeats=2)
     found = read(rows, axes=axes)
-    groups = group_rows(found.rows, designed(found).factors)
+    groups = group_rows(found.rows, find_design(found).factors)
     assert [group.levels for group in groups] == [
         {"controller": name, "contact.spacing_mm": spacing}
         for name in (OURS, "open-loop")
@@ -99,7 +95,7 @@ def test_groups_are_every_level_of_every_factor(read):
 
 def compared(rows, read, **more):
     found = read(rows, **more)
-    return compare_controllers(found.rows, designed(found))
+    return compare_controllers(found.rows, find_design(found))
 
 
 def test_controllers_are_compared_pair_by_pair(read):
@@ -160,7 +156,7 @@ def test_cases_are_compared_with_the_base_for_each_controller(read):
         more = {"as shipped": 0.0, "run_out_mm doubled": 0.02, "initial_bend_mm doubled": -0.01}[row["case"]]
         row["true_error_mm"] += more * (3 if row["controller"] == "open-loop" else 1)
     found = read(rows)
-    differences = compare_cases(found.rows, designed(found))
+    differences = compare_cases(found.rows, find_design(found))
     assert [(d.controller, d.name, d.pairs, d.verdict) for d in differences] == [
         (controller, case, 30, verdict)
         for controller in (OURS, "open-loop")
@@ -205,7 +201,7 @@ def test_no_insertion_is_dropped_for_any_outcomes(tmp_path_factory, data):
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
     found = read_study_folder(write_study(tmp_path_factory.mktemp("study"), rows))
-    groups = group_rows(found.rows, designed(found).factors)
+    groups = group_rows(found.rows, find_design(found).factors)
     assert sum(group.count for group in groups) == 8
     assert sum(group.finished for group in groups) == outcomes.count("done")
     assert sum(kind.count for kind in count_endings(found.rows)) == 8 - outcomes.count("done")

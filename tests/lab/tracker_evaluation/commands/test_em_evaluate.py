@@ -3,8 +3,6 @@
 import json
 import re
 import sys
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
 
 import numpy as np
 import pytest
@@ -15,31 +13,18 @@ from flexneedle.cli import main as cli
 
 @pytest.fixture(scope="module")
 def rows():
-    """A sensor in a clean field, and another over metal as well, with distances to the field generator."""
+    """A sensor in a clean field, and another over metal as well."""
     rng = np.random.default_rng(0)
     rows = random_rows(1, samples=5)
     for name, error, level in (("ideal", 0.5, 0.02), ("noisy", 2.0, 0.2)):
         samples = GRID[:, None] + rng.normal(0.0, error, (27, 1, 3)) + rng.normal(0.0, 0.04, (27, 5, 3))
         rows += rows_of(GRID, samples, "reference", name, (level * rng.uniform(0.5, 1.5, 27)).tolist())
-    return [{**row, "distance_mm": 700.0 + row["true_x_mm"]} for row in rows]
+    return rows
 
 
 @pytest.fixture
 def table(tmp_path, rows):
     return write_csv(tmp_path / "mine.csv", rows)
-
-
-@pytest.fixture(scope="module")
-def evaluated(tmp_path_factory, rows):
-    """Two evaluations of one table, as tables and as JSON: folder, exit status, stdout and stderr of each."""
-    home = tmp_path_factory.mktemp("evaluated")
-    table = write_csv(home / "mine.csv", rows)
-    results = []
-    for name, options in (("tables", ()), ("objects", ("--json",))):
-        with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
-            status = cli.main(["em", "evaluate", str(table), *options, "--out", str(home / name)])
-        results.append((home / name, status, out.getvalue(), err.getvalue()))
-    return results
 
 
 @pytest.fixture
@@ -55,9 +40,10 @@ def run(capsys, *argv):
     return status, captured.out, captured.err
 
 
-def test_tables_show_the_papers_and_the_manufacturers_values(evaluated):
-    folder, status, out, err = evaluated[0]
-    assert (status, err) == (0, "note: tip: not in noisy, only in ideal\n")
+@pytest.mark.usefixtures("no_figures")
+def test_tables_show_the_papers_and_the_manufacturers_values(capsys, table, tmp_path):
+    status, out, err = run(capsys, "em", "evaluate", table, "--out", tmp_path / "out")
+    assert (status, err) == (0, "")
     for text in (
         "tip, ideal",
         " paper",
@@ -66,21 +52,14 @@ def test_tables_show_the_papers_and_the_manufacturers_values(evaluated):
         "0.48",
         "threshold",
         "reference, noisy: slope (mm)",
-        " met",
     ):
         assert text in out
-    assert str(folder) in out
+    assert str(tmp_path / "out") in out
 
 
-@pytest.mark.usefixtures("no_figures")
-def test_with_a_registration_its_residual_is_shown(capsys, table, tmp_path):
-    status, out, _ = run(capsys, "em", "evaluate", table, "--register", "--out", tmp_path / "out")
-    assert status == 0
-    assert "registration residual" in out
-
-
-def test_json_is_one_object_in_full_precision_and_is_written_as_well(evaluated):
-    folder, status, out, _ = evaluated[1]
+def test_json_is_one_object_in_full_precision_and_is_written_as_well(capsys, table, tmp_path):
+    folder = tmp_path / "out"
+    status, out, _ = run(capsys, "em", "evaluate", table, "--out", folder, "--json")
     values = json.loads(out)
     assert status == 0
     assert json.loads((folder / "evaluation.json").read_text()) == values
@@ -90,17 +69,7 @@ def test_json_is_one_object_in_full_precision_and_is_written_as_well(evaluated):
         assert tip[name] == pytest.approx(value, abs=1e-12)
     assert values["indicator"][0]["sensor"] == "tip"
     names = [path.rsplit("/", 1)[-1] for path in values["figures"]]
-    assert names == [
-        f"{name}.{kind}" for name in ("field", "indicator", "distance") for kind in ("png", "svg")
-    ]
-
-
-def test_the_same_table_gives_the_same_bytes(evaluated):
-    one, two = (folder for folder, *_ in evaluated)
-    assert sorted(path.name for path in one.iterdir()) == sorted(path.name for path in two.iterdir())
-    for path in one.iterdir():
-        if path.name != "evaluation.json":  # contains the name of its folder
-            assert path.read_bytes() == (two / path.name).read_bytes(), path.name
+    assert names == [f"{name}.{kind}" for name in ("field", "indicator") for kind in ("png", "svg")]
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -112,6 +81,10 @@ def test_the_default_folder_is_new_and_results_are_not_overwritten(capsys, table
     status, _, err = run(capsys, "em", "evaluate", table, "--out", folder)
     assert (status, err.count("\n")) == (2, 1)
     assert "already contains evaluation.json" in err
+    status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "--ideal: no environment 'idael'" in err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", ["evaluate", "check", "register"])
@@ -177,14 +150,10 @@ def test_check_finds_both_environments_by_name(capsys, tmp_path):
     assert "no environment 'off': choose with --off and --on from on, quiet" in err
 
 
-def test_check_reports_few_and_differing_points(capsys, tmp_path):
+def test_check_compares_few_and_differing_points(capsys, tmp_path):
     few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
     assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
     other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
-    note = (
-        "reference: grid points: 20 in power off, 27 in power on, 20 in common: the compared positions differ"
-    )
-    assert run(capsys, "em", "check", other)[2] == f"note: {note}\n"
     values = json.loads(run(capsys, "em", "check", other, "--json")[1])
     assert values["results"][0]["paired"] is False
     low, high = values["results"][0]["difference_interval"]
@@ -195,7 +164,7 @@ def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
     rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
     table = write_csv(tmp_path / "t.csv", rows)
     status, _, err = run(capsys, "em", "check", table)
-    assert (status, err) == (0, "note: ref2: no indicator in power off, only in power on\n")
+    assert (status, err) == (0, "note: ref2: no indicator with power off\n")
     assert json.loads(run(capsys, "em", "check", table, "--json")[1])["notes"] == [err[6:-1]]
     status, _, err = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows[:27] + rows[54:]))
     assert status == 2
@@ -223,21 +192,6 @@ def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
     assert " noisy" not in out
 
 
-def test_a_misspelt_environment_is_refused_before_a_folder_is_made(capsys, table, tmp_path):
-    status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
-    assert (status, err.count("\n")) == (2, 1)
-    assert "--ideal: no environment 'idael': choose from ideal, noisy" in err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_table_of_points_is_not_overwritten(capsys, table, tmp_path):
-    (tmp_path / "points.csv").write_text("mine")
-    status, _, err = run(capsys, "em", "evaluate", table, "--out", tmp_path)
-    assert status == 2
-    assert "already contains points.csv" in err
-    assert (tmp_path / "points.csv").read_text() == "mine"
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
     rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
@@ -248,13 +202,3 @@ def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
     assert " coil, lab" in out
     with pytest.raises(SystemExit):
         run(capsys, *argv[:3], "--sensor", " ")
-
-
-@pytest.mark.parametrize("command", ["evaluate", "check"])
-def test_an_unknown_option_prints_the_usage_of_its_command(capsys, command):
-    with pytest.raises(SystemExit) as ended:
-        run(capsys, "em", command, "t.csv", "--registr")
-    assert ended.value.code == 2
-    err = capsys.readouterr().err
-    assert err.startswith(f"usage: flexneedle em {command} ")
-    assert f"flexneedle em {command}: error: unrecognized arguments: --registr" in err

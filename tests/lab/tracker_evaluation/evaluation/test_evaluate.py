@@ -17,7 +17,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.tables.columns import map_columns
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
-LAWS = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+LAWS = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
 # first, ±2 along y at the second.
 BY_HAND = rows_of(
@@ -180,63 +180,6 @@ def test_sensors_and_environments_are_evaluated_separately_in_the_papers_order(t
     for seed, key in ((1, ("reference", "noisy")), (4, ("reference", "ideal"))):
         bias = 2.0 if seed == 1 else 0.5
         assert found[key]["rmse_mm"] == pytest.approx(plain(random_rows(seed, bias=bias))["rmse_mm"])
-
-
-def test_errors_over_distance_are_those_after_registration(tmp_path):
-    rotation = Rotation.from_euler("xyz", (10, 20, 30), degrees=True)
-    rows = []
-    for row in random_rows(0):
-        position = rotation.apply([row[f"{axis}_mm"] for axis in "xyz"]) + 300.0
-        rows.append(
-            {**row, "distance_mm": 612.0}
-            | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, position), strict=True))
-        )
-    (found,) = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions(register=True)).values()[
-        "results"
-    ]
-    (bin_,) = found["distance"]["bins"]
-    assert bin_["rmse_mm"] == pytest.approx(found["rmse_mm"])
-    assert bin_["rmse_mm"] < 1.5
-
-
-def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_path):
-    error = {400.0: 2.0, 500.0: 0.9, 610.0: 0.3, 700.0: 0.8, 805.0: 0.2}
-    rows = []
-    for distance, off in error.items():
-        around = np.array([(off, 0.01, 0.0), (off, -0.01, 0.0)])
-        own = rows_of(GRID, GRID[:, None] + around)
-        rows += [{**row, "distance_mm": distance} for row in own]
-    evaluation = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
-    found = evaluation.values()["results"][0]["distance"]
-    assert [b["distance_mm"] for b in found["bins"]] == pytest.approx(list(error))
-    assert [b["rmse_mm"] for b in found["bins"]] == pytest.approx(list(error.values()))
-    assert [b["jitter_mm"] for b in found["bins"]] == pytest.approx([0.01] * 5)
-    assert found["bins"][2]["from_mm"] == 600.0
-    assert (found["limit_mm"], found["smallest_mm"], found["exceeded_mm"]) == (
-        0.70,
-        610.0,
-        pytest.approx((700.0,)),
-    )
-    assert evaluation.results[0].distances.limit_met == "from 610 mm, not at 700 mm"
-    assert only(tmp_path / "t.csv", limit_mm=0.1)["distance"]["smallest_mm"] is None
-    wide = only(tmp_path / "t.csv", bin_mm=1000.0)
-    assert len(wide["distance"]["bins"]) == 1
-    pooled = np.mean(list(error.values()))
-    assert wide["rmse_mm"] == pytest.approx(pooled)  # the main figures pool by grid point alone
-    assert wide["jitter_mm"] == pytest.approx(np.sqrt(np.var(list(error.values())) + 0.01**2))
-
-
-def test_orientation_jitter_is_the_rms_angle_for_either_sign_of_the_quaternion(tmp_path):
-    angle = np.radians([0.5, -0.5, 0.5, -0.5])
-    rows = rows_of(GRID, [[p] * 4 for p in GRID])
-    for k, row in enumerate(rows):
-        sign = (-1.0) ** (k % 3)
-        rotated = np.cos(angle[k % 4] / 2), 0.0, np.sin(angle[k % 4] / 2), 0.0
-        row |= {name: sign * float(q) for name, q in zip(("qw", "qx", "qy", "qz"), rotated, strict=True)}
-    found = only(write_csv(tmp_path / "t.csv", rows))["orientation"]
-    assert found["jitter_deg"] == pytest.approx(0.5, rel=1e-9)
-    assert found["axis_jitter_deg"] == pytest.approx(0.5, rel=1e-6)
-    assert found["n_samples"] == len(rows)
 
 
 def test_a_roll_about_the_sensor_axis_is_no_jitter_of_the_axis(tmp_path):

@@ -21,7 +21,6 @@ def test_each_point_has_its_samples_with_the_position_of_the_stage(grid, out):
         true = np.array([float(row[f"true_{axis}_mm"]) for axis in "xyz"])
         measured = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
         np.testing.assert_array_equal(measured - true, (100.0, 0.0, 0.0))
-        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(measured))
         assert (row["environment"], row["indicator"], row["qw"]) == ("ideal, by the window", "0.02", "1.0")
 
 

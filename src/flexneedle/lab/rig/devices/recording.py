@@ -55,8 +55,9 @@ def _frames(table: SampleTable, rows: Sequence[_Row]) -> tuple[Frame, ...]:
         readings: dict[str, SensorReading] = {}
         for position, row in group:
             if row["sensor"] in readings:
-                place, _ = table.find_row(position)
-                raise InputError(f"{place}: duplicate sensor {row['sensor']} in frame {number:g}")
+                raise InputError(
+                    f"{table.find_row(position)}: duplicate sensor {row['sensor']} in frame {number:g}"
+                )
             readings[row["sensor"]] = _reading(row)
         if frames and time < frames[-1].time:
             raise InputError(f"frame {number:g}: time_s must not decrease")

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor, inf, isnan, log10
+from math import isnan
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -13,7 +13,6 @@ from flexneedle.figures.layout import Look, legend, short
 from flexneedle.figures.style import INK, QUIET, signed, styled
 from flexneedle.lab.study.figures.panels import FAINT, Panel, panels, ticks_of
 
-_WIDE = 10.0  # ratio of the largest value to the linear range above which the scale is symlog
 _SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"
 
 
@@ -73,33 +72,10 @@ def _write(ax: Axes, level: int, text: str) -> None:
 def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
     known = [v for row in rows for v in (row.mean, row.low, row.high) if not isnan(v)] or [0.0]
     low, high = min(0.0, *known), max(0.0, *known)
-    even = _find_linear_range(rows)
-    if max(high, -low) > _WIDE * even:
-        _scale_decades(ax, low, high, even, ticks)
-    else:
-        pad = 0.06 * (high - low) or 0.05
-        ax.set_xlim(low - pad, high + pad)
-        ax.locator_params(axis="x", nbins=ticks)
+    pad = 0.06 * (high - low) or 0.05
+    ax.set_xlim(low - pad, high + pad)
+    ax.locator_params(axis="x", nbins=ticks)
     ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
-
-
-def _find_linear_range(rows: Sequence[DifferenceRow]) -> float:
-    """Return the range of the linear scale around zero: largest interval that contains zero, or else nearest end."""
-    known = [(abs(row.low), abs(row.high), row.low <= 0.0 <= row.high) for row in rows if not isnan(row.low)]
-    holding = [max(low, high) for low, high, holds in known if holds]
-    nearest = [min(low, high) for low, high, _ in known]
-    return max(holding) if holding else min(nearest, default=inf)
-
-
-def _scale_decades(ax: Axes, low: float, high: float, even: float, most: int) -> None:
-    """Make the scale linear within ±`even` around zero, and logarithmic beyond."""
-    ax.set_xscale("symlog", linthresh=even)
-    ax.set_xlim(min(1.3 * low, -1.3 * even), max(1.3 * high, 1.3 * even))
-    sizes = [float(f"{digit}e{k}") for k in range(floor(log10(even)) - 1, 4) for digit in (1, 3)]
-    beyond = [sign * size for size in sizes if size > 0.3 * even for sign in (-1.0, 1.0)]
-    inside = sorted([0.0, *(value for value in beyond if low <= value <= high)])
-    ax.set_xticks(inside if len(inside) <= most else [v for v in inside if f"{abs(v):e}"[0] in "01"])
-    ax.set_xticks([], minor=True)
 
 
 def _handles() -> list[Line2D]:

@@ -16,7 +16,6 @@ from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
 Content = TypeVar("Content")
 
 MOST_PANELS = 9
-OVERLAID = 3  # controllers in one panel; more get a panel each
 MANY = 1500  # dots; more are small and drawn as an image inside the SVG
 FAINT = "#c9cbd0"
 LIMIT: Any = {"color": TARGET, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": "1 mm"}

@@ -12,10 +12,11 @@ from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import Floats, legend, short
 from flexneedle.figures.style import BAD, INK, styled
-from flexneedle.lab.study.figures.panels import FAINT, OVERLAID, Panel, decades, panels
+from flexneedle.lab.study.figures.panels import FAINT, Panel, decades, panels
 from flexneedle.lab.study.figures.samples import ErrorSample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
+_MOST_BANDS = 3
 _GAP = 6.0  # pixels between names of levels
 _WIDE = 20.0  # ratio of the largest to the smallest median or mean above which the scale is logarithmic
 Sweep = Panel[Sequence[ErrorSample]]
@@ -23,36 +24,31 @@ Sweep = Panel[Sequence[ErrorSample]]
 
 
 def draw_sweep(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
-    """Return the figure along an axis with levels at `places` (m,); few controllers share one panel."""
-    overlaid = len(sweeps) <= OVERLAID
-    shown = [Panel("", "", INK, ())] if overlaid else list(sweeps)
+    """Return the figure along an axis with levels at `places` (m,); more than three controllers have no bands."""
     with styled():
-        figure, axes = panels(shown, 4.0 if overlaid else 2.7, short(label, 60), "true error (mm)")
-        for k, ax in enumerate(axes):
-            for other in () if overlaid else sweeps:
-                line: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1}
-                ax.plot(
-                    places, _apply_to_levels(other, np.median), label="medians of other controllers", **line
-                )
-            for sweep in sweeps if overlaid else sweeps[k : k + 1]:
-                _draw(ax, sweep, places)
-            _scale(ax, sweeps)
-            _name_levels(ax, places, [row.name for row in sweeps[0].content])
-        if overlaid:
-            _count_unfinished(axes[0], sweeps, places)
-        legend(figure, _handles(), [_name_sweep(sweep) for sweep in sweeps] if overlaid else ())
+        figure, (ax,) = panels([Panel("", "", INK, ())], 4.0, short(label, 60), "true error (mm)")
+        for sweep in sweeps:
+            _draw(ax, sweep, places, with_band=len(sweeps) <= _MOST_BANDS)
+        _scale(ax, sweeps)
+        _name_levels(ax, places, [row.name for row in sweeps[0].content])
+        _count_unfinished(ax, sweeps, places)
+        legend(figure, _handles(), [_name_sweep(sweep) for sweep in sweeps])
         figure.draw_without_rendering()
-        for ax in axes:
-            _thin_names(ax)
+        _thin_names(ax)
     return figure
 
 
-def _draw(ax: Axes, sweep: Sweep, places: Floats) -> None:
+def _draw(ax: Axes, sweep: Sweep, places: Floats, *, with_band: bool) -> None:
     color, marker = sweep.color, sweep.content[0].look.marker
-    low, high = _apply_to_levels(sweep, _FIRST), _apply_to_levels(sweep, _THIRD)
-    ax.fill_between(
-        places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2, label="interquartile range"
-    )
+    if with_band:
+        low, high = _apply_to_levels(sweep, _FIRST), _apply_to_levels(sweep, _THIRD)
+        band: dict[str, Any] = {
+            "color": color,
+            "alpha": 0.16,
+            "linewidth": 0.0,
+            "label": "interquartile range",
+        }
+        ax.fill_between(places, low, high, zorder=2, **band)
     middle, average = _apply_to_levels(sweep, np.median), _apply_to_levels(sweep, np.mean)
     ax.plot(places, middle, color=color, marker=marker, markersize=5, zorder=4, label="median")
     ax.plot(places, average, color=color, linestyle=(0, (4, 2)), linewidth=1.2, zorder=3, label="mean")
@@ -113,5 +109,4 @@ def _handles() -> list[Line2D]:
         Line2D([], [], color=INK, label="median"),
         Line2D([], [], color=INK, alpha=0.16, linewidth=6.0, label="interquartile range"),
         Line2D([], [], color=INK, linestyle=(0, (4, 2)), linewidth=1.2, label="mean"),
-        Line2D([], [], color=FAINT, linewidth=1.0, label="medians of other controllers"),
     ]

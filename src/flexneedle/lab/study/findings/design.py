@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
-from flexneedle.lab.study.findings.reading import StudyDefinition
+from flexneedle.lab.study.findings.reading import StudyTables
 from flexneedle.lab.study.findings.rows import Codes, Floats, InsertionRows
 from flexneedle.scenario.sections.needle import GAUGES
 
@@ -65,16 +65,17 @@ class StudyDesign:
         return tuple(factor for factor in self.factors if factor not in compared)
 
 
-def find_design(rows: InsertionRows, definition: StudyDefinition) -> StudyDesign:
+def find_design(study: StudyTables) -> StudyDesign:
     """Return the factors of a study with the levels in its rows.
 
     The first levels are the default controller and the base case, which is the first case without settings.
     """
-    base = [name for name, settings in definition.cases.items() if not settings][:1]
+    rows = study.rows
+    base = [name for name, settings in study.cases.items() if not settings][:1]
     cases = _make_factor("case", rows.text("case"), first=base)
-    keys = [key for key in definition.axes if key not in _SAMPLED and not key.startswith("target")]
+    keys = [key for key in study.axes if key not in _SAMPLED and not key.startswith("target")]
     axes = [_make_factor(key, _read_column(rows, key)) for key in keys]
-    case_axis = _find_case_axis(cases, definition.cases)
+    case_axis = _find_case_axis(cases, study.cases)
     if case_axis is not None:
         axes, cases = [case_axis, *axes], _make_factor("case", [""] * len(rows))
     return StudyDesign(

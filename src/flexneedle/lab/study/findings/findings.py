@@ -49,7 +49,7 @@ class Findings:
     @property
     def planned(self) -> int:
         """Number of insertions of the complete study."""
-        return self.study.definition.insertions
+        return self.study.insertions
 
     @property
     def finished(self) -> int:
@@ -68,8 +68,10 @@ class Findings:
 
     def values(self) -> dict[str, Any]:
         """Return all statistics as plain values, at full precision; NaN becomes null in JSON."""
+        rows = self.study.rows
         return {
-            "insertions": len(self.study.rows),
+            "study": self.study.title,
+            "insertions": len(rows),
             "planned": self.planned,
             "finished": self.finished,
             "missing": self.missing,
@@ -89,13 +91,17 @@ class Findings:
             "worlds": list(map(asdict, self.worlds)),
             "predictions": list(map(asdict, self.predictions)),
             "endings": list(map(asdict, self.endings)),
+            "worst": [
+                {name: rows.value(name, row) for name in ("index", "true_error_mm", "outcome")}
+                for row in self.worst
+            ],
         }
 
 
 def compute_findings(study: StudyTables) -> Findings:
     """Return the findings of a study."""
     rows = study.rows
-    design = find_design(rows, study.definition)
+    design = find_design(study)
     groups = group_rows(rows, design.factors)
     controllers_only = len(design.factors) == 1
     return Findings(

@@ -155,8 +155,7 @@ def _list_entries(f: _Facts) -> list[_Entry]:
         *(_make_axis_entry(f, axis, number) for number, axis in enumerate(found.design.axes, 1)),
         _Entry(
             "controllers", f"{ours} against the other controllers", _has_means(found.against),
-            f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets. "
-            "If the differences vary widely in size, the scale is linear around zero and logarithmic beyond.",
+            f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets.",
             partial(_against, f), partial(draw_differences, label="difference of the true error (mm)"),
         ),
         _Entry(

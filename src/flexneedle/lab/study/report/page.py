@@ -2,7 +2,7 @@
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
@@ -27,8 +27,8 @@ _HEADING = re.compile(r'<th scope="col"[^>]*>(.*?)</th>')
 _CELL = re.compile(r"<t[dh]\b")
 
 
-def render_page(findings: Findings, figures: Sequence[ReportFigure], commands: Mapping[int, str]) -> str:
-    """Return the page as HTML. commands: command of each listed row."""
+def render_page(findings: Findings, figures: Sequence[ReportFigure]) -> str:
+    """Return the page as HTML."""
     from markupsafe import Markup
 
     study = findings.study
@@ -38,7 +38,6 @@ def render_page(findings: Findings, figures: Sequence[ReportFigure], commands: M
         rows=study.rows,
         factors=findings.design.factors,
         figures=figures,
-        commands=commands,
         versions=list_versions(study.rows),
         settings=list_settings(study.rows),
         written=datetime.fromtimestamp((study.folder / STUDY_FILE).stat().st_mtime, UTC),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
-from flexneedle.cli.values import positive
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
 
 
@@ -38,19 +38,6 @@ def add_parser(commands: Commands) -> None:
         "--noisy", metavar="NAME", help="environment to be detected by the threshold (default: noisy)"
     )
     parser.add_argument(
-        "--bin-mm",
-        type=positive,
-        default=50.0,
-        metavar="MM",
-        help="bin width of distance_mm (default: 50)",
-    )
-    parser.add_argument(
-        "--limit-mm",
-        type=positive,
-        metavar="MM",
-        help="limit of the RMSE over distance (default: the manufacturer's RMSE, for tip and reference)",
-    )
-    parser.add_argument(
         "--out", type=Path, metavar="DIR", help="output folder (default: runs/<date>-em-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
@@ -65,15 +52,30 @@ def _evaluate(args: argparse.Namespace) -> int:
         write_evaluation,
     )
     from flexneedle.lab.tracker_evaluation.figures.evaluation import draw_evaluation
-    from flexneedle.lab.tracker_evaluation.results_folder import make_results_folder
 
-    names = ("register", "unit", "bin_mm", "limit_mm", "ideal", "noisy", "sensor", "environment")
+    names = ("register", "unit", "ideal", "noisy", "sensor", "environment")
     options = EvaluationOptions(tuple(args.columns), **{name: getattr(args, name) for name in names})
     evaluation = evaluate_table(args.data, options)
-    folder = make_results_folder(args.out, args.data.stem, RESULT_FILES)
+    folder = _make_folder(args.out, args.data.stem, RESULT_FILES)
     values = write_evaluation(evaluation, folder, draw_evaluation(evaluation, folder))
     if args.json:
         print_json(values)
     else:
         print_evaluation(evaluation, folder)
     return 0
+
+
+def _make_folder(out: Path | None, name: str, results: Sequence[str]) -> Path:
+    """Create the folder `out`, or a new one in `runs/`, and return it."""
+    from flexneedle.errors import InputError
+    from flexneedle.files import create_folder
+
+    path = out if out is not None else create_folder("em", name)
+    for result in results:
+        if (path / result).exists():
+            raise InputError(f"{path}: already contains {result}: choose another folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be created: {error.strerror}: choose another --out") from None
+    return path

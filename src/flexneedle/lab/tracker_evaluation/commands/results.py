@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from flexneedle.lab.tracker_evaluation.commands.tables import (
@@ -17,7 +17,6 @@ from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples
 from flexneedle.phantom.tracking.table import REFERENCE
 
-_PER_TABLE = 4
 _ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
 _INDICATOR = ("mean", "sd", "max", "min", "p95")
 
@@ -43,9 +42,6 @@ def _print_tables(evaluation: Evaluation) -> None:
     fits = [row for found in evaluation.fits for row in _fit_rows(found, *pair)]
     if fits:
         print_rows("Error by indicator", ("", "", "95 % interval", "paper"), fits)
-    for start in range(0, len(results), _PER_TABLE):
-        some = results[start : start + _PER_TABLE]
-        print_rows("Details (mm)", ("", *(result.grid.title for result in some)), _details(some))
 
 
 def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
@@ -112,37 +108,3 @@ def _found_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[
             format_number(found.threshold, ".4f"),
             format_interval(found.threshold_interval, ".4f"),
         )
-
-
-def _details(results: list[SensorResult]) -> Iterator[tuple[str, ...]]:
-    def row(name: str, text: Callable[[SensorResult], str]) -> tuple[str, ...]:
-        return (name, *map(text, results))
-
-    yield row(
-        "mean error ± sd",
-        lambda r: f"{format_number(r.accuracy.mean_mm)} ± {format_number(r.accuracy.sd_mm)}",
-    )
-    yield row("distance error, rms", lambda r: format_number(r.relative_distance.rms_mm))
-    yield row(
-        " 95 %, max",
-        lambda r: f"{format_number(r.relative_distance.p95_mm)}, {format_number(r.relative_distance.max_mm)}",
-    )
-    yield row(" rms, closest neighbours", lambda r: format_number(r.relative_distance.neighbours_rms_mm))
-    yield row("repeatability, sd", lambda r: format_number(r.repeatability.sd_mm))
-    yield row(" at the worst point", lambda r: format_number(r.repeatability.worst_mm))
-    if any(r.orientation for r in results):
-        yield row("orientation jitter, rms (°)", lambda r: _part(r.orientation, "jitter_deg"))
-        yield row(" of the sensor axis (°)", lambda r: _part(r.orientation, "axis_jitter_deg"))
-    if any(r.distances for r in results):
-        yield row("limit of the rmse", lambda r: _part(r.distances, "limit_mm", "g"))
-        yield row(" met", lambda r: r.distances.limit_met if r.distances else "–")
-    if any(r.registration for r in results):
-        yield row("registration residual, rms", lambda r: _part(r.registration, "residual_mm"))
-        yield row(" rotation angle (°)", lambda r: _part(r.registration, "angle_deg"))
-        for k, axis in enumerate("xyz"):
-            shifts = [r.registration.translation_mm[k] if r.registration else None for r in results]
-            yield (f" translation {axis}", *map(format_number, shifts))
-
-
-def _part(found: object, name: str, form: str = ".3f") -> str:
-    return format_number(getattr(found, name, None), form)

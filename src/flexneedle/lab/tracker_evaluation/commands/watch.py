@@ -16,8 +16,6 @@ from flexneedle.cli.values import positive
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rich.table import Table
-
     from flexneedle.lab.tracker_evaluation.recording.watch import TrackerSnapshot
     from flexneedle.types import Frame, SensorReading
 
@@ -34,8 +32,7 @@ def add_parser(commands: Commands) -> None:
         _watch,
         "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
         "flexneedle em watch --tracker replay:frames.csv@4 --json",
-        about="Show a live table at a terminal; elsewhere print one line per second and per change of the "
-        "verdict. Ends with Ctrl-C or the end of a replay.",
+        about="Print a line per second and per change of the verdict. Ends with Ctrl-C or the end of a replay.",
     )
     parser.add_argument(
         "--tracker",
@@ -73,11 +70,9 @@ def _watch(args: argparse.Namespace) -> int:
 
 
 def _display(stack: ExitStack, as_json: bool) -> Callable[[TrackerSnapshot], None]:
-    """Return the function that shows a snapshot: as JSON, in a live table, or as a line."""
+    """Return the function that shows a snapshot."""
     if as_json:
         return _print_json
-    if sys.stdout.isatty():
-        return _live_table(stack)
     lines = _Lines()
     stack.callback(lines.finish)
     return lines.show
@@ -150,31 +145,3 @@ def _cells(frame: Frame) -> Iterator[str]:
             continue
         position = " {:.2f} {:.2f} {:.2f} mm".format(*reading.position) if name == first else ""
         yield f"{name}{position}" + ("" if reading.indicator is None else f" I {reading.indicator:.4f}")
-
-
-def _live_table(stack: ExitStack) -> Callable[[TrackerSnapshot], None]:
-    from rich.live import Live
-
-    live = stack.enter_context(Live(auto_refresh=True, refresh_per_second=10))
-    return lambda snapshot: live.update(_table(snapshot))
-
-
-def _table(snapshot: TrackerSnapshot) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
-    number = "none yet" if snapshot.frame is None else str(snapshot.frame.number)
-    table = Table(
-        title=f"{snapshot.time:.1f} s, frame {number}", caption=Text(f"verdict: {snapshot.verdict}")
-    )
-    for head in ("sensor", "x mm", "y mm", "z mm", "indicator", "status"):
-        table.add_column(head, justify="left" if head in ("sensor", "status") else "right")
-    for name, reading in (
-        snapshot.frame.readings.items() if snapshot.frame is not None and snapshot.is_new else ()
-    ):
-        position = (
-            ("", "", "") if reading.position is None else tuple(f"{part:.2f}" for part in reading.position)
-        )
-        indicator = "" if reading.indicator is None else f"{reading.indicator:.4f}"
-        table.add_row(*map(Text, (name, *position, indicator, reading.status)))
-    return table

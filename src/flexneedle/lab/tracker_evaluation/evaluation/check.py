@@ -4,7 +4,7 @@ Compares the indicator with power off and on, from two environments of one table
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOpti
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import average_indicator
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import Interval, bootstrap
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples, MeasuredGrid
-from flexneedle.lab.tracker_evaluation.evaluation.notes import find_differing_points, find_missing_sensors
 
 Floats = NDArray[np.float64]
 
@@ -93,12 +92,11 @@ def check_power(data: Path, off: str, on: str, threshold: float, options: Evalua
             f"{data}: no sensor has an indicator both with power off ({', '.join(before) or 'none'}) "
             f"and on ({', '.join(after) or 'none'})"
         )
-    powered = [
-        replace(grid, environment=f"power {power}")
-        for power, own in (("off", before), ("on", after))
-        for grid in own.values()
+    notes = [
+        f"{name}: no indicator with power {'on' if name in before else 'off'}"
+        for name in (before | after)
+        if name not in both
     ]
-    notes = [*find_missing_sensors(powered, "no indicator in"), *find_differing_points(powered)]
     return PowerCheck([compare_power(before[name], after[name], threshold) for name in both], notes)
 
 

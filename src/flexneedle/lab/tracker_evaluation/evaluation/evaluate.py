@@ -16,7 +16,6 @@ from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
     compute_accuracy,
     register_grid,
 )
-from flexneedle.lab.tracker_evaluation.evaluation.distance import DistanceErrors, bin_errors
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
     IndicatorFits,
     IndicatorSummary,
@@ -46,17 +45,14 @@ _FORMAT = 1
 class EvaluationOptions:
     """Options of reading and evaluating a table.
 
-    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm" or "m", of all lengths; limit_mm:
-    limit of the RMSE over distance (None: the manufacturer's RMSE for the paper's sensors); ideal, noisy: names of the
-    environments of the fits to the indicator (None: the paper's); sensor, environment: of all rows, for a table without
-    such a column.
+    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm" or "m", of all lengths; ideal,
+    noisy: names of the environments of the fits to the indicator (None: the paper's); sensor, environment: of all rows,
+    for a table without such a column.
     """
 
     columns: tuple[str, ...] = ()
     register: bool = False
     unit: str = "mm"
-    bin_mm: float = 50.0
-    limit_mm: float | None = None
     ideal: str | None = None
     noisy: str | None = None
     sensor: str | None = None
@@ -79,7 +75,6 @@ class SensorResult:
     relative_distance: RelativeDistance
     repeatability: Repeatability
     orientation: Orientation | None
-    distances: DistanceErrors | None
 
     def values(self) -> dict[str, Any]:
         """Return the result as plain values; lengths in mm, full precision."""
@@ -94,7 +89,6 @@ class SensorResult:
             "relative_distance": asdict(self.relative_distance),
             "repeatability": asdict(self.repeatability),
             "orientation": _values(self.orientation),
-            "distance": _values(self.distances),
             "indicator": _values(self.indicator),
         }
 
@@ -135,7 +129,7 @@ def evaluate_table(data: Path, options: EvaluationOptions) -> Evaluation:
     registered = [result.grid for result in results]
     sensors = dict.fromkeys(grid.sensor for grid in registered)
     fits = [fit_indicator(sensor, *_environments(registered, sensor, options)) for sensor in sensors]
-    notes = find_notes(registered, options.pair, suggest_registration=not options.register)
+    notes = find_notes(registered, suggest_registration=not options.register)
     return Evaluation(data, options, rows, results, [fit for fit in fits if fit is not None], notes)
 
 
@@ -152,7 +146,7 @@ def read_table(
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
     with open_table(data, required, optional, mapping=mapping, labels=names, unit=options.unit) as table:
-        return read_grids(table, options.bin_mm, threshold)
+        return read_grids(table, threshold)
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
@@ -175,8 +169,6 @@ def _check_names(grids: Sequence[MeasuredGrid], options: EvaluationOptions) -> N
 
 def _result(grid: MeasuredGrid, options: EvaluationOptions) -> SensorResult:
     grid, registration = register_grid(grid) if options.register else (grid, None)
-    official = published.OFFICIAL.get(published.find_paper_sensor(grid.sensor) or "", {})
-    limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
     return SensorResult(
         grid,
         compute_accuracy(grid),
@@ -185,7 +177,6 @@ def _result(grid: MeasuredGrid, options: EvaluationOptions) -> SensorResult:
         compute_relative_distance(grid),
         compute_repeatability(grid),
         compute_orientation(grid),
-        bin_errors(grid, options.bin_mm, limit),
     )
 
 

@@ -1,6 +1,6 @@
 """Moments of the samples at each grid point, for each sensor and environment of a table.
 
-DuckDB groups the rows in two passes over the file. Means are Kahan sums (`favg`), and sums of squares are about a
+DuckDB groups the rows. Means are Kahan sums (`favg`), and sums of squares are about a
 running mean (`var_pop`, Welford), so no digits cancel far from the origin.
 """
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from flexneedle.errors import InputError
 from flexneedle.geometry.registration import Rigid
 from flexneedle.lab.tables.rules import (
-    DISTANCES,
     INDICATORS,
     ORIENTATIONS,
     POSITIONS,
@@ -52,22 +51,19 @@ _INDICATORS = """
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Moments of n groups of samples: by grid point, or by grid point and distance bin.
+    """Moments of the samples at n grid points.
 
-    bins (n,): distance bin, NaN if the distance is unknown or pooled. count, missing (n,): number of samples with and
-    without a position. true, position (n, 3): true and mean measured position (mm); scatter (n, 3): sum of squares
-    about the mean along each axis (mm²). distance (n,): mean distance to the field generator (mm). indicators,
-    orientations (n,): number of samples with a position and an indicator or an orientation; indicator (n,): mean
-    indicator; products (n, 4, 4): mean of q qᵀ with q = (w, x, y, z). NaN for groups without such samples.
+    count, missing (n,): number of samples with and without a position. true, position (n, 3): true and mean measured
+    position (mm); scatter (n, 3): sum of squares about the mean along each axis (mm²). indicators, orientations (n,):
+    number of samples with a position and an indicator or an orientation; indicator (n,): mean indicator; products
+    (n, 4, 4): mean of q qᵀ with q = (w, x, y, z). NaN for points without such samples.
     """
 
-    bins: Floats
     count: Counts
     missing: Counts
     true: Floats
     position: Floats
     scatter: Floats
-    distance: Floats
     indicators: Counts
     indicator: Floats
     orientations: Counts
@@ -96,15 +92,14 @@ class IndicatorSamples:
 class MeasuredGrid:
     """The measurements of one sensor in one environment on a grid.
 
-    names: of the grid points; points: moments by grid point, in the order of names; cells: moments by grid point and
-    distance bin; samples: of the indicator, None if the sensor has none; rigid: transform applied to the positions.
+    names: of the grid points; points: moments in the order of names; samples: of the indicator, None if the sensor has
+    none; rigid: transform applied to the positions.
     """
 
     sensor: str
     environment: str
     names: tuple[str, ...]
     points: Moments
-    cells: Moments
     samples: IndicatorSamples | None
     rigid: Rigid | None = None
 
@@ -130,75 +125,69 @@ class MeasuredGrid:
 
     def transform(self, rigid: Rigid) -> "MeasuredGrid":
         """Return the grid with all mean positions transformed; the scatter remains along the tracker's axes."""
-        points, cells = (replace(p, position=rigid.apply(p.position)) for p in (self.points, self.cells))
-        return replace(self, points=points, cells=cells, rigid=rigid)
+        points = replace(self.points, position=rigid.apply(self.points.position))
+        return replace(self, points=points, rigid=rigid)
 
 
 _Arrays = dict[str, NDArray[Any]]
 
 
-def read_grids(table: SampleTable, bin_mm: float, threshold: float) -> tuple[list[MeasuredGrid], int]:
+def read_grids(table: SampleTable, threshold: float) -> tuple[list[MeasuredGrid], int]:
     """Return a grid for each sensor and environment, and the number of rows.
 
-    bin_mm: width of the distance bins; threshold: of the indicator. Raises InputError for rows that violate a rule, or
-    if there are no rows.
+    threshold: of the indicator. Raises InputError for rows that violate a rule, or if there are no rows.
     """
-    if 0 < len(table.columns.intersection(_QUATERNION)) < len(_QUATERNION):
+    if 0 < len(table.fields.keys() & {*_QUATERNION}) < len(_QUATERNION):
         raise InputError("qw, qx, qy, qz: the table must have all four columns or none")
     rules = _choose_rules(table)
-    cells = table.arrays(_cells_query(table, rules), bin_mm=bin_mm)
-    if not len(cells["n"]):
+    points = table.arrays(_points_query(table, rules))
+    if not len(points["n"]):
         raise InputError("has no rows")
-    labels = {name.lower() for column in _LABELS for name in cells[column]}
-    if cells["n_invalid"].any() or not labels.isdisjoint(EMPTY):
+    labels = {name.lower() for column in _LABELS for name in points[column]}
+    if points["n_invalid"].any() or not labels.isdisjoint(EMPTY):
         table.refuse([*require_text(*_LABELS), *rules])
-    _refuse_moved(table, cells)
-    indicators = table.arrays(_INDICATORS, threshold=threshold) if cells["n_indicator"].any() else {}
-    pairs = sorted({*zip(cells["sensor"], cells["environment"], strict=True)}, key=lambda p: [*map(_rank, p)])
-    rows = int(cells["n_rows"][cells["pooled"] == 1].sum())
-    return [_grid(cells, indicators, sensor, environment) for sensor, environment in pairs], rows
+    _refuse_moved(table, points)
+    indicators = table.arrays(_INDICATORS, threshold=threshold) if points["n_indicator"].any() else {}
+    pairs = sorted(
+        {*zip(points["sensor"], points["environment"], strict=True)}, key=lambda p: [*map(_rank, p)]
+    )
+    return [_grid(points, indicators, *pair) for pair in pairs], int(points["n_rows"].sum())
 
 
 def _choose_rules(table: SampleTable) -> tuple[Rule, ...]:
-    optional = {"indicator": INDICATORS, "distance_mm": DISTANCES, "qw": ORIENTATIONS}
-    others = (rule for column, rules in optional.items() if column in table.columns for rule in rules)
+    optional = {"indicator": INDICATORS, "qw": ORIENTATIONS}
+    others = (rule for column, rules in optional.items() if column in table.fields for rule in rules)
     return (*TRUE_POSITIONS, *POSITIONS, *others)
 
 
-def _cells_query(table: SampleTable, rules: tuple[Rule, ...]) -> str:
-    """Return the SQL for the moments by grid point (pooled = 1) and by grid point and distance bin (pooled = 0).
-
-    Indicator, distance and orientation of samples without a position are ignored.
-    """
-    orientations = _ORIENTATIONS if "qw" in table.columns else _NO_ORIENTATIONS
-    with_bins = "distance_mm" in table.columns
-    sets = f"({_KEY})" + (f", ({_KEY}, bin)" if with_bins else "")
-    bins = "bin, grouping(bin) AS pooled" if with_bins else "NULL::DOUBLE AS bin, 1 AS pooled"
+def _points_query(table: SampleTable, rules: tuple[Rule, ...]) -> str:
+    """Return the SQL for the moments by grid point; indicator and orientation without a position are ignored."""
+    orientations = _ORIENTATIONS if "qw" in table.fields else _NO_ORIENTATIONS
     return f"""
         WITH checked AS (
             SELECT * REPLACE (if(x_mm IS NULL, NULL, indicator) AS indicator),
-                floor(distance_mm / $bin_mm + 1e-9) AS bin, {first_violation(rules)} AS rule,
+                {first_violation(rules)} AS rule,
                 if(x_mm IS NULL, NULL, qw * qw + qx * qx + qy * qy + qz * qz) AS norm
             FROM samples
         ), grouped AS (
-            SELECT {_KEY}, {bins}, count(*) AS n_rows, count(x_mm) AS n, {_POSITIONS}, {orientations},
-                favg(if(x_mm IS NULL, NULL, distance_mm)) AS distance, favg(indicator) AS indicator,
-                count(indicator) AS n_indicator, count(norm) AS n_orientation, count(rule) AS n_invalid
-            FROM checked GROUP BY GROUPING SETS ({sets})
+            SELECT {_KEY}, count(*) AS n_rows, count(x_mm) AS n, {_POSITIONS}, {orientations},
+                favg(indicator) AS indicator, count(indicator) AS n_indicator, count(norm) AS n_orientation,
+                count(rule) AS n_invalid
+            FROM checked GROUP BY {_KEY}
         )
-        SELECT * FROM grouped ORDER BY pooled, bin,
+        SELECT * FROM grouped ORDER BY
             CASE WHEN bool_and(regexp_full_match(point_id, '{_NUMBER}')) OVER () THEN try_cast(point_id AS HUGEINT) END,
             point_id
     """
 
 
-def _refuse_moved(table: SampleTable, cells: _Arrays) -> None:
+def _refuse_moved(table: SampleTable, points: _Arrays) -> None:
     """Raise InputError for the first row of a grid point whose true position differs from the first one."""
-    moved = np.max([cells[f"moved_{a}"] for a in _AXES], axis=0)
+    moved = np.max([points[f"moved_{a}"] for a in _AXES], axis=0)
     if moved.max() <= SAME_POSITION_MM:
         return
     worst = int(moved.argmax())
-    place = {name: str(cells[name][worst]) for name in ("sensor", "environment", "point_id")}
+    place = {name: str(points[name][worst]) for name in ("sensor", "environment", "point_id")}
     own = " AND ".join(f"{name} = ${name}" for name in place)
     query = f"SELECT true_x_mm AS x, true_y_mm AS y, true_z_mm AS z FROM samples WHERE {own} LIMIT 1"
     first = table.arrays(query, **place)
@@ -211,36 +200,27 @@ def _refuse_moved(table: SampleTable, cells: _Arrays) -> None:
         table.refuse([(f"greatest({off}) > {limit}", message)], own, **place)
 
 
-def _grid(cells: _Arrays, indicators: _Arrays, sensor: str, environment: str) -> MeasuredGrid:
-    own = (cells["sensor"] == sensor) & (cells["environment"] == environment)
-    pooled = own & (cells["pooled"] == 1)
-    return MeasuredGrid(
-        sensor,
-        environment,
-        tuple(cells["point_id"][pooled].tolist()),
-        _moments(cells, pooled),
-        _moments(cells, own & (cells["pooled"] == 0)),
-        _samples(indicators, sensor, environment),
-    )
+def _grid(points: _Arrays, indicators: _Arrays, sensor: str, environment: str) -> MeasuredGrid:
+    chosen = (points["sensor"] == sensor) & (points["environment"] == environment)
+    own = {name: column[chosen] for name, column in points.items()}
+    samples = _samples(indicators, sensor, environment)
+    return MeasuredGrid(sensor, environment, tuple(own["point_id"].tolist()), _moments(own), samples)
 
 
-def _moments(cells: _Arrays, chosen: NDArray[np.bool_]) -> Moments:
+def _moments(own: _Arrays) -> Moments:
     def stack_axes(name: str) -> Floats:
-        return np.stack([cells[f"{name}_{a}"][chosen] for a in _AXES], axis=1).astype(float)
+        return np.stack([own[f"{name}_{a}"] for a in _AXES], axis=1).astype(float)
 
-    own = {name: column[chosen] for name, column in cells.items()}
     products = np.zeros((len(own["n"]), 4, 4))
     for a, b in _PAIRS:
         i, j = "wxyz".index(a), "wxyz".index(b)
         products[:, i, j] = products[:, j, i] = own[f"p_{a}{b}"]
     return Moments(
-        bins=own["bin"],
         count=own["n"],
         missing=own["n_rows"] - own["n"],
         true=stack_axes("true"),
         position=stack_axes("mean"),
         scatter=stack_axes("scatter"),
-        distance=own["distance"],
         indicators=own["n_indicator"],
         indicator=own["indicator"],
         orientations=own["n_orientation"],

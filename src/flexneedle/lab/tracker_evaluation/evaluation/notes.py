@@ -16,43 +16,16 @@ _UNREGISTERED = 5.0
 _FEWEST_POINTS = 6  # a rigid fit with its six parameters always fits fewer points well
 
 
-def find_notes(grids: Sequence[MeasuredGrid], pair: tuple[str, str], suggest_registration: bool) -> list[str]:
+def find_notes(grids: Sequence[MeasuredGrid], suggest_registration: bool) -> list[str]:
     """Return a line for each unusual property of the grids.
 
-    pair: environments of the fits to the indicator; suggest_registration: add a note if --register seems needed.
+    suggest_registration: add a note if --register seems needed.
     """
     return [
         *(note for grid in grids for note in _count_missing(grid)),
-        *find_missing_sensors(grids),
-        *find_differing_points(grids),
         *_misfits(grids),
         *(_unregistered(grids) if suggest_registration else ()),
-        *_missing_environments(grids, pair),
     ]
-
-
-def find_missing_sensors(grids: Sequence[MeasuredGrid], absent: str = "not in") -> Iterator[str]:
-    """Yield a line, with the words `absent`, for each sensor that is missing in an environment."""
-    environments = list(dict.fromkeys(grid.environment for grid in grids))
-    for sensor in dict.fromkeys(grid.sensor for grid in grids):
-        own = [grid.environment for grid in grids if grid.sensor == sensor]
-        missing = [name for name in environments if name not in own]
-        if missing:
-            yield f"{sensor}: {absent} {', '.join(missing)}, only in {', '.join(own)}"
-
-
-def find_differing_points(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
-    """Yield a line for each sensor whose grid points differ between environments."""
-    for sensor in dict.fromkeys(grid.sensor for grid in grids):
-        own = {grid.environment: _measured_names(grid) for grid in grids if grid.sensor == sensor}
-        shared = set.intersection(*own.values())
-        if any(names != shared for names in own.values()):
-            counts = ", ".join(f"{len(names)} in {name}" for name, names in own.items())
-            yield f"{sensor}: grid points: {counts}, {len(shared)} in common: the compared positions differ"
-
-
-def _measured_names(grid: MeasuredGrid) -> set[str]:
-    return {name for name, known in zip(grid.names, grid.known.tolist(), strict=True) if known}
 
 
 def _count_missing(grid: MeasuredGrid) -> Iterator[str]:
@@ -95,13 +68,3 @@ def _fit(grid: MeasuredGrid) -> tuple[float, float] | None:
         return None
     raw = root_mean_square(compute_errors(measured))
     return (raw, residual) if raw > _UNREGISTERED * residual else None
-
-
-def _missing_environments(grids: Sequence[MeasuredGrid], pair: tuple[str, str]) -> Iterator[str]:
-    present = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicators.any()))
-    missing = [name for name in pair if name not in present]
-    if len(present) > 1 and missing:
-        yield (
-            f"no indicator in an environment named {' or '.join(missing)} (found: {', '.join(present)}): "
-            "use --ideal and --noisy to name the two environments to compare"
-        )

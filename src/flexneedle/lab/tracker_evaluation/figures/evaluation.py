@@ -2,14 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from flexneedle.figures.style import save, signed
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import compute_error_vectors
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, LineFit, average_indicator
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
-from flexneedle.lab.tracker_evaluation.figures.distance import DistanceLine, draw_distance
 from flexneedle.lab.tracker_evaluation.figures.field import FieldRow, draw_field
 from flexneedle.lab.tracker_evaluation.figures.indicator import (
     IndicatorPanel,
@@ -21,17 +18,12 @@ MOST_PANELS = 3
 
 
 def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Draw `field`, `indicator` and `distance` as PNG and SVG, omitting those without data."""
+    """Draw `field`, and `indicator` if there is one, as PNG and SVG."""
     paths = save(draw_field([_field(result) for result in evaluation.results]), folder, "field")
     panels = [_indicator(evaluation, found) for found in evaluation.fits[:MOST_PANELS]]
     if panels:
         paths += save(draw_indicator(panels, len(evaluation.fits) - len(panels)), folder, "indicator")
-    binned = [
-        _distance(result)
-        for result in evaluation.results
-        if result.distances and len(result.distances.bins) > 1
-    ]
-    return paths + (save(draw_distance(binned), folder, "distance") if binned else [])
+    return paths
 
 
 def _field(result: SensorResult) -> FieldRow:
@@ -64,12 +56,3 @@ def _is_of(result: SensorResult, found: IndicatorFits) -> bool:
 
 def _points(grid: MeasuredGrid, fit: str) -> PlottedPoints:
     return PlottedPoints(grid.environment, *average_indicator(grid), fit)
-
-
-def _distance(result: SensorResult) -> DistanceLine:
-    found = result.distances
-    if found is None:
-        raise ValueError("the result has no distances")
-    distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
-    note = found.limit_met if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.limit_met}"
-    return DistanceLine(result.grid.title, distance, rmse, found.limit_mm, note)

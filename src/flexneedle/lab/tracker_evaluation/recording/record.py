@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import dist, hypot, inf
+from math import dist, inf
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -251,8 +251,7 @@ def _make_row(stop: GridStop, reading: SensorReading, sensor: str, environment: 
         | dict(zip(("true_x_mm", "true_y_mm", "true_z_mm"), stop.position, strict=True))
         | dict(zip(("x_mm", "y_mm", "z_mm"), reading.position, strict=True))
         | dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
-        # The field generator is at the origin of an Aurora's frame.
-        | {"indicator": reading.indicator, "distance_mm": hypot(*reading.position)}
+        | {"indicator": reading.indicator}
     )
 
 
