@@ -46,7 +46,7 @@ _ADDED = f"""async ([selectors, tone]) => {{
 
 def arrived(page):
     """Wait until what the server has sent so far is there and painted: an answer comes after it."""
-    page.evaluate("flexneedle.link.ask({ type: 'rows_from', index: 0 })")
+    page.evaluate("flexneedle.link.ask({ type: 'ping' })")
     page.evaluate(PAINTED)
 
 

@@ -134,12 +134,24 @@ class Client:
             assert values["first"] <= len(rows), "rows are missing"
             rows[values["first"] :] = values["rows"]
 
+    def has(self, key: str, **values) -> dict:
+        """Wait for a message of a key with these values, and return it."""
+        return self.wait(
+            lambda: (found := self.newest.get(key)) and values.items() <= found.items() and found
+        )
+
     def job(self, kind: str, state: str) -> dict:
         """Wait for the state of a job."""
-        return (
-            self.wait(lambda: self.newest.get(f"job {kind}", {}).get("state") == state)
-            and self.newest[f"job {kind}"]
-        )
+        return self.has(f"job {kind}", state=state)
+
+    def inserts(self, state: str, **options) -> None:
+        """Start a virtual insertion and wait for its state."""
+        self.do("insert", **options)
+        self.has("insertion live", state=state)
+
+    def got_rows(self, count: int, of: str = "live") -> None:
+        """Wait for all rows of an insertion."""
+        self.wait(lambda: [row["index"] for row in self.rows.get(of, ())] == list(range(count)))
 
 
 _PARTS = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}

@@ -1,7 +1,10 @@
 """Jobs of the page's worker, done in this process; what they report is kept."""
 
+import json
 from contextlib import suppress
 from functools import cache
+
+from pydantic_core import to_json
 
 from flexneedle.errors import FlexneedleError
 from flexneedle.lab.page.job_orders import RigReport, WorkOrder
@@ -25,6 +28,15 @@ def short(name="phantom", **changes):
         "plan.max_iterations": 3,
     }
     return load_scenario(name).with_values(values | changes)
+
+
+def plain(rows):
+    """Return rows as a page gets them, without the time of the decision, which the wall clock decides."""
+    return [{key: value for key, value in as_sent(row).items() if key != "decide_ms"} for row in rows]
+
+
+def as_sent(row):
+    return json.loads(to_json(row, inf_nan_mode="null"))
 
 
 class Reported:
@@ -63,7 +75,7 @@ def task(do, kind=None, scenario=None, *, reported=None, pace=NO_WAIT, **values)
 
 
 def done(action, one):
-    """What a task has reported when it is done, also if it has failed or was cancelled."""
+    """Return the reports of a task when it has ended."""
     with suppress(FlexneedleError, Cancelled):
         action(one)
     return one.report

@@ -25,7 +25,6 @@ from flexneedle.lab.page.protocol import (
     InsertionMessage,
     IterationMessage,
     JobMessage,
-    PeriodRow,
     PlanMessage,
     RigCheckMessage,
     RowsMessage,
@@ -114,7 +113,7 @@ class Worker:
         )
 
     def rows(self, of, first, count):
-        rows = [PeriodRow.model_construct(index=index) for index in range(first, first + count)]
+        rows = [{"index": index} for index in range(first, first + count)]
         self.report(RowsMessage.model_construct(of=of, first=first, rows=rows))
 
     def rig(self, state, why="", waits=0):
@@ -232,8 +231,6 @@ class Worker:
 
 class WorkerThread:
     """The worker in place of a `ChildProcess`."""
-
-    pid = -1
 
     def __init__(self):
         ours, theirs = socket.socketpair()

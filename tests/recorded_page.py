@@ -12,7 +12,6 @@ from flexneedle.lab.page.protocol import (
     InsertionMessage,
     IterationMessage,
     JobMessage,
-    PeriodRow,
     PlanMessage,
     ReachMessage,
     RowsMessage,
@@ -181,15 +180,15 @@ def estimate(revision=1, roll_deg=0.0):
 def row(index):
     x, y, z = needle(_tip_x(index), sway=0.3)[-1]
     true = needle(_tip_x(index), sway=0.6)[-1]
-    return PeriodRow(
-        index=index, time=0.2 * index, action="advance", decision="advance as planned", verdict="ok",
-        measured=(x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
-        estimate=(x, y, z), true=tuple(true), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
-        guide=(0.02 * index, 0.01 * index), roll_deg=3.0 * index, indicator=0.1,
-        energy_mj=2e-5 * index, true_energy_mj=2.1e-5 * index,
-        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05,
-        decide_ms=12.0, late=False,
-    )  # fmt: skip
+    return {
+        "index": index, "time": 0.2 * index, "action": "advance", "decision": "advance as planned", "verdict": "ok",
+        "measured": (x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
+        "estimate": (x, y, z), "true": tuple(true), "error_mm": float(np.hypot(*(true[1:] - (y, z)))),
+        "guide": (0.02 * index, 0.01 * index), "roll_deg": 3.0 * index, "indicator": 0.1,
+        "energy_mj": 2e-5 * index, "true_energy_mj": 2.1e-5 * index,
+        "miss_mm": (0.3 * (1 - index / PERIODS), -0.1), "miss_sd_mm": 0.5 * (1 - index / PERIODS) + 0.05,
+        "decide_ms": 12.0, "late": False, "warning": "",
+    }  # fmt: skip
 
 
 def rows(first=0, count=PERIODS, of="live"):

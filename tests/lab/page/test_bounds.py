@@ -1,6 +1,6 @@
-"""Each bound of a request, as its model declares it, is kept: what is just beyond it is refused.
+"""Bounds of requests: a value just beyond a bound, or of another type, is refused.
 
-The bounds are those of the JSON schema of the models, so that a new one is tested without a change here.
+The bounds are read from the JSON schema of the models, so that a new one is tested without a change here.
 """
 
 import json
@@ -14,8 +14,8 @@ from pydantic import ValidationError
 from flexneedle.lab.page.requests import REQUESTS, ClientRequest
 
 SCHEMAS = {model.__name__: model.model_json_schema() for model in ClientRequest.__subclasses__()}
-WORDS = {"title", "description", "default", "type"}
-"""Of a schema that bound nothing; a type is tested by other types."""
+UNBOUND = {"title", "description", "default", "type"}
+"""Words of a schema without a bound; a type is tested by other types."""
 NUMBERS = {"minimum", "maximum", "exclusiveMaximum"}
 TEXTS = {"minLength", "maxLength", "pattern"}
 TABLES = {"minProperties", "maxProperties", "propertyNames", "patternProperties"}
@@ -26,12 +26,12 @@ OTHERS = {
     "boolean": (1, 0, "true", [True]),
     "object": (1, "a", [1]),
 }
-"""Values of other types by type: of a request they are refused, not converted."""
+"""Values of other types by type; a request with them is refused, they are not converted."""
 LETTERS = string.printable + "\0é\u2028🙂"
 
 
 def parts_of(name):
-    """Schemas of the values of a request, by name; of what may be None the schema of the rest."""
+    """Return the schemas of the values of a request by name, without None."""
     properties = SCHEMAS[name]["properties"]
     return {part: given_of(schema) for part, schema in properties.items() if part != "type"}
 
@@ -46,12 +46,8 @@ def given_of(schema):
     return some[0]
 
 
-def text_of(length):
-    return "a" * length
-
-
 def valid(schema):
-    """A value that keeps all bounds."""
+    """Return a value within all bounds."""
     kind = schema["type"]
     if "enum" in schema:
         return schema["enum"][0]
@@ -60,17 +56,21 @@ def valid(schema):
     return {"integer": 1, "number": 1.0, "string": "a", "boolean": True}[kind]
 
 
+def table_of(count):
+    return {f"a{number}": 1 for number in range(count)}
+
+
 def inside(schema):
-    """Values at the bounds."""
+    """Yield values at the bounds."""
     for word, bound in schema.items():
         if word in ("minimum", "maximum"):
             yield bound
         elif word == "exclusiveMaximum":
             yield bound - 1
         elif word in ("minLength", "maxLength"):
-            yield text_of(bound)
+            yield "a" * bound
         elif word in ("minProperties", "maxProperties"):
-            yield {f"a{number}": 1 for number in range(bound)}
+            yield table_of(bound)
         elif word == "propertyNames":
             yield from ({text: 1} for text in inside(bound))
         elif word == "enum":
@@ -78,17 +78,15 @@ def inside(schema):
 
 
 def beyond(schema):
-    """Values just beyond each bound, and of other types."""
+    """Yield values just beyond each bound, and of other types."""
     yield from OTHERS[schema["type"]]
     for word, bound in schema.items():
         if word in NUMBERS:
             yield next_to(bound, schema["type"], word)
         elif word in TEXTS:
             yield from texts_beyond(word, bound)
-        elif word == "minProperties":
-            yield {f"a{number}": 1 for number in range(bound - 1)}
-        elif word == "maxProperties":
-            yield {f"a{number}": 1 for number in range(bound + 1)}
+        elif word in ("minProperties", "maxProperties"):
+            yield table_of(bound + (1 if word == "maxProperties" else -1))
         elif word == "propertyNames":
             yield from ({text: 1} for key in bound for text in texts_beyond(key, bound[key]))
         elif word == "patternProperties":
@@ -96,7 +94,7 @@ def beyond(schema):
         elif word == "enum":
             yield from ("", bound[0].upper(), f"{bound[0]} ")
         else:
-            assert word in WORDS, f"{word}: no value beyond it is known here"
+            assert word in UNBOUND, f"{word}: no value beyond it is known here"
 
 
 def next_to(bound, kind, word):
@@ -108,16 +106,13 @@ def next_to(bound, kind, word):
 
 
 def texts_beyond(word, bound):
-    if word == "minLength":
-        yield text_of(bound - 1)
-    elif word == "maxLength":
-        yield text_of(bound + 1)
-    else:
-        some = [text for letter in LETTERS for text in (letter, f"a{letter}", f"{letter}a")]
-        yield from (text for text in some if not re.fullmatch(bound, text))
+    if word in ("minLength", "maxLength"):
+        return ["a" * (bound + (1 if word == "maxLength" else -1))]
+    texts = [text for letter in LETTERS for text in (letter, f"a{letter}", f"{letter}a")]
+    return [text for text in texts if not re.fullmatch(bound, text)]
 
 
-def accepted(request):
+def accepts(request):
     try:
         REQUESTS.validate_json(json.dumps(request))
     except ValidationError:
@@ -125,45 +120,36 @@ def accepted(request):
     return True
 
 
-def taken(name, *given):
-    """Whether a request is taken with some values, given as (name, value), and valid others."""
+def accepts_values(name, *given):
+    """Return whether a request is accepted with some values, given as (name, value), and valid others."""
     others = {part: valid(schema) for part, schema in parts_of(name).items()}
-    return accepted({"type": type_of(name), **others, **dict(given)})
+    return accepts({"type": type_of(name), **others, **dict(given)})
 
 
 @pytest.mark.parametrize("name", SCHEMAS)
-def test_each_number_has_two_bounds_and_each_text_a_longest(name):
+def test_values_at_a_bound_are_accepted_and_values_beyond_it_refused(name):
+    """Each number has two bounds, and each text a longest."""
+    assert accepts_values(name)
     for part, schema in parts_of(name).items():
         if schema["type"] in ("integer", "number"):
             assert "minimum" in schema, part
             assert (NUMBERS - {"minimum"}) & schema.keys(), part
         elif schema["type"] == "string":
             assert {"enum", "maxLength", "const"} & schema.keys(), part
-
-
-@pytest.mark.parametrize("name", SCHEMAS)
-def test_what_is_at_a_bound_is_taken(name):
-    assert taken(name)
-    some = [(part, value) for part, schema in parts_of(name).items() for value in inside(schema)]
-    assert [given for given in some if not taken(name, given)] == []
-
-
-@pytest.mark.parametrize("name", SCHEMAS)
-def test_what_is_beyond_a_bound_is_refused(name):
-    some = [(part, value) for part, schema in parts_of(name).items() for value in beyond(schema)]
-    assert [given for given in some if taken(name, given)] == []
+        assert [value for value in inside(schema) if not accepts_values(name, (part, value))] == []
+        assert [value for value in beyond(schema) if accepts_values(name, (part, value))] == []
 
 
 @pytest.mark.parametrize("name", SCHEMAS)
 def test_unknown_and_missing_values_are_refused(name):
-    assert not taken(name, ("unknown", 1))
+    assert not accepts_values(name, ("unknown", 1))
     required = [part for part in SCHEMAS[name]["required"] if part != "type"]
     request = {"type": type_of(name), **{part: valid(parts_of(name)[part]) for part in required}}
-    assert accepted(request)
+    assert accepts(request)
     for part in request:
-        assert not accepted({key: value for key, value in request.items() if key != part}), part
+        assert not accepts({key: value for key, value in request.items() if key != part}), part
 
 
 def test_bounds_of_numbers_texts_and_tables_are_found():
     words = {word for name in SCHEMAS for schema in parts_of(name).values() for word in schema}
-    assert words - WORDS == NUMBERS | TEXTS | TABLES | {"enum"}
+    assert words - UNBOUND == NUMBERS | TEXTS | TABLES | {"enum"}

@@ -1,4 +1,4 @@
-"""A client gets the newest of each key, and all rows."""
+"""The hub: a client gets the newest message of each key, and all rows and shapes of an insertion."""
 
 import asyncio
 import json
@@ -7,20 +7,30 @@ import math
 import pytest
 
 from flexneedle.errors import RunError
-from flexneedle.lab.page.protocol import ClientsMessage, JobMessage, PeriodRow, RefusedMessage, ServerMessage
+from flexneedle.lab.page.protocol import ClientsMessage, JobMessage, RefusedMessage, ServerMessage
 from flexneedle.lab.page.server.hub import Hub
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
 
 
 def joined(hub):
-    """A client that has got its first message."""
+    """Return the outbox of a client that has its first message."""
     outbox = hub.join(ClientsMessage(clients=0, steering=None))
     assert '"people"' in outbox._take()
     return outbox
 
 
+@pytest.fixture
+def hub():
+    return Hub()
+
+
+@pytest.fixture
+def outbox(hub):
+    return joined(hub)
+
+
 def drained(outbox):
-    """All that a client has to get."""
+    """Return all messages that a client has not received."""
 
     async def drain():
         found = []
@@ -29,6 +39,10 @@ def drained(outbox):
         return found
 
     return asyncio.run(drain())
+
+
+def types(found):
+    return [message["type"] for message in found]
 
 
 TYPES = {each.model_fields["type"].default: each for each in ServerMessage.__subclasses__()}
@@ -40,39 +54,32 @@ def report(hub, type_, **values):
 
 
 def rows(hub, first, count, of="live"):
-    made = [PeriodRow.model_construct(index=first + i) for i in range(count)]
-    report(hub, "rows", of=of, first=first, rows=made)
+    report(hub, "rows", of=of, first=first, rows=[{"index": first + i} for i in range(count)])
 
 
 def indices(found):
     return [row["index"] for message in found if message["type"] == "rows" for row in message["rows"]]
 
 
-def test_a_client_gets_the_newest_of_each_key():
-    hub = Hub()
-    outbox = joined(hub)
+def test_a_client_gets_the_newest_of_each_key(hub, outbox):
     for clients in range(1000):
         hub.publish(ClientsMessage(clients=clients, steering=None))
         hub.publish(JobMessage(job=clients, kind="plan", state="running"))
     found = drained(outbox)
-    assert [message["type"] for message in found] == ["people", "job"]
+    assert types(found) == ["people", "job"]
     assert found[0]["clients"] == found[1]["job"] == 999
 
 
-def test_a_new_client_gets_all_keys_once():
-    hub = Hub()
-    report(hub, "plan", strategy="steering")
-    report(hub, "plan", strategy="manipulation")
-    report(hub, "plan", strategy="steering", cost=2)
+def test_a_new_client_gets_all_keys_once(hub):
+    for strategy in ("steering", "manipulation", "steering"):
+        report(hub, "plan", strategy=strategy)
     rows(hub, 0, 3)
     found = drained(joined(hub))
     assert [message.get("strategy") for message in found] == ["steering", "manipulation", None]
     assert indices(found) == [0, 1, 2]
 
 
-def test_frames_are_kept_by_source_and_kind():
-    hub, outbox = Hub(), None
-    outbox = joined(hub)
+def test_frames_are_kept_by_source_and_kind(hub, outbox):
     frames = [
         make_frame(kind, source, number, [[1.0, 2.0, 3.0]])
         for number in range(3)
@@ -87,13 +94,13 @@ def test_frames_are_kept_by_source_and_kind():
 
 
 def needle(hub, first, count, points=1, source=FrameSource.LIVE):
-    """A worker shows needles of periods, at whose points x is the period."""
+    """Publish needles of periods; x of their points is the period."""
     paths = [[[number, 0.0, 0.0]] * points for number in range(first, first + count)]
     hub.publish(make_frame(FrameKind.NEEDLE, source, first, *paths))
 
 
 def periods(found):
-    """x of the paths of frames, by the number of their period."""
+    """Return x of the paths of frames, by the number of their period."""
     return {
         frame.number + at: float(path[0, 0])
         for frame in map(unpack_frame, found)
@@ -101,34 +108,22 @@ def periods(found):
     }
 
 
-def test_shapes_of_periods_are_sent_once_and_none_is_lost():
-    hub = Hub()
-    outbox = joined(hub)
+def test_shapes_of_periods_are_sent_once_and_none_is_lost(hub, outbox):
     for number in range(3):
         needle(hub, number, 1)
     assert periods(drained(outbox)) == {0: 0.0, 1: 1.0, 2: 2.0}
-    needle(hub, 3, 1)
-    needle(hub, 4, 2)
-    (message,) = drained(outbox)
-    assert periods([message]) == {3: 3.0, 4: 4.0, 5: 5.0}
-    assert drained(outbox) == []
-    assert [*periods(drained(joined(hub)))] == [0, 1, 2, 3, 4, 5]
-
-
-def test_a_period_without_a_shape_is_not_a_number():
-    hub = Hub()
-    needle(hub, 1, 1)
     needle(hub, 4, 1)
+    needle(hub, 5, 2)
+    (message,) = drained(outbox)
+    assert periods([message]) == {4: 4.0, 5: 5.0, 6: 6.0}
+    assert drained(outbox) == []
     found = periods(drained(joined(hub)))
-    assert (found[1], found[4]) == (1.0, 4.0)
-    assert math.isnan(found[2])
-    assert math.isnan(found[3])
+    assert [*found] == [0, 1, 2, 3, 4, 5, 6]
+    assert math.isnan(found[3])  # a period without a shape
 
 
 @pytest.mark.parametrize(("first", "points"), [(0, 1), (5, 1), (6, 2)])
-def test_shapes_of_a_new_insertion_replace_those_of_the_last(first, points):
-    hub = Hub()
-    outbox = joined(hub)
+def test_shapes_of_a_new_insertion_replace_the_last(hub, outbox, first, points):
     needle(hub, 0, 6)
     drained(outbox)
     needle(hub, first, 1, points)
@@ -136,9 +131,7 @@ def test_shapes_of_a_new_insertion_replace_those_of_the_last(first, points):
         assert periods(drained(each)) == {first: float(first)}
 
 
-def test_shapes_that_are_forgotten_are_not_sent():
-    hub = Hub()
-    outbox = joined(hub)
+def test_forgotten_shapes_are_not_sent(hub, outbox):
     needle(hub, 0, 3)
     needle(hub, 0, 2, source=FrameSource.FIRST)
     drained(outbox)
@@ -150,117 +143,72 @@ def test_shapes_that_are_forgotten_are_not_sent():
     assert [frame.number for frame in hub.shapes["frame 1 1"].frames] == [3]
 
 
-def test_many_shapes_are_sent_in_parts():
-    hub = Hub()
+def test_many_shapes_are_sent_in_parts(hub):
     for first in (0, 2, 5, 9):
         needle(hub, first, 2, points=70_000)
-    parts = drained(joined(hub))
-    assert [(unpack_frame(part).number, unpack_frame(part).end) for part in parts] == [
-        (0, 4),
-        (5, 7),
-        (9, 11),
-    ]
+    parts = [unpack_frame(part) for part in drained(joined(hub))]
+    assert [(part.number, part.end) for part in parts] == [(0, 4), (5, 7), (9, 11)]
 
 
-def test_rows_are_sent_once_and_in_order():
-    hub = Hub()
-    outbox = joined(hub)
+def test_rows_are_sent_once_and_in_order_and_begin_at_0_with_an_insertion(hub, outbox):
     rows(hub, 0, 2)
     assert indices(drained(outbox)) == [0, 1]
     rows(hub, 2, 1)
     rows(hub, 3, 1000)
     assert indices(drained(outbox)) == list(range(2, 1003))
     assert drained(outbox) == []
-
-
-def test_many_rows_leave_others_their_turn():
-    hub = Hub()
-    rows(hub, 0, 1000)
-    hub.publish(ClientsMessage(clients=1, steering=None))
-    outbox = joined(hub)
-    types = [message["type"] for message in drained(outbox)]
-    assert types.index("people") < len(types) - 1 - types[::-1].index("rows")
-
-
-def test_rows_that_were_missed_are_sent_again():
-    hub = Hub()
-    outbox = joined(hub)
-    rows(hub, 0, 10)
-    drained(outbox)
-    outbox.resend_rows("rows live", 7)
-    assert indices(drained(outbox)) == [7, 8, 9]
-    outbox.resend_rows("rows live", 99)
-    assert drained(outbox) == []
-
-
-def test_rows_of_a_new_insertion_begin_at_0():
-    hub = Hub()
-    outbox = joined(hub)
-    rows(hub, 0, 10)
-    drained(outbox)
     rows(hub, 0, 2)
     (message,) = drained(outbox)
-    assert message["first"] == 0
-    assert indices([message]) == [0, 1]
-
-
-def test_rows_with_a_gap_are_an_error_of_the_worker():
-    hub = Hub()
-    rows(hub, 0, 2)
-    with pytest.raises(RunError, match="rows from 3: those from 2 are missing"):
+    assert (message["first"], indices([message])) == (0, [0, 1])
+    with pytest.raises(RunError):
         rows(hub, 3, 1)
 
 
-def test_what_is_forgotten_is_not_sent():
-    hub = Hub()
-    rows(hub, 0, 2, of="first")
-    report(hub, "insertion", of="first")
-    hub.forget(["rows first", "insertion first"])
-    assert drained(joined(hub)) == []
+def test_unknown_numbers_of_a_row_are_null(hub, outbox):
+    report(hub, "rows", of="live", first=0, rows=[{"index": 0, "miss_mm": (math.nan, 1.5), "late": False}])
+    assert drained(outbox)[0]["rows"] == [{"index": 0, "miss_mm": [None, 1.5], "late": False}]
 
 
-def test_the_end_of_a_job_comes_after_its_results():
-    hub = Hub()
-    outbox = joined(hub)
+def test_many_rows_are_interleaved_with_other_keys(hub):
+    rows(hub, 0, 1000)
+    hub.publish(ClientsMessage(clients=1, steering=None))
+    found = types(drained(joined(hub)))
+    assert found.index("people") < len(found) - 1 - found[::-1].index("rows")
+
+
+def test_the_end_of_a_job_follows_its_results(hub, outbox):
     hub.publish(JobMessage(job=1, kind="plan", state="waiting"))
     report(hub, "plan", strategy="steering")
     hub.publish(JobMessage(job=1, kind="plan", state="done"))
     for each in (outbox, joined(hub)):
-        assert [message["type"] for message in drained(each)] == ["plan", "job"]
+        assert types(drained(each)) == ["plan", "job"]
 
 
-def test_what_is_forgotten_and_comes_again_comes_later():
-    hub = Hub()
-    outbox = joined(hub)
+def test_a_forgotten_key_is_not_sent_and_a_later_update_goes_to_the_back(hub, outbox):
     report(hub, "reach", revision=1)
     rows(hub, 0, 5)
     hub.forget(["rows live", "reach"])
+    assert drained(joined(hub)) == []
     report(hub, "insertion", of="live")
     report(hub, "reach", revision=2)
     rows(hub, 0, 2)
     found = drained(outbox)
-    assert [message["type"] for message in found] == ["insertion", "reach", "rows"]
+    assert types(found) == ["insertion", "reach", "rows"]
     assert indices(found) == [0, 1]
 
 
-def test_an_answer_comes_after_the_news():
-    hub = Hub()
-    outbox = joined(hub)
+def test_answers_follow_what_the_request_has_caused_and_are_not_replaced(hub, outbox):
     report(hub, "session", revision=2)
-    outbox.answer(RefusedMessage(request=1, what="edit", reason="no"))
-    report(hub, "session", revision=3)
-    report(hub, "scene", revision=3)
-    assert [message["type"] for message in drained(outbox)] == ["session", "refused", "scene"]
-
-
-def test_answers_are_not_replaced():
-    outbox = joined(Hub())
     for number in range(3):
         outbox.answer(RefusedMessage(request=number, what="edit", reason="no"))
-    assert [message["request"] for message in drained(outbox)] == [0, 1, 2]
+    report(hub, "session", revision=3)
+    report(hub, "scene", revision=3)
+    found = drained(outbox)
+    assert types(found) == ["session", *(["refused"] * 3), "scene"]
+    assert [message["request"] for message in found[1:4]] == [0, 1, 2]
 
 
-def test_next_waits_for_news():
+def test_next_waits_for_a_message():
     async def wait():
         hub = Hub()
         outbox = joined(hub)

@@ -1,4 +1,4 @@
-"""Insertions of the page's worker: the same as those of `flexneedle.insert`, at any pace."""
+"""Virtual insertions of the page's worker: equal to `flexneedle.insert`, at any pace, with disturbances."""
 
 import math
 from dataclasses import replace
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
+import recorded_page
 from flexneedle.errors import InputError
 from flexneedle.lab.page.job_orders import JobChange
 from flexneedle.lab.page.requests import DisturbRequest
@@ -20,61 +21,79 @@ from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.phantom.draw import draw
 from flexneedle.record.export import mark_columns
 from flexneedle.record.saving import save
-from page_tasks import NO_WAIT, Reported, done, short, task
+from page_tasks import NO_WAIT, Reported, done, plain, short, task
 
-TIMED = {"decide_ms"}
+pytestmark = pytest.mark.usefixtures("empty_figures")
+
 REFERENCES = ("ref1", "ref2", "ref3")
 
 
-def plain(rows):
-    """Rows without what the wall clock decides; NaN is None."""
-    return [row.model_dump(exclude=TIMED, mode="json") for row in rows]
+def by_command(scenario):
+    return flexneedle.insert(scenario, flexneedle.plan(scenario, seed=3), 3)
 
 
 @pytest.fixture(scope="module")
-def by_command():
+def expected():
     """The insertion of `flexneedle.insert`."""
-    plan = flexneedle.plan(short(), seed=3)
-    return flexneedle.insert(short(), plan, 3)
+    return by_command(short())
+
+
+@pytest.fixture(scope="module")
+def in_field():
+    """An insertion with a tracker that has references and an indicator."""
+    return by_command(short(**{"tracker.environment": "ideal", "monitor.enabled": False}))
+
+
+def rows_of(insertion):
+    return plain(row_of(period, insertion.plan) for period in insertion.periods)
 
 
 @pytest.fixture(scope="module")
 def inserted():
-    """The worker of a finished insertion, and what it has reported."""
+    """The worker of a finished insertion, and its reports."""
     worker, one = InsertionJobs(), task("insert", "insertion", seed=3)
     worker.insert(one)
     return worker, one.report
 
 
-def advancing(signals, count):
-    for _ in range(count):
-        signals.take(JobChange(job=1, advance=True))
-
-
-def test_rows_are_those_of_the_command(inserted, by_command):
+def test_rows_are_equal_to_the_command(inserted, expected):
     rows = inserted[1].rows
-    assert plain(rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
-    assert len(rows) == len(by_command.periods) > 12
+    assert plain(rows) == rows_of(expected)
+    assert len(rows) > 12
+    assert rows[0].keys() == recorded_page.row(0).keys()  # of which the browser tests draw pages
 
 
-def test_the_indicator_is_the_largest_of_the_references(by_command):
-    assert {row_of(period, by_command.plan).indicator for period in by_command.periods} == {None}
-    scenario = short(**{"tracker.environment": "ideal", "monitor.enabled": False})
-    plan = flexneedle.plan(scenario, seed=3)
-    for period in flexneedle.insert(scenario, plan, 3).periods:
+def test_states_and_frames_are_reported_in_order(inserted, expected):
+    reported, count = inserted[1], len(expected.periods)
+    assert [one.state for one in reported.of("insertion")] == ["planning", "running", "done"]
+    last = reported.of("insertion")[-1]
+    assert (last.summary, last.error_mm, last.periods) == (expected.summary, expected.error_mm, count)
+    assert last.target == short().target.position
+    for kind in (FrameKind.NEEDLE, FrameKind.TRUE, FrameKind.PREDICTED):
+        assert [frame.number for frame in reported.shapes(kind, FrameSource.LIVE)] == list(range(count))
+    decided = {frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.LIVE)}
+    assert decided == {period.index for period in expected.periods if not math.isnan(period.cost)}
+    channel = reported.shapes(FrameKind.CHANNEL, FrameSource.LIVE)[-1].values[0]
+    assert channel[0, 0] < 1.0 < channel[-1, 0]
+    assert (channel[:, 3] >= 1.0).all()
+    assert channel[:, 3].max() > 1.0
+
+
+def test_the_indicator_is_the_largest_of_the_references(expected, in_field):
+    assert {row["indicator"] for row in rows_of(expected)} == {None}
+    for period in in_field.periods:
         frames = [checked.measurement.frame for checked in period.readings]
         by_name = {name: [frame.readings[name].indicator for frame in frames] for name in REFERENCES}
         medians = [np.median([one for one in values if one is not None]) for values in by_name.values()]
-        assert row_of(period, plan).indicator == pytest.approx(max(medians), rel=1e-12)
+        assert row_of(period, in_field.plan)["indicator"] == pytest.approx(max(medians), rel=1e-12)
 
 
-def test_the_indicator_of_the_tip_counts_only_without_references():
-    """The monitor judges the field by the references, too."""
-    plan = flexneedle.plan(scenario := short(**{"tracker.environment": "ideal"}), seed=3)
-    period = flexneedle.insert(scenario, plan, 3).periods[3]
+def test_the_indicator_of_the_tip_counts_only_without_references(in_field):
+    """As for the monitor, which judges the field by the references."""
+    period = in_field.periods[3]
 
-    def seen(*names):
-        """The period's indicator with these sensors alone, the tip with an indicator of 9."""
+    def indicator(*names):
+        """Return the period's indicator with these sensors alone; the tip has an indicator of 9."""
         readings = []
         for checked in period.readings:
             frame = checked.measurement.frame
@@ -83,71 +102,41 @@ def test_the_indicator_of_the_tip_counts_only_without_references():
                 sensors["tip"] = replace(sensors["tip"], indicator=9.0)
             measured = replace(checked.measurement, frame=replace(frame, readings=sensors))
             readings.append(replace(checked, measurement=measured))
-        return row_of(replace(period, readings=tuple(readings)), plan).indicator
+        return row_of(replace(period, readings=tuple(readings)), in_field.plan)["indicator"]
 
-    assert seen("tip", *REFERENCES) == seen(*REFERENCES) == row_of(period, plan).indicator < 1.0
-    assert seen("tip") == 9.0
-    assert seen() is None
+    assert indicator("tip", *REFERENCES) == indicator(*REFERENCES) < 1.0
+    assert (indicator("tip"), indicator()) == (9.0, None)
 
 
-def test_rows_are_the_same_period_by_period(by_command):
+def test_rows_are_the_same_in_single_periods(expected):
     one = task("insert", "insertion", seed=3, pace=0.0)
-    advancing(one.control, len(by_command.periods) + 1)
+    for _ in range(len(expected.periods) + 1):
+        one.control.take(JobChange(job=1, advance=True))
     InsertionJobs().insert(one)
-    assert plain(one.report.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
-    assert "paused" in [news.state for news in one.report.of("insertion")]
+    assert plain(one.report.rows) == rows_of(expected)
+    assert "paused" in [message.state for message in one.report.of("insertion")]
 
 
-def test_states_are_reported_in_order(inserted, by_command):
-    news = inserted[1].of("insertion")
-    assert [one.state for one in news] == ["planning", "running", "done"]
-    assert news[-1].summary == by_command.summary
-    assert news[-1].error_mm == by_command.error_mm
-    assert news[-1].periods == len(by_command.periods)
-    assert news[-1].target == short().target.position
-
-
-def test_each_period_has_its_frames(inserted, by_command):
-    reported, count = inserted[1], len(by_command.periods)
-    for kind in (FrameKind.NEEDLE, FrameKind.TRUE, FrameKind.PREDICTED):
-        assert [frame.number for frame in reported.shapes(kind, FrameSource.LIVE)] == list(range(count))
-    decided = {frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.LIVE)}
-    assert decided == {period.index for period in by_command.periods if not math.isnan(period.cost)}
-    channel = reported.shapes(FrameKind.CHANNEL, FrameSource.LIVE)[-1].values[0]
-    assert channel[0, 0] < 1.0 < channel[-1, 0]
-    assert (channel[:, 3] >= 1.0).all()
-    assert channel[:, 3].max() > 1.0
-
-
-@pytest.mark.parametrize("controller", ["ce-mpc", "open-loop"])
-def test_another_controller(controller):
-    one = task("insert", "insertion", seed=1, controller=controller)
+def test_another_controller():
+    one = task("insert", "insertion", seed=1, controller="open-loop")
     InsertionJobs().insert(one)
-    assert one.report.of("insertion")[-1].controller == controller
-    assert bool(one.report.shapes(FrameKind.SAMPLES, FrameSource.LIVE)) == (controller == "ce-mpc")
+    assert one.report.of("insertion")[-1].controller == "open-loop"
+    assert not one.report.shapes(FrameKind.SAMPLES, FrameSource.LIVE)
 
 
-def stopping(at, **signal):
-    """A task with a signal after the row of this index."""
+@pytest.mark.parametrize("change", [{"stop": "person 2"}, {"cancel": True}])
+def test_a_stop_ends_it_as_interrupted_and_a_cancel_without_a_result(change):
+    def then(message):
+        if message.type == "rows" and message.first == 4:
+            one.control.take(JobChange(job=1, **change))
 
-    def then(news):
-        if news.type == "rows" and news.first == at:
-            one.control.take(JobChange(job=1, **signal))
-
-    one = task("insert", "insertion", reported=Reported(then))
-    return one
-
-
-def test_a_stop_ends_it_as_interrupted():
-    one = stopping(4, stop="person 2")
-    InsertionJobs().insert(one)
-    last = one.report.of("insertion")[-1]
-    assert (last.state, last.periods) == ("interrupted", 5)
-    assert last.summary.endswith("stopped: person 2")
-
-
-def test_a_cancelled_one_has_no_result():
-    one, worker = stopping(4, cancel=True), InsertionJobs()
+    one, worker = task("insert", "insertion", reported=Reported(then)), InsertionJobs()
+    if "stop" in change:
+        worker.insert(one)
+        last = one.report.of("insertion")[-1]
+        assert (last.state, last.periods) == ("interrupted", 5)
+        assert last.summary.endswith("stopped: person 2")
+        return
     with pytest.raises(Cancelled):
         worker.insert(one)
     assert len(one.report.rows) == 5
@@ -155,117 +144,104 @@ def test_a_cancelled_one_has_no_result():
         worker.save(task("save", folder="nowhere"))
 
 
-def test_one_that_is_refused_is_reported():
+def test_a_refused_insertion_is_reported():
     scenario = short(**{"target.lateral_mm": 12.0})
     reported = done(InsertionJobs().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
     assert reported.of("insertion")[-1].state == "refused"
     assert "misses the target" in reported.of("insertion")[-1].summary
 
 
-def test_an_insertion_is_listed_once_it_is_saved_as_a_whole(inserted, tmp_path, monkeypatch):
-    runs, while_saving = RunsFolder(tmp_path), []
+def test_an_insertion_is_listed_once_it_is_completely_saved_and_is_read_again(
+    inserted, tmp_path, monkeypatch
+):
+    (worker, reported), runs, while_saving = inserted, RunsFolder(tmp_path), []
 
     def watched(insertion, folder):
         save(insertion, folder)
         while_saving.append((runs.listed(), list(tmp_path.glob("*/run.json"))))
 
     monkeypatch.setattr(recordings, "save", watched)
-    (tmp_path / ".saved").mkdir()  # of somebody else
-    inserted[0].save(task("save", folder=str(tmp_path / "saved")))
+    worker.save(task("save", folder=str(tmp_path / "saved")))
     ((listed, (written,)),) = while_saving
     assert listed == []
     assert not written.exists()  # it has moved
     assert [run["name"] for run in runs.listed()] == ["saved"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".saved", "saved"]
-
-
-def test_a_saved_insertion_is_read_as_it_was(inserted, tmp_path):
-    worker, reported = inserted
-    folder = tmp_path / "saved"
-    worker.save(task("save", folder=str(folder)))
-    again = task("read", "recording", folder=str(folder), of="second")
+    assert [path.name for path in tmp_path.iterdir()] == ["saved"]
+    again = task("read", "recording", folder=str(tmp_path / "saved"), of="second")
     read_run(again)
-    rows = again.report.rows
-    assert [news.of for news in again.report.of("rows")] == ["second"]
-    assert len(rows) == len(reported.rows)
-    for row, live in zip(rows, reported.rows, strict=True):
-        assert row.true == pytest.approx(live.true, abs=1e-6)
-        assert row.error_mm == pytest.approx(live.error_mm, abs=1e-6)
-        assert (row.action, row.verdict, row.decision) == (live.action, live.verdict, live.decision)
+    assert [message.of for message in again.report.of("rows")] == ["second"]
+    for row, live in zip(again.report.rows, reported.rows, strict=True):
+        for key in ("true", "error_mm"):
+            assert row[key] == pytest.approx(live[key], abs=1e-6)
+        for key in ("action", "verdict", "decision"):
+            assert row[key] == live[key]
     (needles,) = again.report.shapes(FrameKind.NEEDLE, FrameSource.SECOND)
-    assert needles.values.shape[0] == len(rows)
+    assert needles.values.shape[0] == len(reported.rows)
     assert needles.values[-1] == pytest.approx(reported.shapes(FrameKind.NEEDLE)[-1].values[0], abs=1e-4)
-
-
-def test_a_folder_without_an_insertion_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"run\.json is missing"):
+    with pytest.raises(InputError, match=r"run\.json"):
         read_run(task("read", "recording", folder=str(tmp_path)))
 
 
-def disturbed(*disturbs, scenario=None, seed=3):
-    """What an insertion reports that is disturbed from its start."""
-    one = task("insert", "insertion", scenario, seed=seed, pace=NO_WAIT)
+def disturbed(*disturbs, scenario=None, worker=None):
+    """Return the reports of an insertion that is disturbed from its start."""
+    one = task("insert", "insertion", scenario, seed=3, pace=NO_WAIT)
     for disturb in disturbs:
         one.control.take(JobChange(job=1, disturb=DisturbRequest(type="disturb", **disturb)))
-    InsertionJobs().insert(one)
+    (worker or InsertionJobs()).insert(one)
     return one.report
 
 
-def test_a_push_moves_the_true_tip_in_its_direction(by_command):
-    pushed = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}).rows[1].true[1]
-    back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0}).rows[1].true[1]
-    free = by_command.periods[1].true_tip.y
-    assert pushed > free + 0.02
-    assert back < free - 0.02
+def test_a_push_moves_the_true_tip_in_its_direction_and_is_recorded(expected, inserted, tmp_path):
+    """The seed of its record alone does not reproduce it."""
+    worker, free = InsertionJobs(), expected.periods[1].true_tip.y
+    pushed = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}, worker=worker)
+    back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0})
+    assert pushed.rows[1]["true"][1] > free + 0.02
+    assert back.rows[1]["true"][1] < free - 0.02
+    summary = pushed.of("insertion")[-1].summary
+    assert summary.endswith("; disturbed: push of 0.05 N at 0° at 0.0 s")
+    for name, ended in (("pushed", worker), ("plain", inserted[0])):
+        ended.save(task("save", folder=str(tmp_path / name)))
+    saved, plain_one = flexneedle.load(tmp_path / "pushed"), flexneedle.load(tmp_path / "plain")
+    assert (saved.disturbed, plain_one.disturbed) == ("push of 0.05 N at 0° at 0.0 s", "")
+    assert saved.summary == summary
+    assert (mark_columns(saved), mark_columns(plain_one)) == ({"disturbed": True}, {})
 
 
-def test_no_push_is_no_disturbance(by_command):
+def test_an_ended_push_and_none_at_all_are_no_disturbance(expected):
     reported = disturbed({"what": "push", "size": 0.0}, {"what": "stiffen", "size": 1.0})
-    assert plain(reported.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
+    assert plain(reported.rows) == rows_of(expected)
     assert reported.of("disturbances")[-1].active == []
-    assert reported.of("insertion")[-1].summary == by_command.summary
+    assert reported.of("insertion")[-1].summary == expected.summary
 
 
-def test_the_record_of_a_disturbed_insertion_says_so(tmp_path, inserted):
-    """Its seed alone does not give it again."""
-    one, worker = task("insert", "insertion", seed=3, pace=NO_WAIT), InsertionJobs()
-    for size in (0.05, 0.0):
-        one.control.take(
-            JobChange(job=1, disturb=DisturbRequest(type="disturb", what="push", size=size, angle_deg=90.0))
-        )
-    worker.insert(one)
-    disturbed_by = "push of 0.05 N at 90° at 0.0 s, push ended at 0.0 s"
-    assert one.report.of("insertion")[-1].summary.endswith(f"; disturbed: {disturbed_by}")
-    for folder, ended in (("pushed", worker), ("plain", inserted[0])):
-        ended.save(task("save", folder=str(tmp_path / folder)))
-    pushed, plain_one = flexneedle.load(tmp_path / "pushed"), flexneedle.load(tmp_path / "plain")
-    assert (pushed.disturbed, plain_one.disturbed) == (disturbed_by, "")
-    assert pushed.summary == one.report.of("insertion")[-1].summary
-    assert mark_columns(pushed) == {"disturbed": True}
-    assert mark_columns(plain_one) == {}
+def disturber_of(scenario, truth=None):
+    """Return a disturber with a clock that counts its calls, and a true needle."""
+    made, times = Disturber(scenario, lambda _message: None), iter(range(100))
+    made.now = lambda: next(times)
+    made.plant(truth or draw(scenario, np.random.default_rng(3)), 0.0)
+    made.watch(None)
+    return made
 
 
-def test_a_record_names_the_first_disturbances_and_counts_the_others():
-    times = iter(range(100))
-    disturber = Disturber(short(), lambda _news: None)
-    disturber.now = lambda: next(times)
-    disturber.plant(draw(short(), np.random.default_rng(3)), 0.0)
-    disturber.watch(None)
-    for size in range(1, 14):
-        disturber.take(DisturbRequest(type="disturb", what="push", size=0.01 * size))
-    assert disturber.summary.startswith("push of 0.01 N at 0° at 0.0 s, push of 0.02 N at 0° at 1.0 s, ")
+def test_a_record_has_the_first_disturbances_with_their_times_and_counts_the_others():
+    disturber = disturber_of(short())
+    for size in (0.1, 0.0, *(0.01 * size for size in range(3, 14))):
+        disturber.take(DisturbRequest(type="disturb", what="push", size=size))
+    assert disturber.summary.startswith("push of 0.1 N at 0° at 0.0 s, push ended at 1.0 s, ")
     assert disturber.summary.endswith("push of 0.1 N at 0° at 9.0 s, 3 more")
 
 
-def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(by_command):
+def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(expected):
+    energy = expected.periods[-1].true_strain_energy
     rows = disturbed({"what": "stiffen", "size": 3.0, "layer": 0}).rows
-    assert rows[-1].true_energy_mj > 1.3 * by_command.periods[-1].true_strain_energy
+    assert rows[-1]["true_energy_mj"] > 1.3 * energy
     deep = disturbed({"what": "stiffen", "size": 3.0, "layer": 1}).rows  # which the needle does not reach
-    assert deep[-1].true_energy_mj == by_command.periods[-1].true_strain_energy
+    assert deep[-1]["true_energy_mj"] == energy
 
 
-def test_a_layer_is_stiffer_where_it_truly_is(monkeypatch):
-    """Its boundaries are displaced, and a hidden layer splits those of the scenario."""
+def test_a_layer_is_stiffened_between_its_true_boundaries(monkeypatch):
+    """Its boundaries are displaced, and a hidden layer splits the scenario's layers."""
     hidden = {"top_mm": 24.0, "thickness_mm": 3.0, "modulus_factor": 4.0}
     scenario = short().with_values(
         {"phantom.layer_shift_sd_mm": 1.5, "phantom.structure.hidden_layer": hidden}
@@ -273,38 +249,35 @@ def test_a_layer_is_stiffer_where_it_truly_is(monkeypatch):
     truth = draw(scenario, np.random.default_rng(3))
     tops = np.cumsum([layer.thickness_mm for layer in truth.scenario.tissue[:-1]])
     assert len(tops) > 1
-    assert truth.layer_tops[1] in (0.0, *tops.tolist())
-    assert abs(truth.layer_tops[1] - scenario.layer_tops[1]) > 0.1
+    boundary = truth.layer_tops[1]
+    assert boundary in (0.0, *tops.tolist())
+    assert abs(boundary - scenario.layer_tops[1]) > 0.1
     given = []
     monkeypatch.setattr(DisturbedPlant, "stiffen", lambda _plant, *how: given.append(how))
-    disturber = Disturber(scenario, lambda _news: None)
-    disturber.now = lambda: 0.0
-    disturber.plant(truth, 0.0)
-    disturber.watch(None)
+    disturber = disturber_of(scenario, truth)
     for layer in (0, 1):
         disturber.take(DisturbRequest(type="disturb", what="stiffen", size=3.0, layer=layer))
-    boundary = truth.layer_tops[1]
     assert given == [(0.0, boundary, 3.0), (boundary, math.inf, 3.0)]
 
 
-def test_a_lost_tip_holds_the_needle_and_comes_back():
+def test_a_lost_tip_holds_the_needle_and_returns():
     reported = disturbed({"what": "drop", "size": 0.5})
-    verdicts = [row.verdict for row in reported.rows]
+    verdicts = [row["verdict"] for row in reported.rows]
     assert any(verdict.startswith("missing") for verdict in verdicts)
     assert verdicts[-1] == "ok"
-    assert [news.active for news in reported.of("disturbances")] == [["tip not measured for 0.5 s"], []]
+    assert [message.active for message in reported.of("disturbances")] == [["tip not measured for 0.5 s"], []]
 
 
 @pytest.mark.parametrize("environment", ["ideal", "noisy"])
-def test_a_plate_distorts_the_readings_until_it_is_taken_away(environment):
+def test_a_plate_distorts_the_readings_until_it_is_removed(environment, in_field):
     scenario = short(**{"tracker.environment": environment, "monitor.enabled": False})
-    plan = flexneedle.plan(scenario, seed=3)
-    by_command = flexneedle.insert(scenario, plan, 3)
-    assert plain(disturbed(scenario=scenario).rows) == plain(row_of(one, plan) for one in by_command.periods)
+    free = in_field if environment == "ideal" else by_command(scenario)
     near = disturbed({"what": "plate", "size": 60.0}, scenario=scenario).rows
-    assert near[3].indicator > 1.2 * row_of(by_command.periods[3], plan).indicator
-    assert abs(near[3].measured[1] - by_command.periods[3].measurement.y) > 0.1
+    assert near[3]["indicator"] > 1.2 * row_of(free.periods[3], free.plan)["indicator"]
+    assert abs(near[3]["measured"][1] - free.periods[3].measurement.y) > 0.1
     away = disturbed({"what": "plate", "size": 60.0}, {"what": "plate", "size": 0.0}, scenario=scenario)
-    same = [row.measured for row in away.rows] == [row.measured for row in disturbed(scenario=scenario).rows]
-    assert same == (environment == "ideal")
+    without = [
+        row["measured"] for row in plain(away.rows)
+    ]  # in "noisy" also without the plate of the scenario
+    assert (without == [row["measured"] for row in rows_of(free)]) == (environment == "ideal")
     assert away.of("disturbances")[-1].active == []

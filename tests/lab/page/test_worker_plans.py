@@ -19,40 +19,42 @@ from flexneedle.planning.horizon import Samples
 from page_tasks import Reported, done, short, task
 
 
-def test_the_needle_at_the_start_lies_from_its_base_to_its_tip():
+def test_the_scene_and_the_needle_at_the_start_are_those_of_the_scenario():
     made = short("phantom3d", **{"entry.lateral_mm": 1.0, "entry.slope_z_mrad": 20.0})
-    reported = done(needle, task("needle", scenario=made))
-    (shape,) = reported.shapes(FrameKind.NEEDLE, FrameSource.SCENE)
-    assert shape.values[0, 0] == pytest.approx(describe_scene(made, 1).base, abs=1e-4)
+    scene = describe_scene(made, 7)
+    assert (scene.revision, scene.axes, scene.target) == (7, 2, made.target.position)
+    assert [(layer["top_mm"], layer["bottom_mm"]) for layer in scene.layers] == [(0.0, 20.0), (20.0, None)]
+    assert scene.guide == pytest.approx((-41.0, 1.0, -0.82))
+    assert scene.axis == {"point": (1.0, 0.0), "slope": (0.0, 0.02)}
+    assert scene.base == pytest.approx((made.start_base_x, 1.0, 0.02 * made.start_base_x))
+    (shape,) = done(needle, task("needle", scenario=made)).shapes(FrameKind.NEEDLE, FrameSource.SCENE)
+    assert shape.values[0, 0] == pytest.approx(scene.base, abs=1e-4)
     assert shape.values[0, -1, 0] == pytest.approx(-2.0, abs=0.05)
+    without_guide = describe_scene(short("phantom", **{"setup.guide_to_skin_mm": None}), 1)
+    assert (without_guide.guide, without_guide.axes) == (None, 1)
 
 
-def test_an_estimate_ends_near_the_target():
-    reported = done(estimate, task("estimate"))
-    (news,) = reported.of("estimate")
+@pytest.mark.parametrize("search", [{}, {"plan.samples": 200, "plan.elite_fraction": 0.02}])
+def test_an_estimate_ends_near_the_target(search):
+    """Its few samples contain two elites, even if the scenario's fraction of them is smaller."""
+    reported = done(estimate, task("estimate", scenario=short(**search)))
+    (message,) = reported.of("estimate")
     (path,) = reported.shapes(FrameKind.PATH, FrameSource.SCENE)
-    assert math.dist(path.values[0, -1], short().target.position) == pytest.approx(news.error_mm, abs=1e-4)
-    (needle_at_target,) = reported.shapes(FrameKind.SWEEP, FrameSource.SCENE)
-    assert needle_at_target.values.shape[0] == 1
-    assert needle_at_target.values[0, -1] == pytest.approx(path.values[0, -1], abs=1e-4)
-
-
-def test_an_estimate_of_few_elites():
-    """Fewer samples than the scenario's leave fewer than two of them with its share of elites."""
-    done_ = done(
-        estimate, task("estimate", scenario=short(**{"plan.samples": 200, "plan.elite_fraction": 0.02}))
-    )
-    assert done_.of("estimate")
+    error = math.dist(path.values[0, -1], short().target.position)
+    assert error == pytest.approx(message.error_mm, abs=1e-4)
+    (at_target,) = reported.shapes(FrameKind.SWEEP, FrameSource.SCENE)
+    assert at_target.values.shape[0] == 1
+    assert at_target.values[0, -1] == pytest.approx(path.values[0, -1], abs=1e-4)
 
 
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
-def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch):
+def test_a_plan_is_equal_to_the_command_and_reports_each_iteration(strategy, monkeypatch):
     monkeypatch.setattr(plan_jobs, "BETWEEN_S", 0.0)
     reported = done(plan, task("plan", strategy=strategy, seed=2))
     made = flexneedle.plan(short(), strategy=strategy, seed=2)
-    (news,) = reported.of("plan")
-    assert (news.error_mm, news.cost, news.terms) == (made.error_mm, made.cost, made.terms)
-    assert news.roll_deg == math.degrees(made.roll)
+    (message,) = reported.of("plan")
+    assert (message.error_mm, message.cost, message.terms) == (made.error_mm, made.cost, made.terms)
+    assert message.roll_deg == math.degrees(made.roll)
     iterations = reported.of("iteration")
     assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
     source = FrameSource[strategy.upper()]
@@ -68,51 +70,48 @@ def test_a_plan_is_that_of_the_command_with_each_iteration(strategy, monkeypatch
     assert reported.shapes(FrameKind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
 
 
-def test_a_fast_search_shows_its_first_and_last_iteration_and_all_costs(monkeypatch):
+def test_a_fast_search_reports_its_first_and_last_iteration_and_all_costs(monkeypatch):
     monkeypatch.setattr(plan_jobs, "BETWEEN_S", 60.0)
     reported = done(plan, task("plan", seed=2))
     made = flexneedle.plan(short(), seed=2)
     first, last = reported.of("iteration")
     assert (first.iteration, last.iteration) == (1, made.iterations)
     assert last.best == [entry["best"] for entry in made.history]
-    assert [frame.number for frame in reported.shapes(FrameKind.SAMPLES, FrameSource.MANIPULATION)] == [
-        1,
-        made.iterations,
-    ]
+    shown = reported.shapes(FrameKind.SAMPLES, FrameSource.MANIPULATION)
+    assert [frame.number for frame in shown] == [1, made.iterations]
 
 
 @pytest.mark.parametrize(("action", "kind"), [(plan, "plan"), (estimate, "estimate")])
-def test_the_roll_with_which_a_plan_begins_is_reported(action, kind):
-    """The bevel begins with the side to which the needle has to bend: the one away from +y."""
+def test_the_roll_at_the_start_of_a_plan_is_reported(action, kind):
+    """The bevel begins on the side away from the target."""
     rolls = []
     for lateral in (0.5, -0.5):
         scenario = short(**{"target.lateral_mm": lateral})
-        (news,) = done(action, task(kind, scenario=scenario, strategy="steering")).of(kind)
-        rolls.append(abs(news.roll_deg))
+        (message,) = done(action, task(kind, scenario=scenario, strategy="steering")).of(kind)
+        rolls.append(abs(message.roll_deg))
     assert sorted(rolls) == pytest.approx([0.0, 180.0])
 
 
 def test_a_comparison_plans_both():
     reported = done(plan, task("plan", "compare"))
-    assert [news.strategy for news in reported.of("plan")] == ["manipulation", "steering"]
-    shares = [news.share for news in reported.of("job")]
+    assert [message.strategy for message in reported.of("plan")] == ["manipulation", "steering"]
+    shares = [message.share for message in reported.of("job")]
     assert shares == sorted(shares)
     assert shares[-1] <= 1.0
 
 
 def test_a_plan_is_cancelled_between_two_iterations():
-    def then(news):
-        if news.type == "iteration":
+    def then(message):
+        if message.type == "iteration":
             one.control.take(JobChange(job=1, cancel=True))
 
     one = task("plan", reported=Reported(then))
     carry_out(one, {"plan": plan})
-    assert len(one.report.of("iteration")) == 1
-    assert one.report.of("plan") == []
+    assert (len(one.report.of("iteration")), one.report.of("plan")) == (1, [])
     assert one.report.of("job")[-1].state == "cancelled"
 
 
-def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_them():
+def test_at_most_64_paths_of_48_points_are_reported_the_best_and_the_worst_among_them():
     rng = np.random.default_rng(0)
     tips, costs = rng.normal(size=(200, 100, 5)), rng.uniform(size=200)
     frame = samples_of(Samples(tips, costs), FrameSource.LIVE, 3)
@@ -123,21 +122,21 @@ def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_th
     assert not shown[:, :-1, 3].any()
 
 
-@pytest.fixture(autouse=True)
-def few(monkeypatch):
-    """Few and short searches of the reach."""
+@pytest.fixture
+def reached(monkeypatch):
+    """A function that returns the outlines and messages of a reach, by few and short searches."""
     monkeypatch.setattr("flexneedle.lab.page.worker.reach_job._PASSES", ((1, (12, 2)), (2, (16, 4))))
 
+    def made(scenario, **values):
+        reported = done(reach, task("reach", scenario=scenario, **values))
+        return reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values, reported.of("reach")
 
-def reached(scenario, **values):
-    reported = done(reach, task("reach", scenario=scenario, **values))
-    return reported, reported.of("reach")[-1]
+    return made
 
 
-def test_the_reach_grows_with_the_depth_and_is_within_the_travel():
+def test_the_reach_grows_with_the_depth_within_the_travel_and_is_less_by_the_bevel_alone(reached):
     scenario = short(**{"setup.stroke_mm": 40.0})
-    reported, last = reached(scenario)
-    first = reported.of("reach")[0]
+    _, (first, last) = reached(scenario)
     assert len(first.high) < len(last.high)
     (depths, high, _), (_, low, _) = zip(*last.high, strict=True), zip(*last.low, strict=True)
     assert all(np.diff(depths) > 0.0)
@@ -145,55 +144,41 @@ def test_the_reach_grows_with_the_depth_and_is_within_the_travel():
     assert high[0] < high[-1] <= scenario.setup.max_lateral + 0.1
     assert all(least < -0.5 * greatest for least, greatest in zip(low, high, strict=True))
     assert high[-1] >= first.high[-1][1]
+    assert reached(scenario, strategy="steering")[1][-1].high[-1][1] < high[-1]
 
 
-def test_the_reach_ends_where_the_needle_does():
-    """The stroke ends before a needle that bends much is as deep as a straight one would be."""
+def test_the_reach_ends_where_the_needle_does(reached):
+    """The stroke ends before a strongly bent needle is as deep as a straight one would be."""
     scenario = short(**{"setup.stroke_mm": 12.0, "setup.max_guide_step_mm": 2.0})
-    reported, last = reached(scenario)
+    outlines, (*_, last) = reached(scenario)
     sought = scenario.setup.max_depth * _DEEPEST
     assert max(depth for depth, *_ in (*last.low, *last.high)) < sought - 0.2
     edges = np.array([last.high, last.low]).swapaxes(0, 1)
     assert (np.diff(edges[:, :, 0], axis=0) >= 0.0).all()
-    outlines = reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values
     np.testing.assert_allclose(outlines[:, :2], edges, atol=1e-4)
 
 
-def test_the_bevel_alone_reaches_less():
-    scenario = short(**{"setup.stroke_mm": 40.0})
-    assert reached(scenario, strategy="steering")[1].high[-1][1] < reached(scenario)[1].high[-1][1]
+def test_outlines_in_space_are_closed_in_the_plane_of_the_target_and_independent_of_its_place(reached):
+    """Targets at one angle about the axis have the same reach, in the plane and in space."""
 
+    def at(depth, lateral, name="phantom3d"):
+        place = {"target.depth_mm": depth, "target.lateral_mm": lateral}
+        place |= {"target.lateral_z_mm": lateral} if name == "phantom3d" else {}
+        return reached(short(name, **{"setup.stroke_mm": 12.0}, **place))
 
-def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
-    values = {"setup.stroke_mm": 12.0, "target.depth_mm": 8.0, "target.lateral_z_mm": 0.5}
-    reported, last = reached(short("phantom3d", **values))
+    outlines, messages = at(8.0, 0.5)
+    last = messages[-1]
     assert last.angle_deg == pytest.approx(45.0)
-    outlines = reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values
     assert outlines.shape == (2, 9, 3)
     assert (outlines[:, 0] == outlines[:, -1]).all()
     np.testing.assert_allclose(outlines[:, 0], last.high, atol=1e-4)
     np.testing.assert_allclose(outlines[:, 4], last.low, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("name", "one", "other"),
-    [
-        ("phantom", {}, {"target.depth_mm": 6.0, "target.lateral_mm": -1.0}),
-        # The angle of the target about the axis is that of the outlines' points.
-        (
-            "phantom3d",
-            {"target.depth_mm": 8.0, "target.lateral_mm": 0.5, "target.lateral_z_mm": 0.5},
-            {"target.depth_mm": 5.0, "target.lateral_mm": 0.2, "target.lateral_z_mm": 0.2},
-        ),
-    ],
-)
-def test_the_reach_does_not_depend_on_the_target(name, one, other):
-    first, second = (reached(short(name, **{"setup.stroke_mm": 12.0}, **target)) for target in (one, other))
-    assert first[1] == second[1]
-    shapes = [
-        reported.shapes(FrameKind.REACH, FrameSource.SCENE)[-1].values for reported, _ in (first, second)
-    ]
-    np.testing.assert_array_equal(*shapes)
+    for first, second in (
+        ((outlines, messages), at(5.0, 0.2)),
+        (at(10.0, 0.5, "phantom"), at(6.0, -1.0, "phantom")),
+    ):
+        np.testing.assert_array_equal(first[0], second[0])
+        assert first[1] == second[1]
 
 
 def test_a_reach_is_cancelled():
@@ -203,7 +188,7 @@ def test_a_reach_is_cancelled():
         reach(one)
 
 
-def test_what_goes_wrong_is_the_end_of_the_job(capsys):
+def test_an_error_is_the_end_of_the_job(capsys):
     one = task("plan")
     bad = replace(one.order, scenario=one.order.scenario | {"needle": {}})
     failed = type(one)(bad, one.control, Reported())

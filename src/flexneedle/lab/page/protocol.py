@@ -198,42 +198,16 @@ class ReachMessage(ServerMessage):
     angle_deg: float
 
 
-class PeriodRow(ProtocolMessage):
-    """A control period of an insertion, for plots and player. Unknown values are None, in Python also NaN.
-
-    error_mm: lateral distance of the true tip (on a rig: of the estimated tip) from the planned path at its depth.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True, ser_json_inf_nan="null")
-
-    index: int
-    time: float
-    action: str
-    decision: str
-    verdict: str
-    measured: tuple[float | None, float | None, float | None] | None
-    estimate: Vector
-    true: Vector | None
-    error_mm: float | None
-    guide: tuple[float, float]
-    roll_deg: float
-    indicator: float | None
-    energy_mj: float
-    true_energy_mj: float | None
-    miss_mm: tuple[float | None, float | None]
-    miss_sd_mm: float | None
-    decide_ms: float
-    late: bool
-    warning: str = ""
-
-
 class RowsMessage(ServerMessage):
-    """Rows of an insertion from `first` on, in order. of: "live", "first" or "second" recording."""
+    """Rows of an insertion's periods from `first` on, in order. of: "live", "first" or "second" recording.
+
+    A row has the keys of `record.fields.page_values`, and those that `worker.recordings.row_of` adds.
+    """
 
     type: Literal["rows"] = "rows"
     of: Literal["live", "first", "second"]
     first: int
-    rows: list[PeriodRow]
+    rows: list[dict[str, Any]]
 
     @property
     def key(self) -> str:

@@ -203,15 +203,6 @@ class PingRequest(ClientRequest):
     type: Literal["ping"]
 
 
-class RowsFromRequest(ClientRequest):
-    """Ask for the rows of the insertion from an index on, which this client has missed."""
-
-    needs_control = False
-
-    type: Literal["rows_from"]
-    index: Whole
-
-
 AnyRequest = Annotated[
     SteerRequest
     | EditRequest
@@ -233,8 +224,7 @@ AnyRequest = Annotated[
     | OpenRequest
     | StudyRequest
     | SaveRequest
-    | PingRequest
-    | RowsFromRequest,
+    | PingRequest,
     Field(discriminator="type"),
 ]
 REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)

@@ -54,9 +54,7 @@ def elsewhere(**changes):
 
 def known(**missing):
     """The rows until PERIOD, without some of their positions."""
-    return RowsMessage(
-        of="live", first=0, rows=[row(k).model_copy(update=missing) for k in range(PERIOD + 1)]
-    )
+    return RowsMessage(of="live", first=0, rows=[row(k) | missing for k in range(PERIOD + 1)])
 
 
 def parts_of_a_plan():

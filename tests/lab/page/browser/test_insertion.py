@@ -119,9 +119,7 @@ def test_an_insertion_is_disturbed(panel, server):
 
 
 def some_rows(first, *changed):
-    return RowsMessage(
-        of="live", first=first, rows=[row(first + k).model_copy(update=one) for k, one in enumerate(changed)]
-    )
+    return RowsMessage(of="live", first=first, rows=[row(first + k) | one for k, one in enumerate(changed)])
 
 
 def test_decisions_are_listed_where_their_words_change(panel, server):

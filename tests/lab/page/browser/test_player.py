@@ -24,9 +24,7 @@ def recorded(of="first", count=50, **changes):
 
 def of_rows(of, change, count=50):
     """Rows of a recorded run, each changed by what a function of its index returns."""
-    return rows(0, 1, of).model_copy(
-        update={"rows": [row(k).model_copy(update=change(k)) for k in range(count)]}
-    )
+    return rows(0, 1, of).model_copy(update={"rows": [row(k) | change(k) for k in range(count)]})
 
 
 def shows(page, of):
@@ -168,7 +166,7 @@ def test_plots_follow_the_player_and_choose_its_period(player, server):
     assert abs(page.evaluate(PERIOD) - 25) <= 2
     page.click("text=Latest period")
     see_plots(page)
-    figure, error = page.locator(f"{PLOTS} figure").first, f"{row(49).error_mm:.3f}"
+    figure, error = page.locator(f"{PLOTS} figure").first, f"{row(49)['error_mm']:.3f}"
     title = "Error from the planned path (mm)"
     page.wait_for_selector(f"{PLOTS} [aria-label='{title} at 9.8 s: true tip {error}']")
     assert figure.locator(".legend").inner_text() == "true tip"

@@ -96,7 +96,7 @@ def test_a_run_is_read_played_and_scrubbed(replay):
     at(page, 20)
     page.wait_for_selector(f"{PLOTS} [aria-label^='Error from the planned path (mm) at 4.0 s']")
     label = page.get_attribute(f"{PLOTS} [aria-label^='Error']", "aria-label")
-    assert label == f"Error from the planned path (mm) at 4.0 s: true tip {row(20).error_mm:.3f}"
+    assert label == f"Error from the planned path (mm) at 4.0 s: true tip {row(20)['error_mm']:.3f}"
     plot = page.locator(f"{PLOTS} .u-over").first
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()

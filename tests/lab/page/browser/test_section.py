@@ -91,7 +91,7 @@ def test_legends_of_all_views_name_the_drawn_parts(views, server):
     check_swatch("measured tip", "cross", "color: var(--measured);")
     both = {"true path of the tip", "measured tip"}
     assert [both & names for names in legends(page)] == [both] * 3
-    blind = [row(k).model_copy(update={"measured": None, "true": None}) for k in range(3)]
+    blind = [row(k) | {"measured": None, "true": None} for k in range(3)]
     missing = RowsMessage(of="live", first=0, rows=blind)
     server.send(insertion("planning", periods=0), insertion(rig="Bench"), missing)
     until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
@@ -294,7 +294,7 @@ def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
     section, axial = page.evaluate(OF_TONE, "--measured")
     assert section > 8
     assert axial > 8
-    unknown = [each.model_copy(update={"measured": None}) for each in known]
+    unknown = [each | {"measured": None} for each in known]
     server.send(measured.model_copy(update={"rows": unknown}))
     until(page, "flexneedle.store.get('rows live')[9].measured === null")
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")

@@ -66,12 +66,7 @@ class Downloads:
 
     def __init__(self, handler: RequestHandler) -> None:
         self._handler = handler
-        self._made: dict[str, tuple[str, Callable[[Path], Coroutine[Any, Any, bytes]]]] = {
-            "trace.csv": ("text/csv", export_csv),
-            "run.zip": ("application/zip", _zip),
-            "replay.html": ("text/html", export_replay),
-        }
-        self._busy = 0
+        self._two_at_once = asyncio.Semaphore(2)
 
     async def scenario(self, _request: Request) -> Response:
         """Return the present scenario as a file (TOML)."""
@@ -85,49 +80,28 @@ class Downloads:
             folder = self._handler.runs.run(name)
             if file == "figure.png":
                 return _figure(folder)
-            if file not in self._made:
-                choices = ", ".join(("figure.png", *self._made))
+            if file not in _MADE:
+                choices = ", ".join(("figure.png", *_MADE))
                 raise Refusal(f"{file!r}: must be one of {choices}")
-            media, make = self._made[file]
+            media, make = _MADE[file]
             if make is not _zip:
                 self._handler.require_processor()
-            made = await _make_unless_gone(request, self._make_one_of_two(make, folder))
-            return Response() if made is None else _download(made, media, f"{name}-{file}")
+            async with self._two_at_once:
+                return _download(await make(folder), media, f"{name}-{file}")
         except Refusal as refusal:
             raise HTTPException(404, refusal.reason) from None
-
-    async def _make_one_of_two(
-        self, make: Callable[[Path], Coroutine[Any, Any, bytes]], folder: Path
-    ) -> bytes:
-        if self._busy >= 2:
-            raise Refusal("two downloads are being made: try again in a moment")
-        self._busy += 1
-        try:
-            return await make(folder)
-        finally:
-            self._busy -= 1
-
-
-async def _make_unless_gone(request: Request, making: Coroutine[Any, Any, bytes]) -> bytes | None:
-    """Return the file; cancel it and return None if the browser disconnects."""
-    task = asyncio.create_task(making)
-    gone = asyncio.create_task(_wait_for_disconnect(request))
-    try:
-        await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
-        return await task if task.done() else None
-    finally:
-        for each in (task, gone):
-            each.cancel()
-        await asyncio.gather(task, gone, return_exceptions=True)
-
-
-async def _wait_for_disconnect(request: Request) -> None:
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
 
 
 async def _zip(folder: Path) -> bytes:
     return await to_thread.run_sync(zip_run, folder)
+
+
+_MADE: dict[str, tuple[str, Callable[[Path], Coroutine[Any, Any, bytes]]]] = {
+    "trace.csv": ("text/csv", export_csv),
+    "run.zip": ("application/zip", _zip),
+    "replay.html": ("text/html", export_replay),
+}
+"""Media type of each file, and the function that makes it."""
 
 
 def _figure(folder: Path) -> Response:

@@ -7,10 +7,13 @@ of an insertion and shapes of its periods are lists; each client receives those 
 import asyncio
 import json
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic_core import to_json
 
 from flexneedle.errors import RunError
-from flexneedle.lab.page.protocol import PeriodRow, RowsMessage, ServerMessage
+from flexneedle.lab.page.protocol import RowsMessage, ServerMessage
 from flexneedle.lab.page.shape_frames import ShapeFrame, join_frames, pack_frame
 
 _ROWS, _JOB, _FIRST = "rows", "job", "first"
@@ -23,13 +26,13 @@ class RowLog:
     def __init__(self) -> None:
         self.edition, self.texts = 0, list[str]()
 
-    def put(self, first: int, rows: Iterable[PeriodRow]) -> None:
+    def put(self, first: int, rows: Iterable[Mapping[str, Any]]) -> None:
         """Add rows from an index on; at 0 a new insertion begins. Raises RunError if rows before them are missing."""
         if first > len(self.texts):
             raise RunError(f"rows from {first}: those from {len(self.texts)} are missing")
         if first == 0:
             self.edition += 1
-        self.texts[first:] = [row.model_dump_json() for row in rows]
+        self.texts[first:] = [to_json(row, inf_nan_mode="null").decode() for row in rows]
 
 
 class ShapeLog:
@@ -95,11 +98,6 @@ class ClientOutbox:
     def drop(self, key: str) -> None:
         """Drop a pending key; a later update goes to the back of the queue."""
         self._keys.pop(key, None)
-
-    def resend_rows(self, key: str, index: int) -> None:
-        """Send rows of a key again, from an index on."""
-        self._has[key] = (self._hub.rows(key).edition, index)
-        self.touch(key)
 
     async def next(self) -> str | bytes:
         """Wait for the next message."""

@@ -137,7 +137,7 @@ class RequestHandler:
 
     # Requests
 
-    def carry_out(self, client: int, outbox: ClientOutbox, request: ask.AnyRequest) -> None:
+    def carry_out(self, client: int, request: ask.AnyRequest) -> None:
         """Carry out a request. Raises Refusal."""
         if request.needs_control:
             self.clients.require_control(client)
@@ -162,8 +162,6 @@ class RequestHandler:
                 self._cancel(request.job)
             case ask.PingRequest():
                 pass
-            case ask.RowsFromRequest():
-                outbox.resend_rows("rows live", request.index)
             case ask.OpenRequest():
                 self._open(request)
             case ask.StudyRequest():

@@ -86,7 +86,7 @@ def _answer(handler: RequestHandler, client: int, outbox: ClientOutbox, text: st
         what, number = request.type, request.request
         if not isinstance(request, LoadRequest):
             _require_length(text, handler.limits.message_bytes)
-        handler.carry_out(client, outbox, request)
+        handler.carry_out(client, request)
     except Refusal as refusal:
         problems = refusal.problems
         outbox.answer(RefusedMessage(request=number, what=what, reason=refusal.reason, problems=problems))

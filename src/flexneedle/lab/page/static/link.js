@@ -8,7 +8,7 @@ const MOST_REFUSALS = 20;
 const ANSWER_WITHIN = 10_000; // ms
 const LOOK_EVERY = 1000; // ms between two checks of the server
 const MOST_SILENT = 4; // checks without a message: more, and the line is dead, which a browser notices after minutes
-const FREE = ["steer", "stop", "rows_from", "ping"]; // requests that need no control
+const FREE = ["steer", "stop", "ping"]; // requests that need no control
 
 export class Link {
   #store;
@@ -23,7 +23,6 @@ export class Link {
   #edits = {};
   #editTimer = 0;
   #lastEdit = -Infinity;
-  #filling = new Map(); // by insertion: first requested row
 
   // store.js; address of the web socket (default: /live of this page).
   constructor(store, address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`) {
@@ -149,17 +148,10 @@ export class Link {
   #news(message) {
     if (message.type === "welcome") {
       this.#attempts = 0;
-      this.#filling.clear();
       this.#store.set("connection", "open");
     }
     if (message.type === "session") this.#compare(message);
-    const missing = this.#store.receive(message);
-    if (message.type !== "rows") return;
-    if (missing === null) this.#filling.delete(message.of);
-    else if (this.#filling.get(message.of) !== missing) {
-      this.#filling.set(message.of, missing);
-      this.#send({ type: "rows_from", index: missing });
-    }
+    this.#store.receive(message);
   }
 
   // A restarted server counts its revisions from the beginning.

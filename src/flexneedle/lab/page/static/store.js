@@ -59,10 +59,14 @@ export class Store {
     return () => this.#listeners.delete(entry);
   }
 
-  // Take a message of the server. Return the index of the first row that is missing, or null.
+  // Take a message of the server.
   receive(message) {
-    if (message.type === "rows") return this.#receiveRows(message);
-    if (message.type === "closed") return this.#close(message);
+    if (message.type === "rows") this.#receiveRows(message);
+    else if (message.type === "closed") this.#close(message);
+    else this.#receiveState(message);
+  }
+
+  #receiveState(message) {
     const key = keyOf(message);
     const earlier = this.get(key);
     if (message.type === "insertion") this.#announce(key, message);
@@ -70,7 +74,6 @@ export class Store {
     if (message.type === "welcome") this.#forgetAll();
     if (message.type === "session" && message.name !== earlier?.name) this.#forgetPlans();
     this.set(key, message);
-    return null;
   }
 
   // Take a frame (`unpacked` of frames.js).
@@ -108,9 +111,7 @@ export class Store {
   #receiveRows({ of, first, rows }) {
     const key = `rows ${of}`;
     const known = first === 0 ? [] : this.get(key) ?? []; // at 0 an insertion begins
-    if (first > known.length) return known.length;
     this.set(key, [...known.slice(0, first), ...rows, ...known.slice(first + rows.length)]);
-    return null;
   }
 
   // An insertion that begins, or a recording that is opened, takes the place of the last one, and is shown. After a
@@ -130,7 +131,6 @@ export class Store {
     this.#before.delete(`insertion ${of}`);
     this.#forget(of);
     this.set(`insertion ${of}`, undefined);
-    return null;
   }
 
   #forget(of) {

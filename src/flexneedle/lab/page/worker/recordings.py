@@ -12,7 +12,6 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.lab.page.protocol import (
     InsertionMessage,
-    PeriodRow,
     Recording,
     RowsMessage,
     ServerMessage,
@@ -22,6 +21,7 @@ from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame,
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.loop.monitor.rules import has_indicator
 from flexneedle.phantom.tracking.table import TIP
+from flexneedle.record.fields import page_values
 from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save
 from flexneedle.results import Insertion, Period, Plan, scenario_of
@@ -90,31 +90,18 @@ def save_complete(insertion: Insertion, folder: str) -> None:
                 raise InputError(f"{whole}: cannot be created: {error.strerror}") from error
 
 
-def row_of(period: Period, plan: Plan) -> PeriodRow:
-    """Return the row of a period."""
+def row_of(period: Period, plan: Plan) -> dict[str, Any]:
+    """Return the row of a period: its fields, and three values for the plots.
+
+    error_mm: lateral distance of the true tip (on a rig: of the estimated tip) from the planned path at its depth;
+    indicator: as `_largest_indicator`; decide_ms: time of the decision.
+    """
     tip = period.true_tip or period.estimate
-    measured = period.measurement
-    return PeriodRow(
-        index=period.index,
-        time=period.time,
-        action=str(period.action),
-        decision=period.decision,
-        verdict=str(period.verdict),
-        measured=None if measured.x is None else (measured.x, measured.y, measured.z),
-        estimate=period.estimate.point,
-        true=None if period.true_tip is None else period.true_tip.point,
-        error_mm=_distance_from_path(plan, tip.point),
-        guide=period.guide,
-        roll_deg=math.degrees(period.roll),
-        indicator=_largest_indicator(period),
-        energy_mj=period.strain_energy,
-        true_energy_mj=period.true_strain_energy,
-        miss_mm=period.miss,
-        miss_sd_mm=period.miss_sd,
-        decide_ms=1e3 * period.durations.get("decide", 0.0),
-        late=period.late,
-        warning=period.warning,
-    )
+    return page_values(period) | {
+        "error_mm": _distance_from_path(plan, tip.point),
+        "indicator": _largest_indicator(period),
+        "decide_ms": 1e3 * period.durations.get("decide", 0.0),
+    }
 
 
 def _distance_from_path(plan: Plan, point: Sequence[float]) -> float:
