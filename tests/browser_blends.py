@@ -1,4 +1,4 @@
-"""What a part adds to the drawings of a page: pixels that have come closer to its tone."""
+"""Pixels that a part adds to the drawings of a page: those that have come closer to its tone."""
 
 PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 FLAT = ("[data-panel=section] canvas", "[data-panel=axial] canvas")
@@ -44,10 +44,15 @@ _ADDED = f"""async ([selectors, tone]) => {{
 }}"""
 
 
-def arrived(page):
-    """Wait until what the server has sent so far is there and painted: an answer comes after it."""
-    page.evaluate("flexneedle.link.ask({ type: 'ping' })")
+def painted(page):
+    """Wait until two paints have followed."""
     page.evaluate(PAINTED)
+
+
+def arrived(page):
+    """Wait until everything that the server has sent is received and painted: an answer comes after it."""
+    page.evaluate("flexneedle.link.ask({ type: 'ping' })")
+    painted(page)
 
 
 def added(page, server, tone, *news, canvases=FLAT):

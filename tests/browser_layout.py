@@ -1,4 +1,4 @@
-"""Whether a page in a browser fits its width."""
+"""Parts of a page in a browser that are wider than their box."""
 
 TOO_WIDE = """() => {
   const boxes = [document.documentElement, ...document.querySelectorAll("main, aside, .status, .panel, [data-panel]")];
@@ -8,5 +8,5 @@ TOO_WIDE = """() => {
 
 
 def too_wide(page):
-    """Parts of a page that are wider than their box: document, columns, which scroll by themselves, panels."""
+    """Return the parts that are wider than their box: document, columns (which scroll separately), panels."""
     return page.evaluate(TOO_WIDE)

@@ -11,4 +11,4 @@ NO_WEBGL = """{
     return kind.startsWith("webgl") ? null : context.call(this, kind, ...more);
   };
 }"""
-"""A script before those of a page, which then has no WebGL."""
+"""A script that runs first and leaves the page without WebGL."""

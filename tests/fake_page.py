@@ -1,4 +1,4 @@
-"""A small server of the page's files, without flexneedle behind it: sends what it is given, records requests."""
+"""A small server of the page's files without flexneedle: it sends given messages and records requests."""
 
 import asyncio
 import json
@@ -43,11 +43,15 @@ class Guarded:
 
 
 class FakePage:
-    """The server in a thread of its own, on a free port.
+    """The server in a separate thread, on a free port.
 
-    news: what a client gets when it comes; requests: all that clients asked; invalid: what is wrong with those that
-    the page's server would not take; answers: by type of a request, a `Refused`, or a function of the request that
-    returns news and frames for that client before `Done`; files: what is served by path.
+    Attributes:
+        news: Messages and frames for a new client.
+        requests: Requests of all clients.
+        invalid: Requests that the page's server would refuse, with their problem.
+        answers: By type of a request, a `RefusedMessage`, or a function of the request that returns messages and
+            frames for its client, which precede the `DoneMessage`.
+        files: Contents by path.
     """
 
     def __init__(self, schema=b"{}"):
@@ -84,14 +88,14 @@ class FakePage:
         self._thread.join(20.0)
 
     def begin_anew(self):
-        """Wait until all clients have left, and forget them and what they were sent; returns what was invalid."""
+        """Wait until all clients have left, and reset the server; return the invalid requests."""
         asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(20.0)
         invalid = self.invalid
         self._begin()
         return invalid
 
     def send(self, *news):
-        """Send news and frames to all clients."""
+        """Send messages and frames to all clients."""
         asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(20.0)
 
     def drop(self, reason=""):
@@ -99,7 +103,7 @@ class FakePage:
         asyncio.run_coroutine_threadsafe(self._drop(reason), self._loop).result(20.0)
 
     def cut(self):
-        """Send nothing more over the present connections, and leave them open, as a line that is dead."""
+        """Send nothing more over the present connections, and leave them open, like a dead line."""
         self._cut = list(self._sockets)
 
     def asked(self, kind):
@@ -111,7 +115,7 @@ class FakePage:
         ]
 
     def wait_for(self, kind, count=1):
-        """Wait until clients have asked for something so many times; returns these requests."""
+        """Wait for `count` requests of a type, and return them."""
         with self._heard:
             assert self._heard.wait_for(lambda: len(self.asked(kind)) >= count, 20.0), self.requests
         return self.asked(kind)
@@ -149,7 +153,7 @@ class FakePage:
         self._sockets.remove(socket)
 
     def _taken(self, text):
-        """A request that is kept, with what the page's server finds wrong with it."""
+        """Keep a request, and the problem that the page's server would find."""
         try:
             REQUESTS.validate_json(text)
         except ValidationError as error:

@@ -1,4 +1,4 @@
-"""News and frames of an insertion in space as a server sends them, drawn from closed curves: no mechanics, no draws.
+"""Messages and frames of an insertion in space as a server sends them, from closed curves without mechanics.
 
 The needle begins at x = -90 mm, its guide is at -41 mm, its tip at the start at -28.5 mm; the skin is x = 0.
 """
@@ -224,7 +224,7 @@ def period_frames(period, source=FrameSource.LIVE):
 
 
 def opening(**changes):
-    """What the server sends to a client that comes: a scene, nothing planned."""
+    """Return what a new client gets: a scene, nothing planned."""
     return [
         WELCOME,
         people(),
@@ -237,7 +237,7 @@ def opening(**changes):
 
 
 def planned():
-    """As after a plan with both strategies and a reach."""
+    """Return the state after plans with both strategies and a reach."""
     return [
         *opening(),
         iteration(ITERATIONS - 1),
@@ -253,7 +253,7 @@ def planned():
 
 
 def inserting(period=50):
-    """As in the middle of an insertion."""
+    """Return the state in the middle of an insertion."""
     return [
         *planned(),
         insertion(periods=period + 1),

@@ -1,4 +1,4 @@
-"""Replays of made-up insertions, and what is in such a file."""
+"""Replays of invented insertions, and the contents of their files."""
 
 import json
 from base64 import b64decode
@@ -17,7 +17,7 @@ def insertion(seed=0, **options):
 
 
 def record(made=None, name="mine", of="first", lacking=""):
-    """What a worker reports of an insertion."""
+    """Return the reports of a worker about an insertion."""
     return list(describe_recording(made or insertion(), name, of, lacking))
 
 

@@ -7,20 +7,20 @@ from page_clients import Client, served
 
 @pytest.fixture
 def server(tmp_path):
-    """A server of its own; its runs are in tmp_path / "runs"."""
+    """A server for one test; its runs are in tmp_path / "runs"."""
     with served(tmp_path / "runs") as server:
         yield server
 
 
 @pytest.fixture
 def client(server):
-    """A client that steers."""
+    """A client in control."""
     with Client(server) as client:
         yield client.steer()
 
 
 @pytest.fixture(scope="module")
 def shared_server(tmp_path_factory):
-    """A server for tests that change nothing of it."""
+    """A server for tests that leave it unchanged."""
     with served(tmp_path_factory.mktemp("shared") / "runs") as server:
         yield server

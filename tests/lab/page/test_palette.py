@@ -49,7 +49,7 @@ COMPARED = {
     *combinations(IN_VIEWS, 2),
     *((name, "second") for name in IN_PLOTS),
 }
-"""What else there is in one picture differs by width, dashes or form."""
+"""Other lines of one picture differ by width, dashes or form."""
 
 
 def palette(scheme):

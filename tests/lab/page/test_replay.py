@@ -1,4 +1,4 @@
-"""A run as one HTML file: the record is in it, it is complete, and nothing in it is read as something else."""
+"""A run as one HTML file: complete, with its record, and without loading or executing anything else."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ import pytest
 
 import flexneedle.lab.page
 from flexneedle.lab.page.replay import bundle_modules, encode_record, make_document
-from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, pack_frame, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameSource, ShapeFrame, pack_frame, unpack_frame
 from replays import File, insertion, record
 from synthetic import blind
 
@@ -33,46 +33,37 @@ def file(text):
 
 
 def as_sent(record):
-    """As the page gets it from its server."""
+    """Return the messages and frames as the page gets them from its server."""
     return [
         pack_frame(one) if isinstance(one, ShapeFrame) else json.loads(one.model_dump_json())
         for one in record
     ]
 
 
-def test_the_record_is_what_a_worker_reports(file):
-    assert file.record == as_sent(record())
-    kinds = [each["type"] for each in file.record if isinstance(each, dict)]
-    assert kinds == ["insertion", "rows"]
-    assert len(file.record[-1]["rows"]) == 69
+def kinds(record):
+    return [one.kind.name if isinstance(one, ShapeFrame) else one.type for one in record]
 
 
-def test_the_shapes_are_those_of_the_insertion(file):
+def test_the_record_is_equal_to_the_reports_of_a_worker(file):
     made = insertion()
+    assert file.record == as_sent(record())
+    assert kinds(record()) == ["insertion", "PATH", "NEEDLE", "TRUE", "rows"]
     path, needles, true = (unpack_frame(each) for each in file.record if isinstance(each, bytes))
-    assert [frame.kind for frame in (path, needles, true)] == [
-        FrameKind.PATH,
-        FrameKind.NEEDLE,
-        FrameKind.TRUE,
-    ]
     assert {frame.source for frame in (path, needles, true)} == {FrameSource.FIRST}
     assert path.values[0] == pytest.approx(made.plan.tips[:, :3], abs=1e-4)
+    assert len(file.record[-1]["rows"]) == 69
     for at in (0, 68):
         assert needles.values[at] == pytest.approx(made.periods[at].shape[:, :3], abs=1e-4)
         assert true.values[at] == pytest.approx(made.periods[at].true_shape, abs=1e-4)
 
 
-def test_what_was_not_recorded_is_not_in_it():
+def test_unknown_values_are_null_and_have_no_shapes():
     made = insertion()
     made = replace(made, periods=tuple(blind(period) for period in made.periods))
+    assert kinds(record(made)) == ["insertion", "PATH", "NEEDLE", "rows"]
     *_, rows = File.of(make_document("mine", record(made))).record
-    assert {
-        (row["measured"], row["true"], row["true_energy_mj"], row["miss_sd_mm"]) for row in rows["rows"]
-    } == {(None, None, None, None)}
-    assert [one.kind for one in record(made) if isinstance(one, ShapeFrame)] == [
-        FrameKind.PATH,
-        FrameKind.NEEDLE,
-    ]
+    unknown = ("measured", "true", "true_energy_mj", "miss_sd_mm")
+    assert {tuple(row[key] for key in unknown) for row in rows["rows"]} == {(None,) * 4}
 
 
 def test_a_text_of_the_record_ends_no_element():
@@ -124,22 +115,19 @@ def test_every_module_that_the_replay_imports_is_in_it_once(file):
     assert {"store.js", "space/view.js", "vendor/three.js", "vendor/uplot.js"} <= set(names)
     assert names[-1] == "replay.js"
     assert "link.js" not in names
-
-
-def test_copies_of_vendored_modules_have_their_licence(file):
     for path in (STATIC / "vendor").glob("*.LICENSE"):
         assert path.read_text() in file.script
 
 
-@pytest.mark.parametrize("path", sorted(STATIC.rglob("*.js")), ids=lambda path: path.name)
-def test_all_modules_can_be_bundled(path):
-    """main.js alone imports by a name that it computes."""
-    name = path.relative_to(STATIC).as_posix()
-    if name == "main.js":
-        with pytest.raises(ValueError, match=r"main\.js"):
-            bundle_modules(STATIC, name)
-    else:
-        assert not re.search(r"^(?:import|export)\b", bundle_modules(STATIC, name), re.MULTILINE)
+def test_all_modules_can_be_bundled():
+    """Except main.js, which imports by a computed name."""
+    for path in STATIC.rglob("*.js"):
+        name = path.relative_to(STATIC).as_posix()
+        if name == "main.js":
+            with pytest.raises(ValueError, match=r"main\.js"):
+                bundle_modules(STATIC, name)
+        else:
+            assert not re.search(r"^(?:import|export)\b", bundle_modules(STATIC, name), re.MULTILINE)
 
 
 def bundle_of(folder, **modules):
@@ -183,13 +171,10 @@ UNKNOWN = [
 ]
 
 
-@pytest.mark.parametrize("source", UNKNOWN)
-def test_other_forms_are_refused(tmp_path, source):
-    with pytest.raises(ValueError, match=r"^entry\.js: .* a form of import or export"):
-        bundle_of(tmp_path, entry=f"{source}\n", a="export const b = 1;\n")
-
-
-def test_modules_that_import_each_other_are_refused(tmp_path):
+def test_other_forms_and_modules_that_import_each_other_are_refused(tmp_path):
+    for source in UNKNOWN:
+        with pytest.raises(ValueError, match=r"^entry\.js: .* a form of import or export"):
+            bundle_of(tmp_path, entry=f"{source}\n", a="export const b = 1;\n")
     with pytest.raises(ValueError, match=r"^entry\.js imports a\.js imports entry\.js: "):
         bundle_of(tmp_path, entry='import { a } from "./a.js";\n', a='import { b } from "./entry.js";\n')
 

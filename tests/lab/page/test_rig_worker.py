@@ -1,4 +1,4 @@
-"""Insertions on a rig in the page's worker: those of the command, which wait, are held and stopped when signalled."""
+"""Insertions on a rig in the page's worker: as by the command, and they wait, are held and stopped on request."""
 
 import json
 from dataclasses import replace
@@ -9,7 +9,7 @@ import tomli_w
 
 import fake_engine
 from bench_rig import rig, values
-from commands import run
+from commands import names, run
 from flexneedle.errors import DriverError, InputError, RigError
 from flexneedle.lab.page.job_orders import SILENT_S, JobChange
 from flexneedle.lab.page.rigs import usable_rig
@@ -48,11 +48,11 @@ class SupervisorClient:
         assert self.waits < 1000, "it waits for what does not come"
         self.on_wait()
 
+    def take_signals(self):
+        """Do nothing, as for a command without signals."""
+
     def request_stop(self, who):
         self.stops.append(who)
-
-    def take_signals(self):
-        """As for a command."""
 
 
 @pytest.fixture
@@ -64,11 +64,11 @@ def in_tmp(tmp_path, monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """What `flexneedle.loop.insert.insert` was called with: plan and loop are made up, the rig is `supervisor`."""
-    found = []
+    """Calls of `loop.insert.carry_out`: plan and loop are invented, the rig is `supervisor`."""
+    found, supervisor = [], SupervisorClient()
     fake_engine.install(monkeypatch.setattr)
 
-    def inserted(scenario, plan, choices, stream):
+    def carry_out(scenario, plan, choices, stream):
         found.append((scenario, choices))
 
         def wait_while_held(_event):
@@ -79,74 +79,69 @@ def calls(monkeypatch):
         held = Stream((wait_while_held, *stream.listeners))
         return fake_engine.carry_out(scenario, plan, choices, held)
 
-    supervisor = inserted.supervisor = SupervisorClient()
-    monkeypatch.setattr(recording, "carry_out", inserted)
+    monkeypatch.setattr(recording, "carry_out", carry_out)
     return SimpleNamespace(found=found, supervisor=supervisor)
 
 
 def order(tmp_path, reported=None, **more):
-    one = task(
-        "insert",
-        "insertion",
-        load_scenario("phantom"),
-        reported=reported,
-        rig="rig.toml",
-        folder=str(tmp_path),
-        **more,
-    )
+    values = {"scenario": load_scenario("phantom"), "rig": "rig.toml", "folder": str(tmp_path), **more}
+    one = task("insert", "insertion", reported=reported, **values)
     return replace(one, control=JobControl(held="not armed"))
 
 
 def going(one, calls):
-    """The order goes when it waits for the third time."""
+    """Let the insertion go when it waits for the third time."""
 
-    def signalled():
+    def signal():
         if calls.supervisor.waits % 3 == 0:
             one.control.take(JobChange(job=1, go=True))
 
-    calls.supervisor.on_wait = signalled
+    calls.supervisor.on_wait = signal
     return one
 
 
+def inserted(one):
+    """Insert, and return the last reported state."""
+    InsertionJobs().insert(one)
+    return one.report.of("insertion")[-1]
+
+
 def states(one):
-    return [news.state for news in one.report.of("insertion")]
+    return [message.state for message in one.report.of("insertion")]
 
 
-def reports(one):
-    return [(news.state, news.waits, len(news.moves)) for news in one.report.rig]
+def in_row_4(then):
+    """Return reports that call a function after the fifth row."""
+    return Reported(lambda message: getattr(message, "type", "") == "rows" and message.first == 4 and then())
 
 
 def run_file(folder):
     return json.loads((folder / "run.json").read_text())
 
 
-def test_it_waits_with_what_will_move_until_it_may_go(calls, in_tmp):
+def test_it_waits_with_its_motions_until_it_may_go(calls, in_tmp):
     one = going(order(in_tmp), calls)
-    InsertionJobs().insert(one)
+    last = inserted(one)
     assert states(one) == ["planning", "ready", "running", "done"]
     assert calls.supervisor.waits == 3
     waiting, goes = one.report.rig
     assert list(waiting.moves[:-1]) == MOVES
-    assert waiting.moves[-1].startswith("The motors of all axes are switched on first.")
+    assert "switched on" in waiting.moves[-1]
     assert (waiting.waits, goes.waits, goes.moves) == (1, 0, ())
-    assert len(one.report.rows) == one.report.of("insertion")[-1].periods > 10
+    assert len(one.report.rows) == last.periods > 10
+    assert last.summary.endswith("flexneedle rig retract rig.toml")  # the needle is left in
+    with pytest.raises(InputError, match="no insertion to save"):  # it is recorded already
+        InsertionJobs().save(task("save", folder=str(in_tmp / "again")))
 
 
-def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
-    one = going(order(in_tmp / "runs", seed=3, controller="ce-mpc"), calls)
-    InsertionJobs().insert(one)
+def test_its_record_is_equal_to_the_command(calls, in_tmp, capsys):
+    last = inserted(going(order(in_tmp / "runs", seed=3, controller="ce-mpc"), calls))
     arguments = ("--seed", "3", "--controller", "ce-mpc", "--out", "command", "--yes")
     assert run(capsys, "insert", "phantom", "--rig", "rig.toml", *arguments)[0] == 0
-    last = one.report.of("insertion")[-1]
     assert last.rig == "Bench"
-    ours, theirs = run_file(in_tmp / "runs" / last.folder), run_file(in_tmp / "command")
-    timed = ("timing",)
-    assert {k: v for k, v in ours.items() if k not in timed} == {
-        k: v for k, v in theirs.items() if k not in timed
-    }
-    assert sorted(file.name for file in (in_tmp / "command").iterdir()) == sorted(
-        file.name for file in (in_tmp / "runs" / last.folder).iterdir()
-    )
+    ours, theirs = in_tmp / "runs" / last.folder, in_tmp / "command"
+    assert run_file(ours) | {"timing": None} == run_file(theirs) | {"timing": None}
+    assert names(ours) == names(theirs)
     (ours, our_choices), (theirs, their_choices) = calls.found
     assert our_choices.parts == their_choices.parts
     assert our_choices.parts["rig"] == "Bench"
@@ -154,119 +149,107 @@ def test_it_is_recorded_as_by_the_command(calls, in_tmp, capsys):
     assert our_choices.seed == their_choices.seed == 3
 
 
-def test_it_is_held_between_two_periods_and_goes_on_when_it_may(calls, in_tmp):
-    def then(news):
-        if getattr(news, "type", "") == "rows" and news.first == 4:
-            one.control.take(JobChange(job=1, hold="nobody is in control"))
+def test_it_is_held_between_two_periods_and_continues_when_it_may(calls, in_tmp):
+    def hold():
+        one.control.take(JobChange(job=1, hold="nobody is in control"))
 
-    one = going(order(in_tmp, Reported(then)), calls)
-    InsertionJobs().insert(one)
+    one = going(order(in_tmp, in_row_4(hold)), calls)
+    inserted(one)
     assert states(one) == ["planning", "ready", "running", "holding", "running", "done"]
-    assert one.report.of("insertion")[3].summary == "nobody is in control"
-    assert one.report.of("insertion")[3].periods == 5
-    assert reports(one) == [("idle", 1, 5), ("idle", 0, 0), ("idle", 2, 4), ("idle", 0, 0)]
+    held = one.report.of("insertion")[3]
+    assert (held.summary, held.periods) == ("nobody is in control", 5)
+    reports = [(report.state, report.waits, len(report.moves)) for report in one.report.rig]
+    assert reports == [("idle", 1, 5), ("idle", 0, 0), ("idle", 2, 4), ("idle", 0, 0)]
     assert list(one.report.rig[2].moves) == MOVES
 
 
 @pytest.mark.parametrize("signal", [{"stop": "person 2"}, {"cancel": True, "stop": "the server has ended"}])
-def test_a_stop_goes_to_the_supervisor_in_the_thread_that_reads_orders(calls, in_tmp, signal):
+def test_a_stop_is_sent_to_the_supervisor_by_the_receiving_thread(calls, in_tmp, signal):
     one = order(in_tmp)
-    calls.supervisor.on_wait = lambda: (one.control.take(JobChange(job=1, **signal)), ended())
 
-    def ended():
+    def stopped():
+        one.control.take(JobChange(job=1, **signal))
         raise DriverError("stopped")
 
+    calls.supervisor.on_wait = stopped
     with pytest.raises(DriverError):
-        InsertionJobs().insert(one)
+        inserted(one)
     assert calls.supervisor.stops == [signal["stop"]]
 
 
-def test_one_that_is_stopped_before_its_rig_is_open_moves_nothing_and_has_a_record(calls, in_tmp):
+def test_a_stop_before_or_while_the_rig_opens_moves_nothing_and_is_recorded(calls, in_tmp):
     one = order(in_tmp)
     one.control.take(JobChange(job=1, stop="person 2"))
     with pytest.raises(Cancelled):
-        InsertionJobs().insert(one)
+        inserted(one)
     last = one.report.of("insertion")[-1]
     assert (last.state, last.summary) == ("interrupted", "stopped: person 2")
     assert calls.found == []
     stored = run_file(in_tmp / last.folder)
     assert (stored["status"], stored["reason"]) == ("interrupted", "stopped: person 2")
 
+    def stop(message):
+        if getattr(message, "type", "") == "job" and "5 of 5" in message.text:  # the plan is ready
+            opening.control.take(JobChange(job=1, stop="person 2"))
 
-def test_one_that_is_stopped_while_the_rig_opens_is_not_armed(calls, in_tmp):
-    one = order(
-        in_tmp, Reported(lambda news: getattr(news, "type", "") == "job" and "5 of 5" in news.text and stop())
-    )
-
-    def stop():
-        one.control.take(JobChange(job=1, stop="person 2"))
-
-    InsertionJobs().insert(one)
-    assert states(one)[-1] == "interrupted"
+    opening = order(in_tmp, Reported(stop))
+    assert inserted(opening).state == "interrupted"
     assert calls.supervisor.waits == 0
 
 
-LEFT_IN = "the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
+def test_a_failure_reports_that_the_needle_is_left_in(calls, in_tmp):
+    def fail():
+        raise DriverError("the motor is off")
 
-
-def test_a_needle_that_is_left_in_is_said_to_be(calls, in_tmp):
-    def then(news):
-        if getattr(news, "type", "") == "rows" and news.first == 4:
-            raise DriverError("the motor is off")
-
-    one = going(order(in_tmp, Reported(then)), calls)
+    one = going(order(in_tmp, in_row_4(fail)), calls)
     with pytest.raises(DriverError):
-        InsertionJobs().insert(one)
+        inserted(one)
     last = one.report.of("insertion")[-1]
-    assert (last.state, last.summary) == ("failed", f"the motor is off; {LEFT_IN}")
+    assert (last.state, last.summary.split("; ")[0]) == ("failed", "the motor is off")
+    assert last.summary.endswith("flexneedle rig retract rig.toml")
 
 
-def test_a_needle_at_its_target_is_left_in_too(calls, in_tmp):
-    one = going(order(in_tmp), calls)
-    InsertionJobs().insert(one)
-    last = one.report.of("insertion")[-1]
-    assert (last.state, last.summary[-len(LEFT_IN) :]) == ("done", LEFT_IN)
-
-
-def follower(**more):
-    one = order("", **more)
+@pytest.fixture
+def gate():
+    """The gate of an insertion whose rig is open, with its control and reports."""
+    one = order("")
     made = RigGate(SimpleNamespace(task=one, announce=lambda *_: None), None)
-    made._supervisor = SupervisorClient()
-    return made, one
+    made._supervisor, made.control, made.reports = SupervisorClient(), one.control, one.report.rig
+    return made
 
 
-def test_states_of_the_supervisor_are_reported_when_they_change():
-    made, one = follower()
-    for state, why in [
-        ("armed", ""), ("armed", ""), ("inserting", ""), ("holding", "missing"), ("stopped", "the controller"),
-    ]:  # fmt: skip
-        made.take(TickReport(0.0, SupervisorState(state), why))
-    found = [(news.state, news.why) for news in one.report.rig]
-    assert found == [("armed", ""), ("inserting", ""), ("holding", "missing"), ("ended", "")]
-    made.take(TickReport(0.0, SupervisorState.STOPPED, "person 2"))
-    assert one.report.rig[-1].state == "stopped"
+def tick(gate, state, why=""):
+    gate.take(TickReport(0.0, SupervisorState(state), why))
 
 
-def test_a_rig_is_stopped_once_when_the_server_is_silent():
-    made, one = follower()
-    made.take(TickReport(0.0, SupervisorState.INSERTING))
-    assert made._supervisor.stops == []
-    one.control.heard -= SILENT_S + 0.1
+def test_changed_states_of_the_supervisor_are_reported(gate):
+    ticks = [
+        ("armed", ""),
+        ("armed", ""),
+        ("inserting", ""),
+        ("holding", "missing"),
+        ("stopped", "the controller"),
+    ]
+    for state, why in (*ticks, ("stopped", "person 2")):
+        tick(gate, state, why)
+    found = [(report.state, report.why) for report in gate.reports]
+    shown = [("armed", ""), ("inserting", ""), ("holding", "missing"), ("ended", ""), ("stopped", "person 2")]
+    assert found == shown
+
+
+def test_a_rig_is_stopped_once_when_the_server_is_silent_without_beats(gate):
+    gate.control.heard -= SILENT_S + 0.1
+    gate.control.take(JobChange(1))  # a beat
+    tick(gate, "inserting")
+    assert gate._supervisor.stops == []
+    gate.control.heard -= SILENT_S + 0.1
     for _ in range(2):
-        made.take(TickReport(0.0, SupervisorState.INSERTING))
-    (why,) = made._supervisor.stops
+        tick(gate, "inserting")
+    (why,) = gate._supervisor.stops
     assert why.startswith("no signal of the page's server for 1.")
 
 
-def test_a_beat_is_a_signal():
-    made, one = follower()
-    one.control.heard -= SILENT_S + 0.1
-    one.control.take(JobChange(1))
-    made.take(TickReport(0.0, SupervisorState.INSERTING))
-    assert made._supervisor.stops == []
-
-
-def test_a_check_is_that_of_the_command(monkeypatch):
+def test_a_check_is_equal_to_the_command(monkeypatch):
     monkeypatch.setattr("flexneedle.lab.page.worker.rig_insertion._CHECKED_S", 0.0)
     one = task("check", "check", load_scenario("phantom"), rig="rig.toml")
     check(one)
@@ -281,14 +264,5 @@ def test_a_check_is_that_of_the_command(monkeypatch):
 @pytest.mark.parametrize("key", ["arm", "target"])
 def test_a_rig_that_ros_arms_or_gives_its_target_is_refused(in_tmp, key):
     (in_tmp / "rig.toml").write_text(tomli_w.dumps(values(KINDS | {f"ros.{key}": True})))
-    with pytest.raises(RigError) as caught:
+    with pytest.raises(RigError, match=f"^ros.{key} = true: "):
         usable_rig("rig.toml")
-    rule = "must be false for the page, which arms the rig and has the target: use flexneedle insert"
-    assert str(caught.value) == f"ros.{key} = true: {rule}"
-
-
-def test_an_insertion_on_a_rig_is_not_saved_again(calls, in_tmp):
-    one, worker = going(order(in_tmp), calls), InsertionJobs()
-    worker.insert(one)
-    with pytest.raises(InputError, match="no insertion to save"):
-        worker.save(task("save", folder=str(in_tmp / "again")))

@@ -64,7 +64,7 @@ def kept_tabs():
 def tab(browser, kept_tabs):
     """A function that opens an empty tab. Errors on its pages, in `errors`, fail the test at its end.
 
-    before: a script that runs before those of a page; draws: whether WebGL draws; touch: whether it is touched.
+    before: a script that runs first; draws: whether WebGL draws; touch: whether the screen is touched.
     """
     kept, fresh, errors = [], [], []
 

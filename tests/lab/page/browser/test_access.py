@@ -95,4 +95,4 @@ def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
     page.evaluate("document.getElementById('main').scrollTop = 0")
     server.send(insertion("done", periods=3))
     until(page, "document.activeElement.innerText === 'Insert'")
-    assert page.evaluate("document.getElementById('main').scrollTop") == 0  # what is looked at stays in view
+    assert page.evaluate("document.getElementById('main').scrollTop") == 0  # the view stays

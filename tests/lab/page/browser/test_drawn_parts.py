@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS, FLAT, added, arrived
+from browser_blends import added, arrived
 from browser_layout import too_wide
 from flexneedle.lab.page.protocol import ReachMessage, RowsMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
@@ -23,7 +23,6 @@ from recorded_page import (
     samples,
     scene,
     scene_frames,
-    session,
     shape,
 )
 
@@ -116,7 +115,7 @@ HORIZON = f"""async () => {{
 
 
 def test_the_sampled_horizon_is_shown_from_its_period_on(views, server):
-    """In all views; it stays until the next one, and scrubbing back shows that of the period."""
+    """In all views; it stays until the next one, and scrubbing back shows the horizon of the period."""
     frames = [frame for period in range(20) for frame in period_frames(period)]
     page = views([*opening(), insertion("running", periods=20), rows(0, 20), *frames])
     page.wait_for_selector("[data-panel=space] .legend li")
@@ -136,102 +135,69 @@ def test_the_sampled_horizon_is_shown_from_its_period_on(views, server):
             assert corners[:, 0].min() == {8: 5.0, 16: 12.0}[count]
 
 
-SPAN = f"""async ([selector, [left, right, half], x]) => {{
-  {BLENDS}
-  const {{ mappingOf }} = await import("/static/flat/plane.js");
-  const canvas = document.querySelector(selector);
-  const {{ width, height }} = canvas;
-  const map = mappingOf({{ left, right, half }}, width, height, 1);
-  const [after, tone, across] = [composed(canvas), toneOf("--reach"), Math.round(map.toX(x))];
-  const rows = Array.from({{ length: height }}, (_, y) => y);
-  const found = rows.filter((y) => shareOf(window.kept[0], after, 4 * (y * width + across), tone));
-  return found.length ? [map.fromY(found.at(-1) + 1), map.fromY(found[0])] : null;
-}}"""
-"""Lowest and highest place (mm) of the reach in the column of a canvas at x (mm), of a view of a box."""
-BOX, AXIAL_BOX = (-50.0, 50.0, 10.0), (-9.0, 9.0, 9.0)
-SLOPES = (0.2, 0.1)
+OUTLINES = """async ([name, target, axes, reach, [paths, points, values], depth]) => {
+  const { planeOf } = await import("/static/flat/plane.js");
+  const { reachAt, reachIn } = await import("/static/flat/reach.js");
+  const scene = { axis: { point: axes, slope: [0, 0] } };
+  const outlines = { paths, points, columns: 3, values: new Float32Array(values) };
+  return [reachIn(planeOf(name, scene, target), reach, outlines), reachAt(depth, outlines)];
+}"""
+"""Outline of the reach in a section, and at a depth."""
+SLOPES = np.array([0.2, 0.1])
 """Half axes of the reach by its depth."""
-TWO_PIXELS = 0.4  # mm
 
 
 def ellipses(*depths, wide=1.0):
-    """Outlines of the reach at depths, around the axis."""
+    """Return outlines of the reach at depths, around the axis."""
     angle = np.linspace(0.0, 2.0 * np.pi, 97)
-    y, z = wide * SLOPES[0] * np.cos(angle), wide * SLOPES[1] * np.sin(angle)
-    return shape(
-        FrameKind.REACH,
-        FrameSource.SCENE,
-        0,
-        *(np.column_stack([np.full(97, x), x * y, x * z]) for x in depths),
-    )
+    y, z = wide * SLOPES[:, None] * (np.cos(angle), np.sin(angle))
+    return np.array([np.column_stack([np.full(97, x), x * y, x * z]) for x in depths])
 
 
-def reach_at(page, server, canvas, box, at, *news):
-    """Where news from the server shade the reach in a column."""
-    assert added(page, server, "--reach", *news, canvases=[canvas])[0] > 0
-    return [page.evaluate(SPAN, [canvas, box, x]) for x in at]
+def cut(page, plane, outlines, depth=0.0, reach=REACH, axis=(0.0, 0.0), target=TARGET):
+    paths, points, _ = outlines.shape
+    values = [paths, points, outlines.ravel().tolist()]
+    return page.evaluate(OUTLINES, [plane, target, axis, reach.model_dump(), values, depth])
 
 
-@pytest.mark.parametrize(
-    ("plane", "slope"), [("x–z", SLOPES[1]), ("target", np.hypot(5, 3) / np.hypot(5 / 0.2, 3 / 0.1))]
-)
-def test_in_space_the_reach_in_section_is_where_the_plane_cuts_its_outlines(views, server, plane, slope):
-    page = views(opening())
-    page.click(f"{SECTION} [data-plane='{plane}']")
-    arrived(page)
-    before, inside, behind = reach_at(
-        page, server, FLAT[0], BOX, (12.0, 30.0, 44.0), REACH, ellipses(15.0, 25.0, 40.0)
-    )
-    assert before is None
-    np.testing.assert_allclose(inside, (-30.0 * slope, 30.0 * slope), atol=TWO_PIXELS)
-    assert behind is None
+def test_the_reach_is_cut_by_the_plane_of_the_section_and_at_the_depth_of_the_target(views):
+    """In space; in the plane its outlines have no width, and its strip is measured from the axis."""
+    page, depths = views(opening()), (15.0, 25.0, 40.0)
+    for plane, slope in (("x–z", SLOPES[1]), ("target", np.hypot(5, 3) / np.hypot(5 / 0.2, 3 / 0.1))):
+        section, _ = cut(page, plane, ellipses(*depths))
+        ends = [(x, side * x * slope) for side, some in ((-1, depths), (1, depths[::-1])) for x in some]
+        np.testing.assert_allclose(section, ends, atol=0.02)
+    _, outline = cut(page, "target", ellipses(15.0, 35.0, 60.0), depth=40.0)
+    half_axes = 40.0 * SLOPES
+    np.testing.assert_allclose(np.hypot(*(np.array(outline)[:, 1:] / half_axes).T), 1.0, atol=0.01)
+    assert cut(page, "target", ellipses(15.0, 38.0), depth=40.0)[1] == []  # below its deepest outline
+    ends = np.array([[[x, -0.2 * x, 0.0], [x, 0.1 * x, 0.0], [x, -0.2 * x, 0.0]] for x in (15.0, 40.0)])
+    strip = ReachMessage(revision=1, angle_deg=0.0, low=ends[:, 0].tolist(), high=ends[:, 1].tolist())
+    for plane, off in (("target", 2.0), ("x–y", 0.0)):
+        section, _ = cut(page, plane, ends, reach=strip, axis=(2.0, 0.0), target=(40.0, 5.0, 0.0))
+        wanted = [(15.0, -3.0 - off), (40.0, -8.0 - off), (40.0, 4.0 - off), (15.0, 1.5 - off)]
+        np.testing.assert_allclose(section, wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize(("plane", "entry"), [("target", 2.0), ("x–y", 2.0)])
-def test_in_the_plane_the_reach_in_section_is_a_strip(views, server, plane, entry):
-    """Its outlines have no width. The section through the axis measures from where that is."""
-    flat = [
-        session(target=(40.0, 5.0, 0.0)),
-        scene(target=(40.0, 5.0, 0.0), axes=1, point=(entry, 0.0)),
-    ]
-    page = views([*opening(), *flat])
-    page.click(f"{SECTION} [data-plane='{plane}']")
-    arrived(page)
-    ends = [np.array([[x, -0.2 * x, 0.0], [x, 0.1 * x, 0.0], [x, -0.2 * x, 0.0]]) for x in (15.0, 40.0)]
-    edges = {"low": [tuple(end[0]) for end in ends], "high": [tuple(end[1]) for end in ends]}
-    strip = ReachMessage(revision=1, angle_deg=0.0, **edges)
-    before, inside = reach_at(
-        page, server, FLAT[0], BOX, (12.0, 30.0), strip, shape(FrameKind.REACH, FrameSource.SCENE, 0, *ends)
-    )
-    assert before is None
-    off = entry if plane == "target" else 0.0
-    np.testing.assert_allclose(inside, (-6.0 - off, 3.0 - off), atol=TWO_PIXELS)
-
-
-def test_along_the_axis_the_reach_is_cut_at_the_depth_of_the_target(views, server):
-    """Nothing is shown beyond its deepest outline."""
-    page = views(opening())
-    assert added(page, server, "--reach", REACH, ellipses(15.0, 38.0), canvases=[FLAT[1]])[0] == 0
-    assert "reach" not in page.locator(f"{AXIAL} .legend li").all_inner_texts()
-    up, side = reach_at(page, server, FLAT[1], AXIAL_BOX, (0.0, 3.0), ellipses(15.0, 35.0, 60.0))
-    half = SLOPES[0] * TARGET[0]
-    np.testing.assert_allclose(up, (-half, half), atol=TWO_PIXELS)
-    rest = half * np.sqrt(1.0 - (3.0 / (SLOPES[1] * TARGET[0])) ** 2)
-    assert side[0] == pytest.approx(-rest, abs=TWO_PIXELS)
+PLACE = """async ([selector, left, right, half, point]) => {
+  const { mappingOf } = await import("/static/flat/plane.js");
+  const stage = document.querySelector(`${selector} .stage`);
+  const handle = stage.querySelector("[data-handle=target]").getBoundingClientRect();
+  const { x, y, width, height } = stage.querySelector("canvas").getBoundingClientRect();
+  const map = mappingOf({ left, right, half }, width, height, 1);
+  return [handle.x + handle.width / 2 - x - map.toX(point[0]), handle.y + handle.height / 2 - y - map.toY(point[1])];
+}"""
+"""Distance (px) of the target's handle from its place in a view of a box."""
 
 
 def test_the_whole_reach_is_in_view(views, server):
-    wide, deepest = 4.0, 60.0
-    page = views(opening())
+    page, wide, deepest = views(opening()), 4.0, 60.0
     page.click(f"{SECTION} [data-plane='x–y']")
+    outlines = ellipses(15.0, 35.0, deepest, wide=wide)
+    server.send(REACH, shape(FrameKind.REACH, FrameSource.SCENE, 0, *outlines))
     arrived(page)
-    half = wide * SLOPES[0] * deepest
-    box, outlines = (BOX[0], deepest + 1.0, np.ceil(half + 1.0)), ellipses(15.0, 35.0, deepest, wide=wide)
-    edge, beyond = reach_at(page, server, FLAT[0], box, (0.95 * deepest, deepest + 0.5), REACH, outlines)
-    np.testing.assert_allclose(edge, (-0.95 * half, 0.95 * half), atol=wide * TWO_PIXELS)
-    assert beyond is None
-    at_target = wide * SLOPES[0] * TARGET[0]
-    shown = np.floor(at_target + 1.0)
-    page = views(opening())
-    (up,) = reach_at(page, server, FLAT[1], (-shown, shown, shown), (0.0,), REACH, outlines)
-    np.testing.assert_allclose(up, (-at_target, at_target), atol=wide * TWO_PIXELS)
+    deep = [SECTION, -50.0, deepest + 1.0, np.ceil(wide * SLOPES[0] * deepest + 1.0), TARGET[:2]]
+    shown = np.ceil(wide * SLOPES[0] * TARGET[0] + 1.0)
+    across = [AXIAL, -shown, shown, shown, TARGET[:0:-1]]
+    for view in (deep, across):
+        np.testing.assert_allclose(page.evaluate(PLACE, view), 0.0, atol=1.5)

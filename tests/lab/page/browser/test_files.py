@@ -189,7 +189,7 @@ REFUSED = study_row(
 
 
 def listing(request):
-    """What the server sends of the rows of a study."""
+    """Return the server's message about rows of a study."""
     index = request.get("index")
     found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
     about = {"title": "Many targets", "insertions": 150, "finished": 149}

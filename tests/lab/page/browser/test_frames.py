@@ -30,31 +30,16 @@ def test_names_and_numbers_are_the_same(name, numbers):
 
 
 @pytest.mark.page
-def test_a_browser_reads_what_python_packs(visit):
+def test_a_browser_reads_what_python_packs_and_refuses_what_python_refuses(visit):
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4) / 7
-    frame = pack_frame(make_frame(FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values))
-    (read,) = visit().evaluate(READ, [list(frame)])
-    assert (read["kind"], read["source"], read["number"]) == (
-        FrameKind.SAMPLES,
-        FrameSource.STEERING,
-        3_000_000_000,
-    )
-    assert (read["paths"], read["points"], read["columns"]) == values.shape
-    np.testing.assert_array_equal(np.float32(read["values"]), values.ravel())
-
-
-@pytest.mark.page
-def test_a_browser_refuses_what_python_refuses(visit):
-    good = pack_frame(make_frame(FrameKind.NEEDLE, FrameSource.LIVE, 0, np.zeros((4, 3))))
-    bad = [
-        good[:15],
-        good[:-1],
-        good + b"\0",
-        good[:3] + b"\1" + good[4:],
-        b"\x63" + good[1:],
-        good[:2] + b"\x63" + good[3:],
-    ]
+    good = pack_frame(make_frame(FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values))
+    other_kind, other_source = b"\x63" + good[1:], good[:2] + b"\x63" + good[3:]
+    bad = [good[:15], good[:-1], good + b"\0", good[:3] + b"\1" + good[4:], other_kind, other_source]
     for frame in bad:
         with pytest.raises(ValueError):
             unpack_frame(frame)
-    assert all(isinstance(read, str) for read in visit().evaluate(READ, [list(frame) for frame in bad]))
+    read, *refused = visit().evaluate(READ, [list(frame) for frame in (good, *bad)])
+    named = (FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values.shape)
+    assert tuple(read[key] for key in ("kind", "source", "number", "paths", "points", "columns")) == named
+    np.testing.assert_array_equal(np.float32(read["values"]), values.ravel())
+    assert all(isinstance(each, str) for each in refused)

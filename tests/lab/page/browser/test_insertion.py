@@ -2,6 +2,7 @@
 
 import pytest
 
+from browser_blends import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import (
     DisturbancesMessage,
@@ -15,7 +16,6 @@ from recorded_page import WELCOME, insertion, opening, people, row, rows, sessio
 pytestmark = pytest.mark.page
 
 PANEL = "[data-panel=insertion]"
-PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 @pytest.fixture
@@ -196,34 +196,28 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
     assert page.locator(".rig .moves li").all_inner_texts() == MOVES
     assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
     assert page.evaluate(FOCUSED) == "Stop"
-    page.check("#rig-free")
-    assert shown_buttons(page) == {"Arm": True, "Insert on the rig": False}
-    click(page, "Arm")
-    server.send(rig("armed", *MOVES, job=7))
-    until(page, f"!document.querySelector('{PANEL} .rig button.danger').disabled")
-    assert shown_buttons(page) == {"Disarm": True, "Insert on the rig": True}
-    click(page, "Disarm")
-    server.send(rig("ready", *MOVES, job=7))
-    page.wait_for_selector(f"{PANEL} >> text=is ready; nothing moves")
-    assert not page.is_checked("#rig-free")
-    page.check("#rig-free")
-    click(page, "Arm")
-    server.send(rig("armed", *MOVES, job=7))
-    until(page, f"!document.querySelector('{PANEL} .rig button.danger').disabled")
-    click(page, "Insert on the rig")
+    for last in ("Disarm", "Insert on the rig"):
+        page.check("#rig-free")
+        assert shown_buttons(page) == {"Arm": True, "Insert on the rig": False}
+        click(page, "Arm")
+        server.send(rig("armed", *MOVES, job=7))
+        until(page, f"!document.querySelector('{PANEL} .rig button.danger').disabled")
+        assert shown_buttons(page) == {"Disarm": True, "Insert on the rig": True}
+        click(page, last)
+        if last == "Disarm":
+            server.send(rig("ready", *MOVES, job=7))
+            page.wait_for_selector(f"{PANEL} >> text=is ready; nothing moves")
+            assert not page.is_checked("#rig-free")
     server.send(rig("inserting", job=7, begun=True), insertion("running", rig="Bench"))
     page.wait_for_selector("text=It inserts.")
-    assert [each["type"] for each in server.requests[-4:]] == ["arm", "arm", "arm", "go"]
-    assert [each["armed"] for each in server.asked("arm")] == [True, False, True]
-    assert {each["job"] for each in server.asked("arm")} == {7}
+    asked = [(each["type"], each.get("armed"), each.get("job")) for each in server.requests[-4:]]
+    assert asked == [("arm", True, 7), ("arm", False, 7), ("arm", True, 7), ("go", None, None)]
     assert shown_buttons(page) == {}
     for what in (".disturb", "[aria-label=Pace]", "button[data-next]", "text=One period"):
         assert not page.locator(PANEL).locator(what).is_visible()
     click(page, "Stop")
-    server.send(
-        insertion("interrupted", rig="Bench", summary="stopped: person 1", folder="2026-rig"),
-        rig("stopped", why="person 1 on the page"),
-    )
+    ended = insertion("interrupted", rig="Bench", summary="stopped: person 1", folder="2026-rig")
+    server.send(ended, rig("stopped", why="person 1 on the page"))
     page.wait_for_selector("text=It was stopped: person 1 on the page.")
     page.wait_for_selector("text=Recorded as 2026-rig.")
     assert len(server.asked("stop")) == 1
@@ -232,20 +226,23 @@ def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, ser
 
 def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_panel, server):
     page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7))
+
+    def shows(state, text, checked, why=""):
+        server.send(rig(state, "Bench: further", job=7, begun=True, why=why))
+        page.wait_for_selector(f"text={text}")
+        assert page.is_checked("#rig-free") == checked
+
     page.check("#rig-free")
-    server.send(rig("holding", "Bench: further", job=7, begun=True, why="nobody is in control"))
-    page.wait_for_selector("text=It holds: the needle rests where it is: nobody is in control.")
-    assert not page.is_checked("#rig-free")
+    shows(
+        "holding",
+        "It holds: the needle rests where it is: nobody is in control.",
+        False,
+        "nobody is in control",
+    )
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
     page.check("#rig-free")
-    server.send(rig("armed", "Bench: further", job=7, begun=True))
-    page.wait_for_selector("text=It is armed for one start.")
-    assert page.is_checked("#rig-free")
-    server.send(
-        rig("holding", "Bench: further", job=7, begun=True, why="not started within 60 s: arm it again")
-    )
-    page.wait_for_selector("text=not started within 60 s")
-    assert not page.is_checked("#rig-free")
+    shows("armed", "It is armed for one start.", True)
+    shows("holding", "not started within 60 s", False, "not started within 60 s: arm it again")
     server.send(people(2, steering=2))
     page.check("#rig-free")
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
@@ -272,7 +269,7 @@ def test_a_check_lists_its_problems(rig_panel, server):
     page.click(".findings summary")
     server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
     until(page, "flexneedle.store.get('session').seed === 3")
-    page.evaluate(PAINTED)
+    painted(page)
     assert page.locator(".findings details[open]").count() == 1
     server.send(*opening(revision=2)[2:3])
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")

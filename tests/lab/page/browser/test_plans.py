@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS, arrived
+from browser_blends import BLENDS, arrived, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
@@ -26,7 +26,6 @@ from recorded_page import (
 pytestmark = pytest.mark.page
 
 PLANS = "[data-panel=plans]"
-PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 @pytest.fixture
@@ -60,19 +59,19 @@ COST = """async ([tone, shares]) => {
   });
   return [columns, over.clientHeight];
 }"""
-"""Where a tone is at shares of the width of the plot of the cost, from 0 at its foot to 1; its height in pixels."""
+"""Places of a tone at shares of the width of the plot of the cost, from 0 at its foot to 1; its height in pixels."""
 DECADES = (-1, 1)
 """Of the plot's axis, which ends at powers of ten, for costs from 0.125 to 4."""
 
 
 def share_of(cost):
-    """Where a cost is in the plot, from 0 at its foot to 1."""
+    """Return the place of a cost in the plot, from 0 at its foot to 1."""
     low, high = DECADES
     return (np.log10(cost) - low) / (high - low)
 
 
 def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, server):
-    """The lowest line is the best cost so far, on an axis that is logarithmic; the others are above it."""
+    """The lowest line is the best cost until then, on a logarithmic axis; the others are above it."""
     page = plans()
     for work in ("plan", "compare", "reach"):
         page.click(f"{PLANS} [data-work={work}]")
@@ -93,7 +92,7 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
         "manipulation, median",
     ]
     page.locator(f"{PLANS} .cost").scroll_into_view_if_needed()
-    page.evaluate(PAINTED)
+    painted(page)
     shares = [*np.linspace(0.0, 1.0, 4), *np.linspace(0.0, 0.03, 24)]
     columns, height = page.evaluate(COST, ["--manipulation", shares])
     lowest = [min(column) for column in columns[:4]]
@@ -105,22 +104,22 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
 
 
-def test_strategies_are_side_by_side_with_their_terms(plans):
+def test_strategies_are_side_by_side_with_their_terms_and_their_age(plans, server):
     page = plans(planned())
     page.wait_for_selector(f"{PLANS} table")
+    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
     cells = table(page)
     assert cells["Cost: accuracy"] == ["0.020", "4.000"]
     assert cells["Cost: energy"] == ["0.120", "–"]
     assert cells["Cost"] == ["0.190", "4.200"]
     assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
-    page.wait_for_timeout(200)
+    page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")
     assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
-    captions = page.locator(f"{PLANS} .sweeps figcaption").all_inner_texts()
-    assert [caption.partition(" ×")[0] for caption in captions] == [
-        "manipulation, lateral",
-        "steering, lateral",
-    ]
+    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
+    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
+    page.wait_for_selector(f"{PLANS} .sweeps .stale")
 
 
 BANDS = f"""async ([selector, tone, x]) => {{
@@ -147,30 +146,20 @@ BANDS = f"""async ([selector, tone, x]) => {{
 """Share of a tone in each of the lines that cross a column of a canvas at x (mm), from above."""
 
 
-@pytest.mark.parametrize("strategy", ["manipulation", "steering"])
-def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans, strategy):
+def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans):
     """At the first step, the last, and evenly between them."""
     x = np.linspace(-60.0, 45.0, 12)
     needles = [np.column_stack([x, np.full(12, 8.0 - 0.5 * step), np.zeros(12)]) for step in range(33)]
     flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0))]
-    sweep = shape(FrameKind.SWEEP, FrameSource[strategy.upper()], 0, *needles)
-    page = plans([*opening(), *flat, plan(strategy), sweep])
+    sweep = shape(FrameKind.SWEEP, FrameSource.STEERING, 0, *needles)
+    page = plans([*opening(), *flat, plan("steering"), sweep])
     canvas = f"{PLANS} .sweeps figure:not([hidden]) canvas"
     page.locator(canvas).scroll_into_view_if_needed()
     arrived(page)
-    shares = page.evaluate(BANDS, [canvas, f"--{strategy}", -11.0])
+    shares = page.evaluate(BANDS, [canvas, "--steering", -11.0])
     assert len(shares) == 9
     assert np.all(np.diff(shares) > 0.04)
     assert shares[-1] > 0.8
-
-
-def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
-    page = plans([*opening(), plan(), *plan_frames()])
-    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
-    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
-    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
-    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
-    page.wait_for_selector(f"{PLANS} .sweeps .stale")
 
 
 def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server):
@@ -189,7 +178,7 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
     until(
         page, "flexneedle.store.get('rows live')?.length === 3 && flexneedle.store.get('session').seed === 8"
     )
-    page.evaluate(PAINTED)
+    painted(page)
     assert page.evaluate("window.changes") == 0
     assert page.evaluate("window.table === document.querySelector('.plans table')")
     server.send(plan("steering"))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from browser_blends import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
@@ -51,9 +52,7 @@ def see_plots(page):
 def test_a_run_is_scrubbed_and_played(player, server):
     page = player()
     page.focus(SCRUB)
-    page.keyboard.press("Home")
-    until(page, f"{PERIOD} === 0")
-    for key, period in (("ArrowRight", 1), (".", 2), (",", 1), ("End", 49)):
+    for key, period in (("Home", 0), ("ArrowRight", 1), (".", 2), (",", 1), ("End", 49)):
         page.keyboard.press(key)
         until(page, f"{PERIOD} === {period}")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
@@ -67,9 +66,7 @@ def test_a_run_is_scrubbed_and_played(player, server):
     page.click(f"{PLAYER} >> text=Play")
     until(page, f"{PERIOD} > 0")
     page.click(f"{PLAYER} >> text=Pause")
-    at = page.evaluate(PERIOD)
-    page.wait_for_timeout(500)
-    assert page.evaluate(PERIOD) == at
+    until(page, f"!{PLAYING}")
     page.focus(SCRUB)
     page.keyboard.press("Home")
     for _ in range(3):
@@ -79,12 +76,16 @@ def test_a_run_is_scrubbed_and_played(player, server):
     page.keyboard.press(" ")
     until(page, f"{PERIOD} === 49 && !{PLAYING}")
     assert (page.evaluate("performance.now()") - start) / 1000 >= 49 * 0.2 / 10 - 0.05
-    page.evaluate("flexneedle.store.set('view speed', 0)")
-    page.click(f"{PLAYER} >> text=Play")
-    until(page, PLAYING)
+    play_slowly(page)
     server.send(insertion("running"), rows(0, 3))  # which ends playing
     until(page, f"!{PLAYING} && {PERIOD} === undefined")
     shows(page, "live")
+
+
+def play_slowly(page):
+    page.evaluate("flexneedle.store.set('view speed', 0)")
+    page.click(f"{PLAYER} >> text=Play")
+    until(page, PLAYING)
 
 
 def choose(page, text, period=None):
@@ -143,58 +144,47 @@ def test_after_a_lost_connection_the_same_is_shown_unless_an_insertion_has_begun
     assert page.evaluate(PERIOD) is None
 
 
-def plotted(page, title):
-    """Label that a plot has at the player's period."""
-    return page.get_attribute(f"{PLOTS} [aria-label^='{title}']", "aria-label")
+ERROR = "Error from the planned path (mm)"
 
 
-def test_plots_follow_the_player_and_choose_its_period(player, server):
+def test_plots_follow_the_player_choose_its_period_and_grow(player, server):
     page = player()
     see_plots(page)
+
+    def labelled(label):
+        page.wait_for_selector(f"{PLOTS} [aria-label='{label}']")
+
     page.evaluate("flexneedle.store.set('view period', 20)")
-    page.wait_for_selector(f"{PLOTS} [aria-label^='Roll (°) at 4.0 s']")
-    assert plotted(page, "Roll") == "Roll (°) at 4.0 s: roll 60.000"
-    assert plotted(page, "Guide") == "Guide (mm) at 4.0 s: y 0.400, z 0.200"
+    labelled("Roll (°) at 4.0 s: roll 60.000")
+    labelled("Guide (mm) at 4.0 s: y 0.400, z 0.200")
     guide = page.locator(f"{PLOTS} figure", has_text="Guide").locator(".swatch")
     assert [each.get_attribute("style") for each in guide.all()] == ["color: var(--guide);"] * 2
-    page.evaluate("flexneedle.store.set('view speed', 0)")
     page.evaluate("flexneedle.store.set('view period', 0)")
-    page.click(f"{PLAYER} >> text=Play")
-    until(page, PLAYING)
+    play_slowly(page)
     click_in_the_middle(page)
     until(page, f"!{PLAYING}")
     assert abs(page.evaluate(PERIOD) - 25) <= 2
     page.click("text=Latest period")
     see_plots(page)
     figure, error = page.locator(f"{PLOTS} figure").first, f"{row(49)['error_mm']:.3f}"
-    title = "Error from the planned path (mm)"
-    page.wait_for_selector(f"{PLOTS} [aria-label='{title} at 9.8 s: true tip {error}']")
+    labelled(f"{ERROR} at 9.8 s: true tip {error}")
     assert figure.locator(".legend").inner_text() == "true tip"
     unknown = of_rows("first", lambda _: {"true": None, "indicator": None})
     server.send(insertion("done", of="first", name="rig", periods=50), unknown)
-    page.wait_for_selector(f"{PLOTS} [aria-label='{title} at 9.8 s: estimated tip {error}']")
+    labelled(f"{ERROR} at 9.8 s: estimated tip {error}")
     assert figure.locator(".legend").inner_text() == "estimated tip"
     page.locator(f"{PLOTS} figure").last.locator("text=This tracker has no indicator.").wait_for()
+    server.send(insertion("running"), rows(0, 10))
+    labelled("Roll (°) at 1.8 s: roll 27.000")
+    server.send(rows(10, 10))
+    labelled("Roll (°) at 3.8 s: roll 57.000")
+    assert page.evaluate(DRAWN, ["Roll", "--needle", [0.25, 0.5, 0.95]]) == [True] * 3  # up to the right end
     ranges = page.evaluate("""async () => {
       const { rangeOf } = await import("/static/plots/plot.js");
       return [[0, 0], [-90, -90], [null, null], [0, 10]].map((each) => rangeOf(null, ...each));
     }""")
     assert ranges[:3] == [[-1, 1], [-135, -45], [None, None]]  # a constant line is in the middle
     assert ranges[3][0] <= 0 < 10 < ranges[3][1]
-
-
-def test_times_of_a_rig_count_from_its_first_period(player):
-    later = of_rows("first", lambda k: {"time": 0.2 * k + 60.0})
-    page = player([*opening(), insertion("done", of="first", periods=50, rig="Bench"), later])
-    see_plots(page)
-    page.evaluate("flexneedle.store.set('view period', 20)")
-    page.wait_for_selector(f"{PLAYER} >> text=4.0 s · period 21 of 50")
-    page.wait_for_selector(f"{PLOTS} [aria-label^='Roll (°) at 4.0 s']")
-    page.wait_for_selector("text=Period 21, 4.0 s: advance as planned")
-    page.wait_for_selector(".decisions li button >> text=0.0 s")
-    click_in_the_middle(page)
-    until(page, f"Math.abs({PERIOD} - 25) <= 2")
-    assert not page.evaluate(PLAYING)
 
 
 def click_in_the_middle(page):
@@ -205,49 +195,38 @@ def click_in_the_middle(page):
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
 
 
-def test_a_second_run_is_shown_as_long_after_its_first_period(player, server):
-    """With a clock and a period of its own, as the plots show it."""
-    page = player()
+SECOND_AT = """async (period) => {
+  const { shownSecond } = await import("/static/shown.js");
+  flexneedle.store.set("view period", period);
+  const second = shownSecond(flexneedle.store);
+  return second && [second.row.index, second.shape("needle").period];
+}"""
+"""Periods of the row and of the needle of the second run."""
+
+
+def test_times_count_from_the_first_period_of_each_run(player, server):
+    """A rig and a second run have another clock, and the second run other periods."""
+    later = of_rows("first", lambda k: {"time": 0.2 * k + 60.0})
+    page = player([*opening(), insertion("done", of="first", periods=50, rig="Bench"), later])
+    see_plots(page)
+    page.evaluate("flexneedle.store.set('view period', 20)")
+    page.wait_for_selector(f"{PLAYER} >> text=4.0 s · period 21 of 50")
+    page.wait_for_selector(f"{PLOTS} [aria-label^='Roll (°) at 4.0 s']")
+    page.wait_for_selector("text=Period 21, 4.0 s: advance as planned")
+    page.wait_for_selector(".decisions li button >> text=0.0 s")
+    click_in_the_middle(page)
+    until(page, f"Math.abs({PERIOD} - 25) <= 2")
     shapes = [frame for period in range(50) for frame in period_frames(period, FrameSource.SECOND)]
-    faster = of_rows("second", lambda k: {"time": 0.1 * k + 60.0})
+    faster = of_rows("second", lambda k: {"time": 0.1 * k + 30.0})
     server.send(insertion("done", of="second", periods=50), faster, *shapes)
-    until(page, "flexneedle.store.get('rows second')?.length === 50")
-    until(page, "flexneedle.store.track('needle', 'second', 49)?.period === 49")  # shapes come after the rows
-    at = """async (period) => {
-      const { shownSecond } = await import("/static/shown.js");
-      flexneedle.store.set("view period", period);
-      const second = shownSecond(flexneedle.store);
-      return [second.row.index, second.shape("needle").period];
-    }"""
+    until(page, "flexneedle.store.track('needle', 'second', 49)?.period === 49")
     for period, second in ((0, 0), (3, 6), (10, 20), (30, 49)):
-        assert page.evaluate(at, period) == [second, second]
-    page.evaluate("flexneedle.store.set('view of', 'scene')")  # chosen: nothing is compared with it
-    shown = """async () => Boolean((await import("/static/shown.js")).shownSecond(flexneedle.store))"""
-    assert not page.evaluate(shown)
+        assert page.evaluate(SECOND_AT, period) == [second, second]
+    page.evaluate("flexneedle.store.set('view of', 'scene')")  # nothing is compared with it
+    assert page.evaluate(SECOND_AT, 3) is None
     server.send(insertion("done", of="second", periods=40))  # another one is opened, and shown
     until(page, "flexneedle.store.get('insertion second').periods === 40")
     assert page.evaluate("flexneedle.store.get('view of')") is None
-    assert page.evaluate(shown)
-
-
-def test_another_run_of_the_same_length_takes_the_place_of_the_last(player):
-    page = player([*opening(), *recorded(), *recorded("second")])
-    see_plots(page)
-    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
-    drawn = f"document.querySelector('{PLOTS} [aria-label^=Roll] canvas').toDataURL()"
-    page.wait_for_timeout(300)
-    before = page.evaluate(drawn)
-    assert before.startswith("data:image/png")
-    for of, roll in (("second", 45.0), ("first", 30.0)):
-        run = [
-            insertion("done", of=of, name="other", periods=50),
-            of_rows(of, lambda _, roll=roll: {"roll_deg": roll}),
-        ]
-        at_once = "(run) => run.forEach((each) => flexneedle.store.receive(JSON.parse(each)))"
-        page.evaluate(at_once, [each.model_dump_json() for each in run])
-        until(page, f"{drawn} !== '{before}'")
-        before = page.evaluate(drawn)
-    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 9.8 s: roll 30.000']")
 
 
 DRAWN = """async ([title, tone, shares]) => {
@@ -269,45 +248,36 @@ def indicators(unknown, value, period):
     return lambda k: {"indicator": None if k in unknown else value, "time": period * k}
 
 
-def test_unknown_values_are_gaps_and_two_runs_are_lines(player, server):
-    """Runs whose periods differ: a line has no gap at the times of the other run, and the whole gap of its own."""
+def test_unknown_values_are_gaps_and_each_run_has_its_line(player, server):
+    """Runs whose periods differ: a line has no gap at the times of the other run, and its own gaps are complete."""
     first = of_rows("first", indicators({*range(20, 30), 43, 44, 46, 47}, 0.1, 0.2))
     page = player([*opening(), insertion("done", of="first", periods=50), first])
     see_plots(page)
 
-    def drawn(tone, *times):
+    def drawn(end, tone, *times):
+        painted(page)
         return page.evaluate(DRAWN, ["Tracker", tone, [time / end for time in times]])
 
-    end = 49 * 0.2
     until(page, f"document.querySelector('{PLOTS} [aria-label^=Tracker]')")
-    page.wait_for_timeout(300)
-    assert drawn("--measured", 1.0, 3.7, 6.1, 8.0, 9.0) == [True] * 5  # at 9 s a value between unknown ones
-    assert drawn("--measured", 3.95, 5.0, 5.9, 8.7, 9.3) == [False] * 5
+    end = 49 * 0.2
+    assert drawn(end, "--measured", 1.0, 3.7, 6.1, 8.0, 9.0) == [True] * 5  # 9 s: between unknown values
+    assert drawn(end, "--measured", 3.95, 5.0, 5.9, 8.7, 9.3) == [False] * 5
     second = of_rows("second", indicators(set(range(35, 40)), 0.3, 0.23))
     server.send(insertion("done", of="second", periods=50), second)
     page.wait_for_selector(f"{PLOTS} >> text=indicator, second")
-    page.wait_for_timeout(300)
     end = 49 * 0.23
-    assert all(drawn("--measured", *np.linspace(0.2, 3.7, 40), *np.linspace(6.1, 8.3, 20)))
-    assert all(drawn("--second", *np.linspace(0.2, 7.7, 40)))
-    assert drawn("--measured", 3.95, 5.0, 5.9) == [False] * 3
-    assert drawn("--second", 7.95, 8.5, 9.1) == [False] * 3
-
-
-def test_plots_grow_while_rows_come(player, server):
-    """The newest row is at the right end."""
-    page = player([*opening(), insertion("running"), rows(0, 10)])
-    see_plots(page)
-    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 1.8 s: roll 27.000']")
-    before = page.evaluate(DRAWN, ["Roll", "--needle", [0.25, 0.5, 0.95]])
-    assert before == [True] * 3
-    drawn = f"document.querySelector('{PLOTS} [aria-label^=Roll] canvas').toDataURL()"
-    picture = page.evaluate(drawn)
-    server.send(rows(10, 10))
-    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 3.8 s: roll 57.000']")
-    until(page, f"{drawn} !== '{picture}'")
-    page.wait_for_timeout(150)
-    assert page.evaluate(DRAWN, ["Roll", "--needle", [0.25, 0.5, 0.95]]) == [True] * 3
+    assert all(drawn(end, "--measured", *np.linspace(0.2, 3.7, 40), *np.linspace(6.1, 8.3, 20)))
+    assert all(drawn(end, "--second", *np.linspace(0.2, 7.7, 40)))
+    assert drawn(end, "--measured", 3.95, 5.0, 5.9) == [False] * 3
+    assert drawn(end, "--second", 7.95, 8.5, 9.1) == [False] * 3
+    picture = f"document.querySelector('{PLOTS} [aria-label^=Tracker] canvas').toDataURL()"
+    for of in ("second", "first"):  # another run of the same length
+        before = page.evaluate(picture)
+        run = [insertion("done", of=of, name="other", periods=50), of_rows(of, indicators((), 0.2, 0.2))]
+        at_once = "(run) => run.forEach((each) => flexneedle.store.receive(JSON.parse(each)))"
+        page.evaluate(at_once, [each.model_dump_json() for each in run])
+        until(page, f"{picture} !== '{before}'")
+    page.wait_for_selector(f"{PLOTS} [aria-label^=Tracker][aria-label$=' at 9.8 s: indicator 0.200']")
 
 
 def test_a_period_without_a_shape_shows_none(player):

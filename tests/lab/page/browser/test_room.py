@@ -1,4 +1,4 @@
-"""What stays in space while a needle moves: layers with their names, skin, guide, grid with its labels."""
+"""Fixed parts in space: layers with their names, skin, guide, grid with its labels."""
 
 import numpy as np
 import pytest
@@ -64,45 +64,33 @@ def labels(page):
 
 def test_layers_and_grid_are_to_scale_and_labelled(space, server):
     """The stiffer a layer, the denser; lines each 5 mm on floor and back wall; without a guide none is named."""
-    page = space(opening())
+    page, (left, right, half) = space(opening()), BOX
     objects = page.evaluate(OBJECTS)
     layers = [each for each in objects if each["type"] == "Mesh BoxGeometry"]
-    _, right, half = BOX
     for layer, (top, bottom) in zip(layers, [(0.0, 20.0), (20.0, right)], strict=True):
         size = layer["size"]
         assert (layer["at"], size["width"]) == ((top + bottom) / 2.0, bottom - top)
         assert (size["height"], size["depth"], layer["tone"]) == (2 * half, 2 * half, "--tissue")
     assert layers[0]["opacity"] < layers[1]["opacity"] < 0.5
-    surfaces = [each for each in objects if "Plane" in each["type"] or "Edges" in each["type"]]
-    assert [(each["at"], each["tone"]) for each in surfaces] == [(0.0, "--skin")] * 2 + [
-        (20.0, "--tissue")
-    ] * 2
-    grids = [each for each in objects if each["tone"] == "--grid"]
-    assert len(grids) == 1
-    lines = np.reshape(grids[0]["corners"], (-1, 2, 3))
-    left, right, half = BOX
+    surfaces = [
+        (one["at"], one["tone"]) for one in objects if "Plane" in one["type"] or "Edges" in one["type"]
+    ]
+    assert surfaces == [(0.0, "--skin")] * 2 + [(20.0, "--tissue")] * 2
+    (grid,) = (each for each in objects if each["tone"] == "--grid")
+    lines = np.reshape(grid["corners"], (-1, 2, 3))
     floor, back = lines[..., 1] == -half, lines[..., 2] == -half
     assert np.all(floor.all(axis=1) | back.all(axis=1))
-    length = np.abs(np.diff(lines, axis=1)[:, 0])
-    assert np.all(np.count_nonzero(length, axis=1) == 1)
-    along = length[:, 0] > 0.0
-    np.testing.assert_array_equal(length[along, 0], right - left)
-    depths = np.unique(lines[~along, 0, 0])
-    np.testing.assert_array_equal(depths, np.arange(left, right + 5.0, 5.0))
-    assert np.count_nonzero(~along) == 2 * len(depths)
+    lengths = np.abs(np.diff(lines, axis=1)[:, 0])
+    along = lengths[:, 0] == right - left
+    np.testing.assert_array_equal(np.unique(lines[~along, 0, 0]), np.arange(left, right + 5.0, 5.0))
     assert np.count_nonzero(along) == 2 * len(np.arange(-half, half + 5.0, 5.0))
     places = labels(page)
-    half = BOX[2]
-    assert places.pop("skin") == [(0.0, half, half)]
-    assert places.pop("superficial") == [(10.0, half, -half)]
-    assert places.pop("deep") == [(35.0, half, -half)]
-    assert places.pop("guide") == [(-41.0, 2.5, 0.0)]
-    assert {text.partition(" ")[0] for text in places if "mm" in text} == {"x", "y", "z"}
-    depths = {float(text.replace("−", "-")): at for text, at in places.items() if "mm" not in text}
+    named = {"skin": (0.0, half, half), "superficial": (10.0, half, -half), "deep": (35.0, half, -half)}
+    assert {name: places[name] for name in named} == {name: [place] for name, place in named.items()}
+    assert places["guide"] == [(-41.0, 2.5, 0.0)]
+    assert {text[0] for text in places if "mm" in text} == {"x", "y", "z"}
     for depth in (-40.0, -20.0, 20.0, 40.0):
-        assert depths[depth] == [(depth, -half, 1.15 * half)]
-    assert {place[1:] for place in depths[half]} == {(half, -half), (-half, half)}
-    assert set(depths) == {-40.0, -20.0, 0.0, 20.0, 40.0, -half, half}
+        assert places[f"{depth:.0f}".replace("-", "−")] == [(depth, -half, 1.15 * half)]
     guide = f"async () => {{ {VIEW} return view.shapes.guide.visible; }}"
     assert page.evaluate(guide)
     server.send(scene().model_copy(update={"guide": None}))

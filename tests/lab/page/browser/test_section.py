@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from browser_blends import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RowsMessage
 from flexneedle.lab.page.shape_frames import FrameSource
@@ -16,7 +17,6 @@ from recorded_page import (
     insertion,
     opening,
     people,
-    period_frames,
     plan,
     plan_frames,
     planned,
@@ -57,9 +57,7 @@ def drag(page, element, right, up=0):
 
 def edited(page, server):
     until(page, "!flexneedle.store.get('draft')")
-    page.evaluate(
-        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-    )  # drawn
+    painted(page)
     return server.asked("edit")[-1]["values"]
 
 
@@ -69,26 +67,30 @@ def legends(page):
     return [set(page.locator(f"{panel} .legend li").all_inner_texts()) for panel in panels]
 
 
+def legend_has(page, panel, text):
+    until(page, f"document.querySelector('[data-panel={panel}] .legend').textContent.includes('{text}')")
+
+
 def test_legends_of_all_views_name_the_drawn_parts(views, server):
-    """The needle at the target is a line; with a band it is an area."""
+    """The needle at the target is a line; with its deviation it is an area."""
     page = views([*planned(), REACH])
-    until(page, "document.querySelector('[data-panel=space] .legend li')")
+    legend_has(page, "space", "reach")
     assert legends(page)[0] == {
         "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
         "needle", "target, 1 mm",
     }  # fmt: skip
 
-    def check_swatch(text, form, style="color: var(--predicted);"):
+    def check_swatch(text, form, tone="predicted"):
         for panel in (SECTION, AXIAL, "[data-panel=space]"):
             swatch = page.locator(f"{panel} .legend li", has_text=text).locator(".swatch")
             assert swatch.get_attribute("class") == f"swatch {form}"
-            assert swatch.get_attribute("style") == style
+            assert swatch.get_attribute("style") == f"color: var(--{tone});"
 
     check_swatch("needle at the target, planned", "line")
     server.send(*inserting())
-    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
+    legend_has(page, "space", "measured tip")
     check_swatch("predicted needle at the target ± 2 sd", "area")
-    check_swatch("measured tip", "cross", "color: var(--measured);")
+    check_swatch("measured tip", "cross", "measured")
     both = {"true path of the tip", "measured tip"}
     assert [both & names for names in legends(page)] == [both] * 3
     blind = [row(k) | {"measured": None, "true": None} for k in range(3)]
@@ -98,27 +100,28 @@ def test_legends_of_all_views_name_the_drawn_parts(views, server):
     assert [both & names for names in legends(page)] == [set()] * 3
 
 
-def test_until_there_is_a_plan_all_views_show_the_first_estimate(views, server):
-    """Also where there is one of an earlier state of the scenario."""
-    page = views(
-        [
-            *opening(),
-            plan(),
-            *plan_frames(),
-            session(2),
-            scene(2),
-            *plan_frames(FrameSource.SCENE),
-            estimate(2),
-        ]
-    )
-    until(page, "document.querySelector('[data-panel=space] .legend li')")
+def test_before_a_plan_all_views_show_the_first_estimate(views, server):
+    """Even if there is a plan of an earlier state of the scenario."""
+    earlier = [*opening(), plan(), *plan_frames()]
+    page = views([*earlier, session(2), scene(2), *plan_frames(FrameSource.SCENE), estimate(2)])
+    legend_has(page, "space", "first estimate")
     wanted = {"first estimate", "needle at the target, first estimate", "needle", "target, 1 mm"}
     assert legends(page) == [wanted] * 3
     server.send(*plan_frames(), plan(revision=2))
-    until(page, "document.querySelector('[data-panel=axial] .legend').textContent.includes('planned path')")
-    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('planned path')")
+    for panel in ("axial", "space"):
+        legend_has(page, panel, "planned path")
     wanted = {"planned path", "needle at the target, planned", "needle", "target, 1 mm"}
     assert legends(page) == [wanted] * 3
+
+
+def layers(thicknesses):
+    """Return the layers of a scene by name and thickness (mm)."""
+    made, top = [], 0.0
+    for name, thickness in thicknesses.items():
+        bottom = None if thickness is None else top + thickness
+        made.append({"name": name, "top_mm": top, "bottom_mm": bottom, "shear_modulus_kpa": 5.0})
+        top = bottom
+    return made
 
 
 DRAWN = """async ([stretch, right]) => {
@@ -158,15 +161,11 @@ def test_the_section_is_to_scale_and_its_labels_have_room(views, server):
         numbers = [each for each in words if each["text"].isdecimal() and each["y"] > 290]
         assert numbers[-1]["text"] == last
         assert all(each["x"] + 3 * len(each["text"]) <= 400 for each in numbers)
-    names, top, layers = ["skin", "fascia", "fat", "muscle wall", "organ"], 0.0, []
-    for name, thickness in zip(names, [1.0, 2.0, 1.0, 20.0, None], strict=True):
-        bottom = None if thickness is None else top + thickness
-        layers.append({"name": name, "top_mm": top, "bottom_mm": bottom, "shear_modulus_kpa": 5.0})
-        top = bottom
-    server.send(scene().model_copy(update={"layers": layers}))
+    names = {"skin": 1.0, "fascia": 2.0, "fat": 1.0, "muscle wall": 20.0, "organ": None}
+    server.send(scene().model_copy(update={"layers": layers(names)}))
     until(page, "flexneedle.store.get('scene').layers.length === 5")
     words = [each for each in page.evaluate(DRAWN, [1, 50])["words"] if each["text"] in names]
-    assert [each["text"] for each in words] == names
+    assert [each["text"] for each in words] == list(names)
     assert len({each["y"] for each in words[:3]}) == 3
     assert words[0]["y"] == words[3]["y"]  # which is thick enough
     for one, other in itertools.combinations(words, 2):
@@ -209,7 +208,7 @@ def test_the_pointer_moves_the_target_in_each_plane(views, server):
     before = {"target.depth_mm": TARGET[0], "target.lateral_mm": TARGET[1], "target.lateral_z_mm": TARGET[2]}
     for plane, key in across.items():
         page.click(f"{SECTION} >> text={plane}")
-        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        painted(page)
         drag(page, handle(page, "target"), 20, 10)
         values = edited(page, server)
         right, up = (values[each] - before[each] for each in ("target.depth_mm", key))
@@ -234,15 +233,7 @@ def test_the_pointer_moves_the_target_in_each_plane(views, server):
 
 
 def test_boundaries_are_moved_and_those_below_stay(views, server):
-    three = scene().model_copy(
-        update={
-            "layers": [
-                {"name": "skin", "top_mm": 0.0, "bottom_mm": 2.0, "shear_modulus_kpa": 5.0},
-                {"name": "fat", "top_mm": 2.0, "bottom_mm": 20.0, "shear_modulus_kpa": 1.0},
-                {"name": "muscle", "top_mm": 20.0, "bottom_mm": None, "shear_modulus_kpa": 4.0},
-            ]
-        }
-    )
+    three = scene().model_copy(update={"layers": layers({"skin": 2.0, "fat": 18.0, "muscle": None})})
     page = views([*opening(), three])
     handle(page, "boundary-0").focus()
     page.keyboard.press("ArrowRight")
@@ -258,7 +249,7 @@ def test_boundaries_are_moved_and_those_below_stay(views, server):
 
 def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(views, server):
     page = views([*planned(), REACH])
-    until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
+    legend_has(page, "space", "reach")
     for panel in (SECTION, AXIAL):
         drag(page, handle(page, "target", panel), 20, 10)
         edited(page, server)
@@ -268,37 +259,6 @@ def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(
     until(page, "flexneedle.store.get('session').revision === 90")
     shown = "[...document.querySelectorAll('[data-panel] .legend')].some((one) => one.textContent.includes('reach'))"
     until(page, f"!{shown}")
-
-
-OF_TONE = """async (tone) => {
-  const { color } = await import("/static/theme.js");
-  const wanted = color(tone).match(/[0-9]+/g).slice(0, 3).map(Number);
-  return ["section", "axial"].map((panel) => {
-    const canvas = document.querySelector(`[data-panel=${panel}] canvas`);
-    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-    let count = 0;
-    for (let at = 0; at < data.length; at += 4) {
-      if (wanted.every((value, part) => Math.abs(data[at + part] - value) < 12)) count++;
-    }
-    return count;
-  });
-}"""
-"""Number of pixels of a tone in the section, and in the view along the axis."""
-
-
-def test_the_measured_tip_is_drawn_where_there_is_one(views, server):
-    """In the section that of the period, along the axis also those before."""
-    known = [row(k) for k in range(10)]
-    measured = RowsMessage(of="live", first=0, rows=known)
-    page = views([*opening(), insertion("running", periods=10), measured, *period_frames(9)])
-    section, axial = page.evaluate(OF_TONE, "--measured")
-    assert section > 8
-    assert axial > 8
-    unknown = [each | {"measured": None} for each in known]
-    server.send(measured.model_copy(update={"rows": unknown}))
-    until(page, "flexneedle.store.get('rows live')[9].measured === null")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    assert page.evaluate(OF_TONE, "--measured") == [0, 0]
 
 
 def test_nothing_is_moved_during_an_insertion_and_the_way_back_is_shown_after_it(views, server):

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS, arrived
+from browser_blends import BLENDS, arrived, painted
 from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
@@ -18,7 +18,6 @@ from recorded_page import (
     estimate,
     inserting,
     insertion,
-    iteration,
     needle,
     opening,
     people,
@@ -26,7 +25,6 @@ from recorded_page import (
     plan,
     planned,
     rows,
-    samples,
     scene,
     session,
 )
@@ -42,7 +40,7 @@ VIEW = "const { spaceView } = await import('/static/space.js'); const view = spa
 
 
 def on_view(page, code):
-    """What a body of JavaScript returns, in which `view` is the view in space."""
+    """Return the result of JavaScript in which `view` is the view in space."""
     return page.evaluate(f"async () => {{ {VIEW} {code} }}")
 
 
@@ -61,12 +59,7 @@ def space(visit, server):
     return opened
 
 
-def settled(page):
-    """Wait until two paints have followed."""
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-
-
-# With SCREENSHOTS all, for who looks at them; a picture takes long to draw in software.
+# With SCREENSHOTS all; drawing a picture takes long in software.
 DRAWN = [
     (state, size, scheme)
     for number, state in enumerate(STATES)
@@ -124,7 +117,7 @@ LEAST = 4
 def test_each_part_of_the_scene_is_drawn_at_each_size(space, pictures, state, size, scheme):
     width, height = SIZES[size]
     page = space(STATES[state](), width=width, height=height, scheme=scheme, draws=True)
-    settled(page)
+    painted(page)
     assert too_wide(page) == []
     pictures(page, f"space-{state}-{size}-{scheme}")
     counts = page.evaluate(ALONE, list(PARTS[state].items()))
@@ -156,7 +149,7 @@ def test_lengths_are_to_scale_and_shapes_follow_the_period(space, server):
     server.send(*inserting(50))
     until(page, "flexneedle.store.get('rows live')?.length === 51")
     page.evaluate("flexneedle.store.set('view period', 20)")
-    settled(page)
+    painted(page)
     tip = on_view(page, "return view.shapes.bevel.position.toArray()")
     np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
 
@@ -166,11 +159,11 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     assert "software" in page.inner_text(f"{SPACE} [role=note]")
     assert legend(page) == ["needle", "target, 1 mm"]
     version = "return view.shapes.group.children[0].geometry.attributes.position.version"
-    settled(page)
+    painted(page)
     before = on_view(page, version)
     server.send(people(clients=2))
     page.wait_for_selector("text=2 people")
-    settled(page)
+    painted(page)
     assert on_view(page, version) == before
     server.send(*planned(), REACH)
     until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('reach')")
@@ -181,7 +174,7 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     server.send(*inserting(10))
     until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('true needle')")
     assert legend(page)[:3] == ["needle", "true needle", "predicted needle at the target ± 2 sd"]
-    settled(page)
+    painted(page)
     page.wait_for_timeout(200)
     count = "return view.renderer.info.render.frame"
     before = on_view(page, count)
@@ -189,12 +182,12 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     assert on_view(page, count) == before
     server.send(rows(11, 1), *period_frames(11))
     until(page, "flexneedle.store.get('rows live')?.length === 12")
-    settled(page)
+    painted(page)
     assert before < on_view(page, count) <= before + 4
     color = "return view.shapes.group.children[0].material.color.getHex()"
     before = on_view(page, color)
     page.click("#theme")
-    settled(page)
+    painted(page)
     assert on_view(page, color) != before
 
 
@@ -215,7 +208,7 @@ def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, s
     ):
         server.send(*news)
         arrived(page)
-        settled(page)
+        painted(page)
         np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
 
 
@@ -237,7 +230,7 @@ def tube(page, order, points):
 def test_the_predicted_needle_shows_its_uncertainty_and_the_channel_its_stretch(space):
     """Two standard deviations around the needle's radius; the darker, the more stretched."""
     page = space(inserting(60))
-    settled(page)
+    painted(page)
     rings, _ = tube(page, PREDICTED, NODES)
     sd = 0.2 + 1.2 * np.linspace(0.0, 1.0, NODES) * (1 - 60 / PERIODS)
     middle = rings.mean(axis=1, keepdims=True)
@@ -257,63 +250,40 @@ def test_the_predicted_needle_shows_its_uncertainty_and_the_channel_its_stretch(
     np.testing.assert_allclose(colors[[0, np.argmax(stretch)], 0], linear, atol=0.005)
 
 
-def test_sampled_paths_narrow_with_each_iteration(space, server):
-    page = space()
-    spreads = []
-    for number in range(4):
-        server.send(iteration(number), samples(number))
-        until(page, f"flexneedle.store.get('shape samples manipulation')?.number === {number}")
-        settled(page)
-        ends = on_view(
-            page,
-            """
-            const lines = view.shapes.group.children.find((each) => each.isLineSegments && each.visible);
-            const { count } = lines.geometry.drawRange;
-            return [...lines.geometry.attributes.position.array.slice(0, 3 * count)];
-            """,
-        )
-        spreads.append(np.ptp(np.reshape(ends, (32, 23, 2, 3))[:, -1, 1, 1]))
-    assert np.all(np.diff(spreads) < 0.0)
+PLACE = "return view.camera.camera.position.toArray()"
+DISTANCE = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
 
 
 def test_keys_pointer_and_wheel_move_the_camera_and_nothing_else(space, server):
     page = space()
-    place = "return view.camera.camera.position.toArray()"
-    start = on_view(page, place)
     page.focus(CANVAS)
-    places = [start]
+    places = [on_view(page, PLACE)]
     for key in ["ArrowLeft", "ArrowUp", "+", "Shift+ArrowRight", "1", "2", "3"]:
         page.keyboard.press(key)
-        places.append(on_view(page, place))
+        places.append(on_view(page, PLACE))
     assert len({tuple(np.round(each, 3)) for each in places}) == len(places)
     page.keyboard.press("0")
-    np.testing.assert_allclose(on_view(page, place), start, atol=1e-6)
-    before = on_view(page, "return view.camera.camera.position.toArray()")
+    np.testing.assert_allclose(on_view(page, PLACE), places[0], atol=1e-6)
     box = page.locator(CANVAS).bounding_box()
     page.mouse.move(box["x"] + 60, box["y"] + 40)
     page.mouse.down()
     page.mouse.move(box["x"] + 160, box["y"] + 60, steps=4)
     page.mouse.up()
-    assert (
-        np.linalg.norm(np.subtract(on_view(page, "return view.camera.camera.position.toArray()"), before))
-        > 5.0
-    )
-    assert not server.asked("edit")
-    distance = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
-    page.mouse.move(box["x"] + 60, box["y"] + 40)
-    distances = [on_view(page, distance)]
+    assert np.linalg.norm(np.subtract(on_view(page, PLACE), places[0])) > 5.0
+    distances = [on_view(page, DISTANCE)]
     for turn in (-200, 400):
         page.mouse.wheel(0, turn)
-        settled(page)
-        distances.append(on_view(page, distance))
+        painted(page)
+        distances.append(on_view(page, DISTANCE))
     assert distances[1] < 0.95 * distances[0]
     assert distances[2] > 1.05 * distances[0]
+    assert not server.asked("edit")
 
 
 def drag_target(page, pixels):
     """Drag the middle of the target's arrows to the right, in steps of one pixel."""
     page.click("text=x–y")
-    settled(page)
+    painted(page)
     x, y = on_view(
         page,
         """
@@ -339,23 +309,23 @@ def test_dragging_the_target_edits_the_scenario(space, server):
     assert set(edits[-1]) == {"target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"}
     assert edits[-1]["target.depth_mm"] > TARGET[0] + 2.0
     assert edits[-1]["target.lateral_z_mm"] == pytest.approx(TARGET[2], abs=0.05)
-    settled(page)
+    painted(page)
     assert page.evaluate("flexneedle.store.get('scene').target[0]") == edits[-1]["target.depth_mm"]
     assert on_view(page, "return view.target.ball.position.x") == edits[-1]["target.depth_mm"]
     assert len(server.wait_for("rest")) == 1
 
 
-@pytest.mark.parametrize(
-    ("target", "strip"), [((32.0, 5.0, 3.0), True), ((40.0, -2.5, -1.5), True), ((40.0, 5.0, -3.0), False)]
-)
-def test_the_strip_of_the_reach_is_shown_while_the_target_is_in_its_plane(space, target, strip):
-    """Its outlines are those of targets in all directions."""
-    page = space([*planned(), REACH, session(2, target, reach_since=1), scene(2, target)])
-    settled(page)
-    shown = "return view.shapes.group.children.at(-1).children.map((each) => each.visible)"
-    assert on_view(page, shown) == [strip, True]
-    assert "reach" in legend(page)
-    assert page.locator(f"{SPACE} .legend li", has_text="reach").locator(".swatch.area").count() == strip
+def test_the_strip_of_the_reach_is_shown_while_the_target_is_in_its_plane(space, server):
+    """Its outlines are for targets in all directions."""
+    page = space([*planned(), REACH])
+    places = {(32.0, 5.0, 3.0): True, (40.0, -2.5, -1.5): True, (40.0, 5.0, -3.0): False}
+    for revision, (target, strip) in enumerate(places.items(), 2):
+        server.send(session(revision, target, reach_since=1), scene(revision, target))
+        arrived(page)
+        shown = "return view.shapes.group.children.at(-1).children.map((each) => each.visible)"
+        assert on_view(page, shown) == [strip, True]
+        assert "reach" in legend(page)
+        assert page.locator(f"{SPACE} .legend li", has_text="reach").locator(".swatch.area").count() == strip
 
 
 def test_in_the_plane_the_target_keeps_its_plane_and_rests_while_another_is_in_control(space, server):

@@ -1,4 +1,4 @@
-"""The vendored modules are those of tools/page/vendor.py; the page needs nothing that a strict policy refuses."""
+"""Vendored modules have their hashes, and the page needs nothing that a strict policy refuses."""
 
 import hashlib
 import re

@@ -40,7 +40,7 @@ def see(page, selector):
 
 
 def downloaded(page, name, path):
-    """What a link downloads."""
+    """Return the path of a link's download."""
     with page.expect_download(timeout=PATIENCE_MS) as download:
         page.click(f"[aria-label='{name}']")
     download.value.save_as(path)
@@ -90,7 +90,7 @@ def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
 
 
 LOST = "((rows) => rows.some((_, at) => at > 2 && rows.slice(at - 3, at + 1).every(({ measured }) => !measured)))"
-"""Whether the tip was not measured in four periods one after the other."""
+"""The tip was not measured in four successive periods."""
 
 
 @pytest.mark.slow
