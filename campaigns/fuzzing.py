@@ -5,6 +5,7 @@ inputs. It has no end, and raises `Failure` if a rule does not hold. Parts with 
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -12,6 +13,8 @@ from random import Random
 from time import monotonic
 
 PROGRESS_S = 10.0
+ODD = (0.0, -0.0, 1.0, -1.0, 5e-324, -2e-308, 9999.9, 1e4, 3.4e38, 1e39, 1e308, math.inf, -math.inf, math.nan)
+"""Numbers that a device should not send, or at the limits of a format."""
 
 Part = Callable[[Random], Iterator[str]]
 

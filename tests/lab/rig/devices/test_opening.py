@@ -132,14 +132,11 @@ def test_an_installed_package_has_drivers_and_trackers_by_name(package):
     assert (tracker.rate, tracker.clock) == (20.0, clock)
 
 
-def test_a_tracker_with_close_is_closed_by_it():
-    tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), Clock())
+def test_a_tracker_is_closed_by_its_close_or_as_a_context_manager():
+    clock = Clock()
+    tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), clock)
     tracker.close()
     assert tracker.closed
-
-
-def test_a_tracker_may_be_a_context_manager():
-    clock = Clock()
     tracker = open_tracker(rig(tracker={"kind": "parts:managed"}), clock)
     clock.wait(0.1)
     assert (len(tracker.read()), tracker.status) == (4, "ok")
@@ -181,60 +178,46 @@ def refusing(_settings, channels):
     return Refusing(channels)
 
 
-def test_any_other_error_of_the_package_in_a_call_is_one_of_the_driver():
+def test_errors_of_the_package_in_a_device_are_errors_of_the_driver():
     motors = open_motors(rig(driver={"kind": "parts:refusing"}))
-    line = "^driver parts:refusing: read: a = 1: no such key; b = 2: no such key$"
-    with pytest.raises(DriverError, match=line):
+    with pytest.raises(DriverError, match=r"^driver parts:refusing: read: a = 1: .*; b = 2: "):
         motors.read()
     with pytest.raises(DriverError, match=r"^no reply within 100 ms$"):
         motors.follow({})
 
 
-def test_any_error_in_a_device_of_your_own_names_it_the_call_and_the_line():
+def test_other_errors_in_a_device_name_it_and_the_call_and_the_line():
     motors = open_motors(rig(driver={"kind": "parts:faulty"}))
-    with pytest.raises(
-        DriverError, match=r"^driver parts:faulty: read: ValueError: invalid literal .* line \d+\)$"
-    ):
+    with pytest.raises(DriverError, match=r"^driver parts:faulty: read: ValueError: .* line \d+\)$"):
         motors.read()
     with pytest.raises(DriverError, match=r"^driver parts:faulty: identity: OSError: no such port \("):
         _ = motors.identity
     motors.stop()
     assert not hasattr(motors, "describe")
-    with pytest.raises(
-        DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_opening\.py, "
-    ):
-        open_motors(rig(driver={"kind": "parts:does_not_open"}))
+    found = rig(driver={"kind": "parts:does_not_open"}, tracker={"kind": "parts:does_not_open"})
+    with pytest.raises(DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_opening"):
+        open_motors(found)
     with pytest.raises(DriverError, match=r"^tracker parts:does_not_open: KeyError: 'nothing' "):
-        open_tracker(rig(tracker={"kind": "parts:does_not_open"}), Clock())
+        open_tracker(found, Clock())
 
 
-def test_an_unknown_name_is_refused_with_the_names_that_are_installed(package):
-    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
-    line = message(open_motors, rig(driver={"kind": "acmee"}))
-    assert line.startswith('driver.kind = "acmee": must be one of ')
-    assert "acme" in line.split("one of ")[1].split(" or ")[0].replace(",", "").split()
-    assert line.endswith("or module:NAME of your own")
-
-
-def test_two_packages_with_the_same_name_are_refused(package):
-    """Which of them would move the needle?"""
-    package("acme-stage", DRIVERS, stage="bench_rig:drivers")
-    package("other-stage", DRIVERS, stage="other:drivers")
-    line = message(open_motors, rig(driver={"kind": "stage"}))
-    assert line.startswith('driver.kind = "stage": several packages have one of this name: ')
-    assert "acme-stage (bench_rig:drivers)" in line
-    assert "other-stage (other:drivers)" in line
-
-
-def test_a_package_that_is_broken_is_named(package):
-    package("acme-stage", DRIVERS, gone="acme_gone:drivers", less="bench_rig:Nothing")
-    gone = message(open_motors, rig(driver={"kind": "gone"}))
-    assert gone.startswith('driver.kind = "gone": no module acme_gone in ')
-    assert gone.endswith("(entry point of acme-stage)")
-    less = message(open_motors, rig(driver={"kind": "less"}))
-    names = less.removeprefix('driver.kind = "less": bench_rig has no Nothing; public names: ').split(", ")
-    assert {"Motors", "Tracker", "drivers", "values"} <= set(names)
-    assert not {"copy", "tomllib", "replace", "MotorState"} & set(names), "imported there"
+def test_a_name_that_names_no_or_several_installed_parts_is_refused(package):
+    package(
+        "acme-stage", DRIVERS, acme="bench_rig:drivers", stage="bench_rig:drivers", gone="acme_gone:drivers"
+    )
+    package("other-stage", DRIVERS, stage="other:drivers", less="bench_rig:Nothing")
+    for kind, words in {
+        "acmee": ("must be one of ", "acme", "module:NAME"),
+        "stage": ("acme-stage (bench_rig:drivers)", "other-stage (other:drivers)"),
+        "gone": ("no module acme_gone in ", "(entry point of acme-stage)"),
+        "less": ("bench_rig has no Nothing; public names: ", "Motors", "Tracker", "drivers"),
+    }.items():
+        line = message(open_motors, rig(driver={"kind": kind}))
+        assert line.startswith(f'driver.kind = "{kind}": ')
+        assert [word for word in words if word not in line] == []
+    assert not {"copy", "tomllib", "replace", "MotorState"} & set(line.replace(",", "").split()), (
+        "imported there"
+    )
 
 
 @pytest.mark.parametrize(
@@ -254,69 +237,62 @@ def test_an_unsuitable_part_of_your_own_is_refused(kind, line):
     assert message(open_tracker, found, Clock()).startswith(f'tracker.kind = "{kind}": {line}')
 
 
-def test_a_device_has_all_parts_of_its_port():
-    missing = "without read, set_speed, follow, stop, define, power, reconnect, close"
-    assert message(open_motors, rig(driver={"kind": "parts:lists"})).endswith(f"made a list {missing}")
-    line = message(open_tracker, rig(tracker={"kind": "parts:lists"}), Clock())
-    assert line.endswith("made a list that cannot be closed: it needs close(), or to be a context manager")
-
-
-def test_a_device_that_is_refused_is_closed():
-    line = message(open_tracker, rig(tracker={"kind": "parts:halves"}), Clock())
-    assert line == 'tracker.kind = "parts:halves": made a Halves without status'
-    assert Halves.closed
-    Halves.closed = False
-    line = message(open_tracker, rig(tracker={"kind": "parts:managed_lists"}), Clock())
-    assert line == 'tracker.kind = "parts:managed_lists": made a list without read, status'
-    assert Halves.closed
+def test_a_device_without_all_parts_of_its_port_is_refused_and_closed():
+    missing = "made a list without read, set_speed, follow, stop, define, power, reconnect, close"
+    assert message(open_motors, rig(driver={"kind": "parts:lists"})).endswith(missing)
+    for kind, words in (
+        ("lists", "made a list that cannot be closed"),
+        ("halves", "made a Halves without status"),
+        ("managed_lists", "made a list without read, status"),
+    ):
+        Halves.closed = kind == "lists"
+        line = message(open_tracker, rig(tracker={"kind": f"parts:{kind}"}), Clock())
+        assert line.startswith(f'tracker.kind = "parts:{kind}": {words}')
+        assert Halves.closed
 
 
 def test_settings_that_a_device_refuses_are_reported_with_its_kind():
     found = rig(driver={"kind": "parts:refuses", "port": 3}, tracker={"kind": "parts:refuses_in_one_line"})
-    assert message(open_motors, found) == (
-        "driver parts:refuses: port = 3: must be text\ndriver parts:refuses: speed = 0: must be above 0"
+    driver = "driver parts:refuses: "
+    assert (
+        message(open_motors, found) == f"{driver}port = 3: must be text\n{driver}speed = 0: must be above 0"
     )
     line = message(open_tracker, found, Clock())
     assert line == "tracker parts:refuses_in_one_line: /dev/tty9: no such port"
 
 
 @pytest.mark.parametrize(
-    ("changes", "line"),
+    ("changes", "rules"),
     [
+        ({"insertion__counts_per_mm": 300.0}, []),  # 30,000 counts/s², and 3000 counts/s
         (
-            {"axes__insertion__counts_per_mm": 300.0},  # 30,000 counts/s², and 3000 counts/s
-            None,
+            {"insertion__acceleration_mm_s2": 1.02},
+            ["insertion.acceleration_mm_s2 = 1.02: must be at least 1.024:"],
         ),
         (
-            {"axes__insertion__acceleration_mm_s2": 1.02},
-            "axes.insertion.acceleration_mm_s2 = 1.02: must be at least 1.024: the controller takes 1024 counts/s² "
-            "and more",
+            {"guide_y__counts_per_mm": 3.0, "guide_y__acceleration_mm_s2": 341.0},
+            [
+                "guide_y.speed_mm_s = 5.0: must be at least 166.666667:",
+                "guide_y.acceleration_mm_s2 = 341.0: must be at least 341.333334:",
+            ],
         ),
+        ({"insertion__speed_mm_s": 10.5}, ["insertion.speed_mm_s = 10.5: must be at most 10:"]),
         (
-            {"axes__guide_y__counts_per_mm": 3.0, "axes__guide_y__acceleration_mm_s2": 341.0},
-            "axes.guide_y.speed_mm_s = 5.0: must be at least 166.666667: the controller takes 500 counts/s and more\n"
-            "axes.guide_y.acceleration_mm_s2 = 341.0: must be at least 341.333334: the controller takes 1024 "
-            "counts/s² and more",
-        ),
-        (
-            {"axes__insertion__speed_mm_s": 10.5},
-            "axes.insertion.speed_mm_s = 10.5: must be at most 10: the controller takes 10000 counts/s and less",
-        ),
-        (
-            {"axes__rotation__acceleration_deg_s2": 2400.0, "axes__rotation__speed_deg_s": 50.0},
-            "axes.rotation.acceleration_deg_s2 = 2400.0: must be at most 2000: the controller takes 200000 "
-            "counts/s² and less",
+            {"rotation__acceleration_deg_s2": 2400.0, "rotation__speed_deg_s": 50.0},
+            ["rotation.acceleration_deg_s2 = 2400.0: must be at most 2000:"],
         ),
     ],
     ids=str,
 )
-def test_speeds_and_accelerations_that_the_controller_does_not_take_are_refused(changes, line):
-    slower = {"axes__rotation__speed_deg_s": 90.0, "axes__guide_y__counts_per_mm": 500.0}
-    found = rig(driver={"kind": "parts:paced"}, **(slower | changes))
-    if line is None:
+def test_speeds_and_accelerations_beyond_the_controllers_are_refused(changes, rules):
+    changed = {"rotation__speed_deg_s": 90.0, "guide_y__counts_per_mm": 500.0} | changes
+    found = rig(driver={"kind": "parts:paced"}, **{f"axes__{key}": value for key, value in changed.items()})
+    if not rules:
         open_motors(found)
         return
-    assert message(open_motors, found) == line
+    lines = message(open_motors, found).splitlines()
+    assert len(lines) == len(rules)
+    assert all(line.startswith(f"axes.{rule}") for line, rule in zip(lines, rules, strict=True)), lines
     assert paced.made.closed
     assert paced.made.calls == []
 
@@ -327,10 +303,7 @@ def test_an_acceleration_below_the_least_of_a_galil_is_refused_when_it_is_opened
         open_motors(rig(driver=galil, axes__insertion__acceleration_mm_s2=1.024)).close()
         line = message(open_motors, rig(driver=galil, axes__insertion__acceleration_mm_s2=1.023))
         assert not [one for one in device.lines if one.startswith(("AC", "DC", "SP", "SH"))]
-    assert line == (
-        "axes.insertion.acceleration_mm_s2 = 1.023: must be at least 1.024: the controller takes 1024 counts/s² "
-        "and more"
-    )
+    assert line.startswith("axes.insertion.acceleration_mm_s2 = 1.023: must be at least 1.024:")
 
 
 def test_a_device_that_does_not_reply_is_no_error_of_the_file():
