@@ -9,17 +9,10 @@ from flexneedle.lab.emulators import codec
 from flexneedle.lab.emulators.motion import EmulatedPose
 
 
-@pytest.mark.parametrize(
-    ("command", "checksum"),
-    [(b"INIT:", 0xE3A5), (b"VER:0", 0x65EE), (b"GETINFO:Features.Firmware.Version", 0x0492)],
-)
-def test_checksums_are_those_that_ndicapi_sends(command, checksum):
-    assert codec.crc16(command) == checksum
-
-
-@pytest.mark.parametrize(("reply", "line"), [("OKAY", b"OKAYA896\r"), ("RESET", b"RESETBE6F\r")])
-def test_replies_are_those_expected_by_ndicapi(reply, line):
-    assert codec.encode_text(reply) == line
+def test_checksums_and_replies_are_those_of_ndicapi():
+    checksums = {b"INIT:": 0xE3A5, b"VER:0": 0x65EE, b"GETINFO:Features.Firmware.Version": 0x0492}
+    assert {command: codec.crc16(command) for command in checksums} == checksums
+    assert list(map(codec.encode_text, ("OKAY", "RESET"))) == [b"OKAYA896\r", b"RESETBE6F\r"]
 
 
 def test_a_command_has_a_checksum_after_a_colon_and_none_after_a_space():
@@ -51,13 +44,9 @@ def test_a_checksum_over_all_of_a_binary_reply_is_the_same():
     assert codec.crc16(reply[:-2]) == codec.crc16(b"abc")
 
 
-def test_a_pose_in_text_is_fixed_point_with_signs():
+def test_a_pose_is_fixed_point_with_signs_in_text_and_eight_singles_in_binary():
     pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
     assert codec.encode_pose_text(pose) == "+05000-05000+05000-05000+000150-002025-020000+00239"
-
-
-def test_a_pose_in_binary_is_eight_singles():
-    pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
     values = struct.unpack("<8f", codec.encode_pose_binary(pose))
     np.testing.assert_allclose(values, (0.5, -0.5, 0.5, -0.5, 1.5, -20.25, -200.0, 0.0239), rtol=1e-6)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emulated import emulated
+from emulated import emulated, emulator
 from flexneedle.lab.emulators.motion import SENSORS, sensor_pose
 
 ndicapy = pytest.importorskip("ndicapy")
@@ -22,17 +22,22 @@ def opened(path):
     return device, [bytes([handle]) for handle in handles]
 
 
+@pytest.fixture(scope="module")
+def device():
+    """The path of a tracker with two sensors, and its orders: ndicapi 3.7.6 cannot decode a binary reply about more."""
+    with emulator("--sensors", "2") as started:
+        yield started
+
+
 @pytest.mark.parametrize("command", ["BX", "TX"])
-def test_ndicapi_reads_poses_and_frame_numbers(command):
-    """Two sensors: with more, ndicapi 3.7.6 cannot decode a binary reply to a str."""
+def test_ndicapi_reads_poses_and_frame_numbers(device, command):
     frame = getattr(ndicapy, f"ndiGet{command}Frame")
     transform = getattr(ndicapy, f"ndiGet{command}Transform")
-    with emulated("--sensors", "2") as path:
-        device, handles = opened(path)
-        ndicapy.ndiCommand(device, f"{command}:0801")
-        read = [(frame(device, handle), transform(device, handle)) for handle in handles]
-        ndicapy.ndiCommand(device, "TSTOP:")
-        ndicapy.ndiClose(device)
+    line, handles = opened(device[0])
+    ndicapy.ndiCommand(line, f"{command}:0801")
+    read = [(frame(line, handle), transform(line, handle)) for handle in handles]
+    ndicapy.ndiCommand(line, "TSTOP:")
+    ndicapy.ndiClose(line)
     for name, (number, values) in zip(SENSORS, read, strict=False):
         true = sensor_pose(name, number, 0)
         np.testing.assert_allclose(values[4:7], true.position, atol=0.0051)
@@ -40,14 +45,14 @@ def test_ndicapi_reads_poses_and_frame_numbers(command):
         np.testing.assert_allclose(values[7], true.indicator, atol=5.1e-5)
 
 
-def test_ndicapi_reads_missing_sensors_and_errors():
-    with emulated("--sensors", "1", "--fault", "missing@0") as path:
-        device, (handle,) = opened(path)
-        ndicapy.ndiCommand(device, "BX:0801")
-        assert ndicapy.ndiGetBXTransform(device, handle) == "MISSING"
-        with pytest.raises(OSError, match="invalid while in the current mode"):
-            ndicapy.ndiCommand(device, "PHSR:02")
-        ndicapy.ndiClose(device)
+def test_ndicapi_reads_missing_sensors_and_errors(device):
+    device[1]("fault missing")
+    line, (handle, _) = opened(device[0])
+    ndicapy.ndiCommand(line, "BX:0801")
+    assert ndicapy.ndiGetBXTransform(line, handle) == "MISSING"
+    with pytest.raises(OSError, match="invalid while in the current mode"):
+        ndicapy.ndiCommand(line, "PHSR:02")
+    ndicapy.ndiClose(line)
 
 
 @pytest.mark.parametrize(

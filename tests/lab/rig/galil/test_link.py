@@ -1,4 +1,4 @@
-"""The line to a controller: what goes over it, and what becomes of a connection whose replies are in doubt."""
+"""The line to a controller: its commands, and connections whose replies are in doubt."""
 
 import socket
 from contextlib import contextmanager
@@ -8,6 +8,7 @@ import pytest
 
 from emulated import until
 from flexneedle.errors import DriverError
+from flexneedle.lab.rig.devices.galil.dialogue import Dialogue
 from flexneedle.lab.rig.devices.galil.link import Link
 from galil_peer import CLOSE, peer
 
@@ -53,7 +54,7 @@ def test_a_host_that_is_not_known_is_refused_in_one_line():
         Link("no-such-host.invalid", 23)
 
 
-def test_a_host_with_several_addresses_is_reached_at_that_of_ipv4(monkeypatch):
+def test_a_host_with_several_addresses_is_reached_by_ipv4(monkeypatch):
     found = socket.getaddrinfo("::1", 0, type=socket.SOCK_STREAM)
     with peer() as device:
         found += socket.getaddrinfo("127.0.0.1", device.port, type=socket.SOCK_STREAM)
@@ -68,13 +69,10 @@ def test_a_port_where_nothing_listens_is_refused_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
     link = Link("127.0.0.1", port)
-    with pytest.raises(
-        DriverError, match=f"^127.0.0.1:{port}: no connection: Connection refused; check the power"
-    ):
+    problem = "no connection: Connection refused; check the power"
+    with pytest.raises(DriverError, match=f"^127.0.0.1:{port}: {problem}"):
         link.open(monotonic() + PATIENT_S)
-    with pytest.raises(
-        DriverError, match="not connected: no connection: Connection refused; check the power"
-    ):
+    with pytest.raises(DriverError, match=f"not connected: {problem}"):
         ask(link, "TPA")
 
 
@@ -130,38 +128,33 @@ def test_an_old_reply_is_never_that_to_a_new_command():
         assert ask(link, "TPA")[0].data == " 5\r\n"
 
 
-def test_a_message_between_two_commands_is_noticed_before_the_second_is_sent():
+@pytest.mark.parametrize(
+    ("sent", "problem"), [(b" 17.0000\r\n", "not asked for.*before TPA"), (b"", "closed the connection")]
+)
+def test_a_message_or_an_end_between_two_commands_is_noticed_before_the_second_is_sent(sent, problem):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         link = Link("127.0.0.1", listening.getsockname()[1])
         link.open(monotonic() + PATIENT_S)
         controller, _ = listening.accept()
         with controller:
-            controller.sendall(b" 17.0000\r\n")
-            until(lambda: link._socket.recv(1, socket.MSG_PEEK))
-            with pytest.raises(DriverError, match=r"data that was not asked for.*before TPA"):
+            controller.sendall(sent)
+            if not sent:
+                controller.shutdown(socket.SHUT_WR)
+            until(lambda: link._socket.recv(1, socket.MSG_PEEK) == sent[:1])
+            with pytest.raises(DriverError, match=problem):
                 ask(link, "TPA")
             assert controller.recv(10) == b""
 
 
-def test_a_connection_that_was_closed_meanwhile_is_noticed():
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        link = Link("127.0.0.1", listening.getsockname()[1])
-        link.open(monotonic() + PATIENT_S)
-        listening.accept()[0].close()
-        until(lambda: link._socket.recv(1, socket.MSG_PEEK) == b"")
-        with pytest.raises(DriverError, match="the controller closed the connection; check the power"):
-            ask(link, "TPA")
-
-
 @pytest.mark.parametrize("damage", [silent, lambda _line, true: true + b"\xff" * 100])
-def test_motors_are_told_goodbye_on_a_connection_that_fails(damage):
+def test_the_farewell_is_sent_on_a_connection_that_fails(damage):
     with linked(damage, farewell="STAB") as (link, device):
         with pytest.raises(DriverError):
             ask(link, "TPA", seconds=TIMEOUT_S)
         until(lambda: device.lines == ["TPA", "STAB"])
 
 
-def test_without_a_failure_there_is_no_goodbye():
+def test_without_a_failure_there_is_no_farewell():
     with linked(farewell="STAB") as (link, device):
         ask(link, "TPA")
         link.close()
@@ -176,3 +169,10 @@ def test_when_the_time_is_over_nothing_is_sent_and_the_connection_stays():
             ask(link, "TPA", seconds=-1.0)
         assert ask(link, "TPB")[0].accepted
         assert device.lines == ["TPB"]
+
+
+def test_control_characters_of_a_refused_query_are_printed():
+    with linked(lambda line, true: true if line == "TC1" else b"?") as (link, device):
+        with pytest.raises(DriverError) as refused:
+            Dialogue(link).text("\x12\x16", monotonic() + PATIENT_S)
+        assert str(refused.value) == f"127.0.0.1:{device.port}: ^R^V refused: 0"

@@ -1,8 +1,7 @@
-"""The emulated controller on TCP: a process of its own, as a client meets it, and its faults over time."""
+"""The emulated controller on TCP, a separate process, and its faults over time."""
 
 import re
 import socket
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,73 +15,53 @@ from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServe
 PAGE = (Path(__file__).parents[4] / "docs" / "rig" / "galil.md").read_text()
 
 
-@contextmanager
-def connected(*arguments):
-    """A client of an emulated controller; gives a function that sends a line and returns the reply."""
-    with emulator(*arguments, device="galil") as (address, _):
+def connect(address):
+    """Return a connection whose call sends a line and returns the reply."""
+    line = socket.create_connection(address, timeout=DEADLINE_S)
+
+    def ask(command):
+        line.sendall(f"{command}\r".encode())
+        answer = b""
+        while answer.count(b":") + answer.count(b"?") <= command.count(";"):
+            if not (got := line.recv(4096)):
+                raise ConnectionResetError
+            answer += got
+        return answer.decode()
+
+    return line, ask
+
+
+def test_a_client_moves_a_motor_until_the_controller_is_unplugged_and_can_connect_again():
+    with emulator("--fault", "unplug@0.5:0.3", device="galil") as (address, _):
         host, port = address.rsplit(":", 1)
-        with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as line:
+        line, ask = connect((host, int(port)))
+        assert ask("BGX;TC1") == "? 4 Operand error\r\n:"
+        assert ask("SHA;SPA=2000;PRA=2000000;BGA") == "::::"
+        positions = []
 
-            def ask(command):
-                line.sendall(f"{command}\r".encode())
-                answer = b""
-                while answer.count(b":") + answer.count(b"?") <= command.count(";"):
-                    got = line.recv(4096)
-                    if not got:
-                        raise ConnectionResetError
-                    answer += got
-                return answer.decode()
+        def is_lost():
+            try:
+                positions.append(int(ask("TPA").strip(" \r\n:")))
+            except OSError:
+                return True
+            return False
 
-            ask.line, ask.address = line, (host, int(port))
-            yield ask
-
-
-def test_a_client_moves_a_motor_in_real_time_and_stops_it():
-    with connected() as ask:
-        assert ask("SHA;SPA=2000;PRA=100;BGA") == "::::"
-        until(lambda: float(ask("MG _BGA").strip(" \r\n:")) == 0.0)
-        assert ask("TPA") == " 100\r\n:"
-        assert ask("JGA=500;BGA") == "::"
-        until(lambda: int(ask("TPA").strip(" \r\n:")) > 150)
-        assert ask("STA") == ":"
-        until(lambda: float(ask("MG _BGA").strip(" \r\n:")) == 0.0)
-        assert ask("SCA") == " 4\r\n:"
-        assert ask("BGX") == "?"
-        assert ask("TC1") == " 4 Operand error\r\n:"
+        until(is_lost)
+        line.close()
+        assert positions == sorted(positions)
+        until(lambda: is_reachable((host, int(port))))
 
 
-def test_an_unplugged_controller_loses_its_connections_and_can_be_reached_again():
-    with connected("--fault", "unplug@0:0.3") as ask:
-        ask("SHA;PRA=2000000;BGA")
-
-        lost, reachable = _holds_for(OSError, lambda: ask("TPA")), _works(ask.address)
-        until(lost)
-        until(reachable)
-        with socket.create_connection(ask.address, timeout=DEADLINE_S) as line:
-            line.sendall(b"EO 0\r")
-            assert line.recv(16) == b":"
-
-
-def _holds_for(error, action):
-    """Whether an action fails with an error."""
-
-    def fails():
-        try:
-            action()
-        except error:
-            return True
+def is_reachable(address):
+    try:
+        line, ask = connect(address)
+    except OSError:
         return False
-
-    return fails
-
-
-def _works(address):
-    """Whether a connection to an address is possible."""
-    refused = _holds_for(OSError, lambda: socket.create_connection(address, timeout=DEADLINE_S).close())
-    return lambda: not refused()
+    with line:
+        return ask("EO 0") == ":"
 
 
-def test_a_port_in_use_is_said_in_one_line():
+def test_a_port_in_use_is_reported_in_one_line():
     with (
         TcpServer("127.0.0.1", 0) as tcp,
         pytest.raises(InputError, match="cannot be listened on: Address already"),
@@ -104,7 +83,7 @@ def position(made, axis):
     return reply(made.device, f"TP{axis}")[1]
 
 
-def test_it_moves_on_while_its_process_is_not_scheduled():
+def test_motion_continues_while_the_process_is_not_scheduled():
     often, once = session(), session()
     for k in range(1, 1001):
         often.advance(k * 1e-3)
@@ -113,7 +92,7 @@ def test_it_moves_on_while_its_process_is_not_scheduled():
 
 
 @pytest.mark.parametrize("kind", ["stall", "lag", "overshoot", "reversed", "off", "reset", "limit"])
-def test_a_fault_of_a_motor_is_of_its_axis_and_time(kind):
+def test_a_fault_of_a_motor_belongs_to_its_axis_and_time(kind):
     good, bad = session(), session(f"{kind}=A@0.5:0.2")
     for now in (0.1, 0.4):
         good.advance(now)

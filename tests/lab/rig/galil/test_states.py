@@ -1,4 +1,4 @@
-"""States of motors from what the controller reports, with what the driver commanded."""
+"""States of motors from the reports of the controller and the commands of the driver."""
 
 from dataclasses import replace
 
@@ -8,22 +8,29 @@ from flexneedle.lab.rig.devices.galil.replies import GarbledError
 from flexneedle.lab.rig.devices.galil.states import ChannelState, make_report, take_report
 
 REST, MOVING, OFF = 0b0000_1111, 0b1000_1111, 0b0010_1111
+AT_FORWARD, AT_REVERSE = 0b0000_0111, 0b0000_1011  # limit bits are 1 while the switch is inactive
 RUNS, ARRIVED, FORWARD, STOPPED, ABORTED, ON_ERROR = 0, 1, 2, 4, 7, 8
 
 
-def states(channel, *reports):
-    """The states after reports of (commanded position, switches, stop code)."""
+def take(channel, *reports):
+    """The channel after reports of (commanded position, switches, stop code), and the state after each."""
     found = []
     for commanded, switches, code in reports:
         channel, state = take_report(channel, make_report(commanded, commanded, switches, code))
         found.append(state)
-    return found
+    return channel, found
 
 
 def after(channel, *reports):
-    for commanded, switches, code in reports:
-        channel, _ = take_report(channel, make_report(commanded, commanded, switches, code))
-    return channel
+    return take(channel, *reports)[0]
+
+
+def states(channel, *reports):
+    return take(channel, *reports)[1]
+
+
+def moving(channel, *reports):
+    return [state.moving for state in states(channel, *reports)]
 
 
 def tracking(target, *reports):
@@ -31,52 +38,43 @@ def tracking(target, *reports):
 
 
 @pytest.mark.parametrize(
-    ("switches", "on", "reverse", "forward", "moving"),
+    ("switches", "on", "reverse", "forward", "moves"),
     [
         (REST, True, False, False, False),
         (MOVING, True, False, False, True),
         (OFF, False, False, False, False),
-        (0b0000_0111, True, False, True, False),
-        (0b0000_1011, True, True, False, False),
+        (AT_FORWARD, True, False, True, False),
+        (AT_REVERSE, True, True, False, False),
         (0b1110_0000, False, True, True, True),
     ],
 )
-def test_bits_of_the_switches(switches, on, reverse, forward, moving):
-    """Limit bits are 1 while the switch is inactive."""
+def test_bits_of_the_switches(switches, on, reverse, forward, moves):
     (state,) = states(ChannelState(), (5, switches, ARRIVED))
-    assert (state.on, state.reverse_limit, state.forward_limit, state.moving) == (
-        on,
-        reverse,
-        forward,
-        moving,
-    )
+    assert (state.on, state.reverse_limit, state.forward_limit, state.moving) == (on, reverse, forward, moves)
     assert state.position == state.commanded == 5
 
 
-def test_in_position_tracking_an_axis_rests_when_two_reports_have_it_at_its_target():
-    """Whether or not the controller counts it as in motion there."""
-    on_the_way = [(40, MOVING, RUNS), (100, MOVING, RUNS), (100, MOVING, RUNS)]
-    assert [state.moving for state in states(tracking(100), *on_the_way)] == [True, True, False]
-    assert [state.moving for state in states(tracking(100), (40, MOVING, RUNS), (100, REST, RUNS))] == [
+@pytest.mark.parametrize(
+    ("reports", "expected"),
+    [
+        ([(40, MOVING, RUNS), (100, MOVING, RUNS), (100, MOVING, RUNS)], [True, True, False]),
+        ([(40, MOVING, RUNS), (100, REST, RUNS)], [True, False]),
+        ([(90, MOVING, RUNS), (100, MOVING, RUNS), (110, MOVING, RUNS), (100, MOVING, RUNS)], [True] * 4),
+    ],
+)
+def test_in_position_tracking_an_axis_rests_after_two_reports_at_its_target(reports, expected):
+    """Whether or not the controller counts it as in motion there. One that passes its target is in motion."""
+    assert moving(tracking(100), *reports) == expected
+
+
+def test_in_a_move_the_controller_reports_the_end_and_a_waiting_target_is_motion():
+    channel = ChannelState().with_target(100, tracking=False)
+    assert moving(channel, (100, MOVING, RUNS), (100, MOVING, RUNS), (100, REST, ARRIVED)) == [
+        True,
         True,
         False,
     ]
-
-
-def test_an_axis_that_passes_its_target_is_in_motion():
-    passing = [(90, MOVING, RUNS), (100, MOVING, RUNS), (110, MOVING, RUNS), (100, MOVING, RUNS)]
-    assert all(state.moving for state in states(tracking(100), *passing))
-
-
-def test_in_a_move_the_controller_reports_the_end():
-    channel = ChannelState().with_target(100, tracking=False)
-    assert [s.moving for s in states(channel, (100, MOVING, RUNS), (100, MOVING, RUNS))] == [True, True]
-    assert states(channel, (100, REST, ARRIVED))[0].moving is False
-
-
-def test_a_target_that_waits_is_motion():
-    (state,) = states(ChannelState(target=5, waiting=True), (0, REST, ARRIVED))
-    assert state.moving
+    assert moving(ChannelState(target=5, waiting=True), (0, REST, ARRIVED)) == [True]
 
 
 @pytest.mark.parametrize(
@@ -111,7 +109,7 @@ def test_after_a_stop_of_the_controller_the_axis_is_not_in_position_tracking():
 
 
 @pytest.mark.parametrize("code", [STOPPED, ABORTED, FORWARD, ON_ERROR])
-def test_an_earlier_stop_is_not_one_of_the_new_motion(code):
+def test_an_earlier_stop_is_not_attributed_to_the_new_motion(code):
     """The code may still be the old one when the motion was just commanded."""
     channel = tracking(100, (0, REST, code))
     early, running, again = states(channel, (0, MOVING, code), (10, MOVING, RUNS), (20, REST, code))
@@ -119,7 +117,7 @@ def test_an_earlier_stop_is_not_one_of_the_new_motion(code):
     assert again.stopped != ""
 
 
-def test_the_drivers_own_stop_is_none_of_the_controller():
+def test_the_drivers_own_stop_is_not_attributed_to_the_controller():
     channel = after(tracking(100), (20, MOVING, RUNS)).without_target(STOPPED).with_target(50, tracking=True)
     early, running, foreign = states(channel, (30, MOVING, STOPPED), (35, MOVING, RUNS), (40, REST, STOPPED))
     assert (early.stopped, running.stopped) == ("", "")
@@ -139,23 +137,21 @@ def test_values_that_an_axis_cannot_have_are_refused(values):
         make_report(*values)
 
 
-def test_a_target_that_waits_is_given_up_where_the_controller_stops_the_axis():
-    """It rests then: who searches a limit switch waits for that. Another stop of its own is as good."""
-    channel = replace(
-        after(ChannelState(), (0, REST, ARRIVED)).with_target(100, tracking=False), target=200, waiting=True
-    )
-    moved, at_switch = (50, MOVING, RUNS), (60, 0b0000_1011, 3)
-    assert [state.moving for state in states(channel, moved, at_switch, at_switch)] == [True, False, False]
-    assert not after(channel, moved, at_switch).waiting
-    ended_there = (
-        100,
-        0b0000_0111,
-        ARRIVED,
-    )  # its move ends just at the forward switch, to which the target leads
-    assert [state.moving for state in states(channel, moved, ended_there)] == [True, False]
-    ended_behind = (100, 0b0000_1011, ARRIVED)  # at the reverse switch, from which the target leads away
-    assert [state.moving for state in states(channel, moved, ended_behind)] == [True, True]
-    assert after(channel, moved).waiting
-    assert [state.moving for state in states(channel, (100, REST, ARRIVED))] == [
-        True
-    ]  # it is still to be sent
+@pytest.mark.parametrize(
+    ("reports", "expected"),
+    [
+        ([(50, MOVING, RUNS), (60, AT_REVERSE, 3), (60, AT_REVERSE, 3)], [True, False, False]),
+        ([(50, MOVING, RUNS), (100, AT_FORWARD, ARRIVED)], [True, False]),  # the target is beyond the switch
+        (
+            [(50, MOVING, RUNS), (100, AT_REVERSE, ARRIVED)],
+            [True, True],
+        ),  # the target is away from the switch
+        ([(100, REST, ARRIVED)], [True]),  # the target is still to be sent
+    ],
+)
+def test_a_waiting_target_is_dropped_if_the_controller_stops_the_axis(reports, expected):
+    """It rests then: a search of a limit switch waits for that."""
+    begun = after(ChannelState(), (0, REST, ARRIVED)).with_target(100, tracking=False)
+    channel = replace(begun, target=200, waiting=True)
+    assert moving(channel, *reports) == expected
+    assert after(channel, *reports).waiting == expected[-1]
