@@ -127,7 +127,7 @@ def _about(table: Table) -> str:
 def _row(key: Key, advice: dict[str, Any]) -> str:
     text = " ".join(key.schema.get("description", "").split())
     if choose := key.schema.get("choose") or advice["keys"].get(key.name):
-        text += f" *Choose:* {choose}"
+        text += f" *{choose[:1].upper()}{choose[1:]}*"
     short = key.name.rsplit(".", 1)[-1]
     cells = (f"`{short}`", _default(key), allowed(key.schema), text)
     return f"|{'|'.join(cell.replace('|', chr(92) + '|') for cell in cells)}|"
