@@ -53,9 +53,3 @@ def after(path, x):
 
 def decide(plan, estimate, seed=0):
     return decided(plan, estimate, seed)[0]
-
-
-def aimed(plan, state, offset, ahead=20.0):
-    """The plan with a target so far ahead of a tip, and off its line (mm)."""
-    x, y, _, theta, _ = state.tip
-    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + offset), 0.0))

@@ -1,15 +1,16 @@
-"""What the tests of the controllers share: a plan that is made quickly, its mirror image, estimates by hand."""
+"""Fixtures of the tests of controllers: quick plans, mirror images, estimates by hand."""
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.estimation.identification import Identified
+from flexneedle.estimation import derivatives
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_THETA, DB_Y, DG_Y, Control
+from flexneedle.types import DB_THETA, DB_Y, DG_Y, Control, X
 from reference.cases import MIRROR
 from tasks import begun_with
 
@@ -18,8 +19,22 @@ PHANTOM = flexneedle.load_scenario("phantom")
 
 @pytest.fixture(scope="session")
 def quick_plan():
-    """A plan to (40, 5) that gets there, if not in the best way."""
+    """A plan that reaches (40, 5)."""
     return flexneedle.plan(PHANTOM, (40.0, 5.0), seed=1, threads=1)
+
+
+@pytest.fixture(scope="session")
+def short_plan():
+    """A plan of 25 steps in its own scenario, with few samples for each controller that searches."""
+    few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}
+    few |= {"control.adaptive_mpc.samples": 12, "control.adaptive_mpc.iterations": 1}
+    near = {
+        "setup.tip_to_skin_mm": 5.0,
+        "target.depth_mm": 20.0,
+        "target.lateral_mm": 2.0,
+        "needle.nodes": 31,
+    }
+    return flexneedle.plan(PHANTOM.with_values({**near, **few, "plan.samples": 48}), seed=1, threads=1)
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +59,7 @@ def mirrored():
 
 @pytest.fixture(scope="session")
 def along():
-    """The state after so many steps of a plan, in a scenario of its own if one is given, then corrected."""
+    """The state after some steps of a plan, in the phantom or another scenario, then corrected."""
 
     def go(plan, steps, scenario=PHANTOM, **corrections):
         simulator = Simulator(scenario, threads=1)
@@ -75,4 +90,14 @@ def estimated():
 @pytest.fixture
 def all_fresh(monkeypatch):
     """Every derivative simulated in every period."""
-    monkeypatch.setattr(Identified, "_due_parameters", lambda self: iter(range(self.parameters.size)))
+    monkeypatch.setattr(derivatives, "due_parameters", lambda fitted: iter(range(fitted.parameters.size)))
+
+
+def assert_predicted_shapes(done, target):
+    """Assert that each period has a shape that ends at the target's depth, and the last one where the needle ended."""
+    assert all(period.predicted is not None for period in done.periods)
+    for period in done.periods[::10]:
+        assert period.predicted.nodes[-1, X] == pytest.approx(target[0], abs=0.6)
+        assert (period.predicted.sd[:, 0] > 0.0).any()
+    last = done.periods[-1]
+    assert np.abs(last.predicted.nodes[-1, 1:3] - last.estimate[1:3]).max() < 0.5

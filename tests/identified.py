@@ -1,11 +1,14 @@
 """Needles of the model's own kind with other constants, followed by the observer that fits the model."""
 
 from dataclasses import dataclass, field
+from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 
 import flexneedle
 from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
+from flexneedle.estimation.derivatives import differentiate
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import POSITION, SENSORS
@@ -25,10 +28,12 @@ TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for ke
 ROLLS = (20, 40, 52)  # moves that roll the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
 SLOTS = Slots.of(QUIET)
-BASE, SLOPE, BEND, RUN_OUT = (part.start for part in (SLOTS.base, SLOTS.slope, SLOTS.bend, SLOTS.run_out))
-BEVEL, CLEARANCE, MODULUS = SLOTS.bevel, SLOTS.clearance, SLOTS.modulus
-SHIFT = MODULUS + LAYERS
-CELLS = SHIFT + LAYERS - 1
+AT = SimpleNamespace(
+    base=SLOTS.base.start, slope=SLOTS.slope.start, bend=SLOTS.bend.start, run_out=SLOTS.run_out.start,
+    bevel=SLOTS.bevel, clearance=SLOTS.clearance, modulus=SLOTS.modulus,
+    shift=SLOTS.modulus + LAYERS, cells=SLOTS.modulus + 2 * LAYERS - 1,
+)  # fmt: skip
+"""Places of the parameters of a needle in the plane."""
 OWN = AdaptiveMpc()
 unexplained = SENSORS[POSITION].unexplained
 WAVES = tuple(
@@ -44,7 +49,7 @@ def commands(count):
 
 @dataclass(frozen=True)
 class Needle:
-    """What a needle of the model's kind, and its tissue, have of their own."""
+    """Constants of a needle of the model's kind and of its tissue."""
 
     base_y: float = 0.0
     base_turn: float = 0.0
@@ -119,6 +124,12 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
     return estimate, states
 
 
+@cache
+def fitted(name, count=70):
+    """The estimate of one of `NEEDLES` after moves with exact readings, and the needle's states."""
+    return followed(NEEDLES[name], count)
+
+
 def ahead(estimate, needle, states, scenario=QUIET, steps=8):
     """Errors (mm) of the measured tip after further steps, of the estimate and of the prior's mean; no readings."""
     plain = Needle(modulus=(1.0,) * len(needle.modulus), shift=(0.0,) * len(needle.shift))
@@ -136,19 +147,25 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
     return abs(estimate.tip[1] - goal), abs(naive.tip[1] - goal)
 
 
-def off_the_prior(count=55, needle="all"):
-    """An estimate after some moves with parameters that are neither the prior's nor fitted, and its readings."""
-    estimate, _ = followed(NEEDLES[needle], count)
+@cache
+def off_the_prior(needle="all"):
+    """An estimate after 55 moves with parameters that are neither the prior's nor fitted, and its readings."""
+    estimate, _ = fitted(needle, 55)
     sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
     off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
-    off_prior = estimate._simulate_with(estimate.parameters + off)._differentiate(range(sd.size))
-    return off_prior, off_prior._readings[0]
+    off_prior = differentiate(estimate.simulate_with(estimate.parameters + off), range(sd.size))
+    return off_prior, off_prior.readings[0]
 
 
 def adaptation_of(parameters):
     """The model's constants for these parameters."""
-    tissue = parameters[SHIFT:CELLS], np.exp(parameters[MODULUS:SHIFT]), 2.5, np.exp(parameters[CELLS:])
-    return Adaptation(*tissue, *parameters[[BEVEL, BEND, CLEARANCE]].tolist())
+    tissue = (
+        parameters[AT.shift : AT.cells],
+        np.exp(parameters[AT.modulus : AT.shift]),
+        2.5,
+        np.exp(parameters[AT.cells :]),
+    )
+    return Adaptation(*tissue, *parameters[[AT.bevel, AT.bend, AT.clearance]].tolist())
 
 
 def stepped(parameters, rows, axial=0.0):
@@ -157,7 +174,7 @@ def stepped(parameters, rows, axial=0.0):
     simulator = nominal.with_adaptation(adaptation_of(parameters))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
-    state = start.with_estimate(base_x=base_x, base=(parameters[BASE],), slope=(parameters[SLOPE],))
+    state = start.with_estimate(base_x=base_x, base=(parameters[AT.base],), slope=(parameters[AT.slope],))
     states = [simulator.step(state, Control())]
     for row in rows:
         states.append(simulator.step(states[-1], row))
@@ -170,4 +187,6 @@ def predicted(parameters, rows, means, axial=0.0):
     y = np.array([state.tip[1] for state in states])
     side = np.array([state.bevel.real for state in states])
     ends = y[means.index + 1]
-    return y[means.index] + means.part * (ends - y[means.index]) + parameters[RUN_OUT] * side[means.index + 1]
+    return (
+        y[means.index] + means.part * (ends - y[means.index]) + parameters[AT.run_out] * side[means.index + 1]
+    )

@@ -7,7 +7,7 @@ from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 
 
 def task_of(simulator, plan, controller=DEFAULT):
-    """What a controller is to carry out, with its settings of the simulator's scenario."""
+    """Task of a controller, with its settings in the simulator's scenario."""
     return tables.make_task(CONTROLLERS[controller], simulator, plan)
 
 

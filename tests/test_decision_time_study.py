@@ -1,20 +1,16 @@
 """studies/decision_time.py: paired insertions, and its two bounds."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+import decision_time as study
 import flexneedle
 from flexneedle.control.controllers import DEFAULT
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
-import decision_time as study
 
 TARGET = (25.0, 0.0)
 
 
+@pytest.mark.long
 def test_without_a_decision_time_it_is_the_insertion_of_the_package():
     ours = study.inserted(study.Job(TARGET, 3, 0.0))
     plan = study.plan_to(TARGET)
@@ -24,12 +20,12 @@ def test_without_a_decision_time_it_is_the_insertion_of_the_package():
 
 
 def test_a_decision_takes_its_time_on_the_clock_of_the_rig():
-    """Of every move and rest that was decided, and of no other period."""
-    quick, slow = (study.inserted(study.Job(TARGET, 3, seconds)) for seconds in (0.0, 0.15))
-    steps = np.diff([0.0, *(period.time for period in slow.periods)])
-    moves = [step for step, period in zip(steps, slow.periods, strict=True) if period.command.db_x >= 1.0]
+    """A move of 0.2 s takes 0.35 s."""
+    periods = study.inserted(study.Job(TARGET, 3, 0.15)).periods
+    steps = np.diff([0.0, *(period.time for period in periods)])
+    moves = [step for step, period in zip(steps, periods, strict=True) if period.command.db_x >= 1.0]
+    assert len(moves) > 40
     assert moves == pytest.approx([0.35] * len(moves))
-    assert slow.periods[-1].time > quick.periods[-1].time + 0.14 * len(moves)
 
 
 def test_every_pair_has_every_decision_time():

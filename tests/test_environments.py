@@ -1,12 +1,8 @@
 """studies/environments.py: the shipped environments agree with the paper's Tables I and II; hand values."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import environments
 
 CASES = [(name, figure) for name, figures in environments.PAPER.items() for figure in figures]

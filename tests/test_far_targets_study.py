@@ -1,16 +1,14 @@
 """studies/far_targets.py: the edge, both plans of a target, and what the table counts."""
 
-import sys
-from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import far_targets
 from flexneedle.scenario.worlds import world
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
-import far_targets
 
-
+@pytest.mark.long
 def test_a_target_that_one_search_misses_is_planned_with_each_width():
     row = far_targets.plan_target(world(4), (11.5, -10.0))
     assert row["before_mm"] > far_targets.MISSED_MM
@@ -20,9 +18,11 @@ def test_a_target_that_one_search_misses_is_planned_with_each_width():
     assert row["after_s"] > row["before_s"] > 0.0
 
 
-def test_the_edge_is_where_the_needle_ends_at_most_at_the_largest_lateral_offset():
+def test_the_edge_is_where_the_needle_ends_at_most_at_the_largest_lateral_offset(monkeypatch):
     assert far_targets.edge(world(1), 6.8, -1.0) == pytest.approx(7.65, abs=0.1)
-    assert far_targets.edge(world(4), 11.5, -1.0) == world(4).setup.max_lateral
+    for end, edge in ((-99.0, world(4).setup.max_lateral), (1.0, 0.0)):
+        monkeypatch.setattr(far_targets, "once", lambda *_, y=end: SimpleNamespace(tip_mm=(11.5, y, 0.0)))
+        assert far_targets.edge(world(4), 11.5, -1.0) == edge
 
 
 def test_a_world_without_a_guide_has_no_targets():

@@ -1,32 +1,18 @@
 """studies/monitor.py: random draws, evaluation of the runs, and consistency of the three runs."""
 
-import importlib.util
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+import monitor as study
 from flexneedle import load_scenario
 from flexneedle.results import CheckedMeasurement
 from flexneedle.types import Frame, Measurement, SensorReading
 from synthetic import make_periods, make_plan
 
-_SCRIPT = Path(__file__).parents[1] / "studies" / "monitor.py"
 
-
-@pytest.fixture(scope="module")
-def study():
-    spec = importlib.util.spec_from_file_location("monitor_study", _SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["monitor_study"] = module  # its dataclasses look up their module here
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["monitor_study"]
-
-
-def record(study, indicator, tip=None, distortion=0.0, held=(), step=0.2):
+def record(indicator, tip=None, distortion=0.0, held=(), step=0.2):
     """A run of n periods; held: indices of the periods held for the field."""
     count = len(indicator)
     time = step * np.arange(1, count + 1)
@@ -37,7 +23,7 @@ def record(study, indicator, tip=None, distortion=0.0, held=(), step=0.2):
     return study.RunRecord(time, np.asarray(indicator, dtype=float), tips, straight, off, flags, "done")
 
 
-def test_draws_depend_on_the_number_alone_and_stay_in_their_ranges(study):
+def test_draws_depend_on_the_number_alone_and_stay_in_their_ranges():
     scenario = load_scenario("phantom")
     drawn = [study.approach(scenario, number) for number in range(100)]
     assert drawn[7] == study.approach(scenario, 7)
@@ -47,20 +33,7 @@ def test_draws_depend_on_the_number_alone_and_stay_in_their_ranges(study):
     assert all(-1e-9 <= depth <= one.target[0] - 5.0 for depth, one in zip(depths, drawn, strict=True))
 
 
-def test_the_plate_approaches_at_constant_speed_and_stops_below_the_needle(study):
-    one = study.Approach(0, (40.0, 0.0), begins=2.0, speed=100.0)
-    assert [one.distance_at(time) for time in (0.0, 2.0, 3.0, 5.7, 99.0)] == [400.0, 400.0, 300.0, 30.0, 30.0]
-
-
-def test_scenarios_differ_only_in_plate_and_monitor(study):
-    bare, plated = study.world(False, True), study.world(True, True)
-    assert bare.tracker.environment.plate is None
-    assert plated.tracker.environment.plate is not None
-    assert plated.tracker.environment.model_copy(update={"plate": None}) == bare.tracker.environment
-    assert not study.world(False, False).monitor.enabled
-
-
-def test_medians_are_those_of_the_worst_reference_over_the_window(study):
+def test_medians_are_those_of_the_worst_reference_over_the_window():
     plan = make_plan()
     periods = list(make_periods(plan))[:10]
     values = np.random.default_rng(0).uniform(0.0, 0.1, (10, 4, 2))
@@ -92,62 +65,54 @@ def test_medians_are_those_of_the_worst_reference_over_the_window(study):
     np.testing.assert_allclose(study.medians(periods, 1.0), expected)
 
 
-def test_a_hold_is_timed_from_the_start_and_from_the_distortion(study):
+def test_a_hold_is_timed_from_the_start_and_from_the_distortion():
     drawn = study.Approach(0, (40.0, 0.0), begins=0.5, speed=100.0)
-    clean = record(study, [0.0] * 10)
+    clean = record([0.0] * 10)
     off = [[k, 0.0 if k < 6 else 0.3] for k in range(10)]
-    run = record(study, [0.0] * 10, off, distortion=[0.0] * 4 + [0.6] * 6, held=(6, 7))
+    run = record([0.0] * 10, off, distortion=[0.0] * 4 + [0.6] * 6, held=(6, 7))
     hold = study.hold_of(drawn, clean, run)
     assert hold.after_begin == pytest.approx(1.4 - 0.5)
     assert hold.after_distortion == pytest.approx(1.4 - 1.0)
     assert (hold.deviation, hold.estimate_error) == (pytest.approx(0.3), pytest.approx(0.3))
-    assert study.hold_of(drawn, clean, record(study, [0.0] * 10)) is None
-    never = study.hold_of(drawn, clean, record(study, [0.0] * 10, held=(3,)))
+    assert study.hold_of(drawn, clean, record([0.0] * 10)) is None
+    never = study.hold_of(drawn, clean, record([0.0] * 10, held=(3,)))
     assert math.isnan(never.after_distortion)
 
 
-def test_a_shorter_run_keeps_its_last_position(study):
-    short, long = record(study, [0.0] * 3), record(study, [0.0] * 8)
+def test_a_shorter_run_keeps_its_last_position():
+    short, long = record([0.0] * 3), record([0.0] * 8)
     assert study.tip_distance(long, short, 1.6) == pytest.approx(5.0)
     assert study.tip_distance(long, short, math.inf) == pytest.approx(5.0)
 
 
-def test_runs_with_different_periods_are_compared_at_the_same_time(study):
+def test_runs_with_different_periods_are_compared_at_the_same_time():
     """1 mm in 0.2 s, and 1 mm in 0.4 s: after 1.6 s the eighth and the fourth position, 4 mm apart."""
-    fast, slow = record(study, [0.0] * 10), record(study, [0.0] * 10, step=0.4)
+    fast, slow = record([0.0] * 10), record([0.0] * 10, step=0.4)
     assert study.tip_distance(fast, slow, 1.6) == pytest.approx(4.0)
-    kept = record(study, [0.0] * 10, held=(7,))
+    kept = record([0.0] * 10, held=(7,))
     off = [[k, 0.1 * k] for k in range(10)]
-    runs = study.Runs([], [record(study, [0.0] * 10, off, step=0.4)], [], [kept], np.array([]))
+    runs = study.Runs([], [record([0.0] * 10, off, step=0.4)], [], [kept], np.array([]))
     assert runs.clean_estimate_errors() == [pytest.approx(0.3)]
 
 
-def test_the_deviation_from_a_path_is_lateral_and_at_the_same_depth(study):
+def test_the_deviation_from_a_path_is_lateral_and_at_the_same_depth():
     """Half as fast on the same path is no deviation, 0.3 mm beside it is 0.3 mm."""
-    fast, slow = record(study, [0.0] * 10), record(study, [0.0] * 10, step=0.4)
-    beside = record(study, [0.0] * 10, [[k, 0.3] for k in range(10)], step=0.4)
+    fast, slow = record([0.0] * 10), record([0.0] * 10, step=0.4)
+    beside = record([0.0] * 10, [[k, 0.3] for k in range(10)], step=0.4)
     assert study.path_deviation(fast, slow, 1.0) == pytest.approx(0.0, abs=1e-12)
     assert study.path_deviation(fast, beside, 1.0) == pytest.approx(0.3)
 
 
-def test_without_a_clean_run_the_deviation_is_unknown(study):
-    kept, drawn = (
-        record(study, [0.0] * 10, held=(7,)),
-        study.Approach(0, (40.0, 0.0), begins=0.5, speed=100.0),
-    )
-    assert math.isnan(study.hold_of(drawn, record(study, [0.0] * 2, held=(0, 1)), kept).deviation)
-
-
-def test_the_curve_counts_false_and_missed_holds(study):
+def test_the_curve_counts_false_and_missed_holds():
     """Three clean runs; four with a plate: never distorted, distorted too late, detected in time, detected late."""
-    clean = [record(study, [level] * 20) for level in (0.01, 0.03, 0.05)]
+    clean = [record([level] * 20) for level in (0.01, 0.03, 0.05)]
     late = [0.0] * 17 + [2.0] * 3
     early = [0.0] * 5 + [2.0] * 15
     free = [
-        record(study, [0.01] * 20),
-        record(study, [0.01] * 20, distortion=late),
-        record(study, [0.01] * 8 + [0.2] * 12, distortion=early),
-        record(study, [0.01] * 11 + [0.2] * 9, distortion=early),
+        record([0.01] * 20),
+        record([0.01] * 20, distortion=late),
+        record([0.01] * 8 + [0.2] * 12, distortion=early),
+        record([0.01] * 11 + [0.2] * 9, distortion=early),
     ]
     runs = study.Runs([], clean, free, [], np.array([0.02, 0.06]))
     false, anywhere, missed = study.curve(runs)
@@ -157,7 +122,8 @@ def test_the_curve_counts_false_and_missed_holds(study):
     np.testing.assert_allclose(missed[at], [0.5, 0.5, 0.5, 1.0])
 
 
-def test_a_run_is_held_only_with_a_plate(study):
+@pytest.mark.long
+def test_a_run_is_held_only_with_a_plate():
     drawn = study.Approach(300_001, (25.0, 0.0), begins=4.0, speed=200.0)
     clean, kept = study.carry_out(drawn, False, True), study.carry_out(drawn, True, True)
     assert not clean.held.any()
@@ -166,9 +132,3 @@ def test_a_run_is_held_only_with_a_plate(study):
     hold = study.hold_of(drawn, clean, kept)
     assert 0.0 < hold.after_begin < 4.0
     assert hold.deviation < 1.0
-
-
-def test_unplaced_references_have_larger_indicators(study):
-    levels = [study.unplaced_indicator(number) for number in range(12)]
-    assert max(levels) > 0.041
-    assert min(levels) > 0.0

@@ -1,14 +1,9 @@
 """studies/steering.py: targets within reach, a plant without imperfections, and both error bounds."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-from flexneedle.planning.planner import bevel_reach
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import steering
+from flexneedle.planning.planner import bevel_reach
 
 
 @pytest.mark.parametrize("number", [2, 20])

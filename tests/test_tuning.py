@@ -1,8 +1,6 @@
 """Tuning: shipped records and settings, and the search itself, without insertions."""
 
-import importlib.util
 import json
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,24 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import flexneedle
+import tune
 from flexneedle.control.controllers import CONTROLLERS, check_tables
 from flexneedle.record.plain import to_text
 
-SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
-SHIPPED = SCRIPT.parent / "tuning"
+SHIPPED = Path(tune.__file__).parent / "tuning"
 TUNED = sorted(item.stem for item in SHIPPED.iterdir())
 NOT_TUNED = {"open-loop", "adaptive-mpc"}  # no settings; settings chosen on random worlds
-
-
-@pytest.fixture(scope="module")
-def tune():
-    """studies/tune.py as a module."""
-    spec = importlib.util.spec_from_file_location("tune", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
 
 
 def text_of(method):
@@ -46,14 +33,14 @@ def test_shipped_settings_are_those_chosen_by_tuning(method):
     assert {key: shipped[key] for key in chosen} == chosen
 
 
-def test_every_controller_with_a_space_has_a_record(tune):
+def test_every_controller_with_a_space_has_a_record():
     assert sorted(tune.SPACES) == TUNED
     assert set(CONTROLLERS) - NOT_TUNED == set(TUNED)
 
 
 @pytest.mark.parametrize("method", TUNED)
-def test_records_agree_with_the_script(tune, method):
-    """Budget, seeds, space and note are those of the present script; the result follows from the trials."""
+def test_records_agree_with_the_script(method):
+    """Budget, seeds, space and note agree with the present script; the result follows from the trials."""
     record = record_of(method)
     assert to_text(record) == text_of(method)
     trials = [tune.Trial(trial["settings"], (trial["mean_mm"],)) for trial in record["trials"]]
@@ -68,15 +55,7 @@ def test_records_agree_with_the_script(tune, method):
     assert sum(trial["cases"] for trial in record["trials"]) == record["budget_insertions"]
 
 
-def test_records_have_no_remarks():
-    assert {method: record_of(method)["note"] for method in TUNED} == dict.fromkeys(TUNED, "")
-
-
-def test_each_controller_gets_200_insertions(tune):
-    assert tune.BUDGET == 200
-
-
-def test_the_first_candidate_is_the_middle_of_the_space(tune):
+def test_the_first_candidate_is_the_middle_of_the_space():
     space = {
         "even": tune.Range(1.0, 3.0, log=False),
         "log": tune.Range(0.01, 1.0),
@@ -87,17 +66,12 @@ def test_the_first_candidate_is_the_middle_of_the_space(tune):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_other_candidates_cover_each_range_evenly(tune, seed):
+def test_the_other_candidates_cover_each_range_evenly(seed):
     space = {"even": tune.Range(0.0, 8.0, log=False), "log": tune.Range(1.0, 1e4)}
     tried = tune.candidates(space, 5, np.random.default_rng(seed))[1:]
     assert sorted(settings["even"] for settings in tried) == [1.0, 3.0, 5.0, 7.0]
     in_log = sorted(np.log10(settings["log"]) for settings in tried)
     assert_allclose(in_log, [0.5, 1.5, 2.5, 3.5], atol=1e-3)  # rounded to three digits
-
-
-def test_values_have_three_digits(tune):
-    assert tune.Range(0.1, 1.0).at(0.5) == 0.316
-    assert tune.Range(2, 16, whole=True).at(0.3) == 4
 
 
 class Race:
@@ -114,7 +88,7 @@ class Race:
 
 
 @pytest.fixture
-def halved(tune, monkeypatch):
+def halved(monkeypatch):
     """Return a function that compares five settings in one thread and returns all trials."""
 
     def run(race):

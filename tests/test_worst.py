@@ -1,18 +1,14 @@
 """studies/worst.py: removing one imperfection changes nothing else, and a folder of another study is refused."""
 
 import json
-import sys
 from dataclasses import asdict
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 import flexneedle
-from flexneedle.errors import InputError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import worst
+from flexneedle.errors import InputError
 
 REMOVED = {
     "moduli": {"superficial", "deep"},

@@ -1,4 +1,4 @@
-"""What a path costs the default controller: weights, miss and reach."""
+"""Cost of a path by the default controller: weights, miss and reach."""
 
 import math
 from dataclasses import replace
@@ -34,7 +34,7 @@ def weights(scenario, plan, x, memory=None):
 
 
 def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
-    """Energy against that of this tissue displaced, line and slope by the path left, late rolls by what they do."""
+    """Energy relative to the scale of this tissue, line and slope by the path left, late rolls by their effect."""
     found, task, estimate, ahead = weights(PHANTOM, quick_plan, 10.0)
     settings, scale = task.settings, task.simulator.energy_scale(40.0)
     assert found == {
@@ -56,13 +56,13 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
 
 
 def test_near_the_target_a_large_miss_gets_no_more_urgent(quick_plan):
-    """As late as a correction takes no effect any more."""
+    """From the depth on at which a correction takes no effect."""
     late, later = (weights(PHANTOM, quick_plan, x)[0]["large miss"] for x in (36.0, 38.0))
     assert late == later == pytest.approx((adaptive_mpc.UNCORRECTED / 40.0) ** -1.5 - 1.0)
 
 
-def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
-    """The standard deviation that the last decision predicted, had it predicted no miss, by the path that is left."""
+def test_a_miss_below_its_standard_deviation_counts_little(quick_plan, along):
+    """The blur is the last standard deviation without a miss, times the share of the path that is left."""
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
@@ -79,7 +79,7 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
 def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what_is_below_is_not(
     quick_plan, along
 ):
-    """Half of a miss that equals the standard deviation, in full, though what blurs it counts by the path left."""
+    """Half of a miss that equals the standard deviation counts; the blur is scaled by the path left."""
     estimate = estimate_of(along(quick_plan, 60), QUICK)
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
@@ -135,7 +135,7 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
 
 @pytest.mark.parametrize("scenario", [PHANTOM, BARE], ids=["a guide", "no guide"])
 def test_the_bevel_keeps_its_reach_with_a_margin_where_it_steers_alone(quick_plan, scenario):
-    """The deviations that the reach is charged with: those of the estimate, or a multiple of them without a guide."""
+    """The reach is charged with the deviations of the estimate, or with a multiple of them without a guide."""
     simulator = Simulator(scenario, threads=1)
     state = simulator.replay(simulator.start(), controls(1, db_x=31.0))[0]
     estimate, task = estimate_of(state, scenario), task_of(simulator, quick_plan)

@@ -66,7 +66,7 @@ def test_it_aims_from_where_the_current_path_ends_to_the_target(state, offset):
 
 @pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -2.0])
 @pytest.mark.parametrize("beyond", [3.0, -0.2])
-def test_the_reach_after_a_step_is_the_disc_of_what_the_bevel_does_then(state, direction, beyond):
+def test_the_reach_after_a_step_is_a_disc(state, direction, beyond):
     """Without uncertainty: the distance from the disc, for a roll at once towards the target or away from it.
 
     The disc by four directions of the bevel after that roll, on the same model.
@@ -92,7 +92,7 @@ def test_the_reach_after_a_step_is_the_disc_of_what_the_bevel_does_then(state, d
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
-    """Along it the guide corrects: the target may be anywhere. Across it, the weight is that of no guide at all."""
+    """Along its axis the guide corrects: the target may be anywhere. Across it, the weight is as without a guide."""
     one_axis = SPACE.with_values({"setup.guide_axes": 1})
     there = inserted(Simulator(one_axis, threads=1))
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])

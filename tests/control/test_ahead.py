@@ -12,10 +12,12 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, Motion, X
 from tasks import task_of
 
-SCENARIOS = {
-    "plane": flexneedle.load_scenario("phantom"),
-    "space": flexneedle.load_scenario("phantom").with_values({"setup.axes": 2, "target.lateral_z_mm": 3.0}),
-}
+PLANE = flexneedle.load_scenario("phantom").with_values(
+    {
+        "needle.nodes": 31, "setup.tip_to_skin_mm": 6.0, "target.depth_mm": 24.0, "plan.samples": 64,
+    }
+)  # fmt: skip
+SCENARIOS = {"plane": PLANE, "space": PLANE.with_values({"setup.axes": 2, "target.lateral_z_mm": 3.0})}
 
 
 @pytest.fixture(scope="module", params=SCENARIOS)
@@ -32,7 +34,7 @@ def estimates(plan, controller, steps):
     return task, estimate
 
 
-@pytest.mark.parametrize("steps", [0, 40, 60])
+@pytest.mark.parametrize("steps", [0, 15, 26])
 def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
     """All of guide, base and rolls; the shape at its end is the plan's, to the length of a step at each roll."""
     task, estimate = estimates(plan, "open-loop", steps)
@@ -55,31 +57,10 @@ def test_the_base_goes_to_its_planned_pose(plan):
     columns = [DB_Y, DB_THETA] if plan.scenario.setup.axes == 1 else [DB_Y, DB_Z, DB_THETA, DB_PSI]
     rows = plan.controls.copy()
     rows[:, columns] = 1e-3 * np.arange(1, 1 + len(columns))
-    task, estimate = estimates(replace(plan, controls=rows), "open-loop", 20)
+    task, estimate = estimates(replace(plan, controls=rows), "open-loop", 6)
     moved = remaining_controls(task, estimate)[:, columns].sum(axis=0)
-    np.testing.assert_allclose(moved, rows[20:, columns].sum(axis=0), atol=1e-2)
-    assert moved.min() > 0.03
-
-
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_each_period_of_each_controller_has_a_predicted_shape(plan, controller):
-    """At the target, less sure ahead of the tip than where it was measured."""
-    done = flexneedle.insert(
-        plan.scenario,
-        plan,
-        1,
-        controller=controller,
-        rig=flexneedle.VirtualRig("model"),
-        force=True,
-        threads=1,
-    )
-    periods = done.periods
-    assert all(period.predicted is not None for period in periods)
-    for period in periods[::10]:
-        assert period.predicted.nodes[-1, X] == pytest.approx(plan.target[0], abs=0.6)
-        assert (period.predicted.sd[:, 0] > 0.0).any()
-    last = periods[-1]
-    assert np.abs(last.predicted.nodes[-1, 1:3] - last.estimate[1:3]).max() < 0.5
+    np.testing.assert_allclose(moved, rows[6:, columns].sum(axis=0), atol=1e-2)
+    assert moved.min() > 0.02
 
 
 def test_at_the_target_the_predicted_shape_is_the_present_one(plan):

@@ -32,7 +32,7 @@ def nearest(pose, curvature, target):
 
 
 def wants_flip(pose, bevel, curvature, target, band, noise):
-    """Whether the bevel is to be rolled, and the reason."""
+    """Return whether the rule rolls the bevel, and the reason."""
     roll, why = choose_roll(pose, bevel, curvature, (*target, 0.0), band, noise)
     assert roll in (0.0, math.pi)
     return roll > 0.0, why
@@ -105,7 +105,7 @@ def test_dead_band_is_a_share_of_the_separation_of_the_paths():
     assert flips(1, (10.0, -0.6 / 16), band=0.80) is False
 
 
-def test_noise_of_the_tracker_is_needed_in_any_case():
+def test_the_noise_of_the_tracker_widens_the_dead_band():
     assert flips(1, (40.0, -0.6), noise=0.55) is True
     assert flips(1, (40.0, -0.6), noise=0.65) is False
     assert flips(1, (40.0, -0.6), band=0.35, noise=0.3) is True  # 0.35 · 0.8 + 0.3 < 0.6

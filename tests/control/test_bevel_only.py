@@ -37,15 +37,10 @@ def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, estimated,
         assert given == Control(db_x=1.0, roll=given.roll)
 
 
-@pytest.mark.parametrize("left", [0.7, 0.02])
-def test_the_last_advance_ends_at_the_target_depth(quick_plan, estimated, along, left):
-    state = along(quick_plan, 50)
-    assert command(aimed(quick_plan, state, 0.0, ahead=left), estimated(state)).db_x == pytest.approx(left)
-
-
 @pytest.mark.parametrize("rolled", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_bevel_rolls_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, rolled):
+    """The target is further off the tip's line than either path bends."""
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=rolled))
         right_way = state.bevel.real == side

@@ -63,7 +63,7 @@ def test_the_gain_is_the_share_of_the_update_that_is_made():
     matrix=arrays(float, (5, 4), elements=NUMBERS), right=arrays(float, 5, elements=st.floats(-5, 5)),
     lower=arrays(float, 4, elements=st.floats(-2, 0)), upper=arrays(float, 4, elements=st.floats(0, 2)),
 )  # fmt: skip
-@hypothesis_settings(max_examples=300)
+@hypothesis_settings(max_examples=100)
 def test_the_bounded_solve_costs_no_more_than_scipys(matrix, right, lower, upper):
     z = bm.bounded_least_squares(matrix, right, lower, upper)
     assert (z >= lower).all()

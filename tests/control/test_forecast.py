@@ -1,4 +1,4 @@
-"""What follows from a predicted miss: its probability, a warning, a hold."""
+"""Consequences of a predicted miss: its probability, a warning, a hold."""
 
 import math
 
@@ -40,13 +40,13 @@ def test_a_miss_that_is_certain_is_beyond_the_limit_or_not(miss, beyond):
 
 
 @pytest.mark.parametrize(("miss", "sd"), [(math.nan, math.nan), (math.nan, 1.0), (9.0, math.nan)])
-def test_what_is_not_predicted_holds_and_warns_of_nothing(miss, sd):
+def test_without_a_prediction_there_is_neither_hold_nor_warning(miss, sd):
     assert probability_beyond(LIMIT, miss, sd) == 0.0
     assert reason_to_hold(predicting(miss, sd), CONTROL) == ""
     assert count_likely_misses(predicting(miss, sd), 5) == 0
 
 
-def test_where_nothing_was_found_the_needle_is_held_for_that():
+def test_where_no_path_was_found_the_needle_is_held():
     assert reason_to_hold(Decision(STILL, "no path converges", math.inf), CONTROL) == "no path converges"
 
 
@@ -58,14 +58,14 @@ def test_a_decision_predicts_nothing_by_default():
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("sd", [0.05, 0.4])
 def test_the_needle_is_held_from_the_confidence_on(side, sd):
-    """Where the limit is as many standard deviations away as the confidence asks for."""
+    """The bound is the limit plus the quantile of the confidence."""
     bound = LIMIT + SURE * sd
     assert reason_to_hold(predicting(side * (bound - 1e-6), sd), CONTROL) == ""
     held = reason_to_hold(predicting(side * (bound + 1e-6), sd), CONTROL)
-    assert held.startswith(f"no path to the target found: predicted miss {side * bound:+.2f} ± {sd:.2f} mm")
+    assert f"{side * bound:+.2f} ± {sd:.2f} mm" in held
     assert "control.miss_limit_mm = 2 " in held
-    assert "(limit 0.95)" in held
-    assert held.endswith("to insert anyway: flexneedle insert --force")
+    assert "0.95" in held
+    assert "--force" in held
 
 
 def test_limit_and_confidence_are_the_scenarios():
@@ -91,7 +91,7 @@ def test_several_likely_misses_in_a_row_make_a_warning():
     lines = warned([bad] * 5)
     first = next(k for k, line in enumerate(lines) if line)
     assert first > 0
-    assert lines[first:] == ["predicted miss +3.00 ± 0.50 mm: likely beyond 1 mm"] * (5 - first)
+    assert all("+3.00 ± 0.50 mm" in line for line in lines[first:])
     assert warned(([bad] * first + [good]) * 4) == [""] * (4 * (first + 1))
 
 
@@ -109,21 +109,17 @@ def test_without_a_prediction_nothing_is_warned_of():
 
 
 @given(st.floats(-5.0, 5.0), st.floats(1e-3, 3.0))
-def test_whoever_is_held_is_warned_too(miss, sd):
+def test_a_miss_that_holds_also_counts_towards_a_warning(miss, sd):
     decision = predicting(miss, sd)
     assert count_likely_misses(decision, 0) == 1 or not reason_to_hold(decision, CONTROL)
 
 
 @pytest.mark.parametrize(
-    ("true", "estimated", "line"),
-    [
-        (1.1, 0.3, "missed the target by 1.10 mm"),
-        (0.9, 1.3, ""),
-        (math.nan, 2.5, "the estimated tip ended 2.50 mm from the target"),
-        (math.nan, 0.9, ""),
-    ],
+    ("true", "estimated", "shown"),
+    [(1.1, 0.3, "1.10 mm"), (0.9, 1.3, ""), (math.nan, 2.5, "2.50 mm"), (math.nan, 0.9, "")],
 )
-def test_an_end_beyond_a_millimetre_of_the_target_is_missed_by_the_truth_where_it_is_known(
-    true, estimated, line
-):
-    assert describe_miss(true, estimated) == line
+def test_an_end_beyond_a_millimetre_of_the_target_is_a_miss(true, estimated, shown):
+    """By the true tip where it is known."""
+    line = describe_miss(true, estimated)
+    assert shown in line
+    assert bool(line) == bool(shown)

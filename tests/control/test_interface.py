@@ -1,4 +1,4 @@
-"""What a decision must be: nine plain numbers, a miss that is predicted or not, a rest that ends."""
+"""Decisions: nine plain numbers, a miss that is predicted or not, a rest that ends."""
 
 import math
 
@@ -29,31 +29,24 @@ def test_decisions_with_a_predicted_shape_can_be_compared():
 
 
 @pytest.mark.parametrize(
-    ("command", "rule"),
+    "command",
     [
-        ((1.0, 0.0), "must be a Control, or its 9 columns"),
-        ((1.0, 0.0, 0.0, 0.0, -1), "must be a Control, or its 9 columns"),
-        (None, "must be a Control, or its 9 columns"),
-        ((1.0, 0.0, 0.0, "far", 0.0, 0.0, 0.0, 0.0, 0.0), "must be a Control, or its 9 columns"),
-        (Control(db_x=math.nan), "must have finite numbers"),
-        (Control(dg_y=math.inf), "must have finite numbers"),
-        (Control(roll=math.nan), "must have finite numbers"),
+        (1.0, 0.0), (1.0, 0.0, 0.0, 0.0, -1), None, (1.0, 0.0, 0.0, "far", 0.0, 0.0, 0.0, 0.0, 0.0),
+        Control(db_x=math.nan), Control(dg_y=math.inf), Control(roll=math.nan),
     ],
-)
-def test_another_command_is_refused(command, rule):
-    with pytest.raises(InputError, match=rf"^command = .*: {rule}"):
+)  # fmt: skip
+def test_another_command_is_refused(command):
+    with pytest.raises(InputError, match=r"^command = "):
         Decision(command, "")
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("key", "values"),
     [
-        ({"miss": 0.1, "miss_sd": -0.1}, "miss_sd = -0.1: must be at least 0, or NaN"),
-        ({"rest": -1.0}, "rest = -1.0: must be finite and at least 0"),
-        ({"rest": math.inf}, "rest = inf: must be finite"),
-        ({"rest": math.nan}, "rest = nan: must be finite"),
+        ("miss_sd", {"miss": 0.1, "miss_sd": -0.1}),
+        *(("rest", {"rest": one}) for one in (-1.0, math.inf, math.nan)),
     ],
 )
-def test_a_prediction_or_a_rest_that_means_nothing_is_refused(value, message):
-    with pytest.raises(InputError, match=f"^{message}"):
-        Decision(STILL, "", **value)
+def test_a_negative_deviation_or_rest_is_refused(key, values):
+    with pytest.raises(InputError, match=f"^{key} = "):
+        Decision(STILL, "", **values)

@@ -8,7 +8,7 @@ import pytest
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
+from flexneedle.types import DB_X, DG_Y, ROLL, Control
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -60,13 +60,6 @@ def test_bevel_rolls_where_planned(quick_plan, estimated):
     rolls[[12, 40], ROLL] = np.pi
     commands, _ = replayed(replace(quick_plan, controls=rolls), estimated)
     assert [k for k, command in enumerate(commands) if command.roll > 0.0] == [12, 40]
-
-
-def test_base_steps_are_replayed_too(quick_plan, estimated):
-    lateral = quick_plan.controls.copy()
-    lateral[:10, [DB_Y, DB_THETA]] = 0.1, 2e-4
-    commands, _ = replayed(replace(quick_plan, controls=lateral), estimated)
-    np.testing.assert_allclose(np.sum(commands, axis=0)[[DB_Y, DB_THETA]], [1.0, 2e-3], atol=1e-12)
 
 
 def test_what_the_tracker_sees_changes_nothing(quick_plan, estimated, along):

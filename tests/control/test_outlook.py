@@ -1,4 +1,4 @@
-"""The standard deviation of the predicted miss: that of a linear problem by Monte Carlo, and what bounds it."""
+"""The standard deviation of the predicted miss: a linear problem by Monte Carlo, and its bounds."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from flexneedle.control import outlook as ol
 from flexneedle.control.outlook import Outlook
 from flexneedle.types import Control, X, Y
-from identified import NEEDLES, RUN_OUT, followed
+from identified import AT, fitted
 
 TARGET = 40.0
 GRID = np.arange(-30.0, 60.0)
@@ -38,15 +38,15 @@ def two_parameters():
 
 
 def floor(estimate):
-    """Of the miss: what no parameter explains of a reading, and of the path that is left (mm)."""
+    """The part of the miss (mm) that no parameter explains, of a reading and of the path that is left."""
     drift = ol._DRIFT * (TARGET - estimate.state.tip[0])
     return float(np.hypot(ol._UNEXPLAINED * np.sqrt(estimate.reading_variance), drift))
 
 
 @pytest.mark.parametrize("now", [-20.0, 5.0, 25.0, 34.0])
 @pytest.mark.parametrize("variance", [1e-4, 1e-2, 0.3])
-def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
-    """Parameters as uncertain as now, readings up to the last correction, a path to the target of the estimate then."""
+def test_it_agrees_with_a_monte_carlo_of_a_linear_problem(now, variance):
+    """Draw parameters, readings up to the last correction, and the miss of a path to the estimated target then."""
     precision, curves = two_parameters()
     outlook, estimate = linear(precision, curves, now, variance)
     rng, n = np.random.default_rng(1), 20_000
@@ -62,7 +62,7 @@ def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
 
 @pytest.mark.parametrize("now", [-20.0, 25.0])
 @pytest.mark.parametrize("miss", [0.0, 0.1, 3.0])
-def test_in_space_it_is_that_on_an_axis(now, miss):
+def test_in_space_it_is_the_deviation_on_an_axis(now, miss):
     """The same problem on both axes, each with its own parameters: the deviation of either."""
     precision, curves = two_parameters()
     flat, plane = linear(precision, curves, now)
@@ -73,8 +73,8 @@ def test_in_space_it_is_that_on_an_axis(now, miss):
     assert deep.sd(space, TARGET, miss * (1 - 1j), guided=True) == pytest.approx(on_an_axis)
 
 
-def test_past_the_last_correction_nothing_is_learned():
-    """What is known now is all that will be."""
+def test_after_the_last_correction_the_uncertainty_stays():
+    """Nothing more becomes known."""
     precision, curves = two_parameters()
     outlook, estimate = linear(precision, curves, now=TARGET - ol.UNCORRECTED)
     end = curves[:, GRID == TARGET].ravel()
@@ -86,10 +86,10 @@ def test_past_the_last_correction_nothing_is_learned():
     miss=st.floats(-30.0, 30.0), now=st.floats(-25.0, 39.0), variance=st.floats(1e-6, 1.0),
     sds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)), guided=st.booleans(),
 )  # fmt: skip
-def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(
+def test_it_is_never_below_the_unexplained_part_and_grows_with_a_miss_that_stays(
     miss, now, variance, sds, guided
 ):
-    """By the miss at first, and by what is uncertain now at most. A guide that corrects makes it smaller."""
+    """It grows by the miss, and at most by the present uncertainty. A guide that corrects makes it smaller."""
     _, curves = two_parameters()
     outlook, estimate = linear(np.diag(np.array(sds) ** -2.0), curves, now, variance)
     least, sd = (outlook.sd(estimate, TARGET, one, guided=guided) for one in (0.0, miss))
@@ -102,7 +102,7 @@ def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(
     assert outlook.sd(estimate, TARGET, -miss, guided=guided) == sd
 
 
-def test_the_nearer_the_target_the_less_will_be_learned():
+def test_nearer_the_target_fewer_readings_are_to_come():
     precision, curves = two_parameters()
     sds = []
     for now in (-20.0, 0.0, 15.0, 30.0, 35.0):
@@ -128,14 +128,14 @@ def ahead_of(estimate, steps=12):
     return np.array(rows), np.array(tips), state.nodes
 
 
-def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
-    """The difference of two needles that are both carried on, one of them with another value; the rest is kept."""
-    estimate, _ = followed(NEEDLES["all"], 40)
+def test_derivatives_just_perturbed_are_renewed_along_the_path_ahead():
+    """Each is the difference of two needles moved on, one with another value; the other derivatives are kept."""
+    estimate, _ = fitted("all", 50)
     controls, tips, shape = ahead_of(estimate)
     old = Outlook.of(estimate)
     new = old.renew(estimate, controls, tips, shape)
     passed = (new.grid > tips[0, X]) & (new.grid < tips[-1, X])
-    renewed = {one.parameter for one in estimate.perturbed} | {RUN_OUT}
+    renewed = {one.parameter for one in estimate.perturbed} | {AT.run_out}
     for one in estimate.perturbed:
         moved, axis = one.state, estimate.state
         expected = []
@@ -151,9 +151,9 @@ def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
 
 
 def test_the_run_out_is_on_the_bevels_side():
-    estimate, _ = followed(NEEDLES["run-out"], 30)
+    estimate, _ = fitted("run-out", 30)
     controls, tips, shape = ahead_of(estimate)
-    curve = Outlook.of(estimate).renew(estimate, controls, tips, shape).curves[RUN_OUT]
+    curve = Outlook.of(estimate).renew(estimate, controls, tips, shape).curves[AT.run_out]
     side = estimate.state.bevel.real
     assert np.interp(tips[3, X], estimate.grid, curve) == side
     assert np.interp(tips[9, X], estimate.grid, curve) == -side

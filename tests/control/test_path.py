@@ -33,7 +33,7 @@ def level(*rolls, guide=0.0):
 
 
 def depths(path):
-    """Those of a path's rolls."""
+    """Depths of a path's rolls."""
     return path.rolls[:, 0].tolist()
 
 
@@ -50,7 +50,7 @@ def started(x, guide=0.0, simulator=None):
 # ---- the plan's path
 
 
-def test_it_begins_as_the_plans(quick_plan):
+def test_the_first_path_is_the_plans(quick_plan):
     """The guide at every depth, the bevel rolled where the plan rolls it."""
     controls = quick_plan.controls.copy()
     controls[:, ROLL] = 0.0
@@ -87,11 +87,11 @@ def test_depths_ascend_where_a_plan_stands_still(quick_plan):
     assert len(path.guide) == len(guide) - 3
 
 
-# ---- sample 0
+# ---- the first sample
 
 
 @pytest.mark.parametrize("steps", [0, 20, 45, 66])
-def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along, steps):
+def test_the_sample_that_corrects_nothing_is_the_current_path(quick_plan, along, steps):
     """The same guide at the ends of the steps, the same rolls."""
     state = along(quick_plan, steps)
     x = float(state.tip[0])
@@ -118,7 +118,7 @@ def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
     np.testing.assert_allclose(np.cumsum(controls[0, :, DG_Y]), expected[1:], atol=1e-12)
 
 
-def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along):
+def test_the_path_found_is_the_current_path_of_the_next_period(quick_plan, along):
     """Any sample, made the current path, is the sample that corrects nothing."""
     state = along(quick_plan, 30)
     ahead = ahead_of(quick_plan, state)
@@ -199,8 +199,8 @@ def test_two_rolls_at_one_place_cancel(quick_plan):
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
 @hypothesis_settings(max_examples=100)
-def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
-    """Where they are, in order, but for those within a twentieth of a control step of each other."""
+def test_rolls_near_each_other_are_all_made(quick_plan, rolls):
+    """In order and in place, except for rolls within a twentieth of a control step of each other."""
     rolls = sorted(rolls)
     assume((np.diff(rolls) > 0.051).all())
     ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
@@ -222,7 +222,7 @@ def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
 
 
 def test_base_motion_of_the_plan_is_followed(quick_plan):
-    """Where the plan has the base at a depth, in the samples and in the command."""
+    """The base follows the plan over the depth, in the samples and in the command."""
     moving = quick_plan.controls.copy()
     moving[:60, [DB_Y, DB_THETA]] = 0.02, 1e-4
     plan, state = replace(quick_plan, controls=moving), started(float(quick_plan.tips[30, 0]))
@@ -243,7 +243,7 @@ def test_base_motion_of_the_plan_is_followed(quick_plan):
 
 @pytest.mark.parametrize("rolls", [(), (20.0,), (15.0, 20.0, 25.0, 30.0)])
 @pytest.mark.parametrize("scenario", [PHANTOM, BARE], ids=["guide", "bare"])
-def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, rolls, scenario):
+def test_proposals_are_around_the_current_path_which_is_the_first(quick_plan, rolls, scenario):
     state = started(10.0, simulator=Simulator(scenario, threads=1))
     ahead = ahead_of(quick_plan, state, level(*rolls), scenario)
     z = propose_samples(ahead, 96, np.random.default_rng(1))
@@ -290,14 +290,6 @@ def test_rolls_are_executed_once_at_their_depth(quick_plan, rolls):
     assert made == pytest.approx(np.maximum(rolls, 10.0).tolist(), abs=0.1 * PHANTOM.setup.max_advance_mm)
     assert depths(left) == []
     assert end.bevel.real == (-1) ** len(rolls)
-
-
-def test_two_rolls_that_are_due_are_none(quick_plan):
-    """They would bring the bevel back to its side; both are over."""
-    ahead = ahead_of(quick_plan, started(10.0), level(9.0, 10.01, 25.0))
-    command, after = ahead.first_command(ahead.path)
-    assert command.roll == 0.0
-    assert depths(after) == [25.0]
 
 
 def test_the_advance_ends_where_the_next_roll_is_due(quick_plan):

@@ -7,7 +7,13 @@ import pytest
 
 import flexneedle
 from flexneedle.control import tables
-from flexneedle.control.controllers import CONTROLLERS, DEFAULT, check_tables, with_controller_defaults
+from flexneedle.control.controllers import (
+    CONTROLLERS,
+    DEFAULT,
+    check_tables,
+    find_controller,
+    with_controller_defaults,
+)
 from flexneedle.control.interface import Controller
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario
@@ -19,7 +25,7 @@ PHANTOM = flexneedle.load_scenario("phantom")
 
 
 class Gains(Section):
-    """Settings of a controller of one's own."""
+    """Settings of a user's controller."""
 
     gain: NonNegative = 0.5
     """Share of the error."""
@@ -29,14 +35,16 @@ def decide(*_):
     raise AssertionError("tables are checked without a decision")
 
 
-OWN = Controller("my-pid", "a controller of one's own", decide=decide, settings=Gains)
+OWN = Controller("my-pid", "a user's controller", decide=decide, settings=Gains)
 
 
 def test_the_default_controller_is_first_and_the_others_are_in_order():
     names = list(CONTROLLERS)
     assert names[0] == DEFAULT
-    assert names[1:] == sorted(names[1:])
-    assert {"ce-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc"} <= set(names)
+    assert names[1:] == sorted(["ce-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc"])
+    assert all(find_controller(name) == (name, controller) for name, controller in CONTROLLERS.items())
+    with pytest.raises(InputError, match=r"'pid'.*broyden-mpc"):
+        find_controller("pid")
 
 
 def test_a_scenario_keeps_a_table_as_it_is_given():
@@ -69,40 +77,30 @@ def test_a_task_has_the_settings_of_its_controller():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("my_pid.gian", 1, "control.my_pid.gian = 1: unknown key; did you mean gain? valid keys: gain"),
-        ("my_pid.gain", -1, "control.my_pid.gain = -1: must be at least 0"),
-        ("my_pid.gain", "1", 'control.my_pid.gain = "1": must be a number'),
-        (
-            "ce_mpc.horizons",
-            1,
-            "control.ce_mpc.horizons = 1: unknown key; did you mean horizon? valid keys: ",
-        ),
-    ],
+    ("key", "value"), [("my_pid.gian", 1), ("my_pid.gain", -1), ("my_pid.gain", "1"), ("ce_mpc.horizons", 1)]
 )
-def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, message):
+def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value):
     scenario = PHANTOM.with_values({f"control.{key}": value})
     for check in (check_tables, with_controller_defaults):
         with pytest.raises(ScenarioError) as caught:
             check(scenario, OWN, source="x.toml")
         (line,) = caught.value.problems
-        assert line.startswith(f"x.toml: {message}")
+        assert line.startswith(f"x.toml: control.{key} = ")
 
 
-def test_a_table_of_nobody_is_refused_by_a_check_and_warned_of_in_use():
+def test_an_unowned_table_is_refused_by_a_check_and_warned_of_in_use():
     scenario = PHANTOM.with_values({"control.my_pdi.gain": 1})
-    message = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; one of your own"
+    message = r"control.my_pdi: .* my_pid\?"
     with pytest.raises(ScenarioError, match="^x.toml: " + message):
         check_tables(scenario, OWN, source="x.toml")
-    with pytest.warns(ScenarioWarning, match=f"^{message}.*; it is not used$"):
+    with pytest.warns(ScenarioWarning, match=f"^{message}"):
         assert with_controller_defaults(scenario, OWN, source="x.toml").control.tables["my_pdi"] == {
             "gain": 1
         }
 
 
 def test_two_controllers_do_not_share_a_table():
-    with pytest.raises(InputError, match="two controllers are called ce-mpc: give one of them another name"):
+    with pytest.raises(InputError, match="ce-mpc"):
         check_tables(PHANTOM, replace(OWN, name="ce-mpc"))
 
 
@@ -128,22 +126,16 @@ class ByName:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        ({"name": "My PID"}, "name = 'My PID': a controller's name must be like my-controller-2"),
-        ({"name": None}, "name = None: a controller's name must be like"),
-        ({"name": "load-gain"}, "name = 'load-gain': control.load_gain is a setting of all controllers"),
-        ({"decide": None}, "controller my-pid: decide must be a function"),
-        ({"arrived": 3}, "controller my-pid: arrived must be a function"),
-        ({"observer": object()}, r"controller my-pid: observer must have a begin\(task\)"),
-        ({"settings": dict}, "controller my-pid: settings must be a class made from flexneedle.Section"),
-        ({"settings": Gains()}, "controller my-pid: settings must be a class made from flexneedle.Section"),
-        ({"settings": NoDefault}, "controller my-pid: settings must have a valid default for each key: gain"),
-        ({"settings": NotInToml}, "controller my-pid: settings must be of a TOML type.*: gains"),
+        ({"name": "My PID"}, "My PID"), ({"name": None}, "None"), ({"name": "load-gain"}, "control.load_gain"),
+        ({"decide": None}, "decide"), ({"arrived": 3}, "arrived"), ({"observer": object()}, "observer"),
+        ({"settings": dict}, "settings"), ({"settings": Gains()}, "settings"),
+        ({"settings": NoDefault}, "settings.*gain"), ({"settings": NotInToml}, "settings.*gains"),
     ],
-)
-def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, message):
-    with pytest.raises(InputError, match=f"^{message}"):
+)  # fmt: skip
+def test_a_controller_that_cannot_work_is_refused(change, named):
+    with pytest.raises(InputError, match=named):
         replace(OWN, **change)
 
 

@@ -1,29 +1,25 @@
-"""The parts of the fit: its derivatives, its step, and the step back, its readings and what is left uncertain."""
+"""The parts of the fit: derivatives, step and shortened step, readings, and the uncertainty left."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from flexneedle.estimation import derivatives, fit
 from flexneedle.estimation import identification as idn
+from flexneedle.estimation.derivatives import differentiate
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import ROLL, Control, Measurement, Motion, X, Y
 from identified import (
-    BASE,
-    BEND,
-    BEVEL,
-    CELLS,
-    CLEARANCE,
+    AT,
     NEEDLES,
     OWN,
     PHANTOM,
     QUIET,
-    RUN_OUT,
-    SHIFT,
-    SLOPE,
     Needle,
     commands,
+    fitted,
     followed,
     off_the_prior,
     predicted,
@@ -37,19 +33,19 @@ from tasks import begun_with
 
 
 def finely(estimate):
-    """The same with all its derivatives simulated now, on a grid so fine that nothing is lost between its points."""
+    """The estimate with all derivatives simulated now, on a grid so fine that interpolation loses nothing."""
     grid = np.arange(estimate.grid[0], estimate.grid[-1], 0.05)
     size = estimate.parameters.size
-    return replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size)))._differentiate(range(size))
+    return differentiate(replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size))), range(size))
 
 
 def test_derivatives_agree_with_central_differences():
     """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
     estimate, readings = off_the_prior()
     fine = replace(estimate, prior=replace(estimate.prior, steps=1e-3 * estimate.prior.steps))
-    jacobian, close = idn.jacobian_of(finely(estimate)), idn.jacobian_of(finely(fine))
+    jacobian, close = fit.jacobian_of(finely(estimate)), fit.jacobian_of(finely(fine))
     assert jacobian.shape == (readings.y.size, estimate.parameters.size)
-    for k in range(CELLS + 12):
+    for k in range(AT.cells + 11):
         step = np.zeros(estimate.parameters.size)
         step[k] = 1e-3 * estimate.prior.steps[k]
         rows = commands(55)
@@ -61,15 +57,15 @@ def test_derivatives_agree_with_central_differences():
         np.testing.assert_allclose(close[:, k], central, atol=6e-3 * scale + 1e-7)
         # Half a step of a boundary may lie across the middle of a contact's interval, where the slope jumps;
         # of the clearance, across where the needle leaves a wall.
-        off = 0.25 if SHIFT <= k < CELLS or k == CLEARANCE else 0.03
+        off = 0.25 if AT.shift <= k < AT.cells or k == AT.clearance else 0.03
         assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
     deepest = estimate.tips[:, X].max()
-    np.testing.assert_array_equal(jacobian[:, CELLS + int(deepest // 2.5) + 1 :], 0.0)
+    np.testing.assert_array_equal(jacobian[:, AT.cells + int(deepest // 2.5) + 1 :], 0.0)
 
 
 def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
-    """Those of the last period, over the depth passed and a few steps ahead."""
-    estimate, _ = followed(NEEDLES["all"], 50)
+    """Over the depth passed and a few steps ahead."""
+    estimate, _ = fitted("all", 50)
     assert len(estimate.perturbed) > 3
     forward = [Control(db_x=1.0)] * 4
     rows = [*commands(50), *forward]
@@ -91,37 +87,37 @@ def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
 
 
 def test_no_derivative_is_older_than_a_round():
-    """All are simulated anew within it, those of start, needle and guide more often."""
+    """All are simulated again within it, the derivatives of start, needle and guide more often."""
     rows, states = commands(40), Needle().inserted(PHANTOM, commands(40))
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
-    last, leading = {}, (BASE, SLOPE, BEND, BEVEL, CLEARANCE)
+    last, leading = {}, (AT.base, AT.slope, AT.bend, AT.bevel, AT.clearance)
     for k, row in enumerate(rows):
         batch = readings(Needle(), states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
         estimate = estimate.move(Motion(row, k, k + 1.0)).observe(batch)
         last |= {one.parameter: k for one in estimate.perturbed}
-    everyone = set(range(estimate.parameters.size)) - {RUN_OUT}
+    everyone = set(range(estimate.parameters.size)) - {AT.run_out}
     assert set(last) == everyone
-    assert min(last.values()) > len(rows) - 1 - idn._ROUND
-    assert min(last[k] for k in leading) > len(rows) - 1 - idn._LEADING_ROUND
+    assert min(last.values()) > len(rows) - 1 - derivatives.ROUND
+    assert min(last[k] for k in leading) > len(rows) - 1 - derivatives.LEADING_ROUND
     assert len(estimate.perturbed) < 0.5 * len(everyone)
 
 
-def test_derivatives_from_the_stops_are_those_from_the_start():
-    """What is not simulated again does not depend on the parameter."""
-    estimate, _ = off_the_prior(66)
+def test_derivatives_from_the_stops_equal_derivatives_from_the_start():
+    """The moves that are not simulated again do not depend on the parameter."""
+    estimate, _ = off_the_prior()
     assert len(estimate.stops) > 4
     whole = replace(estimate, stops=estimate.stops[:1])
     again = replace(whole, prior=replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf)))
-    jacobian = idn.jacobian_of(finely(estimate))
-    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(whole)), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(again)), rtol=1e-6, atol=1e-6)
-    assert np.abs(jacobian[:, CELLS + 12]).max() > 1e-4
+    jacobian = fit.jacobian_of(finely(estimate))
+    np.testing.assert_allclose(jacobian, fit.jacobian_of(finely(whole)), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jacobian, fit.jacobian_of(finely(again)), rtol=1e-6, atol=1e-6)
+    assert np.abs(jacobian[:, AT.cells + 9]).max() > 1e-4
 
 
-def test_the_stops_are_states_of_the_way():
-    """Bit for bit those of stepping, at the start, before the move into the tissue, and every eight moves in it."""
-    estimate, _ = off_the_prior(60)
-    states = stepped(estimate.parameters, commands(60), estimate.axial)
+def test_the_stops_are_states_on_the_way():
+    """Bit for bit as stepped, at the start, before the move into the tissue, and every eight moves in it."""
+    estimate, _ = off_the_prior()
+    states = stepped(estimate.parameters, commands(55), estimate.axial)
     assert [first for first, _ in estimate.stops] == [0, 28, 36, 44, 52]
     for first, state in estimate.stops:
         assert state == states[first]
@@ -130,7 +126,7 @@ def test_the_stops_are_states_of_the_way():
 
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     """Least squares of readings and prior stacked, each over its standard deviation."""
-    estimate, readings = off_the_prior(45, "bend")
+    estimate, readings = off_the_prior("bend")
     y = estimate.tips[:, Y]
     bends = np.abs(np.diff(np.concatenate([y[:1], y, y[-1:]]), n=2))
     chord = 0.25 * np.maximum(bends[readings.index], bends[readings.index + 1])
@@ -138,18 +134,18 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     jitter = QUIET.tracker.jitter_per_axis / np.sqrt(readings.count)
     sd = np.sqrt(jitter**2 + unexplained(QUIET, estimate.settings) ** 2 + chord**2)
     prior = np.linalg.cholesky(estimate.prior.precision).T
-    jacobian = idn.jacobian_of(estimate)
+    jacobian = fit.jacobian_of(estimate)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
-    missing = readings.y - predicted(estimate.parameters, commands(45), readings, estimate.axial)
+    missing = readings.y - predicted(estimate.parameters, commands(55), readings, estimate.axial)
     right = np.concatenate([missing / sd, prior @ (estimate.prior.mean - estimate.parameters)])
     step = np.linalg.lstsq(matrix, right, rcond=None)[0]
     assert (np.abs(step) > 1e-4).sum() > 10
-    found = idn.improve_fit(estimate).parameters
+    found = fit.improve_fit(estimate).parameters
     np.testing.assert_allclose(found, estimate.parameters + step, rtol=1e-6, atol=1e-8)
 
 
 def misfit(estimate, readings, before):
-    """What the fit makes least: squares over variances, halved; the variances are those of the estimate `before`."""
+    """Half of the squares over variances, which the fit minimises; variances from the estimate `before`."""
     variance = estimate.variances()[0] + readings.bent(before.tips[:, Y]) ** 2
     off = estimate.parameters - estimate.prior.mean
     rows, p = np.array([done.applied for done in estimate.moves]), estimate.parameters
@@ -157,7 +153,7 @@ def misfit(estimate, readings, before):
     y = y[readings.index] + readings.part * (y[readings.index + 1] - y[readings.index])
     first = estimate.stops[0][1].bevel.real
     sides = first * np.cumprod(np.where(rows[:, ROLL] > 0.0, -1.0, 1.0))[readings.index]
-    left = readings.y - y - p[RUN_OUT] * sides
+    left = readings.y - y - p[AT.run_out] * sides
     return 0.5 * (left**2 / variance).sum() + 0.5 * off @ estimate.prior.precision @ off
 
 
@@ -169,11 +165,11 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], idn.improve_fit, idn.Identified._simulate_with
+    costs, tried, improved, with_ = [], [], fit.improve_fit, idn.Identified.simulate_with
 
     def spied(estimate):
         tried.append(0)
-        fitted, readings = improved(estimate), estimate._readings[0]
+        fitted, readings = improved(estimate), estimate.readings[0]
         if len(estimate.moves) > 1:
             costs.append((misfit(estimate, readings, estimate), misfit(fitted, readings, estimate)))
         return fitted
@@ -183,7 +179,7 @@ def test_a_step_never_fits_worse(monkeypatch):
         return with_(estimate, parameters)
 
     monkeypatch.setattr(idn, "improve_fit", spied)
-    monkeypatch.setattr(idn.Identified, "_simulate_with", counted)
+    monkeypatch.setattr(idn.Identified, "simulate_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
             Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1))),
@@ -202,70 +198,51 @@ def test_a_step_never_fits_worse(monkeypatch):
 @pytest.mark.parametrize("factor", [-1.0, 1e-3])
 def test_a_wrong_step_is_not_taken(monkeypatch, factor):
     """A Jacobian that leads to a step the other way, or far too far: no parameter moves for the worse."""
-    estimate, readings = off_the_prior(45)
-    jacobian = idn.jacobian_of
-    monkeypatch.setattr(idn, "jacobian_of", lambda *args: factor * jacobian(*args))
-    fitted = idn.improve_fit(estimate)
+    estimate, readings = off_the_prior()
+    jacobian = fit.jacobian_of
+    monkeypatch.setattr(fit, "jacobian_of", lambda *args: factor * jacobian(*args))
+    fitted = fit.improve_fit(estimate)
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate) * (1.0 + 1e-12)
 
 
-def spoilt(estimate):
+def with_nan(estimate):
     return replace(estimate, tips=np.full_like(estimate.tips, np.nan))
 
 
-def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
-    estimate, readings = off_the_prior(45)
-    with_, tried = idn.Identified._simulate_with, []
+def not_converged(estimate):
+    needle = estimate.state.needle
+    solution = needle.solution._replace(converged=False)
+    return replace(estimate, state=replace(estimate.state, needle=needle._replace(solution=solution)))
 
-    def failing(self, parameters):
+
+@pytest.mark.parametrize("spoil", [with_nan, not_converged])
+@pytest.mark.parametrize("failing", [2, 99])
+def test_a_trial_step_that_fails_is_refused(monkeypatch, spoil, failing):
+    """Shorter steps are tried; if all of them fail, the parameters stay."""
+    estimate, readings = off_the_prior()
+    simulate, tried = idn.Identified.simulate_with, []
+
+    def simulate_with(self, parameters):
         tried.append(parameters)
-        other = with_(self, parameters)
-        return spoilt(other) if len(tried) <= 2 else other
+        other, stays = simulate(self, parameters), np.array_equal(parameters, estimate.parameters)
+        return spoil(other) if len(tried) <= failing and not stays else other
 
-    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
-    fitted = idn.improve_fit(estimate)
+    monkeypatch.setattr(idn.Identified, "simulate_with", simulate_with)
+    fitted = fit.improve_fit(estimate)
     assert len(tried) >= 3
+    assert fitted.state.converged
     assert np.isfinite(fitted.tips).all()
+    if failing == 99:
+        np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate)
 
 
-def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
-    estimate, _ = off_the_prior(45)
-    with_ = idn.Identified._simulate_with
-
-    def failing(self, parameters):
-        other = with_(self, parameters)
-        return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
-
-    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
-    fitted = idn.improve_fit(estimate)
-    np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
-    np.testing.assert_array_equal(fitted.tips, estimate.tips)
-
-
-def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
-    estimate, _ = off_the_prior(45)
-    with_ = idn.Identified._simulate_with
-
-    def failing(self, parameters):
-        other = with_(self, parameters)
-        if np.array_equal(parameters, estimate.parameters):
-            return other
-        solution = other.state.needle.solution._replace(converged=False)
-        return replace(
-            other, state=replace(other.state, needle=other.state.needle._replace(solution=solution))
-        )
-
-    monkeypatch.setattr(idn.Identified, "_simulate_with", failing)
-    assert idn.improve_fit(estimate).state.converged
-
-
 def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
-    estimate, readings = off_the_prior(45)
+    estimate, readings = off_the_prior()
     monkeypatch.setattr(
-        idn, "jacobian_of", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
+        fit, "jacobian_of", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
     )
-    np.testing.assert_array_equal(idn.improve_fit(estimate).parameters, estimate.parameters)
+    np.testing.assert_array_equal(fit.improve_fit(estimate).parameters, estimate.parameters)
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
@@ -273,7 +250,7 @@ def test_readings_of_a_move_are_averaged_at_their_mean_time():
     for k in range(2):
         estimate = estimate.move(Motion(Control(db_x=1.0), 2.0 * k, 2.0 * k + 2.0))
     readings = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
-    (means,) = estimate.observe(readings)._readings
+    (means,) = estimate.observe(readings).readings
     assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
     assert (means.part[0], means.x[0], means.y[0]) == pytest.approx((0.5, -27.0, 0.2))
     np.testing.assert_allclose(means.between(np.array([0.0, 10.0, 20.0])), [15.0])
@@ -285,7 +262,7 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(roll
     for k, flip in enumerate((False, True, False, True, False)):
         estimate = estimate.move(Motion(Control(db_x=1.0, flip=flip), float(k), k + 1.0))
     readings = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
-    (means,) = estimate.observe(readings)._readings
+    (means,) = estimate.observe(readings).readings
     np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
     np.testing.assert_array_equal(means.bevel, np.multiply(first, [1, -1, 1, 1]))
 
@@ -298,7 +275,7 @@ def test_the_low_pass_follows_the_newest_and_forgets():
     assert idn.low_pass(OWN, np.zeros(0)) == 0.0
 
 
-# ---- what is left uncertain
+# ---- uncertainty
 
 
 def prior_sd_of_the_tip(estimate):
@@ -310,11 +287,11 @@ def prior_sd_of_the_tip(estimate):
         parameters = prior.mean.copy()
         parameters[k] += prior.steps[k]
         slope[k] = (stepped(parameters, [])[0].tip[Y] - start) / prior.steps[k]
-    slope[RUN_OUT] = estimate.state.bevel.real
+    slope[AT.run_out] = estimate.state.bevel.real
     return float(np.sqrt(slope @ np.linalg.solve(prior.precision, slope)))
 
 
-def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior_says():
+def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior():
     """Across, and along the axis."""
     estimate = Identification().begin(begun_with(Simulator(QUIET, 1)))
     across = prior_sd_of_the_tip(estimate)
@@ -323,7 +300,7 @@ def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior_says():
     np.testing.assert_allclose(estimate.covariance, np.linalg.inv(estimate.prior.precision))
 
 
-def test_readings_leave_nothing_more_uncertain():
+def test_readings_increase_no_uncertainty():
     """The covariance is below the prior's in every direction, and far below it at the end."""
     rows, needle = commands(60), NEEDLES["all"]
     states = needle.inserted(PHANTOM, rows)

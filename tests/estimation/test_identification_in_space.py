@@ -1,4 +1,4 @@
-"""The observer that fits the model, in space: what it finds turns with the needle; directions of the tip help it."""
+"""The observer that fits the model, in space: the estimate turns with the needle; directions of the tip help."""
 
 import math
 from dataclasses import replace
@@ -150,16 +150,15 @@ def test_a_scenario_without_directions_has_no_place_for_their_tilt():
     np.testing.assert_array_equal(one.parameters, other.parameters)
 
 
-def test_it_finds_the_tilt_of_the_sensor_and_the_direction_of_the_tip():
+def test_it_finds_the_tilt_of_the_sensor_and_the_direction_of_the_tip(fitted):
     estimate, states = followed(62, DIRECTED)
     np.testing.assert_allclose(estimate.parameters[estimate.slots.tilt], [TILT.real, TILT.imag], atol=5e-4)
     np.testing.assert_allclose(estimate.state.tip[THETA:], states[-1].tip[THETA:], atol=2e-4)
-    before, _ = followed(62)
-    assert estimate.tip_sd < before.tip_sd
+    assert estimate.tip_sd < fitted[0].tip_sd
 
 
 def test_a_direction_narrows_the_prediction_in_air():
-    """Of a straight needle without a guide the clamp's slope is seen at once, if the sensor is aligned."""
+    """A straight needle without a guide shows the clamp's slope at once, if the sensor is aligned."""
     free = {"setup.guide_to_skin_mm": None, "control.adaptive_mpc.bend_sd_mm": 0.0}
     aligned = {
         **free,
@@ -175,7 +174,7 @@ def test_a_direction_narrows_the_prediction_in_air():
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_reported_covariance_replaces_the_scenarios_noise(name):
-    """Readings said to be useless leave the prior as it is; without a covariance they do not."""
+    """Readings with a huge covariance leave the prior as it is; without a covariance they do not."""
     worthless = {
         "tip position": {"covariance": tuple(tuple(row) for row in (1e6 * np.eye(3)).tolist())},
         "tip direction": {"direction_covariance": tuple(tuple(row) for row in (1e6 * np.eye(2)).tolist())},
@@ -191,7 +190,7 @@ def test_a_reported_covariance_replaces_the_scenarios_noise(name):
 
 
 def test_a_variance_is_of_the_measured_axes_only():
-    """In the plane z is not measured, and its entry says nothing."""
+    """In the plane z is not measured, and its entry is ignored."""
     covariance = ((9.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1e6))
     variance = SENSORS["tip position"].variance
     assert variance(Measurement(0.1, 1.0, 2.0, covariance=covariance)) == 0.5
@@ -218,7 +217,7 @@ def test_reported_variances_become_those_of_the_mean():
 
 @pytest.mark.parametrize(("ahead", "across", "trusted"), [(1e6, 1e-4, False), (1e-4, 1e6, True)])
 def test_the_start_along_the_axis_follows_the_variance_along_the_axis(ahead, across, trusted):
-    """Readings that are a millimetre ahead move it only where x is said to be known."""
+    """Readings that are a millimetre ahead move it only if the reported variance of x is small."""
     covariance = ((ahead, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
     estimate, _ = followed(
         3, truth=False, given=lambda one: replace(one, x=one.x + 1.0, covariance=covariance)

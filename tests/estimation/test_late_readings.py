@@ -35,7 +35,7 @@ def noisy_readings(state, simulator, count, rng):
     return batches
 
 
-def assert_same_belief(one, other):
+def assert_same_estimate(one, other):
     assert one.state == other.state
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert one.innovation == other.innovation
@@ -51,11 +51,11 @@ def test_late_readings_correct_as_if_they_had_come_in_time(depth, count, late):
     state = in_tissue(simulator, depth)
     readings = noisy_readings(state, simulator, count, np.random.default_rng(3))
     in_time = gathered(begun(simulator, state), 0, readings=readings)
-    assert_same_belief(gathered(begun(simulator, state), late, readings=readings), in_time)
+    assert_same_estimate(gathered(begun(simulator, state), late, readings=readings), in_time)
 
 
 @pytest.mark.parametrize("late", [1, 3])
-def test_the_estimate_before_late_readings_is_what_they_left_moved_on(late):
+def test_before_late_readings_the_corrected_estimate_is_moved_on(late):
     """The estimate now is the one corrected `late` periods ago, stepped through the moves since."""
     simulator = Simulator(PHANTOM)
     state = in_tissue(simulator, 36)
@@ -123,12 +123,12 @@ def test_without_readings_nothing_is_corrected_and_moves_stay_open():
     assert updated.measured is None
 
 
-def test_observing_leaves_the_old_belief_as_it_was():
+def test_observing_does_not_change_the_old_estimate():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator, 20)).move(Motion(AHEAD, 0.0, 1.0))
     before = moved.tips.copy(), moved.covariance.copy(), numbers(moved.state), moved.moves
     one, other = (moved.observe([Measurement(1.0, -7.5, 0.2)]) for _ in range(2))
-    assert_same_belief(one, other)
+    assert_same_estimate(one, other)
     now = moved.tips, moved.covariance, numbers(moved.state)
     for kept, there in zip(before, now, strict=False):
         np.testing.assert_array_equal(kept, there)

@@ -43,8 +43,8 @@ def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, bas
     assert estimate.state.tip_load == (0.0, 0.0)
 
 
-def test_in_air_it_still_predicts_well_as_the_needle_goes_in():
-    """What was estimated in air holds 10 mm deep without any further reading."""
+def test_an_estimate_from_air_predicts_the_first_depths():
+    """The estimate from air is still good 10 mm deep, without a further reading."""
     simulator = Simulator(QUIET)
     truth, estimate, _ = follow(start_with(QUIET, base=(0.6,)), begun(simulator), simulator, 28)
     assert truth.tip[X] < 0.0
@@ -106,7 +106,7 @@ def test_without_estimating_the_load_the_offset_stays(gain, estimates):
     assert np.abs(innovations[-5:, Y]).min() > 0.3 * abs(innovations[0, Y])
 
 
-def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
+def test_stiffer_tissue_than_estimated_leaves_little_offset():
     """A disturbance that grows slowly as the needle goes in: a twentieth of what is left without estimating it."""
     left = []
     for gain in (PHANTOM.control.load_gain, 0.0):
@@ -119,7 +119,7 @@ def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
     assert left[0] < 0.2 * left[1]
 
 
-def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
+def test_the_load_grows_by_the_gain_times_the_reaction_and_the_tip_is_held_where_measured():
     simulator = Simulator(PHANTOM)
     known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=(0.001,))), axial=0.0)
     moved = known.move(Motion(AHEAD, 0.0, 1.0))
@@ -138,7 +138,7 @@ def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_se
 
 
 @pytest.mark.parametrize("base_x", [2.0, -2.0])
-def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
+def test_the_start_along_the_axis_and_its_variance_are_found(base_x):
     """The mean of all readings, weighed with the prior; the tip's own uncertainty shrinks with it."""
     simulator = Simulator(PHANTOM)
     start = simulator.start()
@@ -272,7 +272,7 @@ def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(n
         assert bool(updated.base[Y] != 0.0 or updated.tip_load != (0.0, 0.0)) is estimates
 
 
-def test_unseen_keeps_the_belief_and_has_no_innovation():
+def test_without_a_reading_the_estimate_stays_and_the_innovation_is_zero():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator)).move(Motion(AHEAD, 0.0, 1.0))
     updated = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])

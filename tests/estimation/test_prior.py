@@ -1,4 +1,4 @@
-"""The prior of what is identified: the scenario's, and its bounds are those of the law."""
+"""The prior of the identified parameters: the scenario's, with the bounds of the law."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from flexneedle.estimation.prior import Prior
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
-from identified import BEVEL, CELLS, CLEARANCE, OWN, PHANTOM, unexplained
+from identified import AT, OWN, PHANTOM, unexplained
 from tasks import begun_with
 
 
@@ -31,17 +31,17 @@ def test_the_prior_is_that_of_the_scenario():
     prior = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, 81.5)
     cells = 21  # of 4 mm in 81.5 mm
     apart = 4.0 * np.abs(np.subtract.outer(np.arange(cells), np.arange(cells)))
-    covariance = np.zeros((CELLS + cells, CELLS + cells))
-    covariance[:CELLS, :CELLS] = np.diag(np.square([0.6, 2e-3, 0.7, 0.2, 0.4, 0.03, 0.25, 0.25, 1.1]))
-    covariance[CELLS:, CELLS:] = 0.15**2 * np.exp(-apart / 7.0)
-    np.testing.assert_allclose(prior.precision @ covariance, np.eye(CELLS + cells), atol=1e-9)
-    mean = np.zeros(CELLS + cells)
-    mean[[BEVEL, CLEARANCE]] = 1.0, 0.08
+    covariance = np.zeros((AT.cells + cells, AT.cells + cells))
+    covariance[: AT.cells, : AT.cells] = np.diag(np.square([0.6, 2e-3, 0.7, 0.2, 0.4, 0.03, 0.25, 0.25, 1.1]))
+    covariance[AT.cells :, AT.cells :] = 0.15**2 * np.exp(-apart / 7.0)
+    np.testing.assert_allclose(prior.precision @ covariance, np.eye(AT.cells + cells), atol=1e-9)
+    mean = np.zeros(AT.cells + cells)
+    mean[[AT.bevel, AT.clearance]] = 1.0, 0.08
     np.testing.assert_array_equal(prior.mean, mean)
     sd = np.sqrt(np.diag(covariance))
     expected = prior.mean + np.outer([-4.0, 4.0], sd)
-    expected[:, BEVEL] = 0.0, 0.7 * 20.0 / 4.0  # what a scenario may ask for, but for rounding
-    expected[0, CLEARANCE] = 0.0
+    expected[:, AT.bevel] = 0.0, 0.7 * 20.0 / 4.0  # what a scenario may ask for, but for rounding
+    expected[0, AT.clearance] = 0.0
     np.testing.assert_allclose(prior.bounds, expected, atol=0.01)
     off = np.random.default_rng(1).normal(size=sd.size) * sd
     assert prior.cost(prior.mean + off) == pytest.approx(0.5 * off @ np.linalg.solve(covariance, off))
@@ -82,7 +82,7 @@ def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
     layers[-1].pop("thickness_mm")
     values = {"tissue": layers, "needle.bevel.offset_mm": offset, "control.adaptive_mpc.bevel_sd": sd}
     scenario = PHANTOM.with_values(values)
-    low, high = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, 40.0).bounds[:, BEVEL]
+    low, high = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, 40.0).bounds[:, AT.bevel]
     assert low == 0.0
     assert high > 1.0
     assert high * offset <= 0.7 * min(heights)
@@ -110,11 +110,11 @@ def test_a_prior_is_proper_in_any_world(number):
     assert prior.steps.shape == prior.begins.shape == prior.mean.shape
     assert (prior.steps > 0.0).all()
     if not scenario.setup.has_guide:
-        assert prior.mean[CLEARANCE] == 0.0
-        assert prior.bounds[1, CLEARANCE] < 1e-3
+        assert prior.mean[AT.clearance] == 0.0
+        assert prior.bounds[1, AT.clearance] < 1e-3
 
 
-def test_what_no_parameter_explains_is_relative_to_the_bevel_but_no_less_than_a_length():
+def test_the_model_error_is_relative_to_the_bevel_with_a_lower_bound():
     for offset, sd, least, expected in (
         (4.0, 0.02, 0.01, 0.08),
         (4.0, 0.001, 0.01, 0.01),

@@ -59,15 +59,16 @@ def test_without_readings_a_hold_is_one_move_and_no_work(estimate, monkeypatch):
     assert long.moves[-1].ended == pytest.approx((HELD + 1) * READING_S)
 
 
-def test_with_readings_a_hold_keeps_no_more_of_them_than_of_a_short_one(estimate):
-    short, long = (kept(held(estimate, count, late)) for count in (150, 400))
-    assert long[:2] == short[:2]
-    assert long[2] <= 110
+def test_a_long_hold_keeps_no_more_readings_than_a_short_one(estimate):
+    short = held(estimate, 120, late)
+    long = held(short, 80, late, begun_at=120 * READING_S)
+    assert kept(long)[:2] == kept(short)[:2]
+    assert kept(long)[2] <= 110
 
 
 def test_after_a_hold_the_estimate_is_where_the_readings_are(estimate):
     x, y = estimate.tip[:2]
-    found = held(estimate, 300, lambda now, _: [Measurement(now - DELAY_S, x, y + 0.05)])
+    found = held(estimate, 150, lambda now, _: [Measurement(now - DELAY_S, x, y + 0.05)])
     assert found.tip[1] == pytest.approx(y + 0.05, abs=5e-3)
 
 

@@ -9,13 +9,17 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.errors import ScenarioError
-from flexneedle.planning import planner
-from flexneedle.planning.insertion import entry_bounds, read_entry
+from flexneedle.planning.entry import entry_bounds, read_entry
+from flexneedle.planning.problem import make_problem
 from flexneedle.scenario.sections.apparatus import Entry
 from flexneedle.simulator.control import Limits
 
-FEW = {"plan.samples": 32, "plan.max_iterations": 15}
-SHORT = {"plan.iterations": 5, "plan.max_iterations": 5}  # legal from the first iteration on
+FEW = {"plan.samples": 32, "plan.max_iterations": 15, "needle.nodes": 31, "setup.tip_to_skin_mm": 6.0}
+SHORT = {
+    "plan.samples": 16,
+    "plan.iterations": 3,
+    "plan.max_iterations": 3,
+}  # legal from the first iteration on
 PLANE, SPACE = (flexneedle.load_scenario(name).with_values(FEW) for name in ("phantom", "phantom3d"))
 DEPTH = 40.0
 STEEP = {"entry.slope_mrad": 190.0, "entry.free_slope_mrad": 100.0}
@@ -55,7 +59,7 @@ def test_the_entry_of_a_plan_is_legal(scenario, entry, off, strategy):
 def test_every_sample_of_the_entry_is_legal(which, seed):
     """And one that is legal by itself, as most are, is not changed by the limits."""
     free = aimed(*CASES[which])
-    problem = planner._make_problem(free, free.target.position, "steering")
+    problem = make_problem(free, free.target.position, "steering")
     bounds = entry_bounds(problem)
     z = np.random.default_rng(seed).uniform(-1.0, 1.0, (64, bounds.size)) * bounds
     point, slope = read_entry(problem, z)
@@ -75,13 +79,9 @@ def test_with_the_bevel_alone_a_limit_of_the_slope_turns_the_bevel_to_what_is_le
 
 def test_a_target_that_no_free_entry_brings_into_reach_is_refused():
     """19 mm on each axis: 4 mm too far on both, 5.7 mm together; and a slope that has 10 mrad left to one side."""
-    with pytest.raises(
-        ScenarioError, match=r"no free entry brings it and target\.lateral_z_mm both within 15"
-    ):
+    with pytest.raises(ScenarioError, match=r"target\.lateral_z_mm both within 15"):
         aimed(SPACE, NEAR, (19.0, 19.0))
-    with pytest.raises(
-        ScenarioError, match=r"must be from -11\.4 to 23, in reach of the guide from the entry"
-    ):
+    with pytest.raises(ScenarioError, match=r"from -11\.4 to 23"):
         aimed(PLANE, STEEP, (23.1,))
 
 

@@ -56,7 +56,7 @@ def search(rollout=rigid, variables=VARIABLES, settings=SEARCH, seed=0, **option
     return horizon.find_best(variables, rollout, TERMS, settings, np.random.default_rng(seed), **options)
 
 
-def test_what_is_found_is_told_with_its_terms_and_rollout():
+def test_the_result_has_its_terms_and_rollout():
     found = search()
     np.testing.assert_array_equal(found.trajectories.controls, controls(found.z[None]))
     assert found.cost == sum(found.terms.values()) == found.search_state.best_cost
@@ -99,7 +99,7 @@ def test_it_is_never_worse_than_the_incumbent(seed, z):
     assert found.cost <= before
 
 
-def test_an_incumbent_that_no_sample_beats_is_what_is_found():
+def test_an_incumbent_that_no_sample_beats_is_returned():
     best = np.array([[0.375, 0.375, 0.375, 0.375]])  # the last one has no sigma: no sample comes there
     found = search(first=np.concatenate([best, best + np.linspace(0.1, 0.6, 16)[:, None]]))
     np.testing.assert_array_equal(found.z, best[0])
@@ -116,9 +116,3 @@ def test_where_every_sample_fails_the_cost_is_infinite_and_the_mean_is_kept():
     found = search(lambda rows: rigid(rows, lambda tips: np.ones(tips.shape[:2], dtype=bool)))
     assert found.cost == np.inf
     np.testing.assert_array_equal(found.z, VARIABLES.mean)
-
-
-def test_each_iteration_is_shown():
-    calls = []
-    search(progress=calls.append)
-    assert [call["iteration"] for call in calls] == [1, 2, 3]

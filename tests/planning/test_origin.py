@@ -15,7 +15,6 @@ from synthetic import make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
 PLAN = replace(make_plan(), scenario=PHANTOM)
-REMEDY = "make a plan for this scenario, or use the scenario of the plan (plan.scenario)"
 OF_THE_PLAN = {
     "needle.youngs_modulus_gpa": 60.0,
     "needle.bevel.offset_mm": 3.0,
@@ -39,14 +38,14 @@ def test_a_plan_of_another_scenario_is_refused_with_the_key_and_both_values(key)
     value = OF_THE_PLAN[key]
     with pytest.raises(InputError) as caught:
         check_origin(PLAN, PHANTOM.with_values({key: value}))
-    shown = key.replace("tissue.1", "tissue[1]")
-    line = f"{shown} = {value}: the plan was made with {PHANTOM.flat()[key]}: {REMEDY}"
-    assert str(caught.value) == line
+    line = str(caught.value)
+    assert line.startswith(f"{key.replace('tissue.1', 'tissue[1]')} = {value}: ")
+    assert str(PHANTOM.flat()[key]) in line
 
 
 def test_the_first_key_that_differs_is_named_and_a_missing_one_is_none():
     other = PHANTOM.with_values({"setup.guide_to_skin_mm": None, "tissue.1.alpha": 9.0})
-    with pytest.raises(InputError, match=r"^setup\.guide_to_skin_mm = none: the plan was made with 41\.0: "):
+    with pytest.raises(InputError, match=r"^setup\.guide_to_skin_mm = none: .*41\.0"):
         check_origin(PLAN, other)
 
 
@@ -66,7 +65,7 @@ def test_a_target_that_the_planner_was_given_need_not_be_the_scenarios():
     given = replace(PLAN, target=(30.0, -2.0, 0.0))
     check_origin(given, PHANTOM)
     check_origin(given, PHANTOM.with_values({"target.depth_mm": 30.0, "target.lateral_mm": -2.0}))
-    with pytest.raises(InputError, match=r"^target\.depth_mm = 20\.0: the plan was made with 40\.0: "):
+    with pytest.raises(InputError, match=r"^target\.depth_mm = 20\.0: .*40\.0"):
         check_origin(given, PHANTOM.with_values({"target.depth_mm": 20.0}))
 
 
@@ -86,8 +85,6 @@ def test_insert_and_run_refuse_before_anything_moves(quick_plan):
         lambda: flexneedle.insert(other, quick_plan),
         lambda: flexneedle.insert(other, quick_plan, rig=rig),
     ):
-        with pytest.raises(
-            InputError, match=r"^tissue\[0\]\.shear_modulus_kpa = 3\.0: the plan was made with 1\.82"
-        ):
+        with pytest.raises(InputError, match=r"^tissue\[0\]\.shear_modulus_kpa = 3\.0: .*1\.82"):
             carry_out()
     assert rig.clock.now() == 0.0

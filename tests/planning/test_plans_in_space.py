@@ -7,17 +7,21 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError
-from flexneedle.planning.insertion import PlanProblem, entry_bounds, mount_needle
+from flexneedle.planning.entry import entry_bounds, mount_needle
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import bevel_reach
+from flexneedle.planning.problem import PlanProblem
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, across
 
 PHANTOM = flexneedle.load_scenario("phantom").with_values(
-    {"setup.axes": 2, "target.depth_mm": 25.0, "plan.samples": 48, "plan.max_iterations": 25}
-)
+    {
+        "setup.axes": 2, "target.depth_mm": 25.0, "plan.samples": 48, "plan.max_iterations": 25,
+        "needle.nodes": 31, "setup.tip_to_skin_mm": 6.0,
+    }
+)  # fmt: skip
 
 
 def planned(direction=0.0, off=3.0, strategy="manipulation", **changes):
@@ -108,17 +112,18 @@ def test_with_the_bevel_alone_a_free_entry_leaves_it_room_to_correct():
 
 
 def test_an_insertion_begins_where_the_plan_enters():
-    """With the scenario of a free entry, and with that of the plan; another entry is refused."""
+    """With the scenario of a free entry, and with the plan's scenario; another entry is refused."""
     free = PHANTOM.with_values({"entry.free_radius_mm": 4.0, "target.lateral_z_mm": 4.0})
     plan = flexneedle.plan(free, threads=1)
     assert with_planned_entry(free, plan) == plan.scenario
-    one, other = (flexneedle.insert(each, plan, 3, threads=1) for each in (free, plan.scenario))
+    options = {"controller": "resolved-rate", "rig": flexneedle.VirtualRig("model"), "threads": 1}
+    one, other = (flexneedle.insert(each, plan, 3, **options) for each in (free, plan.scenario))
     assert one.true_error_mm == other.true_error_mm
     assert one.scenario.entry == plan.scenario.entry
     entry = plan.scenario.entry
     begun = one.periods[0]
     assert begun.base.y == pytest.approx(entry.lateral(begun.base.x).real, abs=2.0)
-    assert one.true_error_mm < 0.5
+    assert one.true_error_mm < 2.0
     with pytest.raises(InputError, match="entry"):
         flexneedle.insert(PHANTOM.with_values({"target.lateral_z_mm": 4.0, "entry.lateral_mm": 9.0}), plan)
 

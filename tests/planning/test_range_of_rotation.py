@@ -8,8 +8,9 @@ import pytest
 
 import flexneedle
 from flexneedle.planning import planner, steering
-from flexneedle.planning.insertion import PlanProblem, make_controls
 from flexneedle.planning.planner import bevel_reach
+from flexneedle.planning.primitives import make_controls
+from flexneedle.planning.problem import PlanProblem, make_problem
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.simulator import Simulator
@@ -17,8 +18,11 @@ from flexneedle.types import ROLL
 
 DEPTH = 25.0
 SPACE = flexneedle.load_scenario("phantom3d").with_values(
-    {"target.depth_mm": DEPTH, "plan.samples": 32, "plan.max_iterations": 20}
-)
+    {
+        "target.depth_mm": DEPTH, "plan.samples": 32, "plan.iterations": 12, "plan.max_iterations": 12,
+        "needle.nodes": 31, "setup.tip_to_skin_mm": 6.0,
+    }
+)  # fmt: skip
 REACH = bevel_reach(SPACE, DEPTH, threads=1)[1]
 STEER, MOVE = "steering", "manipulation"
 
@@ -48,9 +52,14 @@ def inside(most, direction, share):
     return REACH * (middle + share * edge * way)
 
 
-@pytest.mark.parametrize("most", [45.0, 90.0, 120.0, 135.0, 180.0, 270.0])
-@pytest.mark.parametrize("direction", [0.0, 135.0, 180.0, 270.0])
-def test_every_place_that_the_range_allows_is_steered_to_within_it(most, direction):
+@pytest.mark.parametrize(
+    ("most", "direction"),
+    [
+        (45.0, 0.0), (45.0, 135.0), (90.0, 180.0), (90.0, 270.0), (120.0, 0.0), (120.0, 270.0),
+        (135.0, 135.0), (135.0, 180.0), (180.0, 0.0), (180.0, 135.0), (270.0, 180.0), (270.0, 270.0),
+    ],
+)  # fmt: skip
+def test_every_target_in_reach_of_the_range_is_reached_within_it(most, direction):
     plan = planned(inside(most, direction, 0.9), setup__max_rotation_deg=most)
     assert_legal(plan)
     assert plan.error_mm < 0.05
@@ -80,12 +89,12 @@ def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
         planned(off, setup__max_rotation_deg=60.0).limit
         for off in (0.3 * REACH + 0j, 0.8j * REACH, 2.0 * REACH + 0j)
     )
-    assert near.startswith("setup.max_rotation_deg = 60 (on the line from the needle's axis to the target at")
-    assert near.endswith(f"the bevel alone reaches {0.5 * REACH:.2f} to {REACH:.2f} mm)")
+    assert near.startswith("setup.max_rotation_deg = 60")
+    assert f"{0.5 * REACH:.2f} to {REACH:.2f} mm" in near
     assert side.startswith("setup.max_rotation_deg = 60")
-    assert side.endswith("the bevel alone reaches nothing)")
-    offset = f"needle.bevel.offset_mm = {SPACE.needle.bevel.offset_mm:g}"
-    assert far == f"{offset} (the bevel alone reaches at most {REACH:.2f} mm lateral)"
+    assert "nothing" in side
+    assert far.startswith(f"needle.bevel.offset_mm = {SPACE.needle.bevel.offset_mm:g}")
+    assert f"at most {REACH:.2f} mm" in far
 
 
 @pytest.mark.parametrize(
@@ -102,7 +111,7 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
         {"setup.max_rotation_deg": most, "entry.lateral_mm": 3.0, "entry.slope_z_mrad": 50.0}
     )
     goal = scenario.entry.lateral(DEPTH) + cmath.rect(1.0, math.radians(angle))
-    problem = planner._make_problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
+    problem = make_problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
     rollout = planner._make_rollout(Simulator(scenario, threads=1))
     expected = [REACH * least, REACH * greatest]
     np.testing.assert_allclose(steering.reach(rollout, problem), expected, rtol=0.02, atol=1e-6)
@@ -136,7 +145,7 @@ def test_rolls_take_the_shortest_way_that_the_range_has(most, wanted, expected):
     np.testing.assert_allclose(angles, expected)
 
 
-# ---- what the axis and the limits are
+# ---- axis and limits
 
 
 @pytest.mark.parametrize("axes", [1, 2])
@@ -148,13 +157,13 @@ def test_reach_is_about_the_axis_of_the_entry(axes):
 
 
 @pytest.mark.parametrize("off", [-3.0 + 0.0j, 2.0 - 4.0j])
-def test_beyond_the_bevel_the_distance_from_the_axis_is_told(off):
+def test_beyond_the_bevel_the_distance_from_the_axis_is_reported(off):
     """The axis is at y = 5.5, z = 1."""
     entry = {"entry__lateral_mm": 3.0, "entry__slope_mrad": 100.0, "entry__lateral_z_mm": 1.0}
     plan = planned(5.5 + 1.0j + off, **entry)
-    opening, told = plan.limit.split(" (")
+    opening, rest = plan.limit.split(" (")
     assert opening.startswith("needle.bevel.offset_mm")
-    numbers = [float(word) for word in told.split() if word.lstrip("-").replace(".", "").isdigit()]
+    numbers = [float(word) for word in rest.split() if word.lstrip("-").replace(".", "").isdigit()]
     assert numbers == pytest.approx([-REACH, REACH, abs(off)], abs=0.03)
     assert plan.error_mm == pytest.approx(abs(off) - REACH, abs=0.05)
 
@@ -181,9 +190,8 @@ def test_a_range_that_keeps_the_bevel_from_z_is_named():
     scenario = SPACE.with_values({"setup.guide_axes": 1, "setup.max_rotation_deg": 10.0})
     plan = flexneedle.plan(scenario, (40.0, 1.0, 1.6), MOVE, threads=1)
     assert plan.error_mm > 1.0
-    assert plan.limit.startswith(
-        "setup.max_rotation_deg = 10 (along z only the bevel steers, by up to 0.31 mm)"
-    )
+    assert plan.limit.startswith("setup.max_rotation_deg = 10")
+    assert "0.31 mm" in plan.limit
 
 
 @pytest.mark.parametrize(

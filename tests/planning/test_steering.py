@@ -1,4 +1,4 @@
-"""Rolls of the bevel to controls, and the search of their depths on a needle that is made up."""
+"""Rolls of the bevel as controls, and the search of their depths on a kinematic needle."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from flexneedle.costs.table import Trajectories
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import PlanProblem
+from flexneedle.planning.problem import PlanProblem
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.types import DB_X, DB_Y, ROLL, THETA, X, Y
 
@@ -54,14 +54,14 @@ def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
 
 
 def end(z, side, p=None):
-    """Where the tip ends for rolls at shares z of the depth."""
+    """Return the y of the tip's end for rolls at shares z of the depth."""
     return float(
         kinematic(steering.controls_with_flips(p or problem(0.0), np.array([z]), side)).tips[0, -1, Y]
     )
 
 
 @pytest.mark.parametrize(("z", "side"), [((), 1.0), ((0.3,), -1.0), ((0.25, 0.9), 1.0)])
-def test_rolls_are_where_they_are_asked_for(z, side):
+def test_rolls_are_made_at_their_depths(z, side):
     """Against the double integral of ±κ by hand: a roll at depth r changes the end by −κ (20 − r)²."""
     expected = side * BEND * (200.0 + sum((-1) ** (k + 1) * (20.0 - 20.0 * r) ** 2 for k, r in enumerate(z)))
     assert end(z, side) == pytest.approx(expected, rel=1e-12)
@@ -84,7 +84,7 @@ def test_the_order_of_the_rolls_does_not_matter():
 
 
 @pytest.mark.parametrize("at", [3.0 / 20.0, 0.5, 1.0])
-def test_where_a_roll_crosses_a_step_the_end_is_continuous(at):
+def test_the_end_is_continuous_where_a_roll_crosses_a_step(at):
     """The steps are 2.8 mm long; 6.2 mm deep is the end of one of them, 10 mm is within one."""
     assert end((at - 1e-9,), 1.0) == pytest.approx(end((at,), 1.0), abs=1e-7)
 
@@ -98,7 +98,7 @@ def test_a_roll_leaves_the_other_steps_where_they_are():
 
 
 @given(share=st.floats(-0.95, 0.95), seed=st.integers(0, 2**32))
-@hypothesis_settings(max_examples=20)
+@hypothesis_settings(max_examples=10)
 def test_every_target_within_reach_is_reached(share, seed):
     found = steering.search_rolls(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
     tip = kinematic(found.controls[None], math.cos(found.roll)).tips[0, -1]
@@ -145,10 +145,3 @@ def test_progress_counts_through_all_searches_and_the_best_never_rises():
     assert (np.diff([call["best"] for call in calls]) <= 0.0).all()
     assert all(call["iteration"] <= call["iterations"] for call in calls)
     assert calls[0]["iterations"] == 5 * SEARCH.iterations  # of the five searches that a plan usually takes
-
-
-def test_same_seed_same_bytes():
-    one, again = (
-        steering.search_rolls(kinematic, problem(0.5), SEARCH, np.random.default_rng(3)) for _ in range(2)
-    )
-    assert one.controls.tobytes() == again.controls.tobytes()

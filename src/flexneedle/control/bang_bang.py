@@ -14,7 +14,7 @@ import numpy as np
 from flexneedle.control.rotation import limit_roll
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.planning.insertion import LEAST_ROLL
+from flexneedle.planning.primitives import LEAST_ROLL
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Section
 from flexneedle.types import Floats, Point, X
 

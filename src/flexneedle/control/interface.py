@@ -82,9 +82,8 @@ def _plain_command(command: Any) -> Control:
 
 def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
     """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
-    stroke_left = scenario.setup.stroke_mm - float(
-        state.travel[0]
-    )  # commanded travel, without the start error
+    # The commanded travel is without the start error.
+    stroke_left = scenario.setup.stroke_mm - float(state.travel[0])
     return max(0.0, min(plan.target[0] - float(state.tip[X]), stroke_left))
 
 

@@ -15,7 +15,7 @@ from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import steps_to_planned_base
 from flexneedle.control.rotation import limit_roll, shorten_roll
 from flexneedle.estimation.task import Task
-from flexneedle.planning.insertion import LEAST_ROLL
+from flexneedle.planning.primitives import LEAST_ROLL
 from flexneedle.results import Plan
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.simulator.control import controls
@@ -26,10 +26,8 @@ KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
 LEAST_SLOTS = 4
 """Least number of rolls in a search, which has as many as the current path."""
-_FINE, _COARSE = (
-    2,
-    2.0,
-)  # first steps of the rollout, of one control step; length of its later steps, in control steps
+_FINE = 2  # first steps of the rollout, each of one control step
+_COARSE = 2.0  # length of its later steps, in control steps
 _DUE = 0.05  # of a control step: a roll this near is made at once
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
 _SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step, added to it: largest next to the target
@@ -119,12 +117,12 @@ class Ahead:
 
     @property
     def slots(self) -> int:
-        """Rolls that a sample describes."""
+        """Number of rolls in a sample."""
         return max(LEAST_SLOTS, len(self.path.rolls))
 
     @property
     def knots(self) -> int:
-        """Corrections of the guide in a sample."""
+        """Number of corrections of the guide in a sample."""
         return int(self.axes * KNOTS.size)
 
     @property

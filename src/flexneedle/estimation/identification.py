@@ -10,40 +10,28 @@ takes a millisecond, and compared with the lateral readings. Parameters, with no
 
 So tissue ahead of the tip is estimated as far as it is correlated with the tissue behind it. The start along the axis
 is a shift of all axial readings, fitted separately. The residuals of the fit are low-passed and added as a constant.
-
-The derivative of the lateral position with respect to a parameter is kept as a curve over the depth of the tip, a few
-steps ahead of it too. A few of the curves are simulated again each period, so that none is older than `_ROUND` periods.
 """
 
 import cmath
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.adapted import adapt_model, settle_start
+from flexneedle.estimation.derivatives import ROUND, differentiate
 from flexneedle.estimation.estimate import describe_estimate
+from flexneedle.estimation.fit import improve_fit
+from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along
-from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
-from flexneedle.estimation.readings import MoveMeans, fit_constant
-from flexneedle.estimation.sensor import Sensor
+from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, check_cells
+from flexneedle.estimation.readings import fit_constant
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.control import controls
-from flexneedle.simulator.simulator import Simulator
-from flexneedle.simulator.state import State
-from flexneedle.types import STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z, laterals
+from flexneedle.types import STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z
 
-_MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
 _RECENT = 12  # moves whose residuals are low-passed
-_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that does not raise the cost
-_UNEVEN = (
-    0.2  # of an offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops
-)
-_ROUND = 8  # periods in which each curve of derivatives is simulated once;
-_LEADING_ROUND = 2  # periods in which those of base, bend, bevel and clearance are
 
 
 @dataclass(frozen=True)
@@ -57,7 +45,7 @@ class Identification:
         state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
         step = scenario.setup.max_advance_mm
         grid = np.arange(
-            scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step
+            scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (ROUND + 6) * step, step
         )
         start = Identified(
             simulator,
@@ -76,61 +64,21 @@ class Identification:
             prior.precision,
             axial_variance=scenario.control.start_axial_sd_mm**2,
         )
-        return start._differentiate(range(prior.mean.size))
+        return differentiate(start, range(prior.mean.size))
 
 
 @dataclass(frozen=True, eq=False)
-class Perturbed:
-    """The present needle with one parameter larger by `step`: its model and state."""
-
-    parameter: int
-    step: float
-    simulator: Simulator
-    state: State
-
-
-@dataclass(frozen=True, eq=False)
-class Identified:
+class Identified(FittedInsertion):
     """An `Estimate` with fitted parameters.
 
     Attributes:
-        nominal: The scenario's model, to which the prior refers.
-        settings: Settings of the observer.
-        prior: Prior of the parameters.
-        simulator: The model with the parameters.
-        parameters: Posterior means (K,).
-        state: Present state of the model.
-        tips: Tip poses (m + 1, 5) at the ends of the m moves, the start first.
-        stops: State before some of the moves.
-        grid: Depths of the tip (g,), mm.
-        curves: Derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first.
-        precision: Inverse covariance (K, K) of the parameters.
-        axial: Start error along the axis (mm).
-        axial_variance: Its variance (mm²).
-        period: Number of the period.
-        perturbed: The present needle with one parameter changed, for some parameters.
-        moves: All moves.
+        axial_variance: Variance (mm²) of the start error along the axis.
         residual: Low-passed residual (mm).
         innovation: The last reading minus its prediction (mm).
         measured: Tip measured at the end of the last move with a reading (mm), None before the first.
     """
 
-    nominal: Simulator
-    settings: Priors
-    prior: Prior
-    simulator: Simulator
-    parameters: Floats
-    state: State
-    tips: Floats
-    stops: tuple[tuple[int, State], ...]
-    grid: Floats
-    curves: Laterals
-    precision: Floats
-    axial: float = 0.0
     axial_variance: float = 0.0
-    period: int = 0
-    perturbed: tuple[Perturbed, ...] = ()
-    moves: tuple[Move, ...] = ()
     residual: complex = 0.0
     innovation: Point = (0.0, 0.0, 0.0)
     measured: Point | None = None
@@ -145,16 +93,6 @@ class Identified:
         tip[Y] += off.real
         tip[Z] += off.imag
         return tip
-
-    @property
-    def axes(self) -> int:
-        """Lateral axes."""
-        return self.nominal.scenario.setup.axes
-
-    @cached_property
-    def slots(self) -> Slots:
-        """Places of the parameters."""
-        return Slots.of(self.nominal.scenario)
 
     @property
     def run_out(self) -> complex:
@@ -192,12 +130,12 @@ class Identified:
         if not measurements or not self.moves:
             return self.without_reading()
         extended = replace(self, moves=assign_readings(self.moves, measurements))
-        readings = extended._readings[0]
+        readings = extended.readings[0]
         without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
         axial, axial_variance = fit_constant(without, extended.axial_variances(), prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
-        fitted = improve_fit(extended)._differentiate()
+        fitted = differentiate(improve_fit(extended))
         left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
@@ -211,73 +149,11 @@ class Identified:
             measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
         )
 
-    @cached_property
-    def rows(self) -> Floats:
-        """The commands of the moves (m, 9)."""
-        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, len(STILL))
-
-    @cached_property
-    def sensors(self) -> tuple[Sensor, ...]:
-        """The sensors in use, the tip's position first."""
-        return sensors_of(self.nominal.scenario)
-
-    @cached_property
-    def _readings(self) -> tuple[MoveMeans, ...]:
-        return tuple(MoveMeans.of(self.moves, one.name, self.state.bevel, self.axes) for one in self.sensors)
-
-    def variances(self) -> list[Floats]:
-        """Return variances (r,) of the means of each sensor's readings: jitter, model error, angle error in a roll."""
-        scenario, sd = self.nominal.scenario, 1.0 / np.sqrt(np.diag(self.prior.precision))
-        return [
-            readings.variance(sensor.sd(scenario) or 0.0, sensor.unexplained(scenario, self.settings))
-            + np.where(readings.turns, (_UNEVEN * sd[getattr(self.slots, sensor.offset).start]) ** 2, 0.0)
-            for sensor, readings in zip(self.sensors, self._readings, strict=True)
-        ]
-
     def axial_variances(self) -> Floats:
         """Return variances (r,) of the means of the tip's x: jitter and model error."""
         scenario, position = self.nominal.scenario, self.sensors[0]
         unexplained = position.unexplained(scenario, self.settings)
-        return self._readings[0].axial_variance(position.sd(scenario) or 0.0, unexplained)
-
-    @property
-    def laterals(self) -> list[Laterals]:
-        """Lateral quantity (m + 1,) of the tips for each sensor; the first is their position (mm)."""
-        return [laterals(self.tips, sensor.column, self.axes) for sensor in self.sensors]
-
-    @property
-    def left(self) -> list[Laterals]:
-        """Lateral residuals (r,) of each sensor: readings minus the model's quantities."""
-        return [
-            readings.left(tips, from_components(self.parameters[getattr(self.slots, sensor.offset)]))
-            for sensor, readings, tips in zip(self.sensors, self._readings, self.laterals, strict=True)
-        ]
-
-    def _simulate_with(self, parameters: Floats) -> "Identified":
-        """Return the estimate with these parameters: the insertion is simulated again, in segments."""
-        simulator = adapt_model(self.nominal, self.settings, parameters)
-        state = self._settle_start(simulator, parameters)
-        inside = int(np.argmax(np.append(self.tips[1:, X], np.inf) > 0.0))
-        ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
-        stops, parts, first = [], [state.tip[None]], 0
-        for last in ends:
-            stops.append((first, state))
-            if last > first:
-                state, tips = simulator.replay(state, self.rows[first:last])
-                parts.append(tips)
-            first = last
-        return replace(
-            self,
-            simulator=simulator,
-            parameters=parameters,
-            state=state,
-            tips=np.concatenate(parts),
-            stops=tuple(stops),
-        )
-
-    def _settle_start(self, simulator: Simulator, parameters: Floats) -> State:
-        """Return the state of the start with these parameters."""
-        return settle_start(self.nominal, simulator, parameters, self.stops[0][1].roll, self.axial)
+        return self.readings[0].axial_variance(position.sd(scenario) or 0.0, unexplained)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -288,13 +164,13 @@ class Identified:
     @property
     def tip_sd(self) -> float:
         """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
-        slope = self._slopes(self.state.tip[:1])[0]
+        slope = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
         return float(np.sqrt(variance_of(slope, self.covariance) + self.axial_variance))
 
     def shape_sd(self, nodes: Floats) -> Floats:
         """Return standard deviations (n, 2), mm, of y and z at nodes (n, 5), as of a tip that passes there."""
-        slopes = self._slopes(nodes[:, 0])
+        slopes = self.slopes(nodes[:, 0])
         parts = np.stack([slopes.real, slopes.imag])
         sd: Floats = np.sqrt(np.einsum("ank,kl,anl->na", parts, self.covariance, parts))
         return sd
@@ -316,41 +192,9 @@ class Identified:
         """Standard deviation (mm) of the tip's lateral motion if the bevel rolls now."""
         bend, run_out = self.slots.bend, self.slots.run_out
         slope = np.zeros(self.parameters.size, dtype=self.curves.dtype)
-        slope[bend] = 2.0 * self._slopes(self.state.tip[:1])[0, bend]
+        slope[bend] = 2.0 * self.slopes(self.state.tip[:1])[0, bend]
         slope[run_out] = 2.0 * directions(1.0, self.axes)
         return float(np.sqrt(variance_of(slope, self.covariance)))
-
-    def _slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
-        """Return derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
-        step = self.grid[1] - self.grid[0]
-        place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
-        left = place.astype(int)
-        part = place - left
-        curves = self.curves[sensor]
-        slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
-        return slopes
-
-    def _differentiate(self, which: Sequence[int] | None = None) -> "Identified":
-        """Simulate the curves that are due again, with a few steps ahead."""
-        ahead = controls(_ROUND, db_x=self.nominal.scenario.setup.max_advance_mm)
-        base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
-        depth = np.maximum.accumulate(base[:, X])
-        curves, members = self.curves.copy(), []
-        for k in self._due_parameters() if which is None else which:
-            if self.slots.is_offset(k):
-                continue
-            parameters = self.parameters.copy()
-            parameters[k] += self.prior.steps[k]
-            if depth[-1] < self.prior.begins[k]:
-                simulator = adapt_model(self.nominal, self.settings, parameters)
-                members.append(Perturbed(k, float(self.prior.steps[k]), simulator, self.state))
-                continue
-            member, tips = _perturb(self, parameters, k, ahead)
-            members.append(member)
-            for curve, sensor in zip(curves[:, k], self.sensors, strict=True):
-                moved = laterals(tips, sensor.column, self.axes) - laterals(base, sensor.column, self.axes)
-                curve[:] = np.interp(self.grid, depth, moved / self.prior.steps[k])
-        return replace(self, curves=curves, perturbed=tuple(members), period=self.period + 1)
 
     @property
     def reading_variance(self) -> float:
@@ -360,80 +204,6 @@ class Identified:
         count = max(1.0, step / scenario.tracker.period)
         unexplained = self.sensors[0].unexplained(scenario, self.settings)
         return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
-
-    def _due_parameters(self) -> Iterator[int]:
-        """Yield the parameters whose curves are simulated this period."""
-        leading = (*range(self.slots.run_out.start), self.slots.bevel, self.slots.clearance)
-        for place, k in enumerate(leading):
-            if place % _LEADING_ROUND == self.period % _LEADING_ROUND:
-                yield k
-        for k in range(self.slots.modulus, self.parameters.size):
-            if k % _ROUND == self.period % _ROUND:
-                yield k
-
-
-def improve_fit(estimate: Identified) -> Identified:
-    """Return the estimate after a Gauss–Newton step to the maximum a posteriori within the bounds.
-
-    The step is shortened until the cost does not rise.
-    """
-    prior = estimate.prior
-    jacobian = jacobian_of(estimate)
-    both = zip(estimate.variances(), estimate._readings, estimate.laterals, strict=True)
-    variance = np.concatenate([noise + readings.bent(tips) ** 2 for noise, readings, tips in both])
-    weighted = jacobian.conj().T / variance
-    off = estimate.parameters - prior.mean
-    gradient = (weighted @ np.concatenate(estimate.left)).real - prior.precision @ off
-    precision = (weighted @ jacobian).real + prior.precision
-    estimate = replace(estimate, precision=precision)
-    step = np.linalg.solve(precision, gradient)
-    if not np.isfinite(step).all():
-        return estimate._simulate_with(estimate.parameters)
-    goal = np.clip(estimate.parameters + step, *prior.bounds)
-
-    def cost(other: Identified) -> float:
-        squares = np.abs(np.concatenate(other.left)) ** 2
-        return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
-
-    most, fitted = cost(estimate), estimate
-    for share in _SHARES:
-        fitted = estimate._simulate_with(estimate.parameters + share * (goal - estimate.parameters))
-        if fitted.state.converged and cost(fitted) <= most:
-            break
-    return fitted
-
-
-def jacobian_of(estimate: Identified) -> Laterals:
-    """Return the derivative (r, K) of the predicted readings of all sensors, from the curves."""
-    parts = []
-    for k, (sensor, readings) in enumerate(zip(estimate.sensors, estimate._readings, strict=True)):
-        part = estimate._slopes(readings.between(estimate.tips[:, X]), k)
-        offset = np.multiply.outer(readings.bevel, directions(1.0, estimate.axes))
-        part[:, getattr(estimate.slots, sensor.offset)] = offset
-        parts.append(part)
-    return np.concatenate(parts)
-
-
-def _perturb(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
-    """Return the needle with another value of parameter k, and its tips (m + 1 + a, 5), including a steps `ahead`.
-
-    Moves before the parameter has an effect are not simulated again.
-    """
-    simulator, begins = (
-        adapt_model(estimate.nominal, estimate.settings, parameters),
-        float(estimate.prior.begins[k]),
-    )
-    reached = int(np.argmax(np.append(estimate.tips[:, X], np.inf) > begins))  # by the move before this one
-    first, state = max(
-        (stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0]
-    )
-    if first == 0:
-        state = estimate._settle_start(simulator, parameters)
-    before = np.concatenate([estimate.tips[:first], state.tip[None]])
-    now, tips = simulator.replay(state, estimate.rows[first:])
-    later = simulator.replay(now, ahead)[1]
-    member = Perturbed(k, float(estimate.prior.steps[k]), simulator, now)
-    return member, np.concatenate([before, tips, later])
 
 
 def low_pass(settings: Priors, left: Laterals) -> complex:

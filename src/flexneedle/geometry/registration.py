@@ -18,7 +18,7 @@ _LEAST = 3
 _SIZE_RATIO = 3.0  # largest ratio of the sizes of both sets of points
 _SMALLEST = 0.5  # mm: smaller sets of points are in metres, or useless
 _LOOSE = 0.1  # residual over size above which the fit is rejected
-_MIRRORED = 0.3  # residual of a mirrored fit over that of the best rotation, below which a frame is mirrored
+_MIRRORED = 0.3  # residual of a mirrored fit over the best rotation's, below which a frame is mirrored
 
 
 @dataclass(frozen=True, eq=False)

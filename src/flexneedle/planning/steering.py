@@ -17,16 +17,10 @@ import numpy as np
 from flexneedle.costs.table import RolloutFunction, Term, Trajectories
 from flexneedle.costs.terms import past_target
 from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.entry import entry_bounds, mount_needle, read_entry
 from flexneedle.planning.horizon import Found, OnIteration, Variables, count_iterations, find_best
-from flexneedle.planning.insertion import (
-    PlanProblem,
-    Solution,
-    drop_small_rolls,
-    entry_bounds,
-    make_solution,
-    mount_needle,
-    read_entry,
-)
+from flexneedle.planning.primitives import Solution, drop_small_rolls, make_solution
+from flexneedle.planning.problem import PlanProblem
 from flexneedle.simulator.control import controls
 from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
 

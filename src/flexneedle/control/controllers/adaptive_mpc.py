@@ -250,8 +250,8 @@ def expected_out_of_reach(
         low, high = past.real.min(axis=1), past.real.max(axis=1)
         sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
         return mean_above_zero(low, sd) + mean_above_zero(-high, sd), 0.0
-    # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
-    # the middle towards the target or away from it: the ends are that much farther, or nearer.
+    # By symmetry the ends are the same along any direction of the bevel. The first step displaces their middle towards
+    # the target or away from it, and the ends with it.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
     if _bevel_alone_across(task, ahead):
         away = 1j * away.imag

@@ -26,7 +26,6 @@ CONTROLLER = Controller(
     "bevel-only",
     "bang-bang steering by the bevel, without guide motion",
     StateCorrection(),
-    begin=lambda _task: None,
     decide=decide,
     settings=BevelOnly,
 )

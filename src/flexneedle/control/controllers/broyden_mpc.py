@@ -76,9 +76,8 @@ def decide(
     estimated = record_inputs(estimated, float(state.tip[X]), inputs)
     left = travel_left(scenario, task.plan, state)
     advance = min(setup.max_advance_mm, left)
-    row = Control(
-        advance, *steps_to_planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist()
-    )
+    base = steps_to_planned_base(setup, task.plan, state, state.tip[:1] + advance)[0]
+    row = Control(advance, *base.tolist())
     if estimate.measured is None or left <= 0.0:
         return Decision(row, "no reading yet"), estimated
     tip = np.array(estimate.measured[: 1 + setup.axes])
@@ -88,10 +87,8 @@ def decide(
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
     moves, cost = solve_guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
     slopes, effects = estimated.jacobian[1:, 0], np.diag(estimated.jacobian[1:, 1:])
-    moves_by = (
-        f"tip moves {_join_values(slopes)} laterally with insertion, {_join_values(effects)} with the guide"
-    )
-    why = f"bevel kept: never rolled; {moves_by}"
+    moved = f"{_join_values(slopes)} laterally with insertion, {_join_values(effects)} with the guide"
+    why = f"bevel kept: never rolled; tip moves {moved}"
     return Decision(Control(*row[:DG_Y], *moves[0].tolist()), why, cost), estimated
 
 

@@ -25,7 +25,6 @@ CONTROLLER = Controller(
     "ce-mpc",
     "the paper's: the measured tip is released in the prediction",
     StateCorrection(fits_start=False, estimates_load=False),
-    begin=lambda _task: None,
     decide=decide,
     settings=mpc.CeMpc,
 )

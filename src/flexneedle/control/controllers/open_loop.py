@@ -18,9 +18,8 @@ def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator)
     limits, controls = Limits.of(task.scenario), task.plan.controls
     goal = np.clip(controls[: done + 1, :MOVES].sum(axis=0), *limits.travel.T)
     moves = np.clip(goal - estimate.state.travel, -limits.step, limits.step)
-    return Decision(
-        Control(*moves.tolist(), *controls[done, MOVES:].tolist()), f"planned step {done + 1}"
-    ), done + 1
+    command = Control(*moves.tolist(), *controls[done, MOVES:].tolist())
+    return Decision(command, f"planned step {done + 1}"), done + 1
 
 
 def has_arrived(task: Task, done: int, _estimate: Estimate) -> bool:

@@ -129,7 +129,6 @@ CONTROLLER = Controller(
     "resolved-rate",
     "guide by the damped inverse of the model's Jacobian, bevel by the rule",
     StateCorrection(),
-    begin=lambda _task: None,
     decide=decide,
     settings=ResolvedRate,
     needs_guide=True,
