@@ -1,8 +1,9 @@
-"""Child processes, and messages to and from them: complete, in order, and without waiting."""
+"""Child processes, and the messages exchanged with them."""
 
 import os
 import signal
 import socket
+from contextlib import contextmanager
 from textwrap import dedent
 
 import pytest
@@ -12,27 +13,37 @@ from hypothesis import strategies as st
 from flexneedle.lab.process import ChildProcess, MessageChannel
 
 
-def pair():
+@pytest.fixture
+def ends():
+    """Both ends of a channel."""
+    with closing_pair() as found:
+        yield found
+
+
+@contextmanager
+def closing_pair(**settings):
+    """Give both ends of a channel; the settings are of the first."""
     ours, theirs = socket.socketpair()
-    return MessageChannel(ours), MessageChannel(theirs)
-
-
-@given(st.lists(st.binary(max_size=3000), max_size=50))
-def test_records_arrive_as_they_were_sent(records):
-    one, other = pair()
-    for record in records:
-        one.send(record)
-    received = other.receive()
-    while one.waiting:
-        one.flush()
-        received += other.receive()
-    assert received == records
+    one, other = MessageChannel(ours, **settings), MessageChannel(theirs)
+    yield one, other
     one.close()
     other.close()
 
 
-def test_without_a_reader_the_oldest_records_are_dropped_but_those_to_keep():
-    one, other = pair()
+@given(st.lists(st.binary(max_size=3000), max_size=50))
+def test_messages_arrive_complete_and_in_order(messages):
+    with closing_pair() as (one, other):
+        for message in messages:
+            one.send(message)
+        received = other.receive()
+        while one.waiting:
+            one.flush()
+            received += other.receive()
+    assert received == messages
+
+
+def test_without_a_reader_the_oldest_messages_are_dropped_but_those_to_keep(ends):
+    one, other = ends
     one.send("plan")
     big = bytes(100_000)
     for number in range(1000):
@@ -42,42 +53,35 @@ def test_without_a_reader_the_oldest_records_are_dropped_but_those_to_keep():
         one.send((number, big), keep=False)
     received = []
     while True:
-        received += [record if isinstance(record, str) else record[0] for record in other.receive()]
+        received += [message if isinstance(message, str) else message[0] for message in other.receive()]
         if not one.waiting and 1499 in received:
             break
         one.flush()
     assert one.dropped > 0
-    assert [record for record in received if isinstance(record, str)] == ["plan", "stop"]
-    numbers = [record for record in received if not isinstance(record, str)]
+    assert [message for message in received if isinstance(message, str)] == ["plan", "stop"]
+    numbers = [message for message in received if not isinstance(message, str)]
     assert numbers == sorted(numbers)
     assert len(numbers) + one.dropped == 1500
-    one.close()
-    other.close()
 
 
-def test_the_end_of_the_other_end_is_noticed():
-    one, other = pair()
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_last_messages_of_a_closed_end_are_received_before_its_end(ends, fails):
+    """Also after a message that could not be sent."""
+    one, other = ends
     other.send("last")
     other.close()
+    if fails:
+        assert not one.send("lost")
+        assert not one.ended
     assert one.receive() == ["last"]
+    assert one.ended or not one.receive()
     assert one.ended
-    assert not one.send("into nothing")
+    assert not one.send("lost")
     assert one.waiting == 0
-    one.close()
 
 
-def test_the_last_messages_of_a_closed_end_are_received_after_a_failed_send():
-    one, other = pair()
-    other.send("last")
-    other.close()
-    assert not one.send("into nothing")
-    assert not one.ended
-    assert one.receive() == ["last"]
-    one.close()
-
-
-def test_the_first_message_is_taken_alone():
-    one, other = pair()
+def test_the_first_message_is_received_alone(ends):
+    one, other = ends
     for message in ("job", "order", "order"):
         one.send(message)
     assert other.receive_first() == "job"
@@ -85,29 +89,23 @@ def test_the_first_message_is_taken_alone():
     one.close()
     with pytest.raises(EOFError):
         other.receive_first()
-    other.close()
 
 
-def test_after_its_end_of_sending_an_end_still_receives():
-    one, other = pair()
+def test_an_end_that_has_ended_sending_still_receives(ends):
+    one, other = ends
     one.end_sending()
     assert other.receive(None) == []
     assert other.ended
     other.send("a last word")
     assert one.receive(None) == ["a last word"]
-    one.close()
-    other.close()
 
 
-def test_a_message_that_is_too_long_or_cannot_be_decoded_is_refused():
-    for message, reason in (("x" * 101, "101 bytes"), ("x", "invalid literal")):
-        ours, theirs = socket.socketpair()
-        one, other = MessageChannel(ours, longest=100, decode=int), MessageChannel(theirs, encode=str.encode)
+@pytest.mark.parametrize(("message", "reason"), [(b"x" * 101, "at most 100"), (b"x", "invalid literal")])
+def test_a_message_that_is_too_long_or_cannot_be_decoded_is_refused(message, reason):
+    with closing_pair(longest=100, decode=int) as (one, other):
         other.send(message)
         with pytest.raises(ValueError, match=reason):
             one.receive(None)
-        one.close()
-        other.close()
 
 
 # Processes
@@ -134,7 +132,7 @@ CHILD = """
 
 @pytest.fixture
 def start(tmp_path, monkeypatch):
-    """A function that starts a child that returns messages, or does what they name."""
+    """Return a function that starts a child that returns messages, or carries them out."""
     (tmp_path / "echoing.py").write_text(dedent(CHILD))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     children = []

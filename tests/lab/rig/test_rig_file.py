@@ -1,23 +1,13 @@
 """A rig file is checked once, where it is read: one line for each problem, and no other error."""
 
-import copy
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import tomli_w
-from hypothesis import example, given
-from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from bench_rig import rig, values
 from flexneedle.errors import RigError
-from flexneedle.lab.rig.rig_file import RigFile, load_rig
-from flexneedle.scenario.problems import describe
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "campaigns"))
-import fuzz_rig_file
+from flexneedle.lab.rig.rig_file import load_rig
 
 
 @pytest.fixture
@@ -111,6 +101,7 @@ def test_a_limit_switch_of_the_controller_is_at_an_end_of_the_axis(home, directi
 
 
 RULES = [
+    ("axes.insertion.channel", [[{"": "A"}]], "must be text"),
     ("axes.insertion.channel", "", "must be one line of printable text"),
     ("axes.insertion.channel", "x" * 41, "must have at most 40 characters"),
     ("axes.insertion.direction", 2, "must be one of -1, 1"),
@@ -169,68 +160,3 @@ def test_a_broken_rule_is_reported_in_one_line(file, key, value, rule):
 
 def test_several_problems_have_a_line_each(file):
     assert len(problems(file({"axes.insertion.range_mm": [0, math.inf], "loop.rate_hz": 0, "x": 1}))) == 3
-
-
-ODD = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-(2**70), 2**70),
-    st.floats(),
-    st.text(max_size=8),
-    st.sampled_from(
-        ["A", "here", "absolute", "module:NAME", [0, 1], [], {}, [{}], 1e308, 10**400, "\n", 5e-324]
-    ),
-    st.dates(),
-)
-VALUES = st.recursive(
-    ODD,
-    lambda some: st.lists(some, max_size=3) | st.dictionaries(st.text(max_size=4), some, max_size=3),
-    max_leaves=4,
-)
-
-
-def paths(table, way=()):
-    """The paths of all keys and of items in lists."""
-    for key, value in table.items() if isinstance(table, dict) else enumerate(table):
-        yield (*way, key)
-        if isinstance(value, dict | list):
-            yield from paths(value, (*way, key))
-
-
-FULL = {
-    **values(),
-    "registration": {"fiducials_mm": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]},
-    "loop": {"rate_hz": 40.0, "queue_ms": 75.0, "decision_ms": 200.0, "decision_limit_s": 2.0},
-    "ros": {"profile": "neutral", "arm": True, "target": False},
-}
-PATHS = sorted(paths(FULL), key=str)
-
-
-@given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3), st.booleans())
-@example([(("axes", "insertion", "channel"), [[{"": "A"}]])], False)
-def test_any_change_gives_a_rig_or_lines(changes, removes):
-    changed = copy.deepcopy(FULL)
-    for (*way, last), value in changes:
-        table = changed
-        for part in way:
-            inside = isinstance(table, dict) and part in table
-            inside |= isinstance(table, list) and isinstance(part, int) and part < len(table)
-            table = table[part] if inside else {}
-        if removes and isinstance(table, dict):
-            table.pop(last, None)
-        elif isinstance(table, dict) or (
-            isinstance(table, list) and isinstance(last, int) and last < len(table)
-        ):
-            table[last] = value
-    assert_rig_or_lines(changed)
-
-
-def assert_rig_or_lines(changed):
-    try:
-        found = RigFile.model_validate(changed)
-    except ValidationError as error:
-        lines = describe(error, RigFile)
-        assert lines
-        assert all(line.isprintable() and len(line) < 1000 for line in lines)
-        return
-    assert fuzz_rig_file.unusable(found) == ""

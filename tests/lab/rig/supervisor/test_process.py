@@ -233,7 +233,7 @@ def test_motors_are_moved_by_one_program_at_a_time_and_by_none_in_a_dry_run(shar
     assert (printed.out, printed.err) == ("", "the stage is opened\n" * 2)
 
 
-@pytest.mark.parametrize("how", ["close", "end of the client"])
+@pytest.mark.parametrize("how", ["close", "end of the client", "error in the supervisor"])
 def test_motors_are_stopped_at_the_end_whatever_it_is(make_task, how):
     wakeup = signal.set_wakeup_fd(-1)
     with SupervisorClient(make_task(how)) as made:
@@ -244,6 +244,9 @@ def test_motors_are_stopped_at_the_end_whatever_it_is(make_task, how):
         if how == "end of the client":
             made._process.channel.end_sending()
             until(lambda: made.ended == "the controller has ended")
+        elif how == "error in the supervisor":
+            with pytest.raises(DriverError, match="the supervisor has ended: the supervisor failed: "):
+                made.step(0.0, None, 0.2)
     assert notes_of(made)[-1][0] == "stop"
     made.request_stop("too late")
     assert signal.set_wakeup_fd(wakeup) == -1

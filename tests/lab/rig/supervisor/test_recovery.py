@@ -172,5 +172,3 @@ def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, caps
     begun = read()["C"].position
     assert command("jog", "guide_y", "-1.5mm") == (0, "done")
     assert read()["C"].position == pytest.approx(begun + 750.0, abs=5.0)  # counts, 500 a mm backwards
-    assert command("retract", "--to", "1") == (0, "done")
-    assert read()["A"].position == pytest.approx(1000.0, abs=10.0)

@@ -274,7 +274,8 @@ class Supervisor:
         """Enter the fault state after a failed call of the motors, and stop them as soon as they can be reached."""
         self._enter_fault(why)
         if self._stopping is None:
-            self._stopping = StopUnderWay.at(self._clock.now())
+            now = self._clock.now()
+            self._stopping = StopUnderWay(now, now)
 
     def _halt_motors(self, why: str) -> None:
         """Stop the motors now, and end the motion under way once they rest."""
@@ -282,8 +283,9 @@ class Supervisor:
             self._motion.why = self._motion.why or why
         now = self._clock.now()
         self._tip.stop(now)
-        # A stop that is repeated does not begin anew: motors that do not stop would never be found.
-        self._stop_motors(StopUnderWay.at(now) if self._stopping is None else self._stopping.due_at(now), now)
+        # A repeated stop keeps its first time: otherwise motors that do not stop would never be found.
+        self._stopping = StopUnderWay(now if self._stopping is None else self._stopping.since, now)
+        self._stop_motors(self._stopping, now)
 
     def _stop_motors(self, stopping: StopUnderWay, now: float) -> None:
         """Stop motors, repeatedly while they move or cannot be reached; once they rest, end the motion under way."""
@@ -293,7 +295,7 @@ class Supervisor:
                 self._finish_motion(now)
                 self._axes.settle()
             return
-        self._stopping = stopping.repeated_at(now)
+        stopping.repeat(now)
         if stopping.has_failed(now, self._axes.slowing):
             self._enter_fault("the motors do not stop")
             self._finish_motion(now)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from flexneedle.lab.rig.rig_file import LoopSettings
 from flexneedle.lab.rig.supervisor.drives import Drive, has_arrived
@@ -204,29 +204,17 @@ _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a l
 _RESTING_S = 0.5  # longest time from the first stop, in addition to the deceleration, until motors must rest
 
 
-@dataclass(frozen=True)
+@dataclass
 class StopUnderWay:
     """Stop under way: the times (s) of the first and of the next command."""
 
     since: float
     due: float
 
-    @classmethod
-    def at(cls, now: float) -> "StopUnderWay":
-        """Return a stop that begins now."""
-        return cls(now, now)
-
-    def repeated_at(self, now: float) -> "StopUnderWay":
-        """Return the stop after motors have been stopped now."""
-        return replace(self, due=now + _AGAIN_S)
-
-    def due_at(self, now: float) -> "StopUnderWay":
-        """Return the stop with a command due now."""
-        return replace(self, due=now)
+    def repeat(self, now: float) -> None:
+        """Set the time of the next command, after one that is sent now."""
+        self.due = now + _AGAIN_S
 
     def has_failed(self, now: float, slowing: float) -> bool:
-        """Return whether the time in which motors must come to rest is over.
-
-        slowing: longest deceleration (s) of one.
-        """
+        """Return whether motors should rest by now. slowing: longest deceleration (s) of a motor."""
         return now - self.since > _RESTING_S + slowing
