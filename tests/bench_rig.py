@@ -1,4 +1,4 @@
-"""A rig file, and motors and a tracker that record what they are asked, for tests of what is around them."""
+"""A rig file, and motors and a tracker that record their calls."""
 
 import copy
 import tomllib
@@ -46,7 +46,7 @@ VALUES = tomllib.loads(TEXT)
 
 
 def values(changes=None):
-    """The values of the rig file, with some by dotted key; None takes one out."""
+    """Return the values of the rig file, changed by dotted key; None removes a key."""
     changed = copy.deepcopy(VALUES)
     for key, value in (changes or {}).items():
         *way, last = key.split(".")
@@ -61,12 +61,12 @@ def values(changes=None):
 
 
 def rig(**changes):
-    """The rig, with values changed; `axes__insertion__home="here"` is a dotted key."""
+    """Return the rig with values changed; `axes__insertion__home="here"` is a dotted key."""
     return RigFile.model_validate(values({key.replace("__", "."): value for key, value in changes.items()}))
 
 
 class Motors:
-    """The port `Motors`: states by channel, and the calls that it got. `fails`: raised by each call."""
+    """The port `Motors`: states by channel, and the received calls. fails: reason of the error of each reading."""
 
     def __init__(self, channels=("A", "B", "C"), fails=""):
         self.states = {channel: MotorState(0.0, 0.0) for channel in channels}
@@ -123,7 +123,7 @@ class Tracker:
 
 
 class Clock:
-    """The port `Clock`, of a time that passes only while it is waited for."""
+    """The port `Clock`, whose time passes only in `wait`."""
 
     def __init__(self):
         self.time = 0.0
@@ -136,10 +136,10 @@ class Clock:
 
 
 def drivers(_settings, channels):
-    """A factory of motors."""
+    """Return motors: a driver of a rig file."""
     return Motors(channels)
 
 
 def trackers(settings, clock):
-    """A factory of trackers."""
+    """Return a tracker: a tracker of a rig file."""
     return Tracker(clock, **settings)

@@ -1,4 +1,4 @@
-"""Motors and a tracker in memory, on a clock that a test sets: what a supervisor moves and reads."""
+"""Motors and a tracker in memory, on a clock of the test, and a supervisor that moves and reads them."""
 
 import gc
 import math
@@ -51,7 +51,7 @@ RIG = {
 
 
 def rig_file(**changes):
-    """The rig in memory with keys of its axes changed: rig_file(guide_y={"backlash_mm": 0.1})."""
+    """Return the rig in memory with keys of its axes changed: rig_file(guide_y={"backlash_mm": 0.1})."""
     axes = {name: axis | changes.get(name, {}) for name, axis in RIG["axes"].items()}
     return RigFile.model_validate(RIG | {"axes": axes})
 
@@ -210,7 +210,7 @@ class Stage:
 
 @dataclass
 class Camera:
-    """A tracker in memory: a frame at every tick with the tip where `tip` puts it; None: no frame."""
+    """A tracker in memory: a frame at every reading, with the tip at `tip(time)`; None: no frame."""
 
     clock: Hand
     tip: object = field(default=lambda _: (0.0, 0.0, 0.0))
@@ -317,7 +317,7 @@ class Bench:
 
 
 class Moves(Stage):
-    """Motors that end each motion before they take the newest of the targets that came meanwhile, as with `moves`."""
+    """Motors that end each motion before they follow the newest target received meanwhile, as in the mode `moves`."""
 
     def __init__(self, clock, channels="ABC"):
         super().__init__(clock, channels)

@@ -1,4 +1,4 @@
-"""docs/rig/own-devices.md: the devices of the page do what the page asks, as a module and as an installed package."""
+"""docs/rig/own-devices.md: the devices of the page, as a module and as an installed package."""
 
 import importlib
 import json

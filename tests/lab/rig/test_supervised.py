@@ -19,7 +19,7 @@ from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.lab.rig.supervised import AxisColumns, SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
-from flexneedle.lab.rig.supervisor.protocol import MotionResult, StepCommand, TickReport
+from flexneedle.lab.rig.supervisor.protocol import MotionResult, TickReport
 from flexneedle.loop.closed_loop import _carry_out
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
@@ -51,17 +51,17 @@ def test_along_a_tilted_entry_only_the_insertion_axis_moves():
     assert travel == {"insertion": pytest.approx(math.sqrt(1.0 + 0.1**2 + 0.05**2))}
 
 
-def test_a_turn_of_the_base_is_an_axis_that_no_rig_has():
+def test_no_rig_has_an_axis_that_turns_the_base():
     travel = AxisColumns(0j).to_travel(Control(db_x=1.0, db_theta=0.003, db_psi=-0.002))
     assert travel == {"insertion": 1.0, "base_theta": 0.003, "base_psi": -0.002}
     for axis in ("base_theta", "base_psi"):
         bench = Bench().armed()
-        bench.core.request(StepCommand(1, 0.0, {axis: travel[axis], "insertion": 1.0}, 0.2, None))
-        assert bench.sent[-1].why.startswith(f"the rig has no axis {axis}; axes: insertion, ")
+        bench.step(**{axis: travel[axis], "insertion": 1.0})
+        assert bench.refusal.startswith(f"the rig has no axis {axis}; axes: insertion, ")
 
 
 class Axes:
-    """A supervisor that turns and travels as commanded, but for what it adds to the rotation."""
+    """A supervisor that moves as commanded, with errors of the rotation."""
 
     rig = load_rig("emulated")
 
@@ -130,8 +130,8 @@ def test_a_travel_faster_than_the_speeds_of_the_scenario_is_not_sent(command):
 
 
 @given(st.integers(1, 8), st.floats(0.0, 1e-5))
-def test_the_loop_gives_a_travel_as_long_as_its_driver_wants(readings, more):
-    """Also one that takes whole readings but for a rounding error."""
+def test_the_loop_gives_a_travel_the_duration_that_its_driver_requires(readings, more):
+    """Also a travel of a whole number of readings with a rounding error."""
     axes = Axes()
     advance = PHANTOM.setup.insertion_speed_mm_s * PHANTOM.tracker.period * (readings + more)
     command = Control(db_x=min(advance, PHANTOM.setup.max_advance_mm))
@@ -142,7 +142,7 @@ def test_the_loop_gives_a_travel_as_long_as_its_driver_wants(readings, more):
 
 @pytest.mark.parametrize("command", [Control(db_x=1.0), Control(db_x=1.0, db_y=0.4, dg_y=-0.3, flip=True)])
 def test_the_tip_is_expected_where_the_model_moves_it_from_its_estimate(command):
-    """Not on the line of the needle: base, guide and bevel move it across, most in air."""
+    """Base, guide and bevel move the tip off the line of the needle, most of all in air."""
     axes = Axes()
     driver = SupervisedDriver(axes, PHANTOM, 0.0)
     simulator = Simulator(PHANTOM)
@@ -157,7 +157,7 @@ def test_the_tip_is_expected_where_the_model_moves_it_from_its_estimate(command)
 
 
 class Resting:
-    """A supervisor of a rig that rests: axes where they are, a tip, and what it was asked in order."""
+    """A supervisor of a rig at rest, with positions of axes and tip; records its calls."""
 
     status = "ok"
 

@@ -204,7 +204,7 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
 
     dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
     """
-    supervisor.read()  # measurements before may be of a needle that somebody has moved since
+    supervisor.read()  # earlier measurements may be of a needle that was moved since
     measured = check_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
     depth, tip = plan.target[0], None if dry else measured[0]
     need = needed_advance(scenario, depth, tip)
@@ -221,7 +221,7 @@ def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
 
 
 class SupervisedRig:
-    """The rig of a rig file: a `RigSource` of one insertion, from where the motors are.
+    """The rig of a rig file: a `RigSource` of one insertion, from the present positions of the motors.
 
     Args:
         file: Rig file, or its name or path.
@@ -234,7 +234,7 @@ class SupervisedRig:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Name of the rig, and whether it only goes through the motions."""
+        """Name of the rig, and whether the run is dry."""
         return {"phantom": "", "tracker": "", "rig": self.file.name, "dry_run": self.dry_run}
 
     @property
@@ -243,7 +243,7 @@ class SupervisedRig:
         return not self.dry_run
 
     def check(self, scenario: Scenario, strategy: str) -> None:
-        """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
+        """Raise RigError, one line for each problem, if the rig cannot do what the scenario and the strategy need."""
         if problems := fit_problems(self.file, scenario, strategy):
             raise RigError(*problems)
 
@@ -255,7 +255,7 @@ class SupervisedRig:
     def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
         """Connect the rig, have its motions confirmed, arm it, roll the needle as the plan begins, and yield its ports.
 
-        Positions of the axes at this moment are those at the start of the plan. Raises RigError if the rig has no room
+        The plan starts at the present positions of the axes. Raises RigError if the rig has no room
         for the insertion from where its axes are, DriverError or RunError if a device fails, StoppedError after a stop.
         """
         rig, settings, virtual = self.file, scenario.tracker, scenario

@@ -1,4 +1,4 @@
-"""The table of states: what it allows, and what it never does."""
+"""The table of states."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The way out of a fault: arming holds motors where they are, and motors can be switched off; no power cycle."""
+"""Recovery from a fault without a power cycle: arming holds motors where they are, and motors are switched off."""
 
 import re
 import socket
@@ -23,63 +23,57 @@ HELD = r"^insertion: was 0\.\d+ mm from its commanded position, now held where i
 # In memory
 
 
-def powered(bench):
-    return [call[1:] for call in bench.stage.calls if call[0] == "power"]
-
-
-def test_arming_holds_a_motor_where_it_is_if_it_rests_away_from_its_commanded_position():
+def test_arming_holds_a_motor_that_rests_away_from_its_commanded_position():
     bench = Bench()
     bench.stage.motors["C"].position = -200.0  # 0.4 mm, limit 0.2 mm
-    bench.stage.motors["A"].position = 39.0  # 0.039 mm: a servo may be off by that
+    bench.stage.motors["A"].position = 39.0  # 0.039 mm, below twice the tolerance of a goal
     bench.tick(2)
     bench.armed()
-    assert powered(bench) == [("A", True), ("B", True), ("C", False), ("C", True)]
+    assert bench.calls("power") == [("A", True), ("B", True), ("C", False), ("C", True)]
     bench.tick(20)
-    assert bench.core.state is SupervisorState.ARMED
-    assert bench.reports[-1].why == "guide_y: was 0.400 mm from its commanded position, now held where it is"
-    bench.core.request(protocol.MoveCommand(1, "guide_y", 1.0, 5.0))
+    assert bench.state is SupervisorState.ARMED
+    assert bench.why == "guide_y: was 0.400 mm from its commanded position, now held where it is"
+    bench.move("guide_y", 1.0)
     assert bench.until(1).why == ""
     assert bench.position("guide_y") == pytest.approx(1.0, abs=2e-3)
 
 
-def test_what_no_check_at_rest_allows_is_held_where_it_is():
-    """More than twice the tolerance would be a motor that moves without a command, also below `max_error_mm`."""
+def test_arming_also_holds_a_motor_that_would_be_found_to_have_moved_without_a_command():
+    """A distance of more than twice the tolerance, below `max_error_mm`."""
     bench = Bench()
     bench.stage.motors["A"].position = 41.0
     bench.tick(2)
     bench.armed().tick(20)
-    assert ("A", False) in powered(bench)
-    assert bench.core.state is SupervisorState.ARMED
+    assert ("A", False) in bench.calls("power")
+    assert bench.state is SupervisorState.ARMED
 
 
-def test_a_motor_that_still_moves_is_not_switched_off_by_arming():
+def test_arming_does_not_switch_off_a_motor_that_still_moves():
     bench = Bench()
-    motor = bench.stage.motors["C"]
-    motor.position = -400.0
-    bench.tick()
-    motor.position = -300.0
-    bench.tick()
+    for position in (-400.0, -300.0):
+        bench.stage.motors["C"].position = position
+        bench.tick()
     bench.armed()
-    assert ("C", False) not in powered(bench)
+    assert ("C", False) not in bench.calls("power")
     bench.tick()
-    assert bench.core.state is SupervisorState.FAULT
+    assert bench.state is SupervisorState.FAULT
 
 
-def test_motors_are_switched_off_after_a_stop_only():
+def test_motors_are_switched_off_only_after_a_stop_at_rest():
     bench = Bench().armed()
     bench.core.request(protocol.OffCommand())
-    assert bench.sent[-1].why.startswith("off: refused while armed")
-    bench.core.request(protocol.StopCommand("the test"))
+    assert bench.refusal.startswith("off: refused while armed")
+    bench.stop()
     bench.core.request(protocol.OffCommand())
-    assert "motors have not come to rest yet" in bench.sent[-1].why
+    assert "motors have not come to rest yet" in bench.refusal
     bench.tick(2)
     bench.core.request(protocol.OffCommand())
     assert not any(motor.on for motor in bench.stage.motors.values())
     bench.tick(20)
-    assert bench.core.state is SupervisorState.STOPPED
-    bench.core.request(protocol.ResetCommand())
+    assert bench.state is SupervisorState.STOPPED
+    bench.reset()
     bench.armed().tick(5)
-    assert bench.core.state is SupervisorState.ARMED
+    assert bench.state is SupervisorState.ARMED
 
 
 def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
@@ -89,17 +83,16 @@ def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
     def power(channel, on):
         if channel == "A":
             raise DriverError("A is in motion")
-        if channel == "B":
-            return  # it stays on
-        kept(channel, on)
+        if channel != "B":  # which stays on
+            kept(channel, on)
 
     bench.stage.power = power
-    bench.core.request(protocol.StopCommand("the test"))
+    bench.stop()
     bench.tick(2)
     bench.core.request(protocol.OffCommand())
     assert [motor.on for motor in bench.stage.motors.values()] == [True, True, False]
-    assert bench.core.state is SupervisorState.FAULT
-    assert bench.core.why == "insertion: A is in motion; rotation: the motor is still on"
+    assert bench.state is SupervisorState.FAULT
+    assert bench.why == "insertion: A is in motion; rotation: the motor is still on"
 
 
 # On the emulated controller

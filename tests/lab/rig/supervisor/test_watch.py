@@ -1,4 +1,4 @@
-"""The tick's check before the first step: nothing is expected, but a step does not begin on a reading that is none."""
+"""Check of the readings before the first step: nothing is expected, but a bad reading prevents the step."""
 
 import math
 from dataclasses import replace
@@ -22,7 +22,7 @@ def measured(number, time=NOW, x=0.0):
 
 
 def watched(*readings):
-    """The verdict at the begin of the first step after these readings, each of one tick."""
+    """Return the verdict at the start of the first step after these readings, each of one tick."""
     watch = TipWatch(Monitor(MonitorSettings(references=0)), 0.25, 0.0)
     for reading in readings:
         watch = watch.with_readings([reading], NOW, VISIBLE)
@@ -40,7 +40,7 @@ def watched(*readings):
         (measured(3, NOW + 0.3), VerdictKind.STALE),
     ],
 )
-def test_a_first_step_does_not_begin_on_a_reading_that_is_none_old_or_repeated(newest, kind):
+def test_a_first_step_does_not_begin_on_a_missing_old_or_repeated_reading(newest, kind):
     assert watched(measured(1), measured(2), newest).kind is kind
 
 
@@ -48,7 +48,7 @@ def test_a_good_reading_ends_the_rejection():
     assert watched(measured(1), measured(1), measured(2)).ok
 
 
-def test_while_a_motion_waits_for_its_motors_so_does_what_is_expected_of_the_tip():
+def test_the_expected_motion_of_the_tip_waits_with_its_motors():
     watch = TipWatch(Monitor(MonitorSettings(references=0)), 0.25, 0.0).with_expectation(
         AT_TIP, NOW, NOW + 1.0
     )

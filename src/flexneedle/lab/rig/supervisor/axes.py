@@ -20,10 +20,8 @@ from flexneedle.lab.rig.supervisor.motion import CommandedMotion, Leg, make_leg
 from flexneedle.lab.rig.supervisor.protocol import AxisState
 from flexneedle.ports import Clock, MotorPaces, Motors, MotorState
 
-_SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller takes
-_REST_S = (
-    0.02  # in which a servo that follows on shows it; two readings after a late tick may be closer together
-)
+_SLOWEST_SHARE, _FINE = 0.01, 5.0  # of the largest speed; steps of the speeds that a controller accepts
+_REST_S = 0.02  # in which a servo that still follows has moved; readings after a late tick may be closer
 
 
 class RigAxes:
@@ -56,7 +54,7 @@ class RigAxes:
         return not self.lost and all(map(self.is_at_rest, self.drives.values()))
 
     def is_at_rest(self, drive: Drive) -> bool:
-        """Return whether an axis rests, its servo included, as far as readings show that are long enough apart."""
+        """Return whether an axis rests, its servo included, by two readings that are long enough apart."""
         past, channel = self._past[0], drive.axis.channel
         apart = self.newest.asked - past.known >= _REST_S
         return apart and is_at_rest(drive, self.newest.states[channel], past.states[channel])
@@ -101,8 +99,6 @@ class RigAxes:
         drive = self.drives[name]
         return drive.to_position(self.goals[drive.axis.channel])
 
-    # Where the axes are taken to be
-
     def settle(self, *drives: Drive) -> None:
         """Set goals to current positions, for the given axes or all.
 
@@ -143,8 +139,8 @@ class RigAxes:
     def power_on(self) -> str:
         """Switch all motors on, and read them; return a note of further changes, or "".
 
-        A motor that is on, and rests away from its commanded position, is switched off before, so that it is held at
-        its position.
+        A motor that is on but rests away from its commanded position is switched off first, so that it is held where
+        it is.
         """
         changed = []
         with self._mark_lost_on_error():
@@ -165,7 +161,7 @@ class RigAxes:
         return state.on and is_at_rest(drive, state, before) and is_misplaced(drive, state)
 
     def power_off(self) -> None:
-        """Switch all motors off, the others also where one cannot be; raise DriverError with all problems."""
+        """Switch all motors off, also if one of them fails; raise DriverError with all problems."""
         problems = {}
         for name, drive in self.drives.items():
             try:

@@ -42,7 +42,7 @@ class SupervisorClient(SupervisorConnection):
     def tip(self, within: float) -> Point | None:
         """Return the position (mm) of the tip at rest, None if it is not measured.
 
-        It is the median of at least 9 measurements or of all within a time (s). `read` returns them, too.
+        It is the median of at least 9 measurements or of all within a time (s). `read` still returns them.
         """
         until, found = monotonic() + within, list[Point]()
 

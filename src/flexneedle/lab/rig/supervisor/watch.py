@@ -12,7 +12,7 @@ from flexneedle.ports import Tracker
 from flexneedle.results import OK, Verdict, VerdictKind
 from flexneedle.types import VISIBLE, Measurement, Point
 
-_NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # whatever is expected
+_NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # never good, whatever is expected
 
 
 @dataclass(frozen=True)
