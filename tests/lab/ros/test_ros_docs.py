@@ -25,8 +25,8 @@ def row(key, topic, frames):
     kind = {"publish": PUBLISHED, "subscribe": SUBSCRIBED}[section][name]
     verb = {"publish": "publishes", "subscribe": "reads"}[section]
     latched = ", latched" if section == "publish" and name in LATCHED else ""
-    placed = f"{frames[topic.frame].id} | {topic.unit}" if hasattr(topic, "unit") else "| "
-    return f"| {verb} `{name}`{latched} | `{topic.topic}` | {kind} | {placed} |".replace("|  |", "| |")
+    placed = f"{frames[topic.frame].id}|{topic.unit}" if hasattr(topic, "unit") else "|"
+    return f"|{verb} `{name}`{latched}|`{topic.topic}`|{kind}|{placed}|"
 
 
 def test_the_table_has_each_topic_of_the_neutral_profile():
