@@ -139,7 +139,7 @@ def _default(key: Key) -> str:
         return "required" if key.required else "–"
     text = _toml(value)
     text = text if isinstance(value, int | float) and not isinstance(value, bool) else f"`{text}`"
-    return f"{text} {key.schema.get('unit') or unit(key.name)}".rstrip()
+    return f"{text} {key.schema.get('unit') or unit(key.name)}".rstrip(" –")
 
 
 def _toml(value: Any) -> str:

@@ -39,8 +39,7 @@ class CeMpc(BevelRule):
     curvature_per_m: NonNegative = 0.232
     """κ, curvature of the rule's two paths."""
     flip_dead_band: Fraction = 0.875
-    """Dead band, as a share of half of the two paths' separation at the target: no roll while the target is
-    closer to the tip's line."""
+    """As `control.bevel_only.flip_dead_band`."""
 
 
 @dataclass(frozen=True, eq=False)

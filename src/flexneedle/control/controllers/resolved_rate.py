@@ -37,8 +37,7 @@ class ResolvedRate(bang_bang.BevelRule):
     curvature_per_m: NonNegative = 0.0834
     """κ, curvature of the rule's two paths."""
     flip_dead_band: Fraction = 0.625
-    """Dead band, as a share of half of the two paths' separation at the target: no roll while the target is
-    closer to the tip's line."""
+    """As `control.bevel_only.flip_dead_band`."""
     gain: NonNegative = 1.38
     """Share of the tip's predicted deviation that a step corrects."""
     damping: NonNegative = 0.0533

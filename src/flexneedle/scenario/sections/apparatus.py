@@ -25,7 +25,7 @@ _ROUNDS = 50  # of alternating projections
 
 
 class Setup(Section):
-    """Section `setup`: positions at the start, travel and speed of the actuators."""
+    """Section `setup`: initial positions, travel and speed of the actuators."""
 
     axes: int = count(1, least=1, most=2)
     """Lateral axes: 1 (needle in the plane) or 2 (in space)."""
@@ -54,7 +54,7 @@ class Setup(Section):
     max_base_turn_step_mrad: Positive = 5.0
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
-    """Mean speed of an advance; motors are faster within a step. A step of 1 mm at 5 mm/s lasts 200 ms."""
+    """Mean speed of an advance; motors are faster within a step."""
     guide_speed_mm_s: Positive | None = None
     """Mean lateral speed of the guide on an axis. Not set: its largest step lasts as long as the largest
     advance."""
@@ -63,7 +63,7 @@ class Setup(Section):
     base_turn_speed_mrad_s: Positive | None = None
     """Mean speed of the base's rotation. Not set: as `guide_speed_mm_s`."""
     rotation_speed_deg_s: Positive = 360.0
-    """Speed of rolls, without advance, and spins. A half turn at 360°/s lasts 0.5 s."""
+    """Speed of rolls (without advance) and spins."""
 
     @property
     def half_turns(self) -> bool:

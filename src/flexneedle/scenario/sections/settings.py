@@ -144,8 +144,8 @@ class PhantomSettings(Section):
     start_angle_z_sd_mrad: NonNegative | None = None
     """Standard deviation of the base's slope dz/dx. Not set: as dy/dx in space, 0 in the plane."""
     start_axial_sd_mm: NonNegative = 1.0
-    """Standard deviation of the axial position of base and tip at the start. The error is at most half of the
-    distance to the skin, half of the distance to the guide, and half of the remaining stroke."""
+    """Standard deviation of the axial start position of base and tip, within half of the distances to skin and
+    guide and half of the remaining stroke."""
     youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
     """Largest relative deviation of the needle's E, drawn uniformly."""
     initial_bend_mm: NonNegative = 0.5
@@ -161,8 +161,8 @@ class PhantomSettings(Section):
     friction_mn_per_mm: NonNegative = 5.0
     """Axial friction per mm of inserted needle."""
     rotation_friction_mn: NonNegative | None = None
-    """Largest couple (mN·mm) against rotation per mm of inserted needle; the tip's roll lags behind the base.
-    Not set: in space the axial friction times the needle's radius, in the plane 0."""
+    """Largest couple (mN·mm) against rotation per mm of inserted needle. Not set: in space the axial friction
+    times the needle's radius, in the plane 0."""
     motor_resolution_mm: NonNegative = 0.01
     """Resolution of base and guide motors; 0: exact."""
     delay_periods: NonNegative = 1.0
