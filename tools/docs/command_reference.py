@@ -6,6 +6,7 @@ python tools/docs/command_reference.py
 import argparse
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,7 +30,9 @@ def page() -> str:
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = _COLUMNS
     try:
-        sections = [_section(parser) for parser in parsers(build_parser())]
+        every = list(parsers(build_parser()))
+        shared = _shared(every)
+        sections = [_common(shared), *(_section(parser, shared) for parser in every)]
     finally:
         os.environ.pop("COLUMNS")
         os.environ |= {} if before is None else {"COLUMNS": before}
@@ -45,11 +48,47 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
                 yield from parsers(inner)
 
 
-def _section(parser: argparse.ArgumentParser) -> str:
+def _arguments(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    commands = argparse._SubParsersAction
+    return [each for each in parser._actions if each.dest != "help" and not isinstance(each, commands)]
+
+
+def _key(action: argparse.Action) -> tuple[str, str]:
+    name = action.option_strings[-1] if action.option_strings else action.metavar
+    return f"`{name}`", str(action.help)
+
+
+def _shared(every: list[argparse.ArgumentParser]) -> dict[tuple[str, str], argparse.Action]:
+    """Return the arguments that several commands have with the same help."""
+    arguments = [(_key(action), action) for parser in every for action in _arguments(parser)]
+    found = Counter(key for key, _ in arguments)
+    return {key: action for key, action in arguments if found[key] > 1}
+
+
+def _common(shared: dict[tuple[str, str], argparse.Action]) -> str:
+    parser = argparse.ArgumentParser(add_help=False)
+    for action in shared.values():
+        parser._add_action(action)
+    return f"## Common arguments\n\n```text\n{_help(parser)}\n```\n"
+
+
+def _section(parser: argparse.ArgumentParser, shared: dict[tuple[str, str], argparse.Action]) -> str:
     level = "#" * min(3, 1 + len(parser.prog.split()))
-    text = _NOTHING_ELSE.sub("", _USAGE_AND_HELP.sub("", parser.format_help()))
-    text = _EXAMPLES.sub("", text).rstrip()
-    return f"{level} {parser.prog}\n" + (f"\n```text\n{text}\n```\n" if text else "")
+    common = [action for action in _arguments(parser) if _key(action) in shared]
+    names = ", ".join(_key(action)[0] for action in common)
+    for action in common:
+        action.help = argparse.SUPPRESS
+    text = _EXAMPLES.sub("", _help(parser)).rstrip()
+    parts = [
+        f"{level} {parser.prog}",
+        f"```text\n{text}\n```" if text else "",
+        f"[Common arguments](#common-arguments): {names}" if names else "",
+    ]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _help(parser: argparse.ArgumentParser) -> str:
+    return _NOTHING_ELSE.sub("", _USAGE_AND_HELP.sub("", parser.format_help())).rstrip()
 
 
 if __name__ == "__main__":
