@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import flexneedle
@@ -88,25 +87,14 @@ def test_parts_are_found_by_name_module_and_object():
         ("controller", "lab-parts:FINE", "must be module:NAME"),
         ("controller", "lab_there:FINE", "no module lab_there in "),
         ("controller", "lab_parts.sub:FINE", "no module lab_parts.sub in "),
-        (
-            "controller",
-            "lab_parts:FIEN",
-            "lab_parts has no FIEN; public names: decide, one, nothing, ",
-        ),
-        (
-            "controller",
-            "lab_parts:NUMBER",
-            "is an int, not a flexneedle.Controller, missing: name, summary, decide",
-        ),
-        ("controller", "lab_parts:Half", "is the class Half, not a flexneedle.Controller, missing: summary"),
+        ("controller", "lab_parts:FIEN", "lab_parts has no FIEN; public names: decide, "),
+        ("controller", "lab_parts:NUMBER", "is an int, not a flexneedle.Controller, missing: "),
+        ("controller", "lab_parts:Half", "is the class Half, not a flexneedle.Controller, missing: "),
         ("controller", "lab_syntax:CONTROLLER", "lab_syntax cannot be imported: SyntaxError: "),
-        (
-            "controller",
-            "lab_needs:CONTROLLER",
-            "lab_needs cannot be imported: it needs the module no_such_thing",
-        ),
+        ("controller", "lab_needs:CONTROLLER", "lab_needs cannot be imported: it needs the module "),
         ("controller", "lab_exits:CONTROLLER", "lab_exits cannot be imported: SystemExit: 3"),
         ("controller", "lab_wrong:CONTROLLER", "name = 'My PID': a controller's name must be like"),
+        ("controller", "lab_parts:SAME", "two controllers are called ce-mpc"),
         ("phantom", "jelly", "must be one of exact, model, or module:NAME of your own"),
         ("phantom", "lab_parts:NUMBER", "is an int, not a function of (truth, roll)"),
         ("phantom", "lab_parts:one", "must be a function of (truth, roll): too many positional arguments"),
@@ -117,57 +105,45 @@ def test_parts_are_found_by_name_module_and_object():
 def test_an_unsuitable_part_is_an_error_of_one_line(lab, capsys, option, given, message):
     assert cli.main(["insert", f"--{option}", given]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"flexneedle: {option} = {given!r}: {message}")
+    assert line.startswith("flexneedle: ")
+    assert message in line
     assert not (lab / "runs").exists()
 
 
-@pytest.mark.usefixtures("lab")
-def test_two_controllers_with_the_same_name_are_rejected(capsys):
-    assert cli.main(["insert", "--controller", "lab_parts:SAME"]) == 2
-    assert "two controllers are called ce-mpc: give one of them another name" in capsys.readouterr().err
+class Flat:
+    step = roll = strain_energy = least_stretch = converged = 0
+
+    def __init__(self, _truth, _roll):
+        self.tip = (0.0, 0.0)
 
 
-def test_a_factory_that_returns_no_plant_is_rejected():
-    with pytest.raises(
-        InputError, match="phantom = <lambda>: dict is not a plant, missing: step, tip, roll,"
-    ):
-        Phantom(Truth(PHANTOM), 0.0, lambda _truth, _roll: {})
-
-
-def test_a_plant_whose_tip_is_not_a_pose_is_rejected():
-    class Flat:
-        step = roll = strain_energy = least_stretch = converged = 0
-
-        def __init__(self, _truth, _roll):
-            self.tip = (0.0, 0.0)
-
-    with pytest.raises(InputError, match="phantom = Flat: tip must be five numbers"):
-        Phantom(Truth(PHANTOM), 0.0, Flat)
+@pytest.mark.parametrize(
+    ("factory", "rule"),
+    [
+        (lambda *_: {}, "<lambda>: dict is not a plant, missing: step,"),
+        (Flat, "Flat: tip must be five numbers"),
+    ],
+)
+def test_a_factory_that_returns_no_plant_is_rejected(factory, rule):
+    with pytest.raises(InputError, match=f"phantom = {rule}"):
+        Phantom(Truth(PHANTOM), 0.0, factory)
 
 
 def test_a_factory_that_returns_no_tracker_is_rejected():
-    seeds = Seeds(*(np.random.SeedSequence(k) for k in range(3)))
-    with pytest.raises(
-        InputError, match=r"^tracker = <object .*>: must be an object with read, status; see "
-    ):
-        virtual_rig(PHANTOM, 0.0, seeds, "model", tracker=lambda *_: object())
+    with pytest.raises(InputError, match=r"^tracker = <object .*>: must be an object with read, status"):
+        virtual_rig(PHANTOM, 0.0, Seeds.of(0), "model", tracker=lambda *_: object())
 
 
 @pytest.mark.parametrize("answer", [None, (1, 2), STILL])
 def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
     own = replace(CONTROLLERS["open-loop"], name="odd", decide=lambda *_: answer)
-    with pytest.raises(
-        InputError, match="controller odd: decide must return a Decision and the memory after it"
-    ):
-        flexneedle.insert(
-            PHANTOM, make_plan(), controller=own, rig=flexneedle.VirtualRig("model"), force=True
-        )
+    rig = flexneedle.VirtualRig("model")
+    with pytest.raises(InputError, match="controller odd: decide must return a Decision and the memory"):
+        flexneedle.insert(PHANTOM, make_plan(), controller=own, rig=rig, force=True)
 
 
 @pytest.mark.parametrize("command", [(1.0, 0.0), (1.0, 0.0, 0.0, 0.0, -1), (*STILL, 0.0), 1.0, "forward"])
 def test_a_command_has_nine_columns(command):
-    with pytest.raises(
-        InputError, match=r": must be a Control, or its 9 columns db_x, db_y, db_z, db_theta, "
-    ):
+    with pytest.raises(InputError, match=r": must be a Control, or its 9 columns db_x, db_y, db_z, "):
         flexneedle.Decision(command, "short")
     assert flexneedle.Decision(list(STILL), "still").command == STILL

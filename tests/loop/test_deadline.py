@@ -133,6 +133,7 @@ def test_decisions_that_never_hold_count_as_moves(plan, monkeypatch):
     assert "within 4 times the planned steps" in done.reason
 
 
+@pytest.mark.long
 def test_the_default_controller_ends_at_its_target_when_some_decisions_are_late(plan):
     tank, numbers, method = Tank(plan.roll, delay=0.2), iter(range(1000)), CONTROLLERS[DEFAULT]
 

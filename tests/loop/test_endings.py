@@ -23,7 +23,6 @@ from insertions import (
     moving,
     of_any_scenario,
     run,
-    run_quickly,
 )
 
 
@@ -51,7 +50,7 @@ def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan
     """The miss of the plan does not apply to the phantom's needle; the insertion itself predicts the miss."""
     assert CONTROLLERS[DEFAULT].predicts
     assert not any(method.predicts for name, method in CONTROLLERS.items() if name != DEFAULT)
-    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig())
+    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig(), controller=DEFAULT)
 
 
 class Stuck(Stage):
@@ -69,7 +68,7 @@ class Stuck(Stage):
 
 def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(plan):
     short = replace(plan, controls=plan.controls[:5], tips=plan.tips[:6], guide=plan.guide[:6])
-    done = run_quickly(short, Stuck().rig(), force=True)
+    done = run(short, Stuck().rig(), force=True)
     assert done.outcome == "failed"
     assert "within 4 times the planned steps" in done.reason
     assert len(done.periods) == 20
@@ -79,7 +78,7 @@ def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(
 
 def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
     monkeypatch.setattr(State, "converged", property(lambda _: False))
-    done = run_quickly(plan, Tank(plan.roll).rig())
+    done = run(plan, Tank(plan.roll).rig())
     assert done.outcome == "failed"
     assert done.reason.startswith("the model did not converge")
     assert len(done.periods) == 1
@@ -95,7 +94,7 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
     monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)
-    done = run(plan, Tank(plan.roll).rig())
+    done = run(plan, Tank(plan.roll).rig(), controller=DEFAULT)
     assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
     assert {period.applied for period in done.periods[-3:]} == {STILL}
     assert done.periods[-1].decision == "held: no path converges on the fitted model"
@@ -110,7 +109,7 @@ def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
         return tank.phantom.condition()._replace(converged=tank.phantom.now() < lost_after)
 
     in_air = replace(plan, target=(-20.0, 0.0, 0.0))
-    done = run_quickly(in_air, Rig(tank.phantom, tank, tank, truth), force=True)
+    done = run(in_air, Rig(tank.phantom, tank, tank, truth), force=True)
     assert done.outcome == "done"
     assert [period.converged for period in done.periods] == [p.time < lost_after for p in done.periods]
     assert {period.converged for period in done.periods} == {True, False}
@@ -119,7 +118,7 @@ def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
 def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 40.0, "target.depth_mm": 10.0})
     tank = Tank(plan.roll, scenario=short)
-    done = run_quickly(of_any_scenario(plan), tank.rig(), short)
+    done = run(of_any_scenario(plan), tank.rig(), short)
     assert sum(command.db_x for _, command in tank.moves) == pytest.approx(40.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate.x
     assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
@@ -137,7 +136,7 @@ class Rounding(Tank):
 def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
     known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
     tank = Rounding(plan.roll, scenario=known)
-    done = run_quickly(plan, tank.rig(), known)
+    done = run(plan, tank.rig(), known)
     assert any(period.command.dg_y != period.applied.dg_y for period in done.periods)
     applied = np.cumsum([period.applied.dg_y for period in done.periods])
     np.testing.assert_allclose([period.guide[0] for period in done.periods], applied, atol=1e-12)

@@ -24,13 +24,13 @@ def framed(batch, indicator):
 
 
 @pytest.fixture
-def tape(real):
-    return [framed(batch, 0.02) for batch in real[1].tape]
+def tape(quick):
+    return [framed(batch, 0.02) for batch in quick[1].tape]
 
 
-def test_a_period_with_the_field_in_doubt_moves_without_a_correction(plan, real, tape):
-    tape[30] = framed(real[1].tape[30], 0.2)
-    periods = run(plan, Stage(tape, real[1].applied).rig(), UNNAMED).periods
+def test_a_period_with_the_field_in_doubt_moves_without_a_correction(plan, quick, tape):
+    tape[30] = framed(quick[1].tape[30], 0.2)
+    periods = run(plan, Stage(tape, quick[1].applied).rig(), UNNAMED).periods
     verdicts = {str(reading.verdict) for reading in periods[30].readings}
     assert verdicts == {"field in doubt: ref1 0.2000, limit 0.0547 (median over 0.2 s)"}
     assert (str(periods[30].verdict), periods[30].innovation) == ("ok", (0.0, 0.0, 0.0))
@@ -38,9 +38,9 @@ def test_a_period_with_the_field_in_doubt_moves_without_a_correction(plan, real,
     assert {str(period.verdict) for period in periods} == {"ok"}
 
 
-def test_after_an_arrival_in_doubt_the_needle_rests_until_the_field_is_clean(plan, real, tape):
+def test_after_an_arrival_in_doubt_the_needle_rests_until_the_field_is_clean(plan, quick, tape):
     """Five of eight readings in 0.2 s must be clean."""
-    done, tank = real
+    done, tank = quick
     last = framed(tank.tape[-1], 0.2)
     rests = [framed([replace(last[-1], time=last[-1].time + k * READING)], 0.02) for k in range(1, 9)]
     held = run(plan, Stage([*tape[:-1], last, *rests], tank.applied).rig(), UNNAMED)

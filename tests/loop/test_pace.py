@@ -12,7 +12,7 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.pace import roll_time, travel_time
 from flexneedle.types import COLUMNS, Control
-from insertions import PHANTOM, READING, Tank, on_period, run
+from insertions import PHANTOM, READING, Tank, first_periods
 from tanks import STRAIGHT, TURN, tank, tip
 
 SPACE = PHANTOM.with_values({"setup.axes": 2})
@@ -73,31 +73,23 @@ def scripted(commands, then=STRAIGHT):
     )
 
 
-@pytest.mark.parametrize(
-    ("command", "seconds"),
-    [
-        (Control(dg_y=0.5), 0.2),
-        (Control(dg_y=0.25), 0.1),
-        (Control(db_x=0.5, dg_y=0.5), 0.2),
-        (Control(db_x=1.0), 0.2),
-        (Control(db_x=0.01), READING),
-        (TURN, 0.5 + READING),
-        (Control(db_x=1.0, flip=True), 0.7),
-    ],
-)
-def test_a_period_lasts_as_long_as_its_motion(plan, command, seconds):
+def test_a_period_lasts_as_long_as_its_motion(plan):
     """Travel in whole readings of the tracker; a roll before it."""
-    rig, ends = Tank(plan.roll), []
-    straight = scripted([STRAIGHT, command, STRAIGHT])
-    run(
-        plan,
-        rig.rig(),
-        controller=straight,
-        force=True,
-        listeners=[on_period(lambda one: ends.append(one.time))],
+    commands = {
+        Control(dg_y=0.5): 0.2,
+        Control(dg_y=0.25): 0.1,
+        Control(db_x=0.5, dg_y=0.5): 0.2,
+        Control(db_x=1.0): 0.2,
+        Control(db_x=0.01): READING,
+        TURN: 0.5 + READING,
+        Control(db_x=1.0, flip=True): 0.7,
+    }
+    rig = Tank(plan.roll).rig()
+    periods = first_periods(
+        1 + len(commands), plan, rig, controller=scripted([STRAIGHT, *commands]), force=True
     )
-    durations = [after - before for before, after in itertools.pairwise(ends)]
-    assert durations[:2] == pytest.approx([seconds, 0.2])
+    durations = [after.time - before.time for before, after in itertools.pairwise(periods)]
+    assert durations == pytest.approx([*commands.values()])
 
 
 def test_the_needle_does_not_advance_while_it_rolls():

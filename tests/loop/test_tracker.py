@@ -38,7 +38,7 @@ def inserted(plan):
             plate = {"tracker.environment.plate": PLATE.model_dump(mode="json")}
             scenario = scenario.with_values(plate)
         rig = virtual_rig(scenario, plan.roll, Seeds.of(seed), "model", plate_distance_at=plate_at)
-        return flexneedle.insert(scenario, plan, seed, rig=rig)
+        return flexneedle.insert(scenario, plan, seed, controller="resolved-rate", rig=rig)
 
     return insert
 
@@ -109,7 +109,7 @@ def interrupted(plan, span, calls, **values):
     )
     rig = virtual_rig(scenario, plan.roll, Seeds.of(3), "model", plate_distance_at=passing)
     rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
-    return flexneedle.insert(scenario, plan, 3, rig=rig)
+    return flexneedle.insert(scenario, plan, 3, controller="resolved-rate", rig=rig)
 
 
 def test_a_call_between_two_frames_does_not_change_a_hold(plan):
@@ -154,10 +154,6 @@ def test_nothing_moves_before_the_field_was_checked(inserted):
     assert held.periods[-1].true_tip == held.periods[0].true_tip
 
 
-def test_without_a_plate_the_same_run_is_not_held(inserted):
-    assert inserted("ideal", plate_at=lambda _: 1000.0).held_s == 0.0
-
-
 def test_each_insertion_has_another_room_unless_one_is_set():
     def errors(**values):
         scenario = PHANTOM.with_values({"tracker.environment": "ideal", **values})
@@ -182,17 +178,8 @@ def rig_of(**values):
     return virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_bias_of_the_scenario_also_applies_in_an_environment(seed):
-    scenario = PHANTOM.with_values(
-        {
-            "tracker.environment": STILL,
-            "phantom.missing_fraction": 0.0,
-            "phantom.delay_periods": 0.0,
-            "phantom.tracker_bias_mm": 0.3,
-        }
-    )
-    rig = virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
+def test_the_bias_of_the_scenario_also_applies_in_an_environment():
+    rig = rig_of(**{"phantom.tracker_bias_mm": 0.3})
     rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
     sample = rig.tracker.read()[-1]
     error = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
@@ -224,7 +211,7 @@ def test_references_are_placed_where_the_field_is_clean():
     """At the default positions some are above three quarters of the limit; after the placement hardly any."""
     limit = 0.75 * PHANTOM.monitor.indicator_limit
     above = moved = remaining = 0
-    for seed in range(60):
+    for seed in range(40):
         room, rng = Room(shipped("ideal"), seed), np.random.default_rng(seed)
         first = reference_poses(room.environment, (0.0, 0.0, 0.0))
         placed = placed_references(room, (0.0, 0.0, 0.0), limit, rng)
@@ -234,8 +221,8 @@ def test_references_are_placed_where_the_field_is_clean():
         remaining += clean_indicators(room, placed).max() > 1.1 * limit
         shifts = [np.subtract(placed[name].position, first[name].position) for name in first]
         assert np.linalg.norm(shifts, axis=1).max() <= 30.0
-    assert 5 < above < 40
-    assert abs(moved - above) < 6
+    assert 4 < above < 30
+    assert abs(moved - above) < 5
     assert remaining <= 1
 
 
@@ -279,7 +266,8 @@ class Bench:
 def on_bench(plan, readings_at, status="unplugged", **values):
     bench = Bench(readings_at, status)
     rig = Rig(bench, bench, OnStage(bench, to_stage(None)))
-    return flexneedle.insert(PHANTOM.with_values(values), plan, rig=rig)
+    scenario = PHANTOM.with_values(values)
+    return flexneedle.insert(scenario, plan, controller="resolved-rate", rig=rig)
 
 
 AT_START = SensorReading((-28.5, 0.0, 0.0))

@@ -4,7 +4,7 @@ import pytest
 
 from flexneedle.results import Outcome
 from flexneedle.types import STILL, Motion
-from insertions import PHANTOM, Tank, run, run_quickly
+from insertions import PHANTOM, Tank, run
 
 WHY = "frozen: 4 identical readings while the tip travelled 0.31 mm"
 FIRST = 5
@@ -43,6 +43,6 @@ def test_what_the_rig_never_carries_out_ends_the_insertion_as_held_with_its_reas
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_an_insertion_continues_once_the_rig_does(plan, share):
     times = [*range(FIRST, FIRST + 3), *range(20, 22)]
-    done = run_quickly(plan, Withholding(plan.roll, times, share).rig())
+    done = run(plan, Withholding(plan.roll, times, share).rig())
     assert done.outcome is Outcome.DONE
     assert done.true_error_mm < 0.5

@@ -77,15 +77,6 @@ def trace_file(tmp_path_factory):
     return write(tmp_path_factory.mktemp("trace") / "trace.mcap")
 
 
-@pytest.fixture(scope="module")
-def killed_file(tmp_path_factory):
-    """The trace of a process that was killed (SIGKILL) after its 12th period."""
-    path = tmp_path_factory.mktemp("killed") / "trace.mcap"
-    script = [sys.executable, "-c", WRITE_AND_DIE, str(path), str(Path(__file__).parents[1])]
-    assert subprocess.run(script, check=False).returncode == -signal.SIGKILL
-    return path
-
-
 def test_periods_are_restored_to_the_last_bit_of_every_scalar(trace_file):
     trace = read_trace(trace_file)
     assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
@@ -98,13 +89,6 @@ def test_shapes_are_restored(trace_file):
         np.testing.assert_allclose(again.shape, period.shape, rtol=1e-14, atol=1e-14)
         for found, known in zip(again.predicted, period.predicted, strict=True):
             np.testing.assert_allclose(found, known, rtol=1e-14, atol=1e-13)
-
-
-def test_what_was_not_predicted_is_not_that_of_the_period_before(tmp_path):
-    blank = replace(PERIODS[4], predicted=None)
-    first, second = read_trace(write(tmp_path / "trace.mcap", [PERIODS[3], blank])).periods
-    assert first.predicted is not None
-    assert second.predicted is None
 
 
 def test_a_period_in_space_is_restored(tmp_path):
@@ -126,14 +110,14 @@ def test_a_period_in_space_is_restored(tmp_path):
             assert getattr(again, name) == value, name
 
 
-def test_a_period_does_not_have_the_shapes_of_the_previous_one(tmp_path):
-    shape = PERIODS[3].shape
-    with_shapes = replace(PERIODS[3], predicted=Shape(shape, shape[:, 1:3]), true_shape=shape[:, :3])
+def test_a_period_has_neither_shapes_nor_readings_of_the_previous_one(tmp_path):
+    shape, reading = PERIODS[3].shape, CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict())
+    full = replace(PERIODS[3], true_shape=shape[:, :3], readings=(reading,))
     without = replace(PERIODS[4], predicted=None, true_shape=None)
-    first, second = read_trace(write(tmp_path / "trace.mcap", [with_shapes, without])).periods
+    first, second = read_trace(write(tmp_path / "trace.mcap", [full, without])).periods
     assert first.predicted is not None
-    assert first.true_shape.shape == (len(shape), 3)
-    assert (second.predicted, second.true_shape) == (None, None)
+    assert (first.true_shape.shape, len(first.readings)) == ((len(shape), 3), 1)
+    assert (second.predicted, second.true_shape, second.readings) == (None, None, ())
 
 
 def test_a_period_without_a_tip_is_restored(tmp_path):
@@ -143,13 +127,6 @@ def test_a_period_without_a_tip_is_restored(tmp_path):
     assert (again.measurement.x, again.true_tip, again.true_strain_energy) == (None, None, None)
     assert again.true_stretch is None
     assert (str(again.verdict), again.measurement.time) == ("missing", period.measurement.time)
-
-
-def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
-    """To the last bit, as every scalar."""
-    found = [float(to_row(period)["true_stretch"]) for period in read_trace(trace_file).periods]
-    assert found == [period.true_stretch for period in PERIODS]
-    assert found[0] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -183,17 +160,10 @@ def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, mea
     assert (again.measurement.x, again.measurement.z) == (measurement.x, measurement.z)
 
 
-@pytest.mark.parametrize("kind", VerdictKind)
 @pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.4 mm", "ref1: 0.09", ": "])
-def test_a_verdict_is_restored_from_its_text(kind, reason):
-    verdict = Verdict(kind, reason)
-    assert parse_verdict(str(verdict)) == verdict
-
-
-def test_the_text_of_a_verdict_is_that_of_earlier_traces():
-    assert parse_verdict("not a number") == Verdict(VerdictKind.NOT_A_NUMBER)
-    assert parse_verdict("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
-    assert parse_verdict("ok") == Verdict()
+def test_a_verdict_is_restored_from_its_text(reason):
+    verdicts = [Verdict(kind, reason) for kind in VerdictKind]
+    assert [parse_verdict(str(verdict)) for verdict in verdicts] == verdicts
 
 
 @pytest.mark.parametrize("text", ["fine", "", "okay", "missing the tip", "field"])
@@ -202,23 +172,8 @@ def test_a_text_that_is_not_a_verdict_is_rejected(text):
         parse_verdict(text)
 
 
-def test_a_period_does_not_have_the_readings_of_the_previous_one(tmp_path):
-    with_reading = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict()),))
-    first, second = read_trace(write(tmp_path / "trace.mcap", [with_reading, PERIODS[4]])).periods
-    assert (len(first.readings), len(second.readings)) == (1, 0)
-
-
 def test_columns_carry_units():
-    bare = {
-        "index",
-        "verdict",
-        "cost",
-        "action",
-        "decision",
-        "converged",
-    }
-    bare |= {"warning", "late"}
-    bare |= {"true_stretch"}  # a ratio
+    bare = {"index", "verdict", "cost", "action", "decision", "converged", "warning", "late", "true_stretch"}
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
 
@@ -260,31 +215,28 @@ def test_content_except_for_timing_is_the_same_for_the_same_run(trace_file, tmp_
     assert messages(trace_file) == messages(write(tmp_path / "again.mcap", slower))
 
 
-def test_a_killed_writer_leaves_all_its_periods(killed_file):
-    trace = read_trace(killed_file)
+def test_a_killed_writer_leaves_all_its_periods_also_for_other_readers(tmp_path):
+    """SIGKILL after the 12th period; the file ends with a complete record."""
+    path = tmp_path / "trace.mcap"
+    script = [sys.executable, "-c", WRITE_AND_DIE, str(path), str(Path(__file__).parents[1])]
+    assert subprocess.run(script, check=False).returncode == -signal.SIGKILL
+    trace = read_trace(path)
     assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
     assert "incomplete: 12 complete periods read" in trace.note
-
-
-def test_a_killed_writer_leaves_a_file_for_the_mcap_reader(killed_file):
-    with killed_file.open("rb") as file:
+    with path.open("rb") as file:
         found = NonSeekingReader(file).iter_messages(log_time_order=False)
         topics = [channel.topic for _, channel, _ in until_the_end(found)]
     assert topics.count("/control/status") == 12
-
-
-def test_the_file_of_a_killed_writer_ends_with_a_complete_record(killed_file):
-    size = killed_file.stat().st_size
-    with killed_file.open("rb") as file:
+    with path.open("rb") as file:
         positions = [file.tell() for _ in until_the_end(StreamReader(file, emit_chunks=True).records)]
-    assert positions[-1] == size
+    assert positions[-1] == path.stat().st_size
 
 
 def test_a_truncated_file_loses_only_the_truncated_periods(trace_file, tmp_path):
     torn = tmp_path / "torn.mcap"
     data = trace_file.read_bytes()
     counts = []
-    for length in range(len(data) // 2, len(data), 997):
+    for length in range(len(data) // 2, len(data), 3989):
         torn.write_bytes(data[:length])
         trace = read_trace(torn)
         counts.append(len(trace.periods))
@@ -293,17 +245,13 @@ def test_a_truncated_file_loses_only_the_truncated_periods(trace_file, tmp_path)
     assert counts[-1] == len(PERIODS)
 
 
-@pytest.mark.parametrize("content", [b"", b"no trace at all", b"\x89MCAP0\r\n"])
+@pytest.mark.parametrize("content", [None, b"", b"no trace at all", b"\x89MCAP0\r\n"])
 def test_a_file_that_is_not_a_trace_is_rejected(content, tmp_path):
     path = tmp_path / "trace.mcap"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="not a trace of flexneedle"):
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"trace\.mcap: (not a trace of flexneedle|cannot be read)"):
         read_trace(path)
-
-
-def test_a_missing_trace_is_rejected(tmp_path):
-    with pytest.raises(InputError, match=r"trace\.mcap: cannot be read: No such file"):
-        read_trace(tmp_path / "trace.mcap")
 
 
 def test_a_trace_is_never_overwritten(trace_file):

@@ -77,15 +77,10 @@ def test_places_at_the_start():
     assert PHANTOM.layer_tops == (0.0, 20.0)
 
 
-@pytest.mark.parametrize(
-    ("gauge", "outer", "inner"), [("17G", 1.473, 1.067), ("21G", 0.819, 0.514), ("27G", 0.413, 0.21)]
-)
-def test_a_gauge_gives_the_diameters_of_a_regular_wall_needle(gauge, outer, inner):
-    needle = _with_gauge(gauge).needle
-    assert (needle.outer_diameter, needle.inner_diameter) == (outer, inner)
-
-
-def test_gauges_run_from_17_to_27_and_get_thinner():
+def test_a_gauge_gives_the_diameters_of_a_regular_wall_needle():
+    for gauge, outer, inner in (("17G", 1.473, 1.067), ("21G", 0.819, 0.514), ("27G", 0.413, 0.21)):
+        needle = _with_gauge(gauge).needle
+        assert (needle.outer_diameter, needle.inner_diameter) == (outer, inner)
     outer = [diameters[0] for diameters in GAUGES.values()]
     assert list(GAUGES) == [f"{number}G" for number in range(17, 28)]
     assert outer == sorted(outer, reverse=True)
@@ -103,27 +98,17 @@ def test_a_scenario_is_frozen():
         PHANTOM.needle.length_mm = 1.0
 
 
-def test_a_thickness_of_the_last_layer_is_accepted_and_not_used():
-    thick = PHANTOM.with_values({"tissue.1.thickness_mm": 5.0})
-    assert thick.layer_tops == PHANTOM.layer_tops
-
-
-def test_changes_by_dotted_key_leave_the_original_alone():
+def test_changes_by_dotted_key_leave_the_original_unchanged():
     changed = PHANTOM.with_values(
         {"needle.bevel.offset_mm": 0.0, "tissue.0.alpha": 5, "tissue[1].alpha": 6.0}
     )
     assert changed.needle.bevel.offset_mm == 0.0
     assert [layer.alpha for layer in changed.tissue] == [5.0, 6.0]
     assert [layer.alpha for layer in PHANTOM.tissue] == [8.74, 8.74]
-
-
-def test_a_change_to_none_leaves_the_key_out():
-    assert not PHANTOM.with_values({"setup.guide_to_skin_mm": None}).setup.has_guide
-
-
-def test_changes_may_replace_all_layers():
     layers = PHANTOM.values()["tissue"]
     assert len(PHANTOM.with_values({"tissue": [layers[0], *layers]}).tissue) == 3
+    assert not PHANTOM.with_values({"setup.guide_to_skin_mm": None}).setup.has_guide
+    assert PHANTOM.with_values({"tissue.1.thickness_mm": 5.0}).layer_tops == PHANTOM.layer_tops
 
 
 @pytest.mark.parametrize(
@@ -191,42 +176,41 @@ def test_a_scenario_is_its_own_source():
     assert load_scenario(PHANTOM) is PHANTOM
 
 
-@pytest.mark.parametrize("target", [(25, -5), (81.5, 15), (1e-3, 0)])
-def test_a_target_within_reach_passes(target):
-    assert check_target(PHANTOM, *target) is None
+SPACE = {"setup.axes": 2, "target.lateral_z_mm": -15.0}
+NO_GUIDE = {"setup.guide_to_skin_mm": None, "setup.max_base_travel_mm": 6.0}
 
 
 @pytest.mark.parametrize(
-    ("target", "message"),
+    ("values", "target", "rule"),
     [
-        ((0, 0), "target.depth_mm = 0.0: must be above 0"),
-        ((math.nan, 0), "target.depth_mm = nan: must be above 0"),
-        ((81.6, 0), "target.depth_mm = 81.6: beyond the stroke: must be at most 81.5"),
+        *(({}, target, None) for target in ((25, -5), (81.5, 15), (1e-3, 0))),
+        ({}, (0, 0), "target.depth_mm = 0.0: must be above 0"),
+        ({}, (math.nan, 0), "target.depth_mm = nan: must be above 0"),
+        ({}, (81.6, 0), "target.depth_mm = 81.6: beyond the stroke: must be at most 81.5"),
         (
+            {},
             (40, -15.1),
             "target.lateral_mm = -15.1: must be at most 15 in size, the lateral travel of the guide",
         ),
-        ((40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
-        ((40, 0, -3.0), "target.lateral_z_mm = -3.0: must be 0 with setup.axes = 1"),
+        ({}, (40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
+        ({}, (40, 0, -3.0), "target.lateral_z_mm = -3.0: must be 0 with setup.axes = 1"),
+        (SPACE, (40, 7, -15), None),
+        (SPACE, (40, 7, -15.1), "target.lateral_z_mm = -15.1: must be at most 15 in size"),
+        (
+            NO_GUIDE,
+            (40, 7),
+            "target.lateral_mm = 7.0: must be at most 6 in size, the lateral travel of the base",
+        ),
     ],
 )
-def test_a_target_out_of_reach_is_refused(target, message):
+def test_a_target_out_of_reach_is_refused(values, target, rule):
+    scenario = PHANTOM.with_values(values)
+    if rule is None:
+        assert check_target(scenario, *target) is None
+        return
     with pytest.raises(ScenarioError) as caught:
-        check_target(PHANTOM, *target)
-    assert str(caught.value).startswith(message)
-
-
-def test_in_space_a_target_lies_as_far_aside_on_either_axis():
-    scenario = PHANTOM.with_values({"setup.axes": 2, "target.lateral_z_mm": -15.0})
-    assert scenario.target.position == (40.0, 5.0, -15.0)
-    with pytest.raises(ScenarioError, match=r"target\.lateral_z_mm = -15\.1: must be at most 15 in size"):
-        check_target(scenario, 40, 7, -15.1)
-
-
-def test_without_a_guide_a_target_lies_as_far_aside_as_the_base_travels():
-    scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None, "setup.max_base_travel_mm": 6.0})
-    with pytest.raises(ScenarioError, match="at most 6 in size, the lateral travel of the base"):
-        check_target(scenario, 40, 7)
+        check_target(scenario, *target)
+    assert str(caught.value).startswith(rule)
 
 
 def _with_gauge(gauge, *, stylet=False):

@@ -2,7 +2,6 @@
 
 import pytest
 
-from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.plausible import USUAL, find_doubts
 from flexneedle.scenario.preset import PRESETS
@@ -10,98 +9,42 @@ from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.scenario.worlds import PERFECT, STRUCTURE, world
 
 PHANTOM = load_scenario("phantom")
-WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_to_skin_mm"
 
 
 @pytest.mark.parametrize(
-    ("values", "line"),
+    ("key", "value", "doubt"),
     [
-        (
-            {"target.depth_mm": 0.07},
-            "target.depth_mm = 0.07: 57.1 times below the smallest usual value, 4 to 200 (",
-        ),
-        (
-            {"needle.outer_diameter_mm": 22.0},
-            "needle.outer_diameter_mm = 22: 6.47 times the largest usual value, 0.18 to 3.4 (",
-        ),
-        (
-            {"tissue.1.shear_modulus_kpa": 6000.0},
-            "tissue[1].shear_modulus_kpa = 6000: 28.6 times the largest usual value, 0.6 to 210 (",
-        ),
-        (
-            {"needle.youngs_modulus_gpa": 200000.0},
-            "needle.youngs_modulus_gpa = 200000: 952 times the largest usual value, 3 to 210 (",
-        ),
-        (
-            {"needle.youngs_modulus_gpa": 2000.0},
-            "needle.youngs_modulus_gpa = 2000: 9.52 times the largest usual value, 3 to 210 (",
-        ),
-        (
-            {"needle.youngs_modulus_gpa": 0.2},
-            "needle.youngs_modulus_gpa = 0.2: 15 times below the smallest usual value, 3 to 210 (",
-        ),
-        (
-            {"tissue.0.shear_modulus_kpa": 0.002},
-            "tissue[0].shear_modulus_kpa = 0.002: 300 times below the smallest usual value, 0.6 to 210 (",
-        ),
-        (
-            {"setup.insertion_speed_mm_s": 5000.0},
-            "setup.insertion_speed_mm_s = 5000: 17.9 times the largest usual value, 1 to 280 (",
-        ),
-        (
-            {"tissue.0.alpha": -0.3},
-            "tissue[0].alpha = -0.3: 6.67 times below the smallest usual value, 2 to 40 (in size: ",
-        ),
-        (
-            {"tissue.0.compression_length_mm": 2000.0},
-            "tissue[0].compression_length_mm = 2000: 20 times the largest usual value, 5 to 100 (our estimate",
-        ),
-        (
-            {"tissue.0.engaged_width_mm": 0.0052},
-            "tissue[0].engaged_width_mm = 0.0052: 231 times below the smallest usual value, 1.2 to 70 (our estim",
-        ),
-        (
-            {"tissue.0.thickness_mm": 0.02},
-            "tissue[0].thickness_mm = 0.02: 3.75 times below the smallest usual value, 0.075 to 200 (epidermis ",
-        ),
-        (
-            {"needle.bevel.offset_mm": 0.004},
-            "needle.bevel.offset_mm = 0.004: 250 times below the smallest usual value, 1 to 14 (our estimate",
-        ),
-        (
-            {"needle.bevel.length_mm": 100.0},
-            "needle.bevel.length_mm = 100: 5.26 times the largest usual value, 0.1 to 19 (tubing of 0.18 to 3.4 ",
-        ),
-        (
-            {"setup.max_guide_travel_mm": 15000.0},
-            "setup.max_guide_travel_mm = 15000: 150 times the largest usual value, 1 to 100 (a robot ",
-        ),
-        (
-            {"setup.max_base_travel_mm": 0.015},
-            "setup.max_base_travel_mm = 0.015: 66.7 times below the smallest usual value, 1 to 100 (a robot ",
-        ),
-        (
-            {"tracker.jitter_mm": 0.00007},
-            "tracker.jitter_mm = 7e-05: 143 times below the smallest usual value, 0.01 to 1 (0.07 in the paper",
-        ),
-        (
-            {"phantom.friction_mn_per_mm": 0.005},
-            "phantom.friction_mn_per_mm = 0.005: 1000 times below the smallest usual value, 5 to 86 (measured ",
-        ),
-        (
-            {"tissue.1.thickness_mm": 20.0},
-            "tissue[1].thickness_mm = 20: has no effect: the last layer has no end; leave it out, or add the layer",
-        ),
-        (
-            {"setup.insertion_speed_mm_s": 3.0},
-            "phantom.delay_periods = 1: readings arrive 0.333 s old, above control.stale_after_s (0.3), and hold",
-        ),
+        ("target.depth_mm", 0.07, "57.1 times below the smallest usual value, 4 to 200 ("),
+        ("needle.outer_diameter_mm", 22.0, "6.47 times the largest usual value, 0.18 to 3.4 ("),
+        ("needle.youngs_modulus_gpa", 2000.0, "9.52 times the largest usual value, 3 to 210 ("),
+        ("needle.youngs_modulus_gpa", 0.2, "15 times below"),
+        ("needle.bevel.offset_mm", 0.004, "250 times below"),
+        ("needle.bevel.length_mm", 100.0, "5.26 times the largest"),
+        ("tissue.0.shear_modulus_kpa", 0.002, "300 times below"),
+        ("tissue.1.shear_modulus_kpa", 6000.0, "28.6 times the largest"),
+        ("tissue.0.alpha", -0.3, "6.67 times below the smallest usual value, 2 to 40 (in size: "),
+        ("tissue.0.compression_length_mm", 2000.0, "20 times the largest"),
+        ("tissue.0.engaged_width_mm", 0.0052, "231 times below"),
+        ("tissue.0.thickness_mm", 0.02, "3.75 times below"),
+        ("tissue.1.thickness_mm", 20.0, "has no effect: the last layer has no end"),
+        ("setup.insertion_speed_mm_s", 5000.0, "17.9 times the largest"),
+        ("setup.max_guide_travel_mm", 15000.0, "150 times the largest"),
+        ("setup.max_base_travel_mm", 0.015, "66.7 times below"),
+        ("tracker.jitter_mm", 0.00007, "143 times below"),
+        ("phantom.friction_mn_per_mm", 0.005, "1000 times below"),
     ],
 )
-def test_an_implausible_value_is_one_line(values, line):
-    (found,) = find_doubts(PHANTOM.with_values(values))
-    assert found.startswith(line)
+def test_an_implausible_value_is_one_line(key, value, doubt):
+    (found,) = find_doubts(PHANTOM.with_values({key: value}))
+    assert found.startswith(f"{key.replace('.0.', '[0].').replace('.1.', '[1].')} = {value:g}: {doubt}")
     assert found.isprintable()
+
+
+def test_readings_that_arrive_stale_are_in_doubt():
+    (found,) = find_doubts(PHANTOM.with_values({"setup.insertion_speed_mm_s": 3.0}))
+    assert found.startswith(
+        "phantom.delay_periods = 1: readings arrive 0.333 s old, above control.stale_after_s"
+    )
 
 
 def test_every_value_that_is_off_has_its_line():
@@ -117,9 +60,9 @@ def test_a_warning_begins_half_an_order_of_magnitude_beyond_the_range(value, rat
 
 
 def test_what_comes_with_the_package_is_beyond_doubt():
-    worlds = [world(number) for number in range(201)]
+    worlds = [world(number) for number in range(60)]
     guided = [number for number, each in enumerate(worlds) if each.setup.has_guide]
-    cases = (*(world(n, PERFECT) for n in range(0, 201, 20)), *(world(n, STRUCTURE) for n in guided))
+    cases = (*(world(n, PERFECT) for n in range(0, 60, 10)), *(world(n, STRUCTURE) for n in guided))
     for scenario in (*map(load_scenario, PRESETS.names()), *worlds, *cases):
         assert find_doubts(scenario) == []
     for gauge in GAUGES:
@@ -132,11 +75,3 @@ def test_every_range_names_its_source_and_a_key_of_scenarios():
     keys = {key.replace("tissue.0", "tissue.*") for key in tube.flat()}
     assert set(USUAL) <= keys
     assert all(usual.low < usual.high and usual.source for usual in USUAL.values())
-
-
-@pytest.mark.parametrize("key", ["setup.max_guide_travel_mm", "setup.max_guide_step_mm"])
-@pytest.mark.parametrize("zero", [0, 0.0])
-def test_a_guide_that_cannot_move_is_refused_with_the_way_to_have_none(key, zero):
-    with pytest.raises(ScenarioError) as caught:
-        PHANTOM.with_values({key: zero})
-    assert str(caught.value) == f"{key} = {zero}: {WITHOUT_A_GUIDE}"
