@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from flexneedle.phantom.plants import Plant
     from flexneedle.planning.planner import plan
     from flexneedle.ports import TipTracker
-    from flexneedle.record.frame import to_dataframe
+    from flexneedle.record.export import to_dataframe
     from flexneedle.record.loading import load
     from flexneedle.record.saving import save
     from flexneedle.results import Insertion, Plan
@@ -153,7 +153,7 @@ _HOMES = {
     "phantom.plants": "Plant",
     "planning.planner": "plan",
     "ports": "TipTracker",
-    "record.frame": "to_dataframe",
+    "record.export": "to_dataframe",
     "record.loading": "load",
     "record.saving": "save",
     "results": "Insertion Plan",

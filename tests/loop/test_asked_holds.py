@@ -1,4 +1,4 @@
-"""Somebody has the needle held: it rests from the next step on, and goes on only when nobody has it held any more."""
+"""The gate holds the needle: it rests from the next step on until the gate no longer holds it."""
 
 from dataclasses import replace
 from itertools import count
@@ -14,7 +14,7 @@ WHY = "nobody is in control"
 
 
 class Asked(Gate):
-    """A hold that is asked for at these calls, the first is 0."""
+    """A gate that holds at these calls; the first is call 0."""
 
     def __init__(self, *calls):
         self.calls, self.count = calls, 0
@@ -33,7 +33,7 @@ def inserted(plan, gate, scenario=PHANTOM, depth=-20.0):
     return run(target, tank.rig(), scenario, controller=method, force=True, gate=gate), tank
 
 
-def test_it_rests_while_it_is_asked_and_then_goes_on(plan):
+def test_the_needle_rests_while_it_is_held_and_then_continues(plan):
     free, _ = inserted(plan, Asked())
     done, tank = inserted(plan, Asked(*range(6, 16)))  # two calls for each of the first three moves
     held = [period for period in done.periods if period.action == "hold"]
@@ -44,14 +44,14 @@ def test_it_rests_while_it_is_asked_and_then_goes_on(plan):
     assert [command for _, command in tank.moves] == [p.command for p in free.periods if p.action == "move"]
 
 
-def test_what_was_decided_meanwhile_is_not_carried_out(plan):
+def test_a_decision_made_before_the_hold_is_not_carried_out(plan):
     done, tank = inserted(plan, Asked(7))  # after the fourth decision
     assert [period.action for period in done.periods[:5]] == ["move", "move", "move", "hold", "move"]
     assert done.periods[4].decision == "number 4"
     assert len(tank.moves) == sum(period.action == "move" for period in done.periods)
 
 
-def test_it_is_not_held_for_longer_than_all_holds_may_take(plan):
+def test_the_hold_counts_towards_the_limit_of_all_holds(plan):
     scenario = PHANTOM.with_values({"control.hold_total_s": 0.5})
     done, _ = inserted(plan, Asked(*range(6, 1000)), scenario)
     assert done.outcome == "held"

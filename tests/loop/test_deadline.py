@@ -56,25 +56,23 @@ def test_a_decision_is_late_if_it_takes_longer_than_the_deadline(plan, deadline,
     assert (done.outcome, done.late) == (Outcome.DONE, late)
 
 
-def test_after_a_late_decision_the_period_is_one_of_rest(plan):
-    done = inserted(plan, Slow(Tank(plan.roll), LATE))
-    before, period = done.periods[LATE - 1 : LATE + 1]
-    assert period.late
+def test_after_a_late_decision_the_needle_rests_and_then_the_decision_is_used(plan):
+    """Where nothing has changed: the next period is its move, and no decision is made twice."""
+    slow = Slow(Tank(plan.roll), LATE)
+    done = inserted(plan, slow)
+    before, period, after = done.periods[LATE - 1 : LATE + 2]
     assert (period.action, period.command, period.applied) == (Action.REST, STILL, STILL)
     assert period.decision == WARNED
     assert period.time - before.time == pytest.approx(TAKEN_S)
     assert len(period.readings) == pytest.approx(TAKEN_S / READING, abs=1)
-    assert not any(other.late for other in done.periods if other is not period)
-
-
-def test_it_is_used_where_nothing_has_changed(plan):
-    """The next period is its move, and no decision is made twice."""
-    slow = Slow(Tank(plan.roll), LATE)
-    done = inserted(plan, slow)
+    assert [other for other in done.periods if other.late] == [period]
     assert used(done) == [f"number {k}" for k in range(slow.count)]
-    after = done.periods[LATE + 1]
     assert (after.decision, after.command) == (f"number {LATE}", STRAIGHT)
-    assert after.time - done.periods[LATE].time == pytest.approx(0.2)
+    assert after.time - period.time == pytest.approx(0.2)
+    for each in (before, period):  # and in the record
+        row = to_row(each)
+        assert row["late"] == str(each.late)
+        assert from_row(row, each.shape, {}).late is each.late
 
 
 def spoilt_while_deciding(fault, number=LATE):
@@ -91,7 +89,7 @@ def spoilt_while_deciding(fault, number=LATE):
     return tank
 
 
-def test_it_is_made_anew_after_readings_that_turned_bad(plan):
+def test_a_late_decision_is_repeated_after_bad_readings(plan):
     """First the needle is held, until a reading is good again."""
     done = inserted(plan, Slow(spoilt_while_deciding(blind), LATE))
     late, held = done.periods[LATE : LATE + 2]
@@ -103,7 +101,7 @@ def test_it_is_made_anew_after_readings_that_turned_bad(plan):
 
 
 @pytest.mark.parametrize(("off", "anew"), [(1.3, True), (0.0, False)])
-def test_it_is_made_anew_where_the_readings_have_moved_the_estimate(plan, off, anew):
+def test_a_late_decision_is_repeated_where_the_readings_have_moved_the_estimate(plan, off, anew):
     """By more than the estimate was uncertain."""
 
     def moved(measurement):
@@ -145,14 +143,6 @@ def test_the_default_controller_ends_at_its_target_when_some_decisions_are_late(
     done = run(plan, rig, controller=replace(method, name="slow-mpc", decide=decide))
     assert done.late >= 8
     assert done.true_error_mm <= 0.2
-
-
-def test_lateness_is_in_the_record(plan):
-    done = inserted(plan, Slow(Tank(plan.roll), LATE))
-    for period in done.periods[LATE - 1 : LATE + 2]:
-        row = to_row(period)
-        assert row["late"] == str(period.late)
-        assert from_row(row, period.shape, {}).late is period.late
 
 
 @pytest.mark.parametrize("deadline", [0.0, -1.0, math.inf, math.nan])

@@ -48,18 +48,9 @@ def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, par
     assert not done.reached
 
 
-def test_a_command_beyond_a_limit_of_the_scenario_ends_the_insertion_as_held(plan):
-    beyond = CommandError("db_x", 1.1, 1.0, "must be at most 1 mm")
-    rig = Failing(plan.roll, apply=beyond)
-    done = run(plan, rig.rig())
-    assert (done.outcome, done.reason, len(done.periods)) == (Outcome.HELD, str(beyond), LAST)
-    assert rig.stops == 1
-
-
-def test_a_command_that_the_rig_refuses_ends_the_insertion_as_held(plan):
-    refusal = RefusedError(
-        "insertion = 56.000 mm: must be at most 55.500 mm, as far as this insertion may go"
-    )
+@pytest.mark.parametrize("refusal", [CommandError("db_x", 1.1, 1.0, "too far"), RefusedError("too far")])
+def test_a_command_that_is_refused_ends_the_insertion_as_held(plan, refusal):
+    """By the limits of the scenario, or by the rig."""
     rig = Failing(plan.roll, apply=refusal)
     done = run(plan, rig.rig())
     assert (done.outcome, done.reason, len(done.periods)) == (Outcome.HELD, str(refusal), LAST)
@@ -73,17 +64,17 @@ def test_before_the_first_motion_the_record_is_empty(plan):
     assert (done.outcome, done.reason, done.periods, rig.stops) == (Outcome.FAILED, str(LOST), (), 1)
 
 
+DEAD = DriverError("galil 10.0.0.5:23: not connected")
+
+
 def test_a_driver_that_cannot_be_stopped_either_is_in_the_reason(plan):
-    dead = DriverError("galil 10.0.0.5:23: not connected")
-    done = run(plan, Failing(plan.roll, apply=LOST, stop=dead).rig())
-    assert done.outcome is Outcome.FAILED
-    assert done.reason == f"{LOST}; the driver was not stopped: {dead}"
+    done = run(plan, Failing(plan.roll, apply=LOST, stop=DEAD).rig())
+    assert (done.outcome, done.reason) == (Outcome.FAILED, f"{LOST}; the driver was not stopped: {DEAD}")
 
 
 def test_at_the_target_a_driver_that_cannot_be_stopped_is_a_failure(plan):
-    dead = DriverError("galil 10.0.0.5:23: not connected")
-    done = run(plan, Failing(plan.roll, stop=dead).rig())
-    assert (done.outcome, done.reason) == (Outcome.FAILED, f"the driver was not stopped: {dead}")
+    done = run(plan, Failing(plan.roll, stop=DEAD).rig())
+    assert (done.outcome, done.reason) == (Outcome.FAILED, f"the driver was not stopped: {DEAD}")
     assert done.true_error_mm <= 1.0
 
 

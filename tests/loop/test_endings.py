@@ -147,7 +147,7 @@ def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
 
 
 def test_without_a_truth_the_true_error_is_not_known(real, replayed):
-    """Whether it reached the target, the tracker says."""
+    """The tracker decides whether the target is reached."""
     assert math.isnan(replayed.true_error_mm)
     assert replayed.error_mm == replayed.residual_mm <= 1.0
     assert replayed.reached

@@ -75,19 +75,14 @@ def test_before_the_start_all_readings_count_whatever_their_age():
 
 @pytest.mark.parametrize(("lost", "verdict"), [(3, OK), (6, "missing: tip not measured (out of volume)")])
 def test_before_the_start_the_tip_may_be_missing_for_a_tenth_of_a_second(lost, verdict):
+    """Then the last good reading is recorded."""
     measurements = second()
+    good = measurements[-lost - 1]
     measurements[-lost:] = [measurement(one.time, measured=False) for one in measurements[-lost:]]
     observation = before(1.0, *measurements)
     assert str(observation.verdict) == verdict
+    assert observation.measurement == (good if verdict == OK else measurements[-1])
     assert not observation.field
-
-
-def test_before_the_start_the_last_good_reading_is_recorded_while_the_tip_may_be_missing():
-    measurements = second()
-    blind = [*measurements[:-2], *(measurement(one.time, measured=False) for one in measurements[-2:])]
-    observation = before(1.0, *blind)
-    assert str(observation.verdict) == OK
-    assert observation.measurement == measurements[-3]
 
 
 def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
@@ -110,34 +105,28 @@ def test_before_the_start_the_newest_frame_must_not_be_stale():
 
 def test_a_repeated_frame_without_the_tip_is_no_dropout():
     monitor = before(1.0, *second()).monitor
-    for again in (
-        measurement(1.0, measured=False),
-        replace(measurement(1.025, measured=False), time=math.nan),
-    ):
+    undated = replace(measurement(1.025, measured=False), time=math.nan)
+    for again in (measurement(1.0, measured=False), undated):
         observation = during(monitor, 1.05, again)
         assert str(observation.verdict) in ("stale: frame 40 after frame 40", "not a number: time nan")
         assert observation.estimate.used is None
 
 
-def test_between_two_frames_a_good_field_stays_good_and_the_estimate_is_not_corrected():
-    monitor = before(1.0, *second()).monitor
-    observation = during(monitor, 1.0 + 0.9 * STALE_AFTER)
-    assert (str(observation.verdict), observation.estimate.used) == (OK, None)
-
-
-def test_between_two_frames_a_distorted_field_stays_distorted_and_the_estimate_is_not_corrected():
-    monitor = before(1.0, *second(indicator=0.2)).monitor
-    observation = during(monitor, 1.0 + 0.9 * STALE_AFTER)
-    assert str(observation.verdict).startswith("field distorted")
-    assert (observation.field, observation.estimate.used) == (True, None)
-
-
-def test_after_the_age_limit_no_reading_is_the_verdict_whatever_the_field():
-    for indicator in (0.02, 0.2):
-        monitor = before(1.0, *second(indicator=indicator)).monitor
-        observation = during(monitor, 1.0 + 1.1 * STALE_AFTER, status="no reply")
-        assert str(observation.verdict) == "missing: no reading (no reply)"
-        assert (observation.field, observation.estimate.used) == (False, None)
+@pytest.mark.parametrize(
+    ("indicator", "age", "verdict"),
+    [
+        (0.02, 0.9, OK),
+        (0.2, 0.9, "field distorted"),
+        (0.02, 1.1, "missing: no reading (no reply)"),
+        (0.2, 1.1, "missing: no reading (no reply)"),
+    ],
+)
+def test_between_two_frames_the_last_verdict_holds_until_it_is_stale(indicator, age, verdict):
+    """The estimate is not corrected."""
+    monitor = before(1.0, *second(indicator=indicator)).monitor
+    observation = during(monitor, 1.0 + age * STALE_AFTER, status="no reply")
+    assert str(observation.verdict).startswith(verdict)
+    assert (observation.field, observation.estimate.used) == (verdict.startswith("field"), None)
 
 
 def periods(monitor, *indicators):
@@ -153,12 +142,8 @@ def periods(monitor, *indicators):
 def test_in_a_distorted_field_no_reading_corrects_the_estimate():
     """It is in doubt for half a second until the median over a second is above the limit."""
     observations = periods(before(1.0, *second()).monitor, 0.2, 0.2, 0.2, 0.2)
-    assert [str(observation.verdict).split(":")[0] for observation in observations] == [
-        "ok",
-        "ok",
-        "field distorted",
-        "field distorted",
-    ]
+    kinds = [str(observation.verdict).split(":")[0] for observation in observations]
+    assert kinds == [OK, OK, "field distorted", "field distorted"]
     for observation in observations:
         assert observation.estimate.used is None
         assert not observation.has_good_reading_after(0.0)
@@ -169,11 +154,8 @@ def test_in_a_distorted_field_no_reading_corrects_the_estimate():
 
 def test_a_field_in_doubt_for_one_period_does_not_hold_the_needle():
     observations = periods(before(1.0, *second()).monitor, 0.02, 0.2, 0.02)
-    assert [(str(observation.verdict), observation.estimate.used) for observation in observations] == [
-        (OK, 8),
-        (OK, None),
-        (OK, 8),
-    ]
+    assert [str(observation.verdict) for observation in observations] == [OK] * 3
+    assert [observation.estimate.used for observation in observations] == [8, None, 8]
     assert [observation.has_good_reading_after(1.0) for observation in observations] == [True, False, True]
 
 

@@ -1,4 +1,4 @@
-"""A motion is what the driver did, and when: not what was commanded, nor the time of a decision."""
+"""A motion has the command as applied and its time, without the time of the decision."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def test_a_driver_that_reports_more_than_a_step_does_not_end_the_insertion(plan,
 
 @pytest.mark.parametrize("thinking", [0.0, THINKING_S])
 def test_the_time_of_a_decision_is_no_motion(plan, thinking):
-    """On a clock that goes on while the controller decides the readings are compared with a needle at rest."""
+    """The clock runs while the controller decides, and the readings are compared with a needle at rest."""
     tank = Tank(plan.roll)
     slow = straight(lambda: thinking and tank.phantom.wait(thinking))
     done = run(plan, tank.rig(), controller=slow, force=True)

@@ -1,4 +1,4 @@
-"""How long a command takes: its slowest axis, after the roll."""
+"""The duration of a command: its slowest axis, after the roll."""
 
 import itertools
 import math
@@ -120,7 +120,7 @@ def test_in_a_roll_the_tip_goes_round_its_axis():
     assert tip(phantom)[1] == pytest.approx(-0.1, abs=1e-6)
 
 
-def test_in_space_it_leaves_the_plane_and_returns():
+def test_in_space_the_tip_leaves_the_plane_and_returns():
     phantom = tank(SPACE.with_values({"phantom.rotation_friction_mn": 0.0}), run_out=0.1)
     phantom.apply(Control(roll=math.pi), 0.025)
     sides = [complex(*phantom.tip_at(0.5 * part)[1:]) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]

@@ -29,7 +29,7 @@ ENTERED = SPACE.with_values(
 
 @pytest.mark.parametrize("kind", PLANTS)
 def test_a_plant_starts_straight_on_the_line_of_the_entry(kind):
-    """And goes on along it in air."""
+    """It then continues along the line in air."""
     phantom = Phantom(Truth(ENTERED), 0.0, kind)
     for _ in range(2):
         pose = phantom.pose_at(phantom.now())
@@ -80,34 +80,26 @@ def test_in_space_a_reading_without_z_is_missing():
     assert verdict(Measurement(0.0, 10.0, 1.0), axes=1).ok
 
 
-def test_the_tracker_of_a_needle_in_space_measures_all_of_it():
-    """Position and, where it is in use, direction, of a needle that has left the plane."""
-    scenario = SPACE.with_values({"tracker.direction_jitter_mrad": 1.0, "tracker.jitter_mm": 0.01})
-    seeds = Seeds(*np.random.SeedSequence(4).spawn(3))
-    rig = virtual_rig(scenario, math.pi / 2, seeds, "model")
-    for _ in range(45):
-        rig.driver.apply(Control(db_x=1.0, dg_z=0.05), 0.2)
-    reading = rig.tracker.read()[-1]
-    true = rig.truth().tip
-    assert reading.z == pytest.approx(true[2], abs=0.3)
-    assert reading.direction[1] == pytest.approx(true[4], abs=0.01)
-    assert abs(true[2]) > 0.5
-
-
-def read(values, seed=4):
-    """The last reading of a needle that was pushed on, and the true tip then."""
-    quiet = {"tracker.jitter_mm": 0.0, "phantom.delay_periods": 0.0, "phantom.missing_fraction": 0.0}
-    rig = virtual_rig(
-        SPACE.with_values(quiet | values), 1.0, Seeds(*np.random.SeedSequence(seed).spawn(3)), "model"
-    )
+def read(values, roll=1.0):
+    """The last reading of a needle that has left the plane, and the true tip then."""
+    rig = virtual_rig(SPACE.with_values(values), roll, Seeds(*np.random.SeedSequence(4).spawn(3)), "model")
     for _ in range(45):
         rig.driver.apply(Control(db_x=1.0, dg_z=0.05), 0.2)
     return rig.tracker.read()[-1], rig.truth().tip
 
 
+def test_the_tracker_of_a_needle_in_space_measures_all_of_it():
+    """Position and, where it is in use, direction."""
+    reading, true = read({"tracker.direction_jitter_mrad": 1.0, "tracker.jitter_mm": 0.01}, math.pi / 2)
+    assert reading.z == pytest.approx(true[2], abs=0.3)
+    assert reading.direction[1] == pytest.approx(true[4], abs=0.01)
+    assert abs(true[2]) > 0.5
+
+
 @pytest.mark.parametrize("room", [{}, {"tracker.environment": STILL}])
 def test_a_bias_of_the_tracker_is_in_all_coordinates(room):
-    reading, tip = read({"phantom.tracker_bias_mm": 0.5, **room})
+    quiet = {"tracker.jitter_mm": 0.0, "phantom.delay_periods": 0.0, "phantom.missing_fraction": 0.0}
+    reading, tip = read({**quiet, "phantom.tracker_bias_mm": 0.5, **room})
     off = np.array([reading.x, reading.y, reading.z]) - tip[:3]
     assert np.linalg.norm(off) == pytest.approx(0.5)
     assert np.abs(off).min() > 0.01

@@ -19,7 +19,7 @@ from flexneedle.types import Control, Frame, Motion, SensorReading
 from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
-PLATE = shipped("noisy").plate
+WITH_PLATE = {"tracker.environment.plate": shipped("noisy").plate.model_dump(mode="json")}
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +35,7 @@ def inserted(plan):
     def insert(environment, enabled=True, seed=3, plate_at=None):
         scenario = PHANTOM.with_values({"tracker.environment": environment, "monitor.enabled": enabled})
         if plate_at is not None:
-            plate = {"tracker.environment.plate": PLATE.model_dump(mode="json")}
-            scenario = scenario.with_values(plate)
+            scenario = scenario.with_values(WITH_PLATE)
         rig = virtual_rig(scenario, plan.roll, Seeds.of(seed), "model", plate_distance_at=plate_at)
         return flexneedle.insert(scenario, plan, seed, controller="resolved-rate", rig=rig)
 
@@ -104,9 +103,7 @@ class Interrupted:
 
 
 def interrupted(plan, span, calls, **values):
-    scenario = PHANTOM.with_values(
-        {"tracker.environment": "ideal", "tracker.environment.plate": PLATE.model_dump(mode="json"), **values}
-    )
+    scenario = PHANTOM.with_values({"tracker.environment": "ideal", **WITH_PLATE, **values})
     rig = virtual_rig(scenario, plan.roll, Seeds.of(3), "model", plate_distance_at=passing)
     rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
     return flexneedle.insert(scenario, plan, 3, controller="resolved-rate", rig=rig)
@@ -166,29 +163,11 @@ def test_each_insertion_has_another_room_unless_one_is_set():
     np.testing.assert_array_equal(one, other)
 
 
-def rig_of(**values):
-    scenario = PHANTOM.with_values(
-        {
-            "tracker.environment": STILL,
-            "phantom.missing_fraction": 0.0,
-            "phantom.delay_periods": 0.0,
-            **values,
-        }
-    )
-    return virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
-
-
-def test_the_bias_of_the_scenario_also_applies_in_an_environment():
-    rig = rig_of(**{"phantom.tracker_bias_mm": 0.3})
-    rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
-    sample = rig.tracker.read()[-1]
-    error = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
-    assert np.hypot(*error) == pytest.approx(0.3)
-
-
 @pytest.mark.parametrize("offset", [0.0, 8.0])
 def test_the_tip_is_measured_by_a_sensor_behind_it(offset):
-    rig = rig_of(**{"tracker.tip_offset_mm": offset})
+    values = {"tracker.environment": STILL, "phantom.missing_fraction": 0.0, "phantom.delay_periods": 0.0}
+    scenario = PHANTOM.with_values({**values, "tracker.tip_offset_mm": offset})
+    rig = virtual_rig(scenario, 0.0, Seeds.of(1), "model")
     for _ in range(30):
         rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
     sample = rig.tracker.read()[-1]

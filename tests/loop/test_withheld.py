@@ -1,4 +1,4 @@
-"""A rig ends motions before their goal: its checks may differ from those of the loop, which shall not spin on that."""
+"""A rig ends motions before their goal, since its checks differ from the loop's: the loop must not repeat forever."""
 
 import pytest
 
@@ -29,7 +29,7 @@ class Withholding(Tank):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
-def test_what_the_rig_never_carries_out_ends_the_insertion_as_held_with_its_reason(plan, share):
+def test_a_command_that_is_never_carried_out_ends_the_insertion_as_held_with_the_reason(plan, share):
     tank = Withholding(plan.roll, range(FIRST, 10_000), share)
     done = run(plan, tank.rig(), controller="open-loop")
     assert (done.outcome, done.reason) == (Outcome.HELD, WHY)

@@ -1,4 +1,4 @@
-"""The Python interface: figures, tables and run folders, the same as those of the commands."""
+"""The Python interface makes the same figures, tables and run folders as the commands."""
 
 import builtins
 import json
@@ -27,7 +27,7 @@ SHALLOW = {"target.depth_mm": 15.0, "target.lateral_mm": 2.0}
 
 
 def same(one, other):
-    """Whether two records agree, except for wall-clock times."""
+    """Compare two records, except for wall-clock times."""
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
         if field.name in ("durations", "seconds"):

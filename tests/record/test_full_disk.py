@@ -54,7 +54,7 @@ def motors(monkeypatch):
         calls.append("apply")
         return apply(phantom, *given)
 
-    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes: None)  # moves a phantom of its own
+    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes: None)  # moves another phantom
     monkeypatch.setattr(Phantom, "apply", applied)
     monkeypatch.setattr(Phantom, "stop", lambda _phantom: calls.append("stop"))
     return calls
@@ -173,14 +173,16 @@ def test_a_trace_keeps_the_periods_before_the_one_that_does_not_fit(tmp_path, sh
     assert "incomplete" in left.note
 
 
-def test_a_trace_without_its_beginning_is_removed(tmp_path):
+def test_a_trace_without_its_beginning_is_removed_and_a_failed_writer_is_closed(tmp_path):
+    with files_up_to(1000), pytest.raises(RecordError):
+        write(tmp_path / "trace.mcap")
+    assert not (tmp_path / "trace.mcap").exists()
     writer = TraceWriter(tmp_path / "trace.mcap", PLAN, about={"seed": "0"}, scenario={})
     with files_up_to(1000), pytest.raises(RecordError):
         writer.add(PERIODS[0])
     writer.close()
     with pytest.raises(ValueError, match="closed"):
         writer.add(PERIODS[0])
-    assert not (tmp_path / "trace.mcap").exists()
 
 
 def test_a_replaced_file_stays_and_its_draft_goes(tmp_path):

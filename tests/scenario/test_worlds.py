@@ -90,7 +90,7 @@ def test_worlds_are_as_varied_as_they_say():
 
 
 def difference(number, case):
-    """What a case changes in the real world."""
+    """Return the values by which a case differs from the real world."""
     real, other = world(number).flat(), world(number, case).flat()
     return {key: other[key] for key in other if real.get(key) != other[key]}
 

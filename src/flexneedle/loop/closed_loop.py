@@ -64,7 +64,7 @@ def _run_to_end(steering: Steering, rig: Rig) -> tuple[list[Period], _Ending]:
         ending = Outcome.HELD, one_line(error)
     except StoppedError as error:
         ending = Outcome.INTERRUPTED, one_line(error)
-    except BaseException as error:  # also after an interrupt or another error no motor goes on
+    except BaseException as error:  # no motor keeps moving after an interrupt or another error
         _, still_on = _stop_driver(rig.driver, (Outcome.INTERRUPTED, ""))
         if still_on:
             raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error

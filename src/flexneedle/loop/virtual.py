@@ -104,7 +104,7 @@ def virtual_rig(
     scenario: Scenario,
     roll: float,
     seeds: Seeds,
-    phantom: str | PlantFactory = DEFAULT_PLANT,
+    plant: str | PlantFactory = DEFAULT_PLANT,
     *,
     tracker: TipTrackerFactory | None = None,
     plate_distance_at: Callable[[float], float | None] | None = None,
@@ -116,20 +116,19 @@ def virtual_rig(
     Raises InputError if the factory returns no tracker.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
-    tank = Phantom(truth, roll, phantom)
+    phantom = Phantom(truth, roll, plant)
     if tracker is not None:
-        own = tracker(scenario, tank, np.random.default_rng(seeds.tracker))
-        return Rig(tank, tank, own, tank.condition)
+        own = tracker(scenario, phantom, np.random.default_rng(seeds.tracker))
+        return Rig(phantom, phantom, own, phantom.condition)
     errors = _Errors(truth.bias, registration_error(scenario.tracker.registration, seeds.room))
-    rng, around = (
-        np.random.default_rng(seeds.tracker),
-        virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
-    )
+    rng = np.random.default_rng(seeds.tracker)
+    plate_distance = None if plate_distance_at is None else plate_distance_at(0.0)
+    around = virtual_room(scenario, seeds.room, plate_distance)
     if around is None:
-        described: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
+        described: TipTracker = _noisy_tracker(scenario, phantom, errors, rng)
     else:
-        described = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
-    return Rig(tank, tank, described, tank.condition)
+        described = _field_tracker(scenario, around, phantom, errors, rng, plate_distance_at)
+    return Rig(phantom, phantom, described, phantom.condition)
 
 
 def virtual_room(
@@ -166,19 +165,19 @@ class _Errors:
 
 
 def _noisy_tracker(
-    scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
+    scenario: Scenario, phantom: Phantom, errors: _Errors, rng: np.random.Generator
 ) -> NoisyTracker:
     """Return the tracker with white noise only."""
 
     def tip_at(time: float) -> Point:
-        tip = tank.tip_at(time)
+        tip = phantom.tip_at(time)
         if scenario.tracker.registration is None:
             return tip
         x, y, z = errors.registration.apply(np.array(tip)).tolist()
         return x, y, z
 
     def direction_at(time: float) -> Lateral:
-        pose = tank.pose_at(time)
+        pose = phantom.pose_at(time)
         if scenario.tracker.registration is None:
             return pose.theta, pose.psi
         return tilt_of(errors.registration.rotation @ np.array(pose.axis))
@@ -186,7 +185,7 @@ def _noisy_tracker(
     jitter = scenario.tracker.direction_jitter
     return NoisyTracker(
         tip_at,
-        tank,
+        phantom,
         scenario.tracker.period,
         scenario.tracker.jitter_per_axis,
         rng,
@@ -202,7 +201,7 @@ def _noisy_tracker(
 def _field_tracker(
     scenario: Scenario,
     around: tuple[Room, Mapping[str, SensorPose]],
-    tank: Phantom,
+    phantom: Phantom,
     errors: _Errors,
     rng: np.random.Generator,
     plate_distance_at: Callable[[float], float | None] | None,
@@ -213,7 +212,7 @@ def _field_tracker(
     registered = to_stage(settings.registration)
 
     def poses_at(time: float) -> Mapping[str, SensorPose]:
-        pose = tank.pose_at(time)
+        pose = phantom.pose_at(time)
         x, y, z = (value + off for value, off in zip(pose.point, errors.bias, strict=True))
         return {
             TIP: tip_sensor_pose((x, y, z), pose.axis, offset),
@@ -223,7 +222,7 @@ def _field_tracker(
     tracker = FieldTracker(
         room,
         poses_at,
-        tank,
+        phantom,
         settings.period,
         rng,
         center=center,

@@ -1,15 +1,38 @@
-"""A run as CSV: a header with units, one line per period or reading, numbers with all digits."""
+"""An insertion as CSV or DataFrame: columns with units, one row per period or reading, numbers with all digits."""
 
 import csv
 from collections.abc import Iterable
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from flexneedle.record.fields import COLUMNS, to_row
-from flexneedle.record.readings import OPTIONAL, to_values
+from flexneedle.arguments import check_instance
+from flexneedle.errors import InputError
+from flexneedle.record import readings
+from flexneedle.record.fields import COLUMNS, to_row, to_values
 from flexneedle.results import Insertion, Period
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
+
+
+def to_dataframe(insertion: Insertion) -> "DataFrame":
+    """Return a pandas DataFrame with one row per control period and the columns of `flexneedle export --csv`.
+
+    Column names end in their unit; unknown numbers are NaN. Raises InputError for another type, or if pandas is not
+    installed.
+    """
+    checked = check_instance(
+        "insertion", insertion, Insertion, "make one with flexneedle.insert(scenario, plan)"
+    )
+    try:
+        from pandas import DataFrame
+    except ModuleNotFoundError:
+        raise InputError("to_dataframe needs pandas, which is not installed: pip install pandas") from None
+    marked = mark_columns(checked)
+    rows = [to_values(period) | marked for period in checked.periods]
+    return DataFrame(rows, columns=[*COLUMNS, *marked])
 
 
 def mark_columns(insertion: Insertion) -> dict[str, Any]:
@@ -35,11 +58,11 @@ def write_readings(file: IO[str], insertion: Insertion) -> None:
     """
     periods, marked = insertion.periods, mark_columns(insertion)
     rows = [
-        {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked) | marked
+        {"period": str(period.index), "verdict": str(checked.verdict)} | readings.to_values(checked) | marked
         for period in periods
         for checked in period.readings
     ]
-    measured = [key for key in OPTIONAL if any(key in row for row in rows)]
+    measured = [key for key in readings.OPTIONAL if any(key in row for row in rows)]
     sensors = (f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)
     columns = [*_READING, *measured, *sensors, *marked]
     writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")

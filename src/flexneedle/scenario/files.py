@@ -30,8 +30,6 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
         return source
     if not isinstance(source, str | Path):
         raise ScenarioError(f"scenario = {shorten(source)}: must be a preset name, a path or a Scenario")
-    if isinstance(source, str) and source in PRESETS.names():
-        return Scenario.from_values(PRESETS.shipped(source), source)
     if isinstance(source, str) and source.startswith(WORLD):
         from flexneedle.scenario.worlds import named_world
 
