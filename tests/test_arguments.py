@@ -58,7 +58,7 @@ def inserting(plan=PLAN, **values):
             "control = (1.0, 0.0): must be a Control; make",
         ),
         (lambda: PHANTOM.with_values("x"), "changes = 'x': must be values by key; such as"),
-        (inserting(rig="arm"), "rig = 'arm': must be a VirtualRig, a Rig with its ports, or"),
+        (inserting(rig="arm"), "rig = 'arm': must be a RigSource; such as a VirtualRig, a Rig"),
         (lambda: flexneedle.Rig(1, 2, 3), "clock = 1: must be an object with now, wait; see"),
         (lambda: flexneedle.Rig(BENCH, 2, 3), "driver = 2: must be an object with apply, stop; see"),
         (lambda: flexneedle.Rig(BENCH, BENCH, 3), "tracker = 3: must be an object with read, status; see"),

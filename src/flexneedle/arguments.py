@@ -18,17 +18,7 @@ _ROUNDING = 1e-6  # of the largest entry: rounding of a product of matrices in s
 
 
 def check_whole(name: str, value: Any, least: int, remedy: str = "") -> int:
-    """Return an integer.
-
-    Args:
-        name: Name of the argument, for the message.
-        value: Any value.
-        least: Smallest valid value.
-        remedy: Further advice in the message (default: none).
-
-    Raises:
-        InputError: The value is no integer, or below `least`.
-    """
+    """Return an integer. Raises InputError, with the name of the argument, for any other value or one below `least`."""
     try:
         number = least - 1 if isinstance(value, bool) else index(value)
     except TypeError:
@@ -39,15 +29,9 @@ def check_whole(name: str, value: Any, least: int, remedy: str = "") -> int:
 
 
 def check_point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
-    """Return a point of three numbers. The third is 0 if only two are given.
+    """Return a point of three numbers; the third is 0 if only two are given.
 
-    Args:
-        name: Name of the argument, for the message.
-        value: Any value.
-        parts: Description of the numbers, for the message.
-
-    Raises:
-        InputError: The value is not two or three numbers.
+    Raises InputError, with the name of the argument and its `parts`, for any other value.
     """
     try:
         given = [] if isinstance(value, str | Mapping) else list(value)
@@ -82,15 +66,9 @@ def read_rows(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
 
 
 def check_covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...], ...]:
-    """Return a covariance by rows. Entries that are not finite are not checked.
+    """Return a covariance by rows, (size, size). Entries that are not finite are not checked.
 
-    Args:
-        name: Name of the argument, for the message.
-        value: Any value.
-        size: Number of rows and of columns.
-
-    Raises:
-        InputError: The value has another shape, is not symmetric up to rounding, or has a negative variance.
+    Raises InputError if the value has another shape, is not symmetric up to rounding, or has a negative variance.
     """
     rows = read_rows(value, size)
     if rows is None or len(rows) != size:

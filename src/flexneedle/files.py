@@ -16,10 +16,7 @@ _LONGEST_NAME = 60
 def replace_file(path: Path, data: bytes) -> None:
     """Replace a file in one step, so that a reader finds the old or the new file, never a part of it.
 
-    Ctrl-C is delayed until the file is complete.
-
-    Raises:
-        RecordError: The file cannot be written; the old file is kept.
+    Ctrl-C is delayed until the file is complete. Raises RecordError if it cannot be written; the old file is kept.
     """
     draft = path.with_name(path.name + ".tmp")
     with uninterrupted():
@@ -37,13 +34,8 @@ def replace_file(path: Path, data: bytes) -> None:
 def create_folder(*parts: str, now: datetime | None = None, root: Path = RUNS) -> Path:
     """Create and return a folder `<root>/<date>-<part>-<part>`, with a number if that exists.
 
-    Args:
-        parts: Parts of the name; other characters than letters, digits, `_`, `.` and `-` are replaced.
-        now: Time in the name (default: the present).
-        root: Folder above it.
-
-    Raises:
-        InputError: The folder cannot be created.
+    Characters other than letters, digits, `_`, `.` and `-` are replaced; now: time in the name (default: the present).
+    Raises InputError if the folder cannot be created.
     """
     plain = (re.sub(r"[^\w.-]+", "-", part).strip("-.")[:_LONGEST_NAME] or "unnamed" for part in parts)
     opening = "-".join((f"{now or datetime.now(UTC):%Y%m%dT%H%M%SZ}", *plain))

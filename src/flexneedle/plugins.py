@@ -35,14 +35,9 @@ def find_part(
 ) -> tuple[str, Part]:
     """Return the name of a part in records, and the part.
 
-    Args:
-        key: The option or argument, for messages.
-        given: A name, `module:NAME`, or the part itself.
-        included: The parts of the package by name.
-        rule: Returns the rule that an object breaks, or "".
-
-    Raises:
-        InputError: The part is not found, or breaks the rule.
+    key: option or argument, for messages; given: a name, `module:NAME`, or the part itself; included: the parts of the
+    package by name; rule: returns the rule that an object breaks, or "". Raises InputError if the part is not found or
+    breaks the rule.
     """
     if isinstance(given, str):
         if given in included:
@@ -66,15 +61,9 @@ def _name_of(part: object) -> str:
 
 
 def load_part(given: str, names: Iterable[str], group: str = "") -> Any:
-    """Return the object of an entry point or of `module:NAME`.
+    """Return the object of an entry point of a group (default: none), or of `module:NAME`.
 
-    Args:
-        given: The name of an entry point, or `module:NAME`.
-        names: The valid names, for messages.
-        group: The group of the entry points (default: none).
-
-    Raises:
-        InputError: The rule that `given` breaks.
+    names: the valid names, for messages. Raises InputError with the rule that `given` breaks.
     """
     points = {point.value: point for point in entry_points(group=group, name=given)} if group else {}
     if len(points) > 1:
@@ -103,8 +92,7 @@ def _package_of(point: EntryPoint) -> str:
 def load_attribute(module: str, name: str) -> Any:
     """Return an attribute of a module, with dots in `name` for attributes of attributes.
 
-    Raises:
-        InputError: The module is missing or cannot be imported, or has no such attribute.
+    Raises InputError if the module is missing or cannot be imported, or has no such attribute.
     """
     found = _import(module)
     for part in name.split("."):

@@ -1,4 +1,4 @@
-"""Types of arguments: what is no such number is refused with the reason."""
+"""Types of arguments: other values are refused with the reason."""
 
 import argparse
 

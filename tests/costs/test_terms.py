@@ -1,4 +1,4 @@
-"""Each term of a cost against numbers by hand, on rollouts that are written down."""
+"""Each term of a cost against numbers by hand."""
 
 from dataclasses import replace
 from functools import partial
@@ -65,7 +65,7 @@ def turned(trajectories, angle):
 
 @pytest.mark.parametrize("angle", [0.7, np.pi / 2, -2.0])
 def test_no_term_prefers_a_direction_across_the_axis(angle):
-    """Of a needle in the plane that is turned about the axis, with the target."""
+    """A needle in the plane is turned about the axis, with the target."""
     flat = replace(TRAJECTORIES, tips=TRAJECTORIES.tips * [1.0, 1.0, 1.0, 1e-6, 1e-6])
 
     def of(given, by):
@@ -167,7 +167,7 @@ def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
 
 @pytest.mark.parametrize("blur", [0.0, 0.01, 0.3, 5.0])
 def test_a_miss_counts_as_far_as_it_is_known(blur):
-    """As its square where it is far below what is known, in full, less that, where it is far above; on either side."""
+    """Quadratically far below the uncertainty, linearly (less the uncertainty) far above it, on either side."""
     tips = np.zeros((4, 1, 5))
     tips[:, 0, X], tips[:, 0, Y] = 40.0, (1e-3, -1e-3, 100.0, -100.0)
     miss = terms.miss(replace(TRAJECTORIES, tips=tips), (40.0, 0.0, 0.0), blur)
@@ -178,7 +178,7 @@ def test_a_miss_counts_as_far_as_it_is_known(blur):
 
 @pytest.mark.parametrize("blur", [0.0, 0.3])
 def test_a_large_miss_is_one_beyond_its_standard_deviation(blur):
-    """Nothing of one that is far below it counts, half of one that equals it, all of one that is far above."""
+    """A miss far below it does not count, half of a miss equal to it counts, and all of a miss far above it."""
     tips = np.zeros((4, 1, 5))
     tips[:, 0, X], tips[:, 0, Y] = 40.0, (1e-4, 0.1, -0.1, 100.0)
     trajectories = replace(TRAJECTORIES, tips=tips)

@@ -23,7 +23,7 @@ def real(plan):
 
 @pytest.fixture(scope="session")
 def quick(plan):
-    """The same by a quick controller, for replays in which any controller serves."""
+    """An insertion as `real` by a quick controller, for replays that any controller can serve."""
     tank = Tank(plan.roll)
     return run(plan, tank.rig()), tank
 

@@ -59,7 +59,7 @@ def bad(done):
 
 
 def test_bad_readings_hold_the_needle_until_good_ones_return(plan):
-    """Each fault for 0.6 s, all in air and again in tissue. The holds have a limit of 1 s each, not together."""
+    """Each fault lasts 0.6 s, in air and in tissue; the limit of 1 s is for each hold, not for their sum."""
     spells = [(2.69 + 1.3 * k, *fault) for k, fault in zip(range(10), cycle(FAULTS.items()), strict=False)]
     spoilers = [between(begin, begin + 0.6, fault) for begin, _, fault in spells]
 
@@ -121,7 +121,7 @@ def test_the_hold_limit_is_that_of_the_scenario(plan, limit):
 
 
 def test_all_holds_together_have_a_limit(plan):
-    """Each is within its own; the insertion ends in the hold in which their sum exceeds it."""
+    """Each hold is within its own limit; the insertion ends when the sum exceeds the total."""
     scenario = PHANTOM.with_values({"control.hold_total_s": 0.5})
 
     def spoil(batch):

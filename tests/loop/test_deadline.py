@@ -57,7 +57,7 @@ def test_a_decision_is_late_if_it_takes_longer_than_the_deadline(plan, deadline,
 
 
 def test_after_a_late_decision_the_needle_rests_and_then_the_decision_is_used(plan):
-    """Where nothing has changed: the next period is its move, and no decision is made twice."""
+    """If nothing has changed, the next period carries it out, and no decision is made twice."""
     slow = Slow(Tank(plan.roll), LATE)
     done = inserted(plan, slow)
     before, period, after = done.periods[LATE - 1 : LATE + 2]
@@ -76,7 +76,7 @@ def test_after_a_late_decision_the_needle_rests_and_then_the_decision_is_used(pl
 
 
 def spoilt_while_deciding(fault, number=LATE):
-    """A tank whose readings have the fault during the late decision of this number."""
+    """A phantom whose readings have the fault during the late decision of this number."""
 
     def spoil(batch):
         now = tank.phantom.now()
@@ -90,7 +90,7 @@ def spoilt_while_deciding(fault, number=LATE):
 
 
 def test_a_late_decision_is_repeated_after_bad_readings(plan):
-    """First the needle is held, until a reading is good again."""
+    """The needle is held until a reading is good again."""
     done = inserted(plan, Slow(spoilt_while_deciding(blind), LATE))
     late, held = done.periods[LATE : LATE + 2]
     assert str(late.verdict).startswith("missing")
@@ -102,7 +102,7 @@ def test_a_late_decision_is_repeated_after_bad_readings(plan):
 
 @pytest.mark.parametrize(("off", "anew"), [(1.3, True), (0.0, False)])
 def test_a_late_decision_is_repeated_where_the_readings_have_moved_the_estimate(plan, off, anew):
-    """By more than the estimate was uncertain."""
+    """By more than the uncertainty of the estimate."""
 
     def moved(measurement):
         return replace(measurement, y=measurement.y + off)
@@ -115,7 +115,7 @@ def test_a_late_decision_is_repeated_where_the_readings_have_moved_the_estimate(
 
 
 def test_a_controller_that_is_always_late_ends(plan):
-    """Its decisions are used, each after a rest; where the estimate never holds, it ends without having moved."""
+    """Each of its decisions is used after a rest."""
     slow = Slow(Tank(plan.roll), *range(1000))
     done = inserted(plan, slow)
     assert (done.outcome, done.late) == (Outcome.DONE, slow.count)
@@ -123,7 +123,7 @@ def test_a_controller_that_is_always_late_ends(plan):
 
 
 def test_decisions_that_never_hold_count_as_moves(plan, monkeypatch):
-    """So an insertion that does not move ends, too."""
+    """An insertion that never moves ends, too."""
     monkeypatch.setattr(LateDecision, "holds_for", lambda *_: False)
     short = replace(plan, controls=plan.controls[:5], tips=plan.tips[:6], guide=plan.guide[:6])
     done = inserted(short, Slow(Tank(plan.roll), *range(1000)))

@@ -11,7 +11,7 @@ LAST = 6
 
 
 class Failing(Tank):
-    """A rig whose driver, tracker or stop raises an error from some call on; it counts its stops."""
+    """A rig whose driver, tracker or stop raises an error after some calls; it counts its stops."""
 
     def __init__(self, roll, **errors):
         super().__init__(roll)

@@ -101,7 +101,7 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
 
 
 def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
-    """It does not end the insertion, since the controller has no access to it; but its periods are not converged."""
+    """The controller has no access to the plant: the insertion continues, but its periods are not converged."""
     tank = Tank(plan.roll)
     lost_after = 1.0
 

@@ -18,7 +18,7 @@ HELD = "held: no path to the target found"
 
 
 def predicting(misses, sd=0.1):
-    """A controller that inserts straight and predicts these misses (mm), the last one from then on."""
+    """A controller that inserts straight and predicts these misses (mm), then the last one repeatedly."""
 
     def decide(_task, memory, _estimate, _rng):
         miss = misses[min(memory, len(misses) - 1)]
@@ -39,7 +39,7 @@ def inserted(plan, misses, sd=0.1, *, force=True, scenario=PHANTOM):
 
 
 def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_reason(plan):
-    """It does not move from the first such decision on; the reason gives the miss, the limit and the remedy."""
+    """The needle rests from the first such decision; the reason gives the miss, the limit and the remedy."""
     done, tank = inserted(plan, [0.0] * 5 + [3.0], force=False)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss +3.00 ± 0.10 mm is beyond")
@@ -106,7 +106,7 @@ def test_a_controller_without_predictions_gets_neither_hold_nor_warning(plan):
 
 
 def test_a_miss_that_was_not_predicted_is_reported_in_the_reason_without_a_warning(plan):
-    """So that a study can count the misses without a warning."""
+    """A study can then count the misses without a warning."""
     lateral = replace(in_air(plan), target=(-20.0, 3.0, 0.0))
     done, _ = inserted(lateral, [0.0])
     assert done.outcome == "done"

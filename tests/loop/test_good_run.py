@@ -89,7 +89,7 @@ def test_the_duration_of_a_move_is_rounded_up_to_whole_tracker_periods(real):
 
 @pytest.mark.long
 def test_phantoms_of_other_seeds_are_reached(plan, inserted):
-    """With all default imperfections; extra periods are the rest for the last reading, or holds for missing ones."""
+    """With all default imperfections; extra periods are rests for the last reading or holds for missing readings."""
     done = [inserted(seed) for seed in range(2001, 2005)]
     assert all(one.reached for one in done)
     assert np.mean([one.true_error_mm for one in done]) < 0.4

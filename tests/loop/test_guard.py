@@ -126,7 +126,7 @@ def test_a_refusal_takes_one_step_of_the_model(plan, monkeypatch):
 
 
 def wild(begin_at, command):
-    """A controller that advances straight, and from a depth (mm) on gives one command."""
+    """A controller that advances straight and repeats one command below a depth (mm)."""
 
     def decide(_task, _memory, estimate, _rng):
         inside = estimate.state.tip[0] > begin_at

@@ -57,7 +57,7 @@ def test_delayed_readings_are_used_at_their_time_of_measurement(late, real):
 
 
 def test_readings_in_transit_during_a_move_are_not_stale(plan, late):
-    """The oldest are 0.375 s old when they are read, with a limit of 0.3 s: they arrived during the move, and count."""
+    """The oldest are 0.375 s old when read, with a limit of 0.3 s: they arrived during the move and are valid."""
     done, tank = late
 
     def estimates(tape, scenario=PHANTOM):
@@ -72,7 +72,7 @@ def test_readings_in_transit_during_a_move_are_not_stale(plan, late):
 
 
 def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):
-    """It has arrived nevertheless: no further move."""
+    """The needle has arrived: there is no further move."""
     done, tank = late
     tape, rests = list(tank.tape), sum(period.decision == RESTING for period in done.periods)
     spoilt = tuple(map(blind, tape[-1]))

@@ -19,7 +19,7 @@ STALE_AFTER = SCENARIO.control.stale_after_s
 
 
 class AtRest:
-    """An estimate of a tip at rest. used: number of readings of the last correction, None for a period without any."""
+    """An estimate of a tip at rest. used: readings of the last correction, None if there was none."""
 
     def __init__(self, used=0):
         self.used = used
@@ -94,7 +94,7 @@ def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
 
 
 def test_before_the_start_the_newest_frame_must_not_be_stale():
-    """Good frames of a minute ago, of a tracker that stopped."""
+    """The tracker stopped a minute ago, after good frames."""
     observation = before(61.0, *second())
     assert str(observation.verdict) == "stale: 60.000 s old, limit 0.3 s"
     blind = [*second()[:-1], measurement(1.0, measured=False)]

@@ -17,7 +17,7 @@ THINKING_S = 0.1
 
 
 def straight(before):
-    """A controller that advances to the target depth; `before` each decision something may happen."""
+    """A controller that advances to the target depth and calls `before` before each decision."""
 
     def decide(task, _memory, estimate, _rng):
         before()
@@ -28,7 +28,7 @@ def straight(before):
 
 
 class Overshooting(Tank):
-    """A driver that reports a little more than was commanded, as encoders do."""
+    """A driver that reports slightly more than the command, as encoders do."""
 
     def apply(self, command, duration):
         motion = super().apply(command, duration)

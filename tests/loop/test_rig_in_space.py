@@ -64,7 +64,7 @@ def verdict(reading, axes=2, limit=1.0, predicted=(10.0, 1.0, -2.0)):
 
 
 def test_in_space_the_distance_from_the_prediction_has_three_components():
-    """In the plane z is not compared, but limited."""
+    """In the plane z is not compared; it has a limit."""
     good = Measurement(0.0, 10.0, 1.0, -2.0)
     assert verdict(good).ok
     off = replace(good, z=-3.1)
@@ -89,7 +89,7 @@ def read(values, roll=1.0):
 
 
 def test_the_tracker_of_a_needle_in_space_measures_all_of_it():
-    """Position and, where it is in use, direction."""
+    """The position and, if the tracker measures it, the direction."""
     reading, true = read({"tracker.direction_jitter_mrad": 1.0, "tracker.jitter_mm": 0.01}, math.pi / 2)
     assert reading.z == pytest.approx(true[2], abs=0.3)
     assert reading.direction[1] == pytest.approx(true[4], abs=0.01)
@@ -106,7 +106,7 @@ def test_a_bias_of_the_tracker_is_in_all_coordinates(room):
 
 
 def test_an_error_of_the_registration_turns_the_measured_direction_with_the_position():
-    """By the rotation that the errors of the positions show along the path."""
+    """By the same rotation as the positions along the path."""
     fiducials = [[0.0, 0.0, 0.0], [60.0, 0.0, 0.0], [0.0, 60.0, 0.0], [0.0, 0.0, 60.0]]
     registration = {
         "rotation": [1.0, 0.0, 0.0, 0.0], "translation_mm": [0.0, 0.0, 0.0],
@@ -152,7 +152,7 @@ def test_a_driver_of_half_turns_turns_to_and_fro(angle, roll, expected):
 
 @pytest.mark.parametrize("kind", PLANTS)
 def test_with_half_turns_the_shaft_is_never_wound_up(kind):
-    """Three flips turn it to the other side, not by one and a half turns; the model's needle is at the same angle."""
+    """After three flips it has turned by half a turn; the model's needle is at the same angle."""
     scenario = SPACE.with_values({"setup.rotation": "half-turns", "phantom.friction_mn_per_mm": 50.0})
     phantom, simulator = Phantom(Truth(scenario), 0.0, kind), Simulator(scenario)
     state, applied = simulator.start(), []
@@ -167,7 +167,7 @@ def test_with_half_turns_the_shaft_is_never_wound_up(kind):
 
 
 def test_the_tissue_holds_a_needle_in_space_by_its_axial_friction_unless_told_otherwise():
-    """f times the outer radius on each mm; in the plane a flip leaves no couple."""
+    """Friction times outer radius on each mm; in the plane a flip leaves no couple."""
 
     def couple(scenario):
         return PLANTS["exact"](Truth(scenario), 0.0).rod.rotation_friction

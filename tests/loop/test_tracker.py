@@ -187,7 +187,7 @@ def clean_indicators(room, poses):
 
 
 def test_references_are_placed_where_the_field_is_clean():
-    """At the default positions some are above three quarters of the limit; after the placement hardly any."""
+    """At the default positions some exceed three quarters of the limit; after the placement hardly any do."""
     limit = 0.75 * PHANTOM.monitor.indicator_limit
     above = moved = remaining = 0
     for seed in range(40):

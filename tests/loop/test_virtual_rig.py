@@ -35,7 +35,7 @@ def test_the_virtual_rig_depends_on_its_seed():
 
 @pytest.mark.parametrize("environment", ["none", "noisy"])
 def test_measurements_are_plain_numbers(environment):
-    """So that they print as numbers: before the first motion, in motion and at rest."""
+    """They print as numbers: before the first motion, in motion and at rest."""
     rig = rig_of(**{"tracker.environment": environment})
     samples = [*rig.tracker.read()]
     rig.driver.apply(Control(db_x=1.0), 0.2)

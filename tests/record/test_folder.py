@@ -130,7 +130,7 @@ def test_plans_are_restored_to_the_last_bit(tmp_path):
 
 
 def test_a_plan_is_restored_with_the_scenario_of_its_run(tmp_path):
-    """Also one of an earlier version: plans are stored without their scenario."""
+    """Plans are stored without their scenario."""
     folder = claim(tmp_path)
     folder.plans["manipulation"] = replace(make_plan(), scenario=load_scenario("phantom"))
     folder.write()
@@ -173,7 +173,7 @@ SOURCES = {"a.py": b"1", "b/c.toml": b"2", "b/d.json": b"3"}
     ],
 )
 def test_any_change_of_a_source_changes_the_digest(tmp_path, changed, same):
-    """Not another folder, nor files beside the sources."""
+    """Another folder, and files beside the sources, do not change it."""
 
     def digest(home, files):
         for name, data in files.items():

@@ -1,4 +1,4 @@
-"""On a full disk the needle is held, the motors are stopped, the result is printed, and what is missing is named."""
+"""On a full disk the needle is held, the motors are stopped, the result is printed, and missing files are named."""
 
 import json
 import resource

@@ -92,7 +92,7 @@ def test_shapes_are_restored(trace_file):
 
 
 def test_a_period_in_space_is_restored(tmp_path):
-    """Every column out of the plane, a roll to any angle and a spin; to the last bit."""
+    """Every column out of the plane, a roll to any angle and a spin, to the last bit."""
     out = {
         "command": Control(1.0, 0.1, -0.2, 1e-3, -2e-3, 0.3, -0.4, 0.5, -0.6),
         "applied": Control(0.9, 0.2, -0.3, 2e-3, -3e-3, 0.4, -0.5, 0.6, -0.7),

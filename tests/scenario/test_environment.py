@@ -1,4 +1,4 @@
-"""Environments of the tracker: by name, by table, changed, and what is wrong with one."""
+"""Environments of the tracker: by name, by table, changed, and refused."""
 
 import pytest
 
@@ -33,7 +33,7 @@ def test_without_an_environment_there_is_none():
 
 
 def test_a_name_in_a_file_is_recorded_as_its_table(tmp_path):
-    """So that a run can be repeated although the package's environments have changed since."""
+    """A run can be repeated after the package's environments have changed."""
     file = tmp_path / "mine.toml"
     text = dump_scenario(load_scenario("phantom"))
     file.write_text(text.replace("[tracker]\n", '[tracker]\nenvironment = "noisy"\nfield_seed = 5\n'))

@@ -1,4 +1,4 @@
-"""Laws of the user's own: what one must define, and that its functions belong together."""
+"""Custom laws: the required definitions, and functions that are consistent with each other."""
 
 import sys
 from types import ModuleType
@@ -97,7 +97,7 @@ def scenario(monkeypatch, law):
 
 @pytest.mark.parametrize("law", [Fung, Bilinear])
 def test_a_law_whose_functions_belong_together_is_accepted(monkeypatch, law):
-    """One with a kink, too."""
+    """Also a law with a kink."""
     assert isinstance(scenario(monkeypatch, law).tissue[0], law)
 
 

@@ -1,4 +1,4 @@
-"""Values that a scenario may have and that no needle or tissue has: warned of, with the usual range and its source."""
+"""Warnings of implausible values, with the usual range and its source."""
 
 import pytest
 

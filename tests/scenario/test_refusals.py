@@ -42,7 +42,7 @@ def changed(key, value):
 
 
 def test_a_target_out_of_reach_from_the_entry_is_told():
-    """With the range around the needle's axis at its depth, the free part included."""
+    """The message has the range around the needle's axis at this depth, including the free part."""
     entry = {"lateral_mm": 20.0, "slope_mrad": 25.0, "free_radius_mm": 0.5}
     (line,) = problems({**PHANTOM.values(), "entry": entry})
     assert line == "target.lateral_mm = 5.0: must be from 5.5 to 36.5, in reach of the guide from the entry"
@@ -86,7 +86,7 @@ def test_every_number_of_the_schema_is_covered_by_a_test_of_its_bounds():
 
 
 def test_a_window_without_two_frames_would_never_know_the_field():
-    """One that the monitor does not judge by may be as short as one likes."""
+    """A window that the monitor does not use may be of any length."""
     short = {"tracker.environment": "ideal", "monitor.indicator_window_s": 0.04}
     with pytest.raises(ScenarioError) as caught:
         PHANTOM.with_values(short)

@@ -187,7 +187,7 @@ def rigs(number):
 @given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
 @many_worlds
 def test_a_world_in_space_differs_in_driver_and_direction_of_its_target(number, case):
-    """The offset has the size that it has in the plane, but for its rounding."""
+    """The offset has the same size as in the plane, except for rounding."""
     flat = world(number, case)
     for rig in rigs(number):
         found = world(number, case, rig)

@@ -217,7 +217,7 @@ def of_device(device):
 
 
 class Motors(Stage):
-    """Motors that refuse what is no position."""
+    """Motors that refuse anything but positions."""
 
     def follow(self, positions):
         if not all(map(math.isfinite, positions.values())):

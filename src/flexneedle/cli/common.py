@@ -81,7 +81,7 @@ def add_seed(parser: argparse.ArgumentParser, meaning: str) -> None:
 
 
 def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> None:
-    """Add the planning strategy; meaning: text of its help; more: choices besides the two."""
+    """Add the planning strategy; meaning: text of its help; more: further choices."""
     parser.add_argument(
         "--strategy",
         choices=(*STRATEGIES, *more),

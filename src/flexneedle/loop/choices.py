@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from flexneedle.arguments import check_whole, make_refusal
+from flexneedle.arguments import check_instance, check_whole
 from flexneedle.control.controllers import DEFAULT, find_controller
 from flexneedle.control.interface import Controller
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.virtual import VirtualRig
-
-_PARTS_OF_SOURCE = ("names", "moves", "check", "open", "results")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +33,8 @@ class Choices:
     ) -> "Choices":
         """Return the resolved choices. Raises InputError for an unknown controller, and for anything but a rig."""
         name, resolved = find_controller(controller)
-        source = VirtualRig() if rig is None else rig
-        if isinstance(source, type) or not all(hasattr(source, part) for part in _PARTS_OF_SOURCE):
-            wanted = "must be a VirtualRig, a Rig with its ports, or the rig of a rig file"
-            raise make_refusal("rig", source, wanted, "see flexneedle.devices.open_rig")
+        known = "such as a VirtualRig, a Rig with its ports, or the rig of flexneedle.devices.open_rig"
+        source = check_instance("rig", VirtualRig() if rig is None else rig, RigSource, known)
         return cls(check_whole("seed", seed, 0), name, resolved, source, force, threads)
 
     @property

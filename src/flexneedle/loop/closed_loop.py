@@ -184,9 +184,7 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
     except CommandError as error:  # of a controller: refused, with a record of all before
         raise RefusedError(one_line(error)) from error
     motion = check_instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
-    if (
-        motion.held
-    ):  # a decision that the rig does not carry out takes no time: the next one shall have a reading
+    if motion.held:  # a refused decision takes no time: wait for a reading before the next
         rig.clock.wait(reading)
     return motion
 

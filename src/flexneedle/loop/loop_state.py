@@ -11,7 +11,7 @@ from flexneedle.loop.measuring import Observation
 from flexneedle.results import Outcome
 from flexneedle.types import Floats, Shape, Z
 
-_CHANGED_SDS = 3.0  # standard deviations of an estimate beyond which a decision on it is made anew
+_CHANGED_SDS = 3.0  # standard deviations; beyond them a late decision is repeated
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def hold_after(hold: Hold | None, observation: Observation, now: float) -> Hold 
 class LateDecision:
     """A decision that came after its deadline, with the memory after it.
 
-    tip, sd: the estimate on which it was made, as pose (5,) and standard deviation (mm).
+    tip, sd: pose (5,) and standard deviation (mm) of the estimate that it is based on.
     """
 
     decision: Decision

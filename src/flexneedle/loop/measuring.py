@@ -19,7 +19,7 @@ _NO_MEASUREMENT = Measurement(0.0, None, None)
 class Observation:
     """The estimate after a period, and the readings with their verdicts.
 
-    measurement: the reading to which the verdict of the period refers, an empty one without any; field: true if that
+    measurement: the reading to which the verdict of the period refers, empty if there is none; field: true if the
     verdict is about the field rather than a reading.
     """
 
@@ -50,7 +50,7 @@ def observe_before_start(
     stale_after = scenario.control.stale_after_s
     if not measurements:
         return _keep_last_reading(estimate, monitor, now, stale_after, tracker.status)
-    # The tracker may have run for long, so that older readings are accepted; the newest one must not be stale.
+    # Older readings are accepted, since the tracker may have been running; the newest one must not be stale.
     max_ages = [math.inf] * (len(measurements) - 1) + [stale_after]
     monitor, readings = _check_readings(scenario, estimate, monitor, measurements, max_ages, now)
     monitor, field = monitor.check_field()

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from flexneedle.arguments import make_refusal
 from flexneedle.estimation.estimate import Estimate
@@ -16,16 +16,13 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import Control
 
 
-class RigSource(Protocol):
+class RigSource:
     """Source of the ports of an insertion: a virtual rig, the rig of a rig file, or a `Rig` of the caller."""
 
     @property
     def names(self) -> dict[str, Any]:
-        """Fields of `Insertion` that name the phantom, the tracker and the rig."""
-
-    @property
-    def moves(self) -> bool:
-        """Whether motors move."""
+        """Fields of `Insertion` that name the phantom, the tracker and the rig (default: none)."""
+        return {}
 
     def check(self, scenario: Scenario, strategy: str) -> None:
         """Raise RigError, one line for each problem, if the rig cannot do what a plan of this strategy needs."""
@@ -38,13 +35,15 @@ class RigSource(Protocol):
         A rig with motors calls `stream.gate.confirm` before it arms them. Raises RigError for a rig that does not fit
         the scenario, DriverError for a device that cannot be opened, StoppedError after a stop.
         """
+        raise NotImplementedError
 
     def results(self) -> dict[str, Any]:
-        """Fields of `Insertion` that are known at its end."""
+        """Return fields of `Insertion` that are known at its end (default: none)."""
+        return {}
 
 
 @dataclass(frozen=True)
-class Rig:
+class Rig(RigSource):
     """Ports of the closed loop; also the `RigSource` that provides them.
 
     Args:
@@ -79,32 +78,11 @@ class Rig:
         if not (self.deadline is None or 0.0 < self.deadline < math.inf):
             raise make_refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
 
-    @property
-    def names(self) -> dict[str, Any]:
-        """No names: the parts are objects of the caller."""
-        return {}
-
-    @property
-    def moves(self) -> bool:
-        """Whether motors move: unknown, so that nobody is asked."""
-        return False
-
-    def check(self, scenario: Scenario, strategy: str) -> None:
-        """Accept any scenario."""
-
     def open(
-        self,
-        scenario: Scenario,
-        plan: Plan,
-        seed: int,
-        stream: Stream,
+        self, scenario: Scenario, plan: Plan, seed: int, stream: Stream
     ) -> AbstractContextManager["Rig"]:
         """Yield these ports."""
         return nullcontext(self)
-
-    def results(self) -> dict[str, Any]:
-        """No results."""
-        return {}
 
 
 def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from flexneedle.geometry.quaternion import to_matrix
 from flexneedle.geometry.registration import Rigid, fit_rigid, identity
 from flexneedle.loop.events import Stream
-from flexneedle.loop.rig import Rig
+from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
@@ -42,7 +42,7 @@ class Seeds:
 
     @classmethod
     def of(cls, seed: int) -> "Seeds":
-        """Return the seeds of the virtual rig of `insert` with a seed, whose third part is the controller's."""
+        """Return the seeds of the virtual rig for a seed of `insert`; the controller has its own."""
         phantom, tracker, _, room = _spawned(seed)
         return cls(phantom, tracker, room)
 
@@ -57,7 +57,7 @@ def _spawned(seed: int) -> list[np.random.SeedSequence]:
     return np.random.SeedSequence(seed).spawn(4)
 
 
-class VirtualRig:
+class VirtualRig(RigSource):
     """The virtual phantom of a scenario, drawn with the seed of the insertion, and a simulated tracker.
 
     Args:
@@ -67,8 +67,6 @@ class VirtualRig:
     Raises:
         InputError: For an unknown name or an unsuitable object.
     """
-
-    moves = False
 
     def __init__(
         self, phantom: str | PlantFactory = DEFAULT_PLANT, tracker: str | TipTrackerFactory = SCENARIO_TRACKER
@@ -81,23 +79,10 @@ class VirtualRig:
         """Names of phantom and tracker in the record."""
         return {"phantom": self._phantom, "tracker": self._tracker}
 
-    def check(self, scenario: Scenario, strategy: str) -> None:
-        """Accept any scenario."""
-
     @contextmanager
-    def open(
-        self,
-        scenario: Scenario,
-        plan: Plan,
-        seed: int,
-        stream: Stream,
-    ) -> Iterator[Rig]:
+    def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:
         """Yield the ports of a new phantom."""
         yield virtual_rig(scenario, plan.roll, Seeds.of(seed), self._plant, tracker=self._factory)
-
-    def results(self) -> dict[str, Any]:
-        """No results beyond the record."""
-        return {}
 
 
 def virtual_rig(

@@ -1,4 +1,4 @@
-"""The figures of a run, always drawn from its folder, so that `view` reproduces them."""
+"""The figures of a run. They are always drawn from its folder: `view` reproduces them exactly."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -114,7 +114,7 @@ class Folder:
 def versions() -> dict[str, str]:
     """Return the versions on which the numbers of a run depend.
 
-    source: digest of the code and data of this package, by which an edited copy differs from the release.
+    source: digest of the code and data of this package, to tell an edited copy from the release.
     """
     return {
         "flexneedle": version("flexneedle"),

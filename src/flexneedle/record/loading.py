@@ -56,7 +56,7 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
 
 
 def unfinished_note(run: RunFile) -> str:
-    """Return a line about a run whose end is not recorded, "" for another."""
+    """Return a line about a run whose end is not recorded, "" for a run that has ended."""
     return f"{run.folder}: {_UNFINISHED}" if run.status == "running" else ""
 
 

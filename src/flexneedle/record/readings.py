@@ -14,7 +14,7 @@ _DIRECTION = ("direction_theta_rad", "direction_psi_rad")
 _POINTS, _COVARIANCE, _DIRECTION_COVARIANCE = "points_mm", "covariance_mm2", "direction_covariance_rad2"
 
 OPTIONAL: tuple[str, ...] = (*_DIRECTION, _POINTS, _COVARIANCE, _DIRECTION_COVARIANCE)
-"""Keys of what a tracker may measure besides the position of the tip, in order."""
+"""Keys of the optional measurements besides the position of the tip, in order."""
 
 
 def to_values(checked: CheckedMeasurement) -> dict[str, str]:

@@ -61,7 +61,7 @@ def record_insertion(
     An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
     includes the result, with the outcome "refused", or "failed" once the needle has moved. An insertion whose trace
-    cannot be written is held; what else cannot be written is in `folder.problems`.
+    cannot be written is held; other files that cannot be written are in `folder.problems`.
 
     Args:
         folder: Folder of the run.
@@ -116,7 +116,7 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
             insertion = ended(Outcome.INTERRUPTED, BY_USER)
         except StoppedError as error:  # before the first motion; later `insert` returns it
             insertion = ended(Outcome.INTERRUPTED, one_line(error))
-        except RecordError as error:  # what happens is no longer recorded: the needle goes no further
+        except RecordError as error:  # the insertion is no longer recorded: the needle is held
             insertion = ended(Outcome.HELD, one_line(error))
         except FlexneedleError as error:
             outcome = Outcome.FAILED if periods else Outcome.REFUSED

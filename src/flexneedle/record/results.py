@@ -90,7 +90,7 @@ def _predicted_sd(insertion: Insertion, fraction: float) -> float | None:
 def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
     """Return the deviation of the final true tip from the predicted one, in its standard deviations.
 
-    The miss predicts it, or else the end of the predicted shape.
+    The prediction is the predicted miss, or the end of the predicted shape if there is none.
     """
     found, last = _prediction(insertion, fraction), _at_target(insertion)
     if found is None or last is None or last.true_tip is None:
@@ -105,7 +105,7 @@ def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
 
 
 def _middle_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
-    """Return as `_tip_sds` the deviation of the needle at half of the target's depth."""
+    """Return the deviation of the needle at half of the target's depth, otherwise as `_tip_sds`."""
     found, last = _prediction(insertion, fraction), _at_target(insertion)
     if found is None or found.predicted is None or last is None or last.true_shape is None:
         return None
@@ -130,7 +130,7 @@ def _in_sds(insertion: Insertion, axis: int, deviation: float, sd: float) -> flo
 
 
 def _prediction_columns() -> dict[str, ResultColumn]:
-    """Yield predicted miss and its standard deviation, then the deviations from the prediction."""
+    """Return the columns of the predicted miss and its standard deviation, then of the deviations from it."""
     columns: dict[str, Callable[[Insertion], Any]] = {}
     for name, fraction in DEPTH_FRACTIONS.items():
         for k, axis in enumerate(LATERAL_AXES):

@@ -41,7 +41,7 @@ class TraceWriter:
 
     about: metadata `flexneedle` of the file, such as seed and versions; scenario: nested values, attached as
     `scenario.json`. Raises FileExistsError if the file exists. It and all functions raise RecordError if the file
-    cannot be written; what was written before stays, and the writer is closed.
+    cannot be written; earlier periods are kept, and the writer is closed.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class TraceWriter:
             with uninterrupted():
                 yield
         except OSError as error:
-            with suppress(OSError):  # the same again, of what is still in the buffer
+            with suppress(OSError):  # the buffer cannot be written either
                 self._file.close()
             raise RecordError.of(self._path, error) from error
 

@@ -51,7 +51,7 @@ class Library:
     def read(self, source: str | Path) -> dict[str, Any]:
         """Return the nested tables of the file of a name or at a path. Names of the package have precedence.
 
-        Raises `error`: file, and what is wrong.
+        Raises `error` with the file and the problem.
         """
         if isinstance(source, str) and source in self.names():
             return self.shipped(source)

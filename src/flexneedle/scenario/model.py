@@ -160,7 +160,7 @@ def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mappin
 
 
 def _expanded(key: str, value: Any) -> Any:
-    """Return the table of an environment's name, so that later changes apply to it; an unknown name unchanged."""
+    """Return the table of an environment's name, for later changes of its values; any other value unchanged."""
     known = key == _ENVIRONMENT and value in ENVIRONMENTS.names()
     return expand_environment(value) if known else value
 

@@ -139,7 +139,7 @@ _TYPE_RULES = {
 
 
 def unknown_key(key: str, valid: Sequence[str]) -> str:
-    """Return the rule that an unknown key breaks, with the closest of the valid ones and all of them."""
+    """Return the rule that an unknown key breaks, with the closest valid key and the list of valid keys."""
     close = get_close_matches(key, valid, n=1)
     hint = f"did you mean {close[0]}? " if close else ""
     return f"unknown key; {hint}valid keys: {', '.join(valid)}"

@@ -137,7 +137,7 @@ class MotorsConformance:
             )
 
     def test_power_holds_the_motor_where_it_is(self) -> None:
-        """Require `on` as it was switched, with the commanded position at the measured one."""
+        """Require that `on` follows the switch, and that the commanded position is the measured one."""
         with self._open() as motors:
             before = self._read(motors).position
             for on in (True, False, True):
@@ -167,7 +167,7 @@ class MotorsConformance:
                     require(-margin <= share <= 1.0 + margin, f"a motion left its way: {share:.0%} of it")
 
     def test_follow_does_not_wait_for_the_end(self) -> None:
-        """Require that `follow` returns during the motion, and leaves its argument as it was."""
+        """Require that `follow` returns during the motion and does not change its argument."""
         with self._open(on=True) as motors:
             given = {self._channel: self._read(motors).position + self.distance}
             before = dict(given)

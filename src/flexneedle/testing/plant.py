@@ -98,7 +98,7 @@ class PlantConformance:
         require(before == after, f"reads must not change the plant: {before}, then {after}")
 
     def test_command_and_truth_are_not_changed(self) -> None:
-        """Require that `step` leaves its row, and the plant its truth, as they were."""
+        """Require that `step` does not change its row, nor the plant its truth."""
         truth, row = self._truth(), _row(db_x=1.0, roll=math.pi)
         before, given = repr(truth), copy.copy(row)
         plant = self.make(truth, 0.0)

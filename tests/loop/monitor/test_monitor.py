@@ -283,7 +283,7 @@ def test_the_travel_that_is_predicted_after_a_jump_adds_to_its_limit():
 
 
 def test_after_a_jump_a_reading_at_its_prediction_shows_that_the_one_before_was_wrong():
-    """As when a plate of metal, which has distorted the last good readings, has gone."""
+    """For example after a metal plate has left, which distorted the last good readings."""
     monitor, _ = Monitor(SETTINGS).check(Measurement(0.0, 30.0, 2.9), at_rest, 0.0, 0.3, 9.0)
     monitor, verdict = monitor.check(Measurement(0.025, 30.0, 5.0), at_rest, 0.025, 0.3, 9.0)
     assert str(verdict) == "jump: 2.10 mm, limit 1.50 mm"

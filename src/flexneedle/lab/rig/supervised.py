@@ -27,7 +27,7 @@ from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.protocol import Expectation, MotionResult, SupervisorTask, TickReport
 from flexneedle.loop.events import Event, Stream
 from flexneedle.loop.measuring import innovation_limit
-from flexneedle.loop.rig import Rig
+from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
@@ -220,7 +220,7 @@ def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
     return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
 
 
-class SupervisedRig:
+class SupervisedRig(RigSource):
     """The rig of a rig file: a `RigSource` of one insertion, from the present positions of the motors.
 
     Args:

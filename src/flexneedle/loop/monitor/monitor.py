@@ -19,9 +19,9 @@ TipAt = Callable[[float], Point]
 def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False) -> Verdict:
     """Check the field by all sensors of `frames` (oldest first) except the tip.
 
-    Enough of them must be references. Only the frames of the last window count, and only sensors with an indicator in
-    at least half of them: a median over a few readings would be no better than a single one. distorted: true after a
-    distorted field, for which the indicators must fall below the lower limit.
+    A minimum number of sensors must be references. Only the frames of the last window count, and only sensors with an
+    indicator in at least half of these frames: a median over a few readings would be no better than a single reading.
+    distorted: true after a distorted field, until the indicators fall below the lower limit.
     """
     window = settings.indicator_window_s
     recent = _within(frames, window)
@@ -77,7 +77,7 @@ class _Repeats:
     def extend(self, time: float, tip_at: TipAt) -> "_Repeats":
         """Return the repeats with one more reading.
 
-        Both ends of the travel are from one estimate, so that corrections do not count.
+        Both ends of the travel are from one estimate: corrections do not count as travel.
         """
         travel = self.travel + math.dist(tip_at(self.time), tip_at(time))
         return _Repeats(self.position, time, self.count + 1, travel)

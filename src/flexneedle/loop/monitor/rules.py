@@ -156,7 +156,7 @@ def check_in_doubt(indicators: Mapping[str, Sequence[float]], limit: float, wind
 
 
 def _largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
-    """Return the sensor with the largest median indicator, and the median; 0 without any indicator."""
+    """Return the sensor with the largest median indicator, and the median; ("", 0) if there is no indicator."""
     medians = {name: median(values) for name, values in indicators.items() if values}
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
 

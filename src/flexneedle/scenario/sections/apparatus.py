@@ -72,7 +72,7 @@ class Setup(Section):
 
     @property
     def half_turns_by(self) -> str:
-        """Key and value by which the needle rolls by half turns only; empty if it rolls to any angle."""
+        """The setting that limits rolls to half turns, as key and value; empty if the needle rolls to any angle."""
         if self.axes == 1:
             return "setup.axes = 1"
         return 'setup.rotation = "half-turns"' if self.half_turns else ""
@@ -163,7 +163,7 @@ class Entry(Section):
     slope_z_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dz/dx of the axis."""
     free_radius_mm: NonNegative = 0.0
-    """Largest distance by which the planner may move the entry point. 0: fixed."""
+    """Largest distance that the planner may move the entry point. 0: fixed."""
     free_slope_mrad: float = Field(default=0.0, ge=0.0, le=STEEPEST_MRAD)
     """Largest change of the slope by the planner. 0: fixed."""
 

@@ -15,7 +15,7 @@ _Settings = TypeVar("_Settings", bound=Section)
 
 
 def _with_name(given: Any) -> Any:
-    """Return `module:NAME` of a function, anything else unchanged."""
+    """Return `module:NAME` for a function; return anything else unchanged."""
     return f"{given.__module__}:{given.__qualname__}" if callable(given) else given
 
 
