@@ -1,4 +1,4 @@
-"""`rig check` joins the domain of `[ros]`, lists who publishes what the rig reads, and publishes nothing."""
+"""`rig check` joins the domain of `[ros]`, lists the publishers of the topics of the rig, and publishes nothing."""
 
 import json
 import os
@@ -54,19 +54,17 @@ def test_a_rig_without_ros_has_no_finding():
     assert check_ros(rig(), WallClock(), 0.1) == []
 
 
-def test_where_nobody_publishes_each_topic_is_listed_without_a_problem(monkeypatch):
+def test_without_publishers_each_topic_is_listed_without_a_problem(monkeypatch):
     domain = str(200 + os.getpid() % 30)  # in which nobody else is
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     found = {one.item: one for one in check_ros(rig(**ROS), WallClock(), 0.1)}
     assert found["connection"].found == f"neutral, domain {domain}"
     assert found["other participants"].found == "0"
-    assert FOUND.fullmatch(found["stop"].found).groups() == (
-        *("/flexneedle/stop", "std_msgs/msg/Bool", "no", "no", "0.1", None),
-    )
+    stop = ("/flexneedle/stop", "std_msgs/msg/Bool", "no", "no", "0.1", None)
+    assert FOUND.fullmatch(found["stop"].found).groups() == stop
     assert found["tip"].found.endswith("; not used")
-    assert list(found) == [
-        *("connection", "other participants", "tip", "shape", "target", "stop", "arm", "joint_states")
-    ]
+    listed = "connection, other participants, tip, shape, target, stop, arm, joint_states"
+    assert ", ".join(found) == listed
     assert not any(one.problem for one in found.values())
 
 
@@ -118,7 +116,7 @@ def test_the_check_publishes_nothing():
         ("state", [text("state")], "another node publishes it"),
     ],
 )
-def test_what_is_wrong_with_a_topic_is_a_problem(item, topics, words):
+def test_a_wrong_topic_is_a_problem(item, topics, words):
     with publishing(*topics):
         found = found_when(lambda found: item in found and found[item].problem, rig(**ROS | TOPICS))
     assert [one.item for one in found.values() if one.problem] == [item]
@@ -132,7 +130,7 @@ def test_a_refused_tip_is_no_problem_of_a_rig_that_does_not_read_it():
     assert not any(one.problem for one in found.values())
 
 
-def test_what_prevents_listening_is_a_problem(monkeypatch, tmp_path):
+def test_an_obstacle_to_listening_is_a_problem(monkeypatch, tmp_path):
     profile = tmp_path / "mine.toml"
     profile.write_text('name = "Mine"\n[subscribe]\nstop = { topic = "/stop" }\n')
     (found,) = check_ros(rig(ros__profile=str(profile), ros__arm=True), WallClock(), 0.1)
@@ -146,7 +144,7 @@ def test_what_prevents_listening_is_a_problem(monkeypatch, tmp_path):
     assert "pip install 'flexneedle[ros]'" in found.problem
 
 
-def test_the_command_prints_what_was_found(capsys, tmp_path):
+def test_the_command_prints_the_findings(capsys, tmp_path):
     path = tmp_path / "rig.toml"
     devices = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
     path.write_text(tomli_w.dumps(values(devices) | {"ros": {"profile": "neutral"}}))

@@ -1,4 +1,4 @@
-"""Messages of the records of an insertion: those of the trace, and those of SmartNeedle."""
+"""Messages of the records of an insertion: the messages of the trace, and messages of SmartNeedle."""
 
 import math
 from dataclasses import replace
@@ -65,6 +65,10 @@ def xyz(at):
     return np.array([at.x, at.y, at.z])
 
 
+def matrix_of(turn):
+    return to_matrix(np.array([turn.w, turn.x, turn.y, turn.z]))
+
+
 def positions(message):
     return np.array([xyz(one.position) for one in message.poses])
 
@@ -82,7 +86,7 @@ def traced(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("key", "topic"), SAME.items())
-def test_topics_have_what_the_trace_has(traced, key, topic):
+def test_topics_agree_with_the_trace(traced, key, topic):
     sent, kept = composed(PLAN, *PERIODS)[key], traced[topic]
     assert sent.header.stamp == kept.header.stamp
     match key:
@@ -111,19 +115,14 @@ def test_stamps_are_moved_by_the_epoch():
 
 
 def test_shapes_of_smartneedle_are_half_a_millimetre_apart_and_end_at_the_tip():
+    """The z of each pose is along the needle."""
     sent = composed(BENT, profile="smartneedle")["shape"]
     steps = np.linalg.norm(np.diff(positions(sent), axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.5, rtol=1e-5)
     x, y, z = BENT.shape[-1, :3]
     np.testing.assert_allclose(positions(sent)[-1], (-z, y, x))
-    assert len(sent.poses) == 300
-    assert sent.header.frame_id == "needle"
-
-
-def test_poses_of_smartneedle_have_their_z_along_the_needle():
-    sent = composed(BENT, profile="smartneedle")["shape"]
-    turns = [one.orientation for one in sent.poses]
-    axes = np.array([to_matrix(np.array([q.w, q.x, q.y, q.z]))[:, 2] for q in turns])
+    assert (len(sent.poses), sent.header.frame_id) == (300, "needle")
+    axes = np.array([matrix_of(one.orientation)[:, 2] for one in sent.poses])
     chords = np.gradient(positions(sent), axis=0)
     np.testing.assert_allclose(axes, chords / np.linalg.norm(chords, axis=1)[:, None], atol=1e-3)
 
@@ -154,10 +153,7 @@ def test_the_needle_pose_is_the_inserted_length_and_the_roll():
 
 def test_a_roll_turns_about_the_needles_own_axis():
     at = pose(0.0, Pose(1.0, 2.0, 3.0, 0.3, -0.2)).pose
-    before, after = (
-        to_matrix(np.array([q.w, q.x, q.y, q.z]))
-        for q in (at.orientation, turn_about_axis(at, 0.7).orientation)
-    )
+    before, after = matrix_of(at.orientation), matrix_of(turn_about_axis(at, 0.7).orientation)
     np.testing.assert_allclose(after[:, 0], before[:, 0])
     np.testing.assert_allclose(after[:, 1] @ before[:, 1], math.cos(0.7))
     np.testing.assert_allclose(after[:, 1] @ before[:, 2], math.sin(0.7))
@@ -179,18 +175,16 @@ def test_a_measured_tip_has_its_covariance():
     assert sent.header.stamp.sec == 1
 
 
-def test_an_angle_that_is_not_measured_may_be_any():
+def test_an_unknown_angle_has_the_variance_of_any_angle():
     measured = Measurement(1.5, 1.0, 2.0, covariance=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
     found = composed(replace(PERIOD, measurement=measured))["measured_tip"].pose.covariance.reshape(6, 6)
     np.testing.assert_allclose(found[3:, 3:], UNKNOWN_TURN * np.eye(3))
 
 
-def test_without_a_covariance_or_an_accepted_reading_there_is_no_measured_tip():
-    assert "measured_tip" not in composed(PERIOD)
-    assert "measured_tip" not in composed(blind(PERIOD))
-
-
-def test_what_was_not_predicted_is_not_published():
+def test_unknown_values_are_not_published():
+    """A tip without a covariance or an accepted reading, and a shape that was not predicted."""
+    for period in (PERIOD, blind(PERIOD)):
+        assert "measured_tip" not in composed(period)
     assert "predicted_shape" not in composed(replace(PERIOD, predicted=None))
 
 
@@ -210,13 +204,10 @@ def test_markers_are_the_layers_and_the_target():
     assert ball.scale.x == pytest.approx(0.002)
 
 
-def test_a_new_target_keeps_the_layers():
+def test_a_new_target_keeps_the_layers_and_a_plan_without_a_scenario_has_none():
     sent = composed(PLAN, RosTarget(3.0, (35.0, -4.0, 1.0)))["markers"].markers
     assert [m.ns for m in sent] == ["tissue", "tissue", "target"]
     np.testing.assert_allclose(xyz(sent[-1].pose.position), (0.035, -0.004, 0.001))
-
-
-def test_a_plan_without_a_scenario_has_no_layers():
     assert [m.ns for m in composed(replace(PLAN, scenario=None))["markers"].markers] == ["target"]
 
 
@@ -224,11 +215,7 @@ def test_the_state_is_a_word_and_a_diagnostic():
     sent = composed(RosState(1.0, "fault", "motor A is off", good=False, values={"axis": "A"}))
     assert sent["state"].data == "fault"
     (status,) = sent["diagnostics"].status
-    assert (status.level, status.name, status.message) == (
-        b"\x01"[0],
-        "flexneedle: rig",
-        "fault: motor A is off",
-    )
+    assert (status.level, status.name, status.message) == (1, "flexneedle: rig", "fault: motor A is off")
     assert [(pair.key, pair.value) for pair in status.values] == [("axis", "A")]
 
 
@@ -239,12 +226,6 @@ def test_joint_targets():
     assert len(sent.velocity) == len(sent.effort) == 0
 
 
-def test_only_what_the_profile_lists_is_made():
-    assert set(composed(PLAN, PERIOD, profile="smartneedle-fbg")) == {
-        "predicted_shape",
-        "tip",
-        "plan",
-        "markers",
-        "joint_states",
-        "diagnostics",
-    }
+def test_only_the_topics_of_the_profile_are_made():
+    listed = {"predicted_shape", "tip", "plan", "markers", "joint_states", "diagnostics"}
+    assert set(composed(PLAN, PERIOD, profile="smartneedle-fbg")) == listed

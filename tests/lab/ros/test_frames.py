@@ -1,4 +1,4 @@
-"""Coordinates of the insertion to those of a topic and back."""
+"""Coordinates of the insertion in the frame of a topic, and back."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_there_are_24_right_handed_axes():
     st.sampled_from(["m", "mm"]),
     st.tuples(*[COORDINATES] * 3),
 )
-def test_a_pose_comes_back(at, axes, body, unit, origin):
+def test_a_pose_is_restored(at, axes, body, unit, origin):
     there = frame(axes, body, unit, origin)
     sent = there.map_pose(pose(0.0, at).pose)
     np.testing.assert_allclose(there.to_point(sent.position), at.point, atol=1e-9)
@@ -79,7 +79,7 @@ def test_the_needles_own_axis_points_along_it(at, axes, body):
     np.testing.assert_allclose(turn @ along, there.rotation @ np.array(at.axis), atol=1e-12)
 
 
-def test_metres_along_x_stay_as_they_are_to_the_last_bit():
+def test_metres_along_x_are_unchanged_to_the_last_bit():
     at = pose(0.0, Pose(1.1, -2.2, 3.3, 0.1, 0.2)).pose
     assert frame(("x", "y", "z")).map_pose(at) == at
 
@@ -99,24 +99,24 @@ def test_a_straight_needle_has_no_rotation_in_its_own_frame():
     np.testing.assert_allclose(turn @ (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), atol=1e-15)  # z of the needle along y
 
 
-def test_an_origin_is_where_the_skin_is_entered():
+def test_the_origin_is_the_skin_entry():
     there = frame(("z", "y", "-x"), unit="mm", origin=(1.0, 2.0, 28.5))
     np.testing.assert_allclose(xyz(there.map_point(PointMessage(0.0, 0.0, 0.0))), (1.0, 2.0, 28.5))
     np.testing.assert_allclose(there.to_point(PointMessage(1.0, 2.0, 0.0)), (-28.5, 0.0, 0.0), atol=1e-12)
 
 
-def test_variances_take_the_unit_squared_and_their_axes():
+def test_variances_have_the_unit_squared_and_turned_axes():
     turned = smartneedle("needle").map_covariance(np.diag([1.0, 4.0, 9.0]) * 1e-6)
     np.testing.assert_allclose(turned, np.diag([9.0, 4.0, 1.0]))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300, 10.1])
-def test_a_position_that_is_none_is_refused(bad):
+def test_an_impossible_position_is_refused(bad):
     with pytest.raises(InputError, match="position"):
         frame(("x", "y", "z")).to_point(PointMessage(0.0, bad, 0.0))
 
 
 @pytest.mark.parametrize("turn", [(0, 0, 0, 0), (math.nan, 0, 0, 1), (0, 0, 0, 2), (1e308, 1e308, 0, 0)])
-def test_an_orientation_that_is_none_is_refused(turn):
+def test_an_impossible_orientation_is_refused(turn):
     with pytest.raises(InputError, match="not a unit quaternion"):
         frame(("x", "y", "z")).to_orientation(Quaternion(*map(float, turn)))

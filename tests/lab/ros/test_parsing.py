@@ -1,4 +1,4 @@
-"""Records of received messages, and what is refused."""
+"""Records of received messages, and refused messages."""
 
 import math
 
@@ -31,18 +31,20 @@ def read(key, message, profile=NEUTRAL, arrival=100.0, **how):
     return Subscription(profile, key).read(data, arrival, **how)
 
 
-def test_a_tip_in_metres():
-    found = read("tip", tip(5.0, (0.040, -0.003, 0.002)))
+ALONG_Y = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
+
+
+@pytest.mark.parametrize(
+    ("profile", "message", "position"),
+    [
+        (NEUTRAL, tip(5.0, (0.040, -0.003, 0.002)), (40.0, -3.0, 2.0)),  # in metres
+        (SMARTNEEDLE, tip(5.0, (-2.0, 40.0, 3.0), ALONG_Y, "stage"), (40.0, 3.0, -2.0)),  # deep along y
+    ],
+)
+def test_a_tip_of_a_needle_straight_along_the_insertion(profile, message, position):
+    found = read("tip", message, profile)
     assert (found.time, found.number, found.status) == (100.0, 1, VISIBLE)
-    np.testing.assert_allclose(found.position, (40.0, -3.0, 2.0))
-    z_to_x = (0.5, 0.5, 0.5, 0.5)  # straight along the insertion
-    np.testing.assert_allclose(found.orientation, z_to_x)
-
-
-def test_a_tip_of_smartneedle():
-    """40 mm deep is y of its stage; its z is along the needle, here along y, too."""
-    found = read("tip", tip(5.0, (-2.0, 40.0, 3.0), (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "stage"), SMARTNEEDLE)
-    np.testing.assert_allclose(found.position, (40.0, 3.0, -2.0))
+    np.testing.assert_allclose(found.position, position)
     np.testing.assert_allclose(z_axis(np.array(found.orientation)), (1.0, 0.0, 0.0), atol=1e-12)
 
 
@@ -59,7 +61,8 @@ def test_targets_stops_arms_and_joints():
     found = read("target", target(5.0, (0.035, 0.005, 0.0)))
     assert isinstance(found, RosTarget)
     np.testing.assert_allclose(found.point, (35.0, 5.0, 0.0))
-    assert read("stop", Bool(True)) == RosStop(100.0, "/flexneedle/stop")
+    for publishers in (1, 2):
+        assert read("stop", Bool(True), publishers=publishers) == RosStop(100.0, "/flexneedle/stop")
     assert read("stop", Bool(False)) is None
     assert read("arm", Bool(True)) == RosArm(100.0, "/flexneedle/arm")
     assert isinstance(read("arm", Bool(False)), RosStop)
@@ -69,7 +72,7 @@ def test_targets_stops_arms_and_joints():
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"\x00\x01\x00\x00", b"\x07\x01\x00\x00\x01", b"\xff" * 40])
-def test_what_cannot_be_read_on_the_topic_of_stops_is_a_stop(data):
+def test_an_unreadable_message_on_the_topic_of_stops_is_a_stop(data):
     found = read("stop", data)
     assert isinstance(found, RosStop)
     assert found.reason.startswith("not a std_msgs/msg/Bool: ")
@@ -103,35 +106,28 @@ def with_twice_the_name():
         ("tip", cdr(tip(5.0)) + bytes(8), "not a geometry_msgs/msg/PoseStamped: "),
     ],
 )
-def test_what_is_refused(key, message, subject):
+def test_invalid_messages_are_refused(key, message, subject):
     found = read(key, message)
     assert isinstance(found, RosRefusal), found
     assert found.reason.startswith(subject)
 
 
-def test_measurements_of_two_publishers_are_refused_and_stops_are_not():
+def test_measurements_of_two_publishers_and_repeated_messages_are_refused():
     assert "2 publishers" in read("tip", tip(5.0), publishers=2).reason
-    assert isinstance(read("stop", Bool(True), publishers=2), RosStop)
-
-
-def test_a_tip_that_is_nowhere_is_a_missing_one():
-    found = read("tip", tip(5.0, (math.nan, 0.0, 0.0)))
-    assert (found.position, found.orientation) == (None, None)
-    assert found.status.startswith("position (nan, 0, 0)")
-
-
-def test_a_tip_without_an_orientation_keeps_its_position():
-    found = read("tip", tip(5.0, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
-    assert found.position == pytest.approx((10.0, 0.0, 0.0))
-    assert (found.orientation, found.status) == (None, VISIBLE)
-
-
-def test_a_message_is_taken_once():
     subscription, data = Subscription(NEUTRAL, "tip"), cdr(tip(5.0))
     assert isinstance(subscription.read(data, 100.0), TipReading)
     again = subscription.read(data, 100.1)
     assert again.reason.startswith("old data")
     assert (subscription.number, again.count) == (2, 1)
+
+
+def test_a_tip_without_a_position_is_missing_and_one_without_an_orientation_keeps_its_position():
+    found = read("tip", tip(5.0, (math.nan, 0.0, 0.0)))
+    assert (found.position, found.orientation) == (None, None)
+    assert found.status.startswith("position (nan, 0, 0)")
+    found = read("tip", tip(5.0, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+    assert found.position == pytest.approx((10.0, 0.0, 0.0))
+    assert (found.orientation, found.status) == (None, VISIBLE)
 
 
 # Times of measurement
@@ -152,12 +148,10 @@ def accepted(clock, stamps_and_arrivals):
         yield number, time
 
 
-def test_a_message_that_was_held_up_has_its_own_time(clock):
-    assert clock.to_time(1000.0, 10.010) == pytest.approx(
-        10.010
-    )  # the least delay until now is taken for none
-    assert clock.to_time(1000.1, 10.105) == pytest.approx(10.105)
-    assert clock.to_time(1000.2, 10.700) == pytest.approx(10.205)
+def test_a_delayed_message_has_its_own_time(clock):
+    """The least delay until now is taken for none."""
+    found = [clock.to_time(*one) for one in ((1000.0, 10.010), (1000.1, 10.105), (1000.2, 10.700))]
+    assert found == pytest.approx([10.010, 10.105, 10.205])
 
 
 @given(st.floats(-1e6, 1e6), st.lists(st.floats(0.0, 0.5), min_size=2, max_size=50))
@@ -189,7 +183,7 @@ def test_a_sender_whose_clock_is_set_back_has_no_earlier_times_afterwards(clock)
 
 @pytest.mark.parametrize("seconds", [1.0, 2.2, 2.9])
 def test_a_clock_that_is_set_back_twice_has_no_earlier_times_afterwards(clock, seconds):
-    """Again before it is seen to be as late as before, while it is observed, and after that."""
+    """Again before it has caught up, while it is observed, and after that."""
     number = np.arange(400)
     true = 10.0 + 0.025 * number
     back = np.where(number >= 40, 2.0, 0.0) + np.where(true >= 11.0 + seconds, 0.1, 0.0)
@@ -208,8 +202,8 @@ def test_a_topic_whose_messages_change_places_recovers_after_a_set_back(clock, e
     assert sum(number > 130 for number, _ in accepted(clock, messages())) > 150
 
 
-def test_messages_after_held_up_ones_that_came_in_order_are_not_taken_for_new(clock):
-    """Nothing but a message without delay shows what the clock of the sender is."""
+def test_messages_after_delayed_ones_in_order_are_not_taken_for_new(clock):
+    """Only a message without delay shows the clock of the sender."""
     messages = ((5.0, 10.0), (3.0, 10.1), (3.1, 10.1), (5.1, 10.5), (5.5, 10.5), (5.6, 10.7), (5.7, 10.8))
     found = dict(accepted(clock, messages))
     assert found == {0: 10.0, 5: pytest.approx(10.6), 6: pytest.approx(10.7)}  # 5.1 came 0.4 s late

@@ -1,4 +1,4 @@
-"""ros2/flexneedle_ros: it agrees with the neutral profile, and its node runs with (a stand-in of) rclpy only."""
+"""ros2/flexneedle_ros agrees with the neutral profile, and its node runs with a stand-in of rclpy."""
 
 import runpy
 import subprocess
@@ -74,7 +74,7 @@ def test_topics_are_those_of_the_neutral_profile(operator):
     assert parameters() == operator.DEFAULTS
 
 
-def test_rviz_shows_topics_of_the_neutral_profile_as_what_they_are():
+def test_rviz_shows_topics_of_the_neutral_profile_by_their_types():
     config = YAML(typ="safe").load((FOLDER / "config" / "flexneedle.rviz").read_text())[
         "Visualization Manager"
     ]
@@ -88,7 +88,7 @@ def test_rviz_shows_topics_of_the_neutral_profile_as_what_they_are():
         assert (display["Topic"]["Durability Policy"] == "Transient Local") is (key in LATCHED)
 
 
-def test_what_is_installed_exists_and_the_launch_file_starts_it(stand_ins):
+def test_installed_files_exist_and_the_launch_file_starts_them(stand_ins):
     setup = stand_ins("setuptools")["setuptools"].setup
     runpy.run_path(str(FOLDER / "setup.py"))
     given = setup.call_args.kwargs
@@ -103,11 +103,8 @@ def test_what_is_installed_exists_and_the_launch_file_starts_it(stand_ins):
     modules["ament_index_python.packages"].get_package_share_directory.return_value = str(FOLDER)
     runpy.run_path(str(FOLDER / "launch" / "flexneedle.launch.py"))["generate_launch_description"]()
     operator, rviz = (call.kwargs for call in modules["launch_ros.actions"].Node.call_args_list)
-    assert (operator["package"], operator["executable"], operator["name"]) == (
-        "flexneedle_ros",
-        "operator",
-        "flexneedle_operator",
-    )
+    names = [operator[key] for key in ("package", "executable", "name")]
+    assert names == ["flexneedle_ros", "operator", "flexneedle_operator"]
     assert Path(rviz["arguments"][1]).is_file()
     defaults = [
         c.kwargs["default_value"] for c in modules["launch.actions"].DeclareLaunchArgument.call_args_list
@@ -115,7 +112,7 @@ def test_what_is_installed_exists_and_the_launch_file_starts_it(stand_ins):
     assert Path(defaults[1]).is_file()
 
 
-def test_the_manifest_names_what_is_imported():
+def test_the_manifest_names_the_imported_packages():
     manifest = ElementTree.parse(FOLDER / "package.xml").getroot()
     assert manifest.findtext("name") == "flexneedle_ros"
     assert manifest.findtext("export/build_type") == "ament_python"
@@ -196,7 +193,7 @@ def running(request, operator, monkeypatch):
 
 @pytest.mark.parametrize("before", ["inserting", "idle"])
 def test_a_stop_is_repeated_until_the_rig_reports_it(running, before):
-    """An idle rig, too: what it last reported may be older than the stop, and an arm may be on its way."""
+    """Also of an idle rig: its last report may be older than the stop, and an arm may be on its way."""
 
     def stop(_answers):
         until(lambda: len(running.sent) >= 3)
@@ -210,7 +207,7 @@ def test_a_stop_is_repeated_until_the_rig_reports_it(running, before):
 
 
 @pytest.mark.parametrize(("name", "state", "sent"), [("stop", "stopped", 3), ("arm", "armed", 1)])
-def test_a_state_that_was_reported_before_the_call_is_no_answer(running, name, state, sent):
+def test_a_state_from_before_the_call_is_not_an_answer(running, name, state, sent):
     """It may be the state of a rig that has ended, while another one begins."""
 
     def report_again(answers):
@@ -223,7 +220,7 @@ def test_a_state_that_was_reported_before_the_call_is_no_answer(running, name, s
 
 
 @pytest.mark.parametrize("running", [0.2], indirect=True)
-def test_what_an_idle_rig_does_not_report_fails_and_an_arm_is_sent_once(running):
+def test_without_a_report_of_an_idle_rig_a_call_fails_and_an_arm_is_sent_once(running):
     running.report("idle")
     failed = (False, "not done within 0.2 s: the rig reports 'idle'")
     assert running.call("arm") == failed
@@ -241,7 +238,7 @@ def test_what_an_idle_rig_does_not_report_fails_and_an_arm_is_sent_once(running)
         ("inserting", ("armed", "inserting"), True),
     ],
 )
-def test_an_arm_is_done_also_where_the_rig_inserts_already(operator, before, after, done):
+def test_an_arm_is_done_also_if_the_rig_inserts_already(operator, before, after, done):
     states = operator.States()
     states.report(before)
     published = []
@@ -256,7 +253,7 @@ def test_an_arm_is_done_also_where_the_rig_inserts_already(operator, before, aft
     assert len(published) == 1
 
 
-def test_without_a_rig_a_service_fails_and_a_stop_is_sent_all_the_same(running):
+def test_without_a_rig_a_service_fails_and_a_stop_is_still_sent(running):
     running.publishers = 0
     running.report("stopped")  # of a rig that has ended
     assert running.call("stop") == (False, "no rig publishes /flexneedle/state")

@@ -20,7 +20,7 @@ from ros_peers import Peer, shape, tip
 
 
 class Node:
-    """A node of whose records the test disposes."""
+    """A node with records of the test."""
 
     status = VISIBLE
 
@@ -65,13 +65,13 @@ def test_times_are_on_the_clock_of_the_run(node):
     assert 11.99 - (after - before) - 1e-9 <= frame.time <= 11.99 + 1e-9
 
 
-def test_a_tip_that_is_nowhere_has_its_reason(node, tracker):
+def test_a_tip_without_a_position_has_its_reason(node, tracker):
     node.records = [reading(position=None, status="position (nan, 0, 0): not a number")]
     (frame,) = tracker.read()
     assert frame.readings["tip"].status == "position (nan, 0, 0): not a number"
 
 
-def test_the_status_is_why_no_frame_arrives(node):
+def test_the_status_is_the_reason_why_no_frame_arrives(node):
     tracker = RosTracker(node, WallClock(), late_s=60.0)
     node.records = [reading()]
     tracker.read()
@@ -108,7 +108,7 @@ def test_invalid_settings_are_one_line(settings, key):
 
 
 def test_tips_of_smartneedle_reach_the_stage_of_the_insertion():
-    """Its /sensor/tip: mm, insertion along y, sent by a process that is not ours."""
+    """Its /sensor/tip: mm, insertion along y."""
     with make_tracker({"profile": "smartneedle"}, WallClock()) as tracker:
         peer, measured = Peer(load_profile("smartneedle"), subscribe=("tip",)), []
         peer.await_node(tracker._node)
