@@ -24,7 +24,7 @@ _CLOCK = r"""
 #include <sys/time.h>
 #include <time.h>
 
-/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one as it is. */
+/* The computer's clock, shifted by the seconds in the file that CLOCK_SHIFT names; the monotonic one is unchanged. */
 static long shift(void) {
     long seconds = 0;
     FILE *file = fopen(getenv("CLOCK_SHIFT"), "r");

@@ -19,8 +19,8 @@ MOTION_MM = 0.5
 """The most that the base may move after detection."""
 END = "end"
 """The state of a rig whose controller has stopped it, at the end of an insertion."""
-_BY_CONTROLLER = "the controller"  # who stops the motors then
-_RECORDED = ("holding", "stopped", "fault")  # states with a reason of their own
+_BY_CONTROLLER = "the controller"  # which stops the motors then
+_RECORDED = ("holding", "stopped", "fault")  # states that have a reason
 _AT_REST = 1e-3  # from where an axis is at the end (mm, rad)
 _COLUMNS = {"guide_y": DG_Y}  # of a control, by axes that move seldom
 _UNSEEN = 2.0  # tolerances of an axis: a stall in less need not be detected

@@ -15,8 +15,8 @@ class Reaction:
     the fault, with spaces; `end` is the stop by the controller at the end of an insertion, "running" an insertion
     whose record has no outcome.
 
-    detected: by which of these states, none where the supervisor records nothing. The reason is from the state, but
-    for `end` and for none, where it is from the outcome.
+    detected: states that count as detection, none if the supervisor records nothing. The reason is from the state; for
+    `end` and for none it is from the outcome.
     """
 
     text: str
@@ -61,7 +61,7 @@ class Fault:
     timed: str = field(default="detection_s", kw_only=True)
 
     def falls_in_roll(self, rolls: bool) -> bool:
-        """Return whether it falls in a roll, in a case in which faults do so or not."""
+        """Return whether the fault falls in a roll. rolls: whether faults of the case do so."""
         return self.rolls == "all" or (self.rolls == "some" and rolls)
 
 
@@ -71,7 +71,7 @@ _computer = partial(Fault, "computer")
 _SOME = "some"
 _NO_READING = "^(missing: no reading|stale)"
 _NOT_CONNECTED = "closed the connection|not connected|not sent|reset by peer"
-# Another character than that of a reply, or another digit: a position that is elsewhere, or a bit of a state.
+# A character that no reply has, or another digit: another position, or a bit of a state.
 _GARBLED = (
     "not a reply|must be .* numbers|more than the replies|before a refusal|no (position|byte)|refused"
     "|jumped|went back|the motor"

@@ -82,7 +82,7 @@ class Trial:
 
     @property
     def key(self) -> dict[str, Any]:
-        """By which its row is found again: rows with the same values are of the same fault in the same insertion."""
+        """Values that identify its row: trials of the same fault in the same insertion have equal ones."""
         scenario = self.case.scenario
         return {
             "group": self.fault.group,

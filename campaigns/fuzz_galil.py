@@ -276,7 +276,7 @@ def call_driver(motors: GalilMotors, server: Server, name: str, random: Random) 
 
 
 def compare_states(states: Mapping[str, MotorState], sent: bytes) -> None:
-    """Raise Failure if states are not those that were sent."""
+    """Raise Failure if states differ from the sent ones."""
     first, second = re.findall(rb"-?[0-9.]+", sent)[:2], re.findall(rb"-?[0-9.]+", sent)[2:4]
     true = [float(value) for value in first + second]
     read = [state.position for state in states.values()] + [state.commanded for state in states.values()]

@@ -188,7 +188,7 @@ class Inserted:
 
     @property
     def ticks(self) -> Mapping[str, Any]:
-        """Times of the supervisor's ticks, empty without any."""
+        """Times of the supervisor's ticks, empty if it has none."""
         return (self.run.get("timing") or {}).get("ticks") or {}
 
     def unexplained(self, seen: "Witness") -> int:
@@ -232,7 +232,7 @@ def resume_rows(
 ) -> Iterator[tuple[Row, bool]]:
     """Yield the row of each task, and whether it is new: those in a file first, then others as they end.
 
-    A row has the values of its task's key, by which it is found again, and is appended to the file (JSON, a line each)
+    A row contains its task's key, which identifies it, and is appended to the file (JSON, a line each)
     once it is complete. A task that raises RuntimeError is printed, and leaves no row. After an interrupt (Ctrl-C,
     SIGTERM) tasks that have not ended leave none, and the processes that they have started are ended.
     """
@@ -268,7 +268,7 @@ def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
         wait_for_end, left = wait(left, _POLL_S, FIRST_COMPLETED)
         if interrupted.is_set():
             raise KeyboardInterrupt
-        # Those that raise come last: another's exception loses no row.
+        # Futures with an exception come last: another's exception loses no row.
         for one in sorted(wait_for_end, key=lambda one: one.exception() is not None):
             try:
                 yield one.result()

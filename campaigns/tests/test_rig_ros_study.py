@@ -24,7 +24,7 @@ def row(**more):
         (0, {"unexplained": 1, "late": 1}, 0),
     ],
 )
-def test_what_subscribers_cost_is_in_the_exit_status(tmp_path, monkeypatch, subscribers, more, status):
+def test_the_cost_of_subscribers_is_in_the_exit_status(tmp_path, monkeypatch, subscribers, more, status):
     def cost(_seed, count, _out):
         return row(**(more if count == subscribers else {}))
 

@@ -39,7 +39,7 @@ def test_a_binary_reply_has_two_checksums_lowest_byte_first():
 
 
 def test_a_checksum_over_all_of_a_binary_reply_is_the_same():
-    """ndicapi computes the checksum of header and body together: that of a header with its checksum is 0."""
+    """ndicapi computes the checksum of header and body together: a header with its own checksum has 0."""
     reply = codec.encode_binary(b"abc")
     assert codec.crc16(reply[:-2]) == codec.crc16(b"abc")
 

@@ -38,7 +38,7 @@ def program(tmp_path_factory):
 
 @contextmanager
 def fast_dds(program, *links):
-    """Run the peer; its stops and starts are its own."""
+    """Run the peer."""
     command = [str(program), os.environ["ROS_DOMAIN_ID"], *links]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
@@ -51,7 +51,7 @@ def fast_dds(program, *links):
 
 
 @pytest.mark.parametrize("profile", [NEUTRAL, SMARTNEEDLE], ids=["neutral", "smartneedle"])
-def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
+def test_every_message_of_the_node_returns_unchanged(program, profile):
     """Node to Fast DDS to a subscriber: decoded and encoded by the other vendor's code, equal to the last byte."""
     own = profile.select(publish=[key for key in PUBLISHED if getattr(profile.publish, key)])
     topics = {key: getattr(own.publish, key).topic for key in PUBLISHED if getattr(own.publish, key)}
@@ -77,8 +77,8 @@ def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
         until(lambda: node.poll() or all(node.subscribers[key] for key in topics))
         found, sent = {}, []
 
-        def come_back():
-            """Send again from time to time: what is sent before two topics have found each other is lost."""
+        def have_returned():
+            """Send repeatedly: messages from before two topics have found each other are lost."""
             if not sent or time.monotonic() > sent[-1] + 0.5:
                 sent.append(time.monotonic())
                 for record in records:
@@ -88,11 +88,11 @@ def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
                     found[key] = data[: len(expected[key])]
             return found == expected
 
-        until(come_back)
+        until(have_returned)
 
 
-def test_what_fast_dds_publishes_is_read(program):
-    """The node's own tip, shape and a stop come back to it through Fast DDS as measurements and a request."""
+def test_messages_of_fast_dds_are_read(program):
+    """The node receives its own tip, shape and a stop through Fast DDS as measurements and a request."""
     publish, subscribe = NEUTRAL.publish, NEUTRAL.subscribe
     links = [
         f"PoseStamped:{publish.tip.topic}:{subscribe.tip.topic}",

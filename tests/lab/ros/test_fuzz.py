@@ -13,7 +13,7 @@ import fuzz_ros
 import fuzzing
 
 
-def test_what_is_received_may_be_anything():
+def test_any_bytes_may_be_received():
     done, note = fuzzing.run(fuzz_ros.messages, 3000, 20.0, seed=7)
     assert done == 3000
     assert set(re.findall(r"(\w+)'", note)) >= {
@@ -45,5 +45,5 @@ def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
         ("joint_states", JointReading(0.0, {"a": float("inf")}), "joints"),
     ],
 )
-def test_it_finds_what_must_not_be(key, record, found):
+def test_wrong_records_are_found(key, record, found):
     assert fuzz_ros.problem(key, b"\x00\x01\x00\x00\x01", record).startswith(found)

@@ -78,14 +78,14 @@ def follow_until(motors, condition):
 
 
 def advance(motors, goal=0.050, speed=0.005):
-    """Begin a motion of the insertion, and return when it is under way."""
+    """Begin a motion of the insertion, and return while it moves."""
     motors.set_speed("insertion", speed, 1.0)
     motors.follow({"insertion": goal})
     return follow_until(motors, lambda s: s["insertion"].position > 0.0102)
 
 
 def reconnect(motors):
-    """Reconnect as a supervisor does: again and again while it connects."""
+    """Reconnect as a supervisor does: repeatedly while it connects."""
 
     def done():
         try:
@@ -115,7 +115,7 @@ def test_states_without_newer_ones_are_repeated(motors, joints):
     until(lambda: not motors.read()["roll"].repeated)
 
 
-def test_nothing_is_sent_before_a_motion_is_asked_for(motors, joints):
+def test_nothing_is_sent_before_the_first_motion(motors, joints):
     for _ in range(5):
         motors.read()
     motors.stop()
@@ -147,7 +147,7 @@ def test_a_motion_is_a_stream_of_set_points_at_the_limited_speed(motors, joints)
 
 
 def test_without_calls_the_joints_stop(motors, joints):
-    """The process of the rig is killed or hangs: what is left is less than one set point."""
+    """The process of the rig is killed or hangs: the remaining motion is less than one set point."""
     advance(motors)
     before = motors.read()["insertion"].commanded
     until(lambda: joints.targets and joints.targets[-1][1]["insertion"] == before)
@@ -157,7 +157,7 @@ def test_without_calls_the_joints_stop(motors, joints):
     assert joints.positions["insertion"] == before
 
 
-def test_a_stop_holds_at_the_set_point_and_sends_none_that_leads_back(motors, joints):
+def test_a_stop_holds_at_the_set_point_and_sends_no_earlier_one(motors, joints):
     advance(motors)
     joints.free.set()  # measured positions lag behind the set points, by 0.5 mm
     late = follow_until(motors, lambda s: s["insertion"].commanded > s["insertion"].position + 5e-4)[-1]
@@ -200,7 +200,7 @@ def test_positions_may_be_defined_at_rest(motors):
         motors.define("insertion", 0.0)
 
 
-def test_old_states_are_an_error_and_a_stop_is_sent_all_the_same(connected, motors, joints, monkeypatch):
+def test_old_states_are_an_error_and_a_stop_is_still_sent(connected, motors, joints, monkeypatch):
     advance(motors)
     joints.silent.set()
     monkeypatch.setattr(connected[1], "_stale", 0.1)
@@ -280,10 +280,10 @@ def test_a_new_connection_has_no_priority_over_the_ticks(monkeypatch):
     assert order == ["connecting", "connected"]
 
 
-# What is refused
+# Refusals
 
 
-def test_what_is_refused(motors, joints):
+def test_invalid_calls_are_refused(motors, joints):
     refused = [
         (lambda: motors.follow({"elbow": 1.0}), "^joint 'elbow': must be one of insertion, roll$"),
         (lambda: motors.follow({"roll": math.nan}), "^joint roll: nan"),
@@ -334,7 +334,7 @@ def test_a_set_point_never_exceeds_its_speed_nor_its_goal(begin, goal, speed, st
         assert point.position == goal
 
 
-def test_they_are_found_by_name():
+def test_driver_and_tracker_are_found_by_name():
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
     for group, make in (("flexneedle.drivers", make_motors), ("flexneedle.trackers", make_tracker)):
         assert EntryPoint("ros", project["entry-points"][group]["ros"], group).load() is make

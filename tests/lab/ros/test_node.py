@@ -156,7 +156,7 @@ def test_a_latched_stop_is_received_at_the_start_and_a_latched_arm_never():
     assert of_kind(RosArm, received) == []
 
 
-def test_a_stop_that_comes_before_the_first_sign_of_life_is_received(monkeypatch):
+def test_a_stop_before_the_first_sign_of_life_is_received(monkeypatch):
     class Process:
         def __init__(self, _module, **_):
             self.channel, self.other = map(MessageChannel, socket.socketpair())
@@ -189,7 +189,7 @@ def test_tips_and_shapes_reach_the_rig(measuring):
     np.testing.assert_allclose(of_kind(ShapeReading, curves)[0].points, [(0, 0, 0), (1.3, 0, 0)])
 
 
-def test_what_is_refused_is_reported(measuring):
+def test_a_refused_message_is_reported(measuring):
     peer = Peer(NEUTRAL, subscribe=("tip",))
     received = peer.ask("tip", lambda: tip(time.time(), frame="map"), measuring, RosRefusal)
     refused = of_kind(RosRefusal, received)[0]
@@ -220,8 +220,8 @@ def test_a_stop_arrives_in_a_flood_of_measurements_whose_refusals_are_limited(me
     assert len(of_kind(RosRefusal, received)) <= 2 + seconds / 0.1  # one in 0.1 s
 
 
-def test_what_a_participant_publishes_is_not_read_back():
-    """Cyclone could deliver a participant's own samples; a profile cannot have a topic both ways, either."""
+def test_a_participant_does_not_read_its_own_messages():
+    """Cyclone could deliver a participant's own samples; a profile cannot have a topic in both directions, either."""
     topic, kind = NEUTRAL.subscribe.target.topic, "geometry_msgs/msg/PointStamped"
     peer, other = Peer(NEUTRAL), Peer(NEUTRAL)
     own, seen = TopicReader(peer.domain, topic, kind), TopicReader(other.domain, topic, kind)
@@ -237,8 +237,8 @@ def test_what_a_participant_publishes_is_not_read_back():
         (DataReader, "_get_matched_publications", lambda domain: TopicReader(domain, STOP, BOOL).writers),
     ],
 )
-def test_one_that_comes_while_they_are_counted_is_counted(monkeypatch, kind, asked, number):
-    found = iter((1, 2, 2, 2))  # Cyclone DDS asks for the number, then for as many
+def test_an_endpoint_that_appears_during_the_count_is_counted(monkeypatch, kind, asked, number):
+    found = iter((1, 2, 2, 2))  # Cyclone DDS asks for the number, then for the list
     monkeypatch.setattr(kind, asked, lambda *_: next(found))
     assert number(Peer(NEUTRAL).domain) == 2
 
@@ -267,7 +267,7 @@ def test_a_node_that_hangs_is_lost_and_ends_with_the_rig():
         assert node._process.wait(DEADLINE_S) == 0
 
 
-def test_what_prevents_a_node_is_one_line(monkeypatch):
+def test_an_obstacle_to_a_node_is_one_line(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", "400")
         with pytest.raises(RunError, match=r"^ROS_DOMAIN_ID = '400'"):

@@ -1,4 +1,4 @@
-"""Profiles: what ships, and what is refused."""
+"""Shipped profiles, and refused ones."""
 
 import tomllib
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_every_shipped_topic_has_a_type_and_one_owner():
     assert set(SUBSCRIBED) == set(profiles.ReadTopics.model_fields)
 
 
-def test_neutral_lists_all_but_what_smartneedle_alone_has():
+def test_neutral_lists_all_topics_but_those_of_smartneedle_alone():
     listed = topics_of("neutral")
     every = {f"publish.{key}" for key in PUBLISHED} | {f"subscribe.{key}" for key in SUBSCRIBED}
     assert every - set(listed) == {"publish.skin_entry", "publish.needle_pose", "publish.guide_pose"}
@@ -116,7 +116,7 @@ def test_the_fibre_optic_needle_publishes_its_own_shape():
         ({"frames__x": {"id": "x", "deep": [[]]}}, "frames.x.deep = [[]]"),
     ],
 )
-def test_what_is_refused(tmp_path, changes, key):
+def test_an_invalid_profile_is_refused(tmp_path, changes, key):
     path = write(tmp_path / "own.toml", **changes)
     with pytest.raises(RigError) as caught:
         load_profile(path)

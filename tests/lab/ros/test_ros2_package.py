@@ -37,7 +37,7 @@ def operator(monkeypatch):
 
 @pytest.fixture
 def stand_ins(monkeypatch):
-    """Modules that stand in for those of ROS, by name."""
+    """Replacements for modules of ROS, by name."""
 
     def stand_in(*names):
         modules = {name: MagicMock(name=name) for name in names}
@@ -121,7 +121,7 @@ def test_the_manifest_names_the_imported_packages():
 
 
 class Rclpy:
-    """Stands in for rclpy: keeps what the node makes, and spins until the test ends it."""
+    """A replacement for rclpy: it keeps the parts of the node, and spins until the test ends it."""
 
     def __init__(self, monkeypatch):
         self.sent, self.services, self.publishers, self.spinning = [], {}, 1, True

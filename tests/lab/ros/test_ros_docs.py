@@ -1,4 +1,4 @@
-"""docs/rig/ros.md: its tables are those of the profiles and of a node, and its rig file is one."""
+"""docs/rig/ros.md: its tables agree with the profiles and a node, and its rig file is valid."""
 
 import re
 import tomllib
@@ -71,7 +71,7 @@ def quality(qos):
 
 
 def table_of_qualities():
-    """The table of the page: qualities by its first column; those of several readers are separated by `;`."""
+    """The table of the page: qualities by its first column; qualities of several readers are separated by `;`."""
     table = re.search(r"<!-- table: quality -->\n\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
     columns = {name: [cell.split("; ") for cell in cells] for name, *cells in rows}
@@ -104,7 +104,7 @@ def test_qualities_of_service_agree_with_the_node():
             assert announced(domain, kind, counts) == wanted
 
 
-def test_the_rig_file_is_one():
+def test_the_rig_file_is_valid():
     rig = RigFile.model_validate(tomllib.loads(rig_of_page()))
     assert (rig.driver.kind, rig.tracker.kind) == ("ros", "ros")
     check_settings(RosDriverSettings, rig.driver.settings)

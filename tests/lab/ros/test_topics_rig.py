@@ -1,4 +1,4 @@
-"""A whole insertion on a rig of ROS topics alone: that of the page about ROS."""
+"""A whole insertion on a rig of ROS topics alone, the rig of the page about ROS."""
 
 import subprocess
 import sys

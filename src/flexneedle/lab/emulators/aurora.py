@@ -14,7 +14,7 @@ from flexneedle.lab.emulators.faults import BYTE, MM, RATIO, SECONDS, FaultKind
 from flexneedle.lab.emulators.motion import SENSORS, EmulatedPose
 
 FIRMWARE = "AURORA Rev 008"
-"""Freeze tag of the firmware, by which clients choose BX or TX."""
+"""Freeze tag of the firmware; clients choose BX or TX by it."""
 
 
 def _fault_of_sensor(text: str) -> FaultKind:

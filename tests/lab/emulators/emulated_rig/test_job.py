@@ -1,4 +1,4 @@
-"""What can be emulated, and the records and orders of its processes."""
+"""Rigs that can be emulated, and the records and orders of their processes."""
 
 import pickle
 import socket
@@ -126,7 +126,7 @@ def test_an_invalid_fault_is_refused_in_one_line(given, message):
     assert split_fault("galil:stall=A@5:1") == ("galil", "stall=A@5:1")
 
 
-def test_the_phantom_is_that_of_the_virtual_rig_of_the_same_seed():
+def test_the_phantom_equals_the_virtual_rig_of_the_same_seed():
     """Also its start: the tip before the first motion."""
     for seed in (0, 5):
         needle = DrivenNeedle(draw_phantom(EmulationJob(RIG, PHANTOM, seed)), np.zeros(6))
@@ -196,7 +196,7 @@ def test_records_arrive_in_order_and_the_end_after_the_last():
     reading.close()
 
 
-def test_a_reader_that_does_not_keep_up_is_an_error_and_one_that_is_gone_the_end():
+def test_a_reader_that_does_not_keep_up_is_an_error_and_one_that_has_ended_the_end():
     reading, writing = channels()
     record = Record(0.0, (0.0,) * 4, True)
 

@@ -1,4 +1,4 @@
-"""The needle that follows the axes: the truth of the virtual rig, and its sensor as the tracker has it."""
+"""The needle that follows the axes: the truth of the virtual rig, and its sensor in the tracker's frame."""
 
 import math
 
@@ -60,7 +60,7 @@ def insertions(name, seed, **values):
 
 
 @pytest.mark.parametrize(("name", "seed"), [("phantom", 0), ("phantom3d", 3)])
-def test_the_truth_is_that_of_the_virtual_rig_of_the_same_seed(name, seed):
+def test_the_truth_equals_the_virtual_rig_of_the_same_seed(name, seed):
     """Up to the steps, of 0.25 mm there and 0.025 mm here: 4.3 µm at the worst of 12 insertions, 3 % in the energy."""
     for virtual, driven in insertions(name, seed):
         np.testing.assert_allclose(driven.tip[:3], virtual.tip[:3], rtol=0, atol=6e-3)
@@ -72,7 +72,7 @@ def test_the_truth_is_that_of_the_virtual_rig_of_the_same_seed(name, seed):
 
 
 def test_with_the_same_steps_the_truth_is_the_same():
-    """What is left, 0.12 µm, comes from turning in many parts in place of one."""
+    """The remaining 0.12 µm are due to turning in many parts instead of one."""
     for virtual, driven in insertions("phantom", 0, step_mm=0.025):
         np.testing.assert_allclose(driven.tip, virtual.tip, rtol=0, atol=3e-4)
 

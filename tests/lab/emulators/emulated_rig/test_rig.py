@@ -32,7 +32,7 @@ JITTER_MM = 0.07 / math.sqrt(3.0)
 
 
 class Monotonic:
-    """The clock of the truth, as that of a run."""
+    """The clock of the truth, with the port of a run's clock."""
 
     def now(self):
         """Seconds."""
@@ -64,7 +64,7 @@ def moved_by(truth, times):
 
 
 def taken(truth, numbers, times, positions):
-    """Times (n,) of frames that are taken at equal intervals: those with which positions agree best with the truth.
+    """Times (n,) of frames at equal intervals for which the positions agree best with the truth.
 
     The adapter's times are late by up to the delay of a request, which on a loaded machine is several ms.
     """
@@ -205,7 +205,7 @@ def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch, tmp_path):
     assert [one.wait() for one in parts.values()] == [0, 1]
 
 
-def test_an_address_that_is_taken_is_found_out_before_anything_is_started(tmp_path):
+def test_an_address_that_is_taken_is_noticed_before_anything_is_started(tmp_path):
     path = rig_file(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = f"127.0.0.1:{other.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""The file of the true states: written as it goes, read back."""
+"""The file of the true states is written continuously, and read back."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ def path(tmp_path):
     return tmp_path / "truth.csv"
 
 
-def test_what_is_written_is_read_back(path):
+def test_a_written_record_is_read_back(path):
     with TruthWriter(path, AXES) as writer:
         writer.write(row(10.0))
         writer.write(row(10.5, 1.25))

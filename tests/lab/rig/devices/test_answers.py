@@ -1,4 +1,4 @@
-"""What a driver or tracker of a user returns that is not of its type is one line: class, method, what is wanted."""
+"""A value of a wrong type from a user's driver or tracker is reported in one line: class, method, expected type."""
 
 import math
 import sys

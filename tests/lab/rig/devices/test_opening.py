@@ -29,7 +29,7 @@ class Halves:
         type(self).closed = True
 
 
-def keeps_what_it_gets(settings, channels):
+def keeps_settings(settings, channels):
     motors = Motors(channels)
     motors.settings = settings
     return motors
@@ -110,14 +110,14 @@ def message(call, *arguments):
 
 
 @pytest.mark.parametrize("group", [DRIVERS, TRACKERS])
-def test_what_the_package_registers_exists(group):
+def test_registered_parts_exist(group):
     points = PROJECT["entry-points"].get(group, {})
     assert all(callable(load_part(value, ())) for value in points.values())
     assert group != TRACKERS or {"aurora", "replay"} <= set(points)
 
 
 def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
-    motors = open_motors(rig(driver={"kind": "parts:keeps_what_it_gets", "port": 7, "deep": {"a": [1]}}))
+    motors = open_motors(rig(driver={"kind": "parts:keeps_settings", "port": 7, "deep": {"a": [1]}}))
     assert motors.settings == {"port": 7, "deep": {"a": [1]}}
     assert tuple(motors.states) == ("A", "B", "C")
 
@@ -231,7 +231,7 @@ def test_a_name_that_names_no_or_several_installed_parts_is_refused(package):
         ("parts:lists", "made a list "),
     ],
 )
-def test_an_unsuitable_part_of_your_own_is_refused(kind, line):
+def test_an_unsuitable_custom_part_is_refused(kind, line):
     found = rig(driver={"kind": kind}, tracker={"kind": kind})
     assert message(open_motors, found).startswith(f'driver.kind = "{kind}": {line}')
     assert message(open_tracker, found, Clock()).startswith(f'tracker.kind = "{kind}": {line}')

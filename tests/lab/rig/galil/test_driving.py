@@ -108,7 +108,7 @@ def test_streamed_targets_are_followed_within_a_fiftieth_of_a_millimetre(motors)
     assert readings[-1][1].position == pytest.approx(COUNTS_PER_MM, abs=1)
 
 
-def test_when_targets_end_the_motor_stops_after_the_motion_that_was_sent_ahead(motors):
+def test_after_the_last_target_the_motor_stops_within_the_motion_sent_ahead(motors):
     for _ in range(5):
         at = motors.read()["A"].commanded
         motors.follow({"A": at + SPEED * AHEAD_S})

@@ -32,7 +32,7 @@ COMMAND = st.one_of(
 LINE = st.lists(COMMAND, min_size=1, max_size=3).map(";".join)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(st.lists(st.tuples(LINE, st.integers(0, 20)), max_size=30))
 def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
     device, _ = reply(ControllerState(), "SHAB")
@@ -92,7 +92,7 @@ def test_any_reply_is_a_state_that_was_sent_or_an_error_in_time(driven, answer, 
 
 
 def reads_truly(motors, device):
-    """Whether a new connection has the positions of the controller, which moves between a reading and the next."""
+    """Return whether a new connection has the positions of the controller, which moves between two readings."""
     try:
         motors.reconnect()
         found = [state.position for state in motors.read().values()]

@@ -43,7 +43,7 @@ def test_commands_are_sent_in_a_line_and_answered_one_by_one():
     ]
 
 
-def test_what_does_not_fit_into_a_line_takes_another():
+def test_commands_that_do_not_fit_into_a_line_take_another():
     with linked() as (link, device):
         assert len(ask(link, *["TPABCD"] * 20)) == 20
     assert len(device.lines) == 2
@@ -163,7 +163,7 @@ def test_without_a_failure_there_is_no_farewell():
     assert device.lines == ["TPA", "TPB"]
 
 
-def test_when_the_time_is_over_nothing_is_sent_and_the_connection_stays():
+def test_after_the_deadline_nothing_is_sent_and_the_connection_remains():
     with linked() as (link, device):
         with pytest.raises(DriverError, match="no time left for TPA"):
             ask(link, "TPA", seconds=-1.0)

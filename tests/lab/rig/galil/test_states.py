@@ -63,7 +63,7 @@ def test_bits_of_the_switches(switches, on, reverse, forward, moves):
     ],
 )
 def test_in_position_tracking_an_axis_rests_after_two_reports_at_its_target(reports, expected):
-    """Whether or not the controller counts it as in motion there. One that passes its target is in motion."""
+    """The controller may count it as in motion there. An axis that passes its target is in motion."""
     assert moving(tracking(100), *reports) == expected
 
 

@@ -1,4 +1,4 @@
-"""What an observer of the emulated controller gets: how far its motors have really turned."""
+"""Observation of the emulated controller: the true travel of its motors."""
 
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession
 
 
 def observed(*faults):
-    """A session with motors on at 0 s, and the list of what its observer gets."""
+    """A session with motors on at 0 s, and the list of observations."""
     seen = []
     session = GalilSession(ControllerState(), [parse_fault(spec, FAULTS) for spec in faults], 0.0)
     session.observe = lambda *record: seen.append(record)
@@ -31,7 +31,7 @@ def test_the_travel_is_that_of_the_encoder_every_few_milliseconds():
     assert moving[-1][1] > 500.0
 
 
-def test_a_motion_is_told_at_its_beginning_and_rest_after_its_end():
+def test_a_motion_is_reported_at_its_begin_and_rest_after_its_end():
     session, seen = observed()
     session.advance(0.05)
     assert not any(moves for *_, moves in seen)
@@ -42,7 +42,7 @@ def test_a_motion_is_told_at_its_beginning_and_rest_after_its_end():
     assert (time, travel[0], moves) == (pytest.approx(1.0), 100.0, False)
 
 
-def test_a_position_that_is_called_otherwise_is_no_motion():
+def test_another_value_for_a_position_is_no_motion():
     session, seen = observed("reset=B@0.2")
     session.reply("DPA=5000", 0.01)
     session.reply("PR 100,200;BGAB", 0.02)
@@ -52,7 +52,7 @@ def test_a_position_that_is_called_otherwise_is_no_motion():
     assert session.device.axes[1].encoder == 0.0
 
 
-def test_a_motor_that_creeps_on_after_its_motion_still_moves():
+def test_a_motor_that_creeps_after_its_motion_still_moves():
     session, seen = observed("lag=A@0")
     session.reply("PR 100;BGA", 0.0)
     session.advance(0.3)

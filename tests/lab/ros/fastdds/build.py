@@ -26,7 +26,7 @@ _BASIC = {
 
 
 def missing():
-    """Why the peer cannot be built, or ""."""
+    """Return the reason why the peer cannot be built, or ""."""
     lacking = [name for name in ("fastddsgen", "g++") if which(name) is None]
     header = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
     lacking += [] if header.exists() else ["libfastrtps-dev"]

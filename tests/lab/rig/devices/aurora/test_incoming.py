@@ -1,4 +1,4 @@
-"""Messages in place of a link's: what is not new, or not in order, ends the link and gives no frame."""
+"""Messages of a link: one that is not new or not in order is refused and gives no frame."""
 
 import json
 import socket
@@ -92,7 +92,7 @@ def test_a_reason_is_one_printable_line():
     assert found.status == ("no reply?[2J" + "x" * 1000)[:200]
 
 
-def test_the_status_is_that_of_the_newest_message():
+def test_the_status_is_from_the_newest_message():
     found = incoming(READY, frame(7))
     assert found.status == VISIBLE
     found.take(parse(data(["error", "garbled", "replies are garbled"])))

@@ -50,7 +50,7 @@ class Link:
 
     @property
     def address(self) -> str:
-        """IP address and port, by whichever name the host was given."""
+        """IP address and port, also if the host was given by name."""
         return ":".join(map(str, self._address[:2]))
 
     @property

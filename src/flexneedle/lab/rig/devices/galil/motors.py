@@ -32,10 +32,8 @@ _REVISION = "\x12\x16"  # Ctrl-R Ctrl-V
 _FARTHEST = 2_147_483_647
 _SPEED_STEP, _RATE_STEP = 2, 1024  # the controller rounds down to multiples, at its default sample time
 _PACES = MotorPaces((_SPEED_STEP, 15_000_000.0), (_RATE_STEP, 1_073_740_800.0))
-_SLOWING_S, _MARGIN_S = (
-    0.5,
-    0.05,
-)  # time to come to rest if speed and acceleration were not set here; and beyond it
+_SLOWING_S = 0.5  # time to come to rest if speed and acceleration were not set here
+_MARGIN_S = 0.05  # after the time to come to rest
 
 
 def factory(settings: Mapping[str, Any], channels: Sequence[str]) -> "GalilMotors":
@@ -102,7 +100,7 @@ class GalilMotors:
         self._dialogue.do(commands, deadline)
 
     def _identify(self, deadline: float) -> None:
-        """Identify the device. Raises DriverError if it is not a controller that can be read as it is."""
+        """Identify the device. Raises DriverError if it is not a controller that can be read without another setup."""
         self._link.ask(["EO 0"], deadline)  # refused where there is no echo to switch off, as on Ethernet
         self.identity = self._dialogue.text(_REVISION, deadline)
         if "DMC" not in self.identity:
@@ -268,7 +266,7 @@ class GalilMotors:
         return max(self._slowing.get(letter, _SLOWING_S) for letter in self._letters) + _MARGIN_S
 
     def set_speed(self, channel: str, speed: float, acceleration: float) -> None:
-        """Limit speed (counts/s) and acceleration (counts/s²) of the motions to come, and of those under way.
+        """Limit speed (counts/s) and acceleration (counts/s²) of present and later motions.
 
         They are rounded down to what the controller has: speeds to multiples of 2, accelerations to multiples of 1024.
         The deceleration is the acceleration; a controller refuses to change it during a motion to a position.

@@ -2,7 +2,7 @@
 
 Each command of a line, between `;`, is answered by its data and `:`, or by `?`. Data are printable ASCII in lines that
 end with CR LF. `:` and `?` do not occur in the data of the commands that the driver sends. A reply has no checksum:
-what has the right form is taken as it is. Source: Galil, Command Reference, DMC-4103.
+data of the right form are accepted. Source: Galil, Command Reference, DMC-4103.
 """
 
 import re
