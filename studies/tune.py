@@ -12,8 +12,7 @@ studies/tuning), with the same bytes for any number of processes.
 
 Each trial sets all settings of the space, independent of the shipped values, so that the result can be reproduced after
 the shipped settings have been changed to it. All other settings are the shipped ones. The weights of `adaptive-mpc` are
-not tuned here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may contain a remark for
-a record.
+not tuned here but chosen on random worlds (docs/decisions/0009-identify-and-search.md).
 """
 
 import argparse
@@ -42,8 +41,6 @@ FIRST_SEED = 5000  # of the phantoms, one per case; evaluations use 100000 and a
 FAILED_MM = 5.0
 PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
-# Remarks on a result, by method.
-NOTES: dict[str, str] = {}
 RECORDS = Path(__file__).resolve().parent / "tuning"
 Settings = dict[str, float]
 
@@ -120,7 +117,7 @@ def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) ->
     ]
 
 
-def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executor) -> list[Trial]:
+def halve(trials: list[Trial], controller: str, plans: list[Plan], executor: Executor) -> list[Trial]:
     """Return all trials after the last round: the last round first, each round sorted by score."""
     out: list[Trial] = []
     first = spent = 0
@@ -128,7 +125,7 @@ def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executo
         trials, out = trials[:settings], trials[settings:] + out
         seeds = range(FIRST_SEED + first, FIRST_SEED + first + cases)
         tasks = [
-            (method, trial.settings, plans[STRIDE * (seed - FIRST_SEED) % len(plans)], seed)
+            (controller, trial.settings, plans[STRIDE * (seed - FIRST_SEED) % len(plans)], seed)
             for trial in trials
             for seed in seeds
         ]
@@ -144,9 +141,9 @@ def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executo
 
 def error_of(task: tuple[str, Settings, Plan, int]) -> float:
     """Return the true error (mm) of one insertion."""
-    method, settings, plan, seed = task
+    controller, settings, plan, seed = task
     scenario = flexneedle.load_scenario("phantom").with_values(settings)
-    done = flexneedle.insert(scenario, plan, seed, controller=method, force=True, threads=1)
+    done = flexneedle.insert(scenario, plan, seed, controller=controller, force=True, threads=1)
     return done.true_error_mm if done.outcome == "done" else FAILED_MM
 
 
@@ -155,21 +152,20 @@ def plan_for(target: tuple[float, float]) -> Plan:
     return flexneedle.plan(flexneedle.load_scenario("phantom"), target, seed=PLAN_SEED, threads=1)
 
 
-def result(method: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
+def result(controller: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
     """Return the record, best trial first."""
     return {
-        "method": method,
+        "controller": controller,
         "chosen": trials[0].settings,
         "score": SCORE,
         "budget_insertions": BUDGET,
         "rounds": [{"settings": settings, "further_cases": cases} for settings, cases in ROUNDS],
         "phantom_seeds": [FIRST_SEED, FIRST_SEED + sum(cases for _, cases in ROUNDS) - 1],
-        "note": NOTES.get(method, ""),
         "plan_seed": PLAN_SEED,
         "search_seed": seed,
         "scenario": "phantom",
         "phantom": "exact",
-        "space": {key: vars(range_) for key, range_ in SPACES[method].items()},
+        "space": {key: vars(range_) for key, range_ in SPACES[controller].items()},
         "trials": [
             {
                 "settings": trial.settings,
@@ -206,10 +202,10 @@ def counted(errors: Iterable[float], before: int) -> Iterator[float]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Return tune, print the table, write the record."""
+    """Tune the controller, print the table, write the record."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument(
-        "method", choices=sorted(SPACES), metavar="CONTROLLER", help=", ".join(sorted(SPACES))
+        "controller", choices=sorted(SPACES), metavar="CONTROLLER", help=", ".join(sorted(SPACES))
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     parser.add_argument(
@@ -218,13 +214,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RECORDS, metavar="DIR")
     chosen = parser.parse_args(arguments)
     rng = np.random.default_rng(chosen.seed)
-    first = [Trial(settings) for settings in candidates(SPACES[chosen.method], ROUNDS[0][0], rng)]
+    first = [Trial(settings) for settings in candidates(SPACES[chosen.controller], ROUNDS[0][0], rng)]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as executor:
         plans = list(executor.map(plan_for, TARGETS))
-        trials = halve(first, chosen.method, plans, executor)
-    found = result(chosen.method, chosen.seed, trials)
+        trials = halve(first, chosen.controller, plans, executor)
+    found = result(chosen.controller, chosen.seed, trials)
     chosen.out.mkdir(parents=True, exist_ok=True)
-    path = chosen.out / f"{chosen.method}.json"
+    path = chosen.out / f"{chosen.controller}.json"
     path.write_text(to_text(found), encoding="utf-8")
     print(table(found))
     print(f"\nchosen: {found['chosen']}\nwritten: {os.fspath(path)}")

@@ -18,17 +18,20 @@ TUNED = sorted(item.stem for item in SHIPPED.iterdir())
 NOT_TUNED = {"open-loop", "adaptive-mpc"}  # no settings; settings chosen on random worlds
 
 
-def text_of(method):
-    return (SHIPPED / f"{method}.json").read_text(encoding="utf-8")
+def text_of(controller):
+    return (SHIPPED / f"{controller}.json").read_text(encoding="utf-8")
 
 
-def record_of(method):
-    return json.loads(text_of(method))
+def record_of(controller):
+    return json.loads(text_of(controller))
 
 
-@pytest.mark.parametrize("method", TUNED)
-def test_shipped_settings_are_those_chosen_by_tuning(method):
-    shipped, chosen = check_tables(flexneedle.load_scenario("phantom")).flat(), record_of(method)["chosen"]
+@pytest.mark.parametrize("controller", TUNED)
+def test_shipped_settings_are_those_chosen_by_tuning(controller):
+    shipped, chosen = (
+        check_tables(flexneedle.load_scenario("phantom")).flat(),
+        record_of(controller)["chosen"],
+    )
     assert chosen
     assert {key: shipped[key] for key in chosen} == chosen
 
@@ -38,19 +41,19 @@ def test_every_controller_with_a_space_has_a_record():
     assert set(CONTROLLERS) - NOT_TUNED == set(TUNED)
 
 
-@pytest.mark.parametrize("method", TUNED)
-def test_records_agree_with_the_script(method):
-    """Budget, seeds, space and note agree with the present script; the result follows from the trials."""
-    record = record_of(method)
-    assert to_text(record) == text_of(method)
+@pytest.mark.parametrize("controller", TUNED)
+def test_records_agree_with_the_script(controller):
+    """Budget, seeds and space agree with the present script; the result follows from the trials."""
+    record = record_of(controller)
+    assert to_text(record) == text_of(controller)
     trials = [tune.Trial(trial["settings"], (trial["mean_mm"],)) for trial in record["trials"]]
-    written = json.loads(to_text(tune.result(method, record["search_seed"], trials)))
+    written = json.loads(to_text(tune.result(controller, record["search_seed"], trials)))
     assert list(written) == list(record)
     found = {"trials", "versions"}
     assert {k: v for k, v in written.items() if k not in found} == {
         k: v for k, v in record.items() if k not in found
     }
-    tried = tune.candidates(tune.SPACES[method], 5, np.random.default_rng(record["search_seed"]))
+    tried = tune.candidates(tune.SPACES[controller], 5, np.random.default_rng(record["search_seed"]))
     assert sorted(map(repr, tried)) == sorted(repr(trial["settings"]) for trial in record["trials"])
     assert sum(trial["cases"] for trial in record["trials"]) == record["budget_insertions"]
 
@@ -81,8 +84,8 @@ class Race:
         self.errors, self.drift, self.tasks = errors, drift or {}, []
 
     def error_of(self, task):
-        method, settings, plan, seed = task
-        self.tasks.append((method, settings["x"], plan, seed))
+        controller, settings, plan, seed = task
+        self.tasks.append((controller, settings["x"], plan, seed))
         late = seed >= 5000 + 20
         return self.errors[settings["x"]] + late * self.drift.get(settings["x"], 0.0)
 
