@@ -55,11 +55,8 @@ def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
     assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
 
 
-@pytest.mark.parametrize("shift", [0.0, 240.0])  # with 240 mm, one tenth would be about a grid step
-def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(shift):
-    row = field_row()
-    row = FieldRow(row.title, row.true, row.error + np.array([shift, 0.0, 0.0]))
-    figure = draw_field([row])
+def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it():
+    figure = draw_field([field_row()])
     drawn = [(ax, one) for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
     ends = np.concatenate([one.XY + np.stack([one.U, one.V], axis=1) for _, one in drawn])
     (low, high), (bottom, top) = drawn[0][0].get_xlim(), drawn[0][0].get_ylim()

@@ -1,29 +1,26 @@
 """Columns of a table: by the names of flexneedle, or by other names that are mapped to them."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 
 from flexneedle.errors import InputError
 from flexneedle.phantom.tracking.table import COLUMNS
-from flexneedle.scenario.library import Library
 
-_MAPS = Library("a column map")
 _OPTION = "--columns NAME=COLUMN"
 
 
 def map_columns(given: Iterable[str]) -> dict[str, str]:
-    """Return the names in the table by column, from pairs "NAME=COLUMN" and paths of TOML files with such pairs.
+    """Return the names in the table by column, from pairs "NAME=COLUMN".
 
-    Raises InputError for invalid pairs and files, and for a column that is unknown or given twice.
+    Raises InputError for an invalid pair, and for a column that is unknown or given twice.
     """
     names: dict[str, str] = {}
     for text in given:
-        for name, column in [_pair(text)] if "=" in text else _from_file(Path(text)):
-            if column not in COLUMNS:
-                raise InputError(f"{_OPTION}: unknown COLUMN {column!r}: choose from {', '.join(COLUMNS)}")
-            if column in names:
-                raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
-            names[column] = name
+        name, mark, column = (part.strip() for part in text.rpartition("="))
+        if not mark or column not in COLUMNS:
+            raise InputError(f"{_OPTION}: {text!r}: COLUMN must be one of {', '.join(COLUMNS)}")
+        if column in names:
+            raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
+        names[column] = name
     return names
 
 
@@ -62,21 +59,6 @@ def _label_options(missing: Iterable[str]) -> str:
     labels = [name for name in ("sensor", "environment") if name in missing]
     options = " ".join(f"--{name} NAME" for name in labels)
     return f"; for a table of one {' and '.join(labels)}, use {options}" if labels else ""
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, _, column = text.rpartition("=")
-    return name.strip(), column.strip()
-
-
-def _from_file(path: Path) -> list[tuple[str, str]]:
-    if not path.is_file():
-        raise InputError(f"{_OPTION}: {path}: must be a pair NAME=COLUMN or an existing file")
-    values = _MAPS.read(path)
-    invalid = [name for name, column in values.items() if not isinstance(column, str)]
-    if invalid:
-        raise InputError(f'{path}: {invalid[0]}: must be a line such as {invalid[0]} = "x_mm"')
-    return list(values.items())
 
 
 def _describe(column: str, name: str) -> str:

@@ -19,38 +19,46 @@ points_mm = [[0, 0, 0], [1, 0, 0]]
 [rest]
 drift_mm = 10.0
 """
+LIMIT = "the stage 50.0 mm: the difference must be at most 10.0 mm"
+
+
+@pytest.fixture(scope="module")
+def still():
+    """The path of an emulated tracker with a sensor at rest."""
+    with emulated("--sensors", "1", "--still") as path:
+        yield path
+
+
+@pytest.fixture
+def grid(tmp_path):
+    """The file of a grid of two points, 1 mm apart."""
+    (tmp_path / "grid.toml").write_text(GRID)
+    return tmp_path / "grid.toml"
 
 
 def run(capsys, *argv):
     """Return exit status, stdout and stderr."""
-    status = cli.main(argv)
+    status = cli.main(list(map(str, argv)))
     captured = capsys.readouterr()
     return status, captured.out, captured.err
 
 
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_the_emulator_provides_the_requested_path_until_it_ends(tmp_path, end):
+def test_the_emulator_provides_the_requested_path_until_it_ends(tmp_path):
     link = tmp_path / "tracker"
-    with emulated("--link", str(link), end=end) as path:
+    with emulated("--link", str(link), end=signal.SIGTERM) as path:
         assert path == str(link)
         assert link.is_char_device()
     assert not link.is_symlink()
 
 
-def test_the_emulator_replaces_no_file(capsys, tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    status, _, err = run(capsys, "emulate", "aurora", "--link", str(tmp_path / "mine"))
-    assert (status, (tmp_path / "mine").read_text()) == (2, "mine")
-    assert "already exists: choose another path, or remove it" in err
-
-
-def test_the_emulator_replaces_only_the_link_of_a_killed_emulator(tmp_path):
+def test_the_emulator_replaces_only_the_link_of_a_killed_emulator(capsys, tmp_path):
     target, link = tmp_path / "kept.txt", tmp_path / "dev"
     target.write_text("mine")
+    assert run(capsys, "emulate", "aurora", "--link", target)[0] == 2
     link.symlink_to(target)
     with pytest.raises(InputError, match="already exists"):
         SerialPort(link)
-    assert link.readlink() == target
+    assert (link.readlink(), target.read_text()) == (target, "mine")
     link.unlink()
     link.symlink_to("/dev/pts/999999")
     with SerialPort(link) as serial:
@@ -74,72 +82,39 @@ def test_an_unknown_fault_is_bad_input(capsys):
     assert err.startswith("flexneedle: --fault mising@1: unknown kind; kinds: missing, ")
 
 
-def test_a_recording_prompts_at_each_point_and_prints_its_file(capsys, tmp_path, monkeypatch):
-    (tmp_path / "grid.toml").write_text(GRID)
-    out = str(tmp_path / "table.csv")
-    with emulated("--sensors", "1", "--still") as path:
-        arguments = ("--tracker", f"aurora:{path}", "--grid", str(tmp_path / "grid.toml"), "--out", out)
-        monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
-        status, _, err = run(capsys, "em", "record", *arguments)
-        assert status == 1
-        assert "point 1 of 2, repeat 1 of 1: press Enter with the stage at 0, 0, 0 mm:\n" in err
-        assert "\nflexneedle: end of input on stdin" in err, "on a separate line"
-        status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
+def test_a_recording_prompts_at_each_point_and_prints_its_file(capsys, tmp_path, monkeypatch, grid, still):
+    out = tmp_path / "table.csv"
+    nowhere = ("em", "record", "--grid", grid, "--out", out, "--tracker", f"aurora:{tmp_path}/nothing")
+    status, printed, err = run(capsys, *nowhere, "--dwell", "0")
+    assert (status, printed) == (2, "")
+    assert "no such port; serial ports found: " in err
+    assert not out.exists()
+    record = (*nowhere[:-1], f"aurora:{still}")
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    status, _, err = run(capsys, *record)
+    assert status == 1
+    assert "point 1 of 2, repeat 1 of 1: press Enter with the stage at 0, 0, 0 mm:\n" in err
+    assert "\nflexneedle: end of input on stdin" in err, "on a separate line"
+    before = out.read_bytes()
+    assert run(capsys, *nowhere)[0] == 2
+    assert out.read_bytes() == before
+    status, printed, err = run(capsys, *record, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
     assert "resuming after 1 recorded points" in err
     assert "point 2 of 2" in err
-    status, printed, err = run(capsys, "em", "record", *arguments)
-    assert (status, printed, err) == (0, f"{out}\n", f"{out}: complete, 2 points\n")
-
-
-def test_a_missing_tracker_is_bad_input(capsys, tmp_path):
-    status, out, err = run(capsys, "em", "watch", "--tracker", f"aurora:{tmp_path}/nothing")
-    assert (status, out) == (2, "")
-    assert "no such port; serial ports found: " in err
-
-
-def test_without_a_tracker_no_file_is_created_or_changed(capsys, tmp_path):
-    (tmp_path / "grid.toml").write_text(GRID)
-    out = tmp_path / "table.csv"
-    arguments = ("em", "record", "--grid", str(tmp_path / "grid.toml"), "--out", str(out), "--dwell", "0")
-    nowhere = ("--tracker", f"aurora:{tmp_path}/nothing")
-    status, printed, err = run(capsys, *arguments, *nowhere)
-    assert (status, printed) == (2, "")
-    assert "no such port" in err
-    assert not out.exists()
-    with emulated("--sensors", "1", "--still") as path:
-        assert run(capsys, *arguments, "--tracker", f"aurora:{path}")[0] == 0
-    lines = out.read_text().splitlines(keepends=True)
-    begun = "".join(lines[:7]) + lines[7][:9]  # one stop and a truncated part of the next
-    out.write_text(begun)
-    assert run(capsys, *arguments, *nowhere)[0] == 2
-    assert out.read_text() == begun
+    assert run(capsys, *record) == (0, f"{out}\n", f"{out}: complete, 2 points\n")
 
 
 def test_a_watch_prints_json_lines_and_saves_the_frames(capsys, tmp_path):
     kept = tmp_path / "kept.csv"
     with emulated("--fault", "missing@0") as path:
-        status, out, _ = run(
-            capsys,
-            "em",
-            "watch",
-            "--tracker",
-            f"aurora:{path}",
-            "--json",
-            "--seconds",
-            "1",
-            "--record",
-            str(kept),
-        )
+        watch = ("em", "watch", "--tracker", f"aurora:{path}", "--json", "--seconds", "1", "--record", kept)
+        status, out, _ = run(capsys, *watch)
     lines = [json.loads(line) for line in out.splitlines()]
     assert status == 0
     assert lines[-1]["verdict"] == "tip: missing"
-    assert lines[-1]["sensors"]["tip"] == {
-        "position_mm": None,
-        "quaternion": None,
-        "indicator": None,
-        "status": "missing",
-    }
+    nothing = dict.fromkeys(("position_mm", "quaternion", "indicator"))
+    assert lines[-1]["sensors"]["tip"] == nothing | {"status": "missing"}
     assert len(lines[-1]["sensors"]["ref1"]["position_mm"]) == 3
     status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{kept}@10")
     assert status == 0
@@ -155,43 +130,29 @@ class Terminal(io.StringIO):
         return True
 
 
-MOVING = GRID.replace("[1, 0, 0]", "[50, 0, 0]")
-
-
-def record_moving(capsys, tmp_path, monkeypatch, typed, *more):
-    """Record a tip that rests while the stage moves by 50 mm."""
-    (tmp_path / "grid.toml").write_text(MOVING)
-    monkeypatch.setattr("sys.stdin", typed)
-    with emulated("--sensors", "1", "--still") as path:
-        out = tmp_path / "table.csv"
-        arguments = ("--tracker", f"aurora:{path}", "--grid", str(tmp_path / "grid.toml"), "--out", str(out))
-        status, _, err = run(capsys, "em", "record", *arguments, *more)
-    return status, err, out.read_text().count("\n") - 1 if out.exists() else 0
-
-
-def test_at_a_terminal_a_mismatch_must_be_confirmed(capsys, tmp_path, monkeypatch):
-    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, Terminal("\n\n\nk\n"))
-    assert (status, rows) == (0, 8)
-    assert err.count("the stage 50.0 mm: the difference must be at most 10.0 mm\n") == 2
-    assert err.count("press Enter to measure this point again, k to keep it: ") == 2
-
-
-def test_without_a_terminal_a_mismatch_is_refused_unless_forced(capsys, tmp_path, monkeypatch):
-    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO("\n" * 9))
-    assert (status, rows) == (1, 4)
-    assert (
-        "the stage 50.0 mm: the difference must be at most 10.0 mm (use --force to record the point anyway)\n"
-        in err
+@pytest.mark.parametrize(
+    ("stdin", "options", "status", "rows", "words"),
+    [
+        (Terminal("\n\n\nk\n"), (), 0, 8, [LIMIT, "press Enter to measure this point again, k to keep it: "]),
+        (Terminal(), (), 1, 0, [" mm: \nflexneedle: end of input on stdin"]),
+        (io.StringIO("\n" * 9), (), 1, 4, [f"{LIMIT} (use --force to record the point anyway)"]),
+        (io.StringIO(), ("--dwell", "0", "--force"), 0, 8, ["recorded (--force)"]),
+    ],
+    ids=["kept", "end of input", "no terminal", "forced"],
+)
+def test_a_tip_that_rests_while_the_stage_moves_must_be_confirmed(
+    capsys, tmp_path, monkeypatch, grid, still, stdin, options, status, rows, words
+):
+    """At a terminal a mismatch must be confirmed; without one it is refused unless forced."""
+    grid.write_text(GRID.replace("[1, 0, 0]", "[50, 0, 0]"))
+    monkeypatch.setattr("sys.stdin", stdin)
+    out = tmp_path / "table.csv"
+    found, _, err = run(
+        capsys, "em", "record", "--tracker", f"aurora:{still}", "--grid", grid, "--out", out, *options
     )
-    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO(), "--dwell", "0", "--force")
-    assert (status, rows) == (0, 8)
-    assert "recorded (--force)" in err
-
-
-def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_prompt(capsys, tmp_path, monkeypatch):
-    status, err, _ = record_moving(capsys, tmp_path, monkeypatch, Terminal())
-    assert status == 1
-    assert " mm: \nflexneedle: end of input on stdin" in err
+    assert found == status
+    assert (out.read_text().count("\n") - 1 if out.exists() else 0) == rows
+    assert all(word in err for word in words)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """`em evaluate` against values computed by hand, a second implementation, and invariances."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.columns import map_columns
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
 LAWS = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -211,10 +209,3 @@ def test_repeatability_uses_n_minus_one_and_separates_the_axes(tmp_path):
     )  # sums of squares 2 and 8 over two degrees of freedom
     assert found["sd_mm"] == pytest.approx(math.sqrt(5.0))
     assert (found["worst_mm"], found["worst_at"]) == (pytest.approx(math.sqrt(8.0)), "1")
-
-
-def test_the_documented_mapping_file_is_valid(tmp_path):
-    text = (Path(__file__).parents[4] / "docs/tracking/evaluate.md").read_text(encoding="utf-8")
-    mapping = tmp_path / "map.toml"
-    mapping.write_text(text.split("```toml\n")[1].split("```")[0])
-    assert map_columns([str(mapping)]) == {"x_mm": "X [mm]", "point_id": "id"}

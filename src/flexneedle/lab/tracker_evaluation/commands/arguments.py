@@ -37,7 +37,7 @@ def add_columns(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=COLUMN",
-        help='name of a column, such as X=x_mm, or a TOML file with lines such as X = "x_mm"; repeatable',
+        help="name of a column, such as X=x_mm; repeatable",
     )
 
 

@@ -45,9 +45,8 @@ _FORMAT = 1
 class EvaluationOptions:
     """Options of reading and evaluating a table.
 
-    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm" or "m", of all lengths; ideal,
-    noisy: names of the environments of the fits to the indicator (None: the paper's); sensor, environment: of all rows,
-    for a table without such a column.
+    columns: pairs "NAME=COLUMN"; unit: "mm" or "m", of all lengths; ideal, noisy: names of the environments of the fits
+    to the indicator (None: the paper's); sensor, environment: of all rows, for a table without such a column.
     """
 
     columns: tuple[str, ...] = ()

@@ -103,29 +103,14 @@ def _level(height: Floats) -> str:
 
 
 def _factor(row: FieldRow, in_slice: int) -> float:
-    """Return the scale of the arrows: 1, 2 or 5 times a power of ten.
-
-    The 95th percentile of their length is at most one grid step, and at least 95 % of the arrows end inside the frame;
-    the others are clipped at its edge.
-    """
+    """Return the scale of the arrows, 1, 2 or 5 times a power of ten: their 95th percentile is at most a grid step."""
     step = float(np.ptp(row.true[:, :2], axis=0).max()) / max(1.0, np.sqrt(in_slice) - 1.0)
     typical = float(np.quantile(np.linalg.norm(row.error, axis=1), 0.95))
     if not (step > 0.0 and typical > 0.0):
         return 1.0
-    most = min(step / typical, float(np.quantile(_room(row), 0.05, method="inverted_cdf")))
+    most = step / typical
     decade = 10.0 ** np.floor(np.log10(most))
     return float(decade * max(digit for digit in (1.0, 2.0, 5.0) if digit * decade <= most * (1.0 + 1e-9)))
-
-
-def _room(row: FieldRow) -> Floats:
-    """Return the scale (n,) at which each arrow reaches the edge of the frame."""
-    left, right, bottom, top = _frame(row.true)
-    position, error = row.true[:, :2], row.error[:, :2]
-    ends = np.where(error > 0.0, np.array([right, top]), np.array([left, bottom]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        times = np.where(error != 0.0, (ends - position) / error, np.inf)
-    room: Floats = times.min(axis=1)
-    return room
 
 
 def _frame(true: Floats) -> tuple[float, float, float, float]:
