@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+import validation_results as results
 from flexneedle.figures import style
 from reference import closed_forms, elastica
 from reference import space_validation as in_space
@@ -44,7 +45,7 @@ def power(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndar
     return f"{problems.order(sizes, errors):.2f}"
 
 
-def document(found: problems.Found) -> str:
+def document(found: results.Found) -> str:
     """Return the text of docs/validation.md."""
     parts = [
         "# Validation of the exact plant",
@@ -82,7 +83,7 @@ LIMITS = (
 )
 
 
-def summary(found: problems.Found) -> str:
+def summary(found: results.Found) -> str:
     """Return the table of the main results."""
     finest = {load: errors[-1] for load, errors in found.cantilever.items()}
     rows = [
@@ -93,14 +94,14 @@ def summary(found: problems.Found) -> str:
         )
         for load, errors in finest.items()
     ]
-    last = found.gaps[1][0.125][problems.CUBIC]
+    last = found.gaps[1][0.125][results.CUBIC]
     worst = max(abs(errors[-1]) for errors in found.curvature.values())
     moved = largest_gap(found)
     rows += [
         (
             "cantilever: order in the segment length",
             "2",
-            power(1.0 / problems.SEGMENTS, found.cantilever[5.0][:, 1]),
+            power(1.0 / results.SEGMENTS, found.cantilever[5.0][:, 1]),
         ),
         ("buckling load over Euler load", "1", f"{found.buckling:.5f}"),
         (
@@ -126,17 +127,17 @@ def summary(found: problems.Found) -> str:
     return table(("check", "expected", "found"), rows)
 
 
-def largest_gap(found: problems.Found) -> float:
+def largest_gap(found: results.Found) -> float:
     """Return the largest difference of work over stored energy from 1 in moves without cutting."""
     return max(abs(done / stored - 1.0) for done, stored in found.moves.values())
 
 
-def lost(found: problems.Found) -> float:
+def lost(found: results.Found) -> float:
     """Return the energy error of an insertion with friction and the finest step."""
     return found.balances[5.0][-1].gap
 
 
-def needle(found: problems.Found) -> list[str]:
+def needle(found: results.Found) -> list[str]:
     """Return the section on the rod alone."""
     rows = [
         (
@@ -149,20 +150,20 @@ def needle(found: problems.Found) -> list[str]:
     return [
         "## The needle alone",
         "A cantilever with a transverse dead load P at its end is compared with the elastica by elliptic integrals"
-        f" (Bisshopp and Drucker 1945). Errors with {problems.SEGMENTS[-1]} segments:",
+        f" (Bisshopp and Drucker 1945). Errors with {results.SEGMENTS[-1]} segments:",
         table(("PL²/EI", "elastica, y/L", "error x/L", "error y/L", "error θ (rad)"), rows),
         "![Bent cantilevers; error over the number of segments](images/validation-needle.png)",
     ]
 
 
-def model(found: problems.Found) -> list[str]:
+def model(found: results.Found) -> list[str]:
     """Return the section on the controller's model."""
     one, two = found.gaps[1], found.gaps[2][0.125]
     rows = [
         (f"{a.angle:.4f}", small(a.lateral), f"{b.angle:.4f}", small(b.lateral))
         for a, b in list(zip(one[0.125], two, strict=True))[::2]
     ]
-    last = one[0.125][problems.CUBIC]
+    last = one[0.125][results.CUBIC]
     slope = power([gap.angle for gap in last], [gap.lateral for gap in last])
     return [
         "## The controller's model at small angles",
@@ -180,7 +181,7 @@ def model(found: problems.Found) -> list[str]:
     ]
 
 
-def bevel(found: problems.Found) -> list[str]:
+def bevel(found: results.Found) -> list[str]:
     """Return the section on steady curvature."""
     rows = []
     for length, errors in found.curvature.items():
@@ -196,19 +197,19 @@ def bevel(found: problems.Found) -> list[str]:
             (
                 "bevel length (mm)",
                 "κ (1/mm)",
-                *(f"error, {r:g} mm segments" for r in problems.RESOLUTIONS),
+                *(f"error, {r:g} mm segments" for r in results.RESOLUTIONS),
             ),
             rows,
         ),
     ]
 
 
-def energy(found: problems.Found) -> list[str]:
+def energy(found: results.Found) -> list[str]:
     """Return the section on energies."""
     moved = largest_gap(found)
     rows = [
         (f"{step:g}", *(small(balances[k].gap) for balances in found.balances.values()))
-        for k, step in enumerate(problems.STEPS)
+        for k, step in enumerate(results.STEPS)
     ]
     gaps = [balance.gap for balance in found.balances[0.0]]
     return [
@@ -218,18 +219,18 @@ def energy(found: problems.Found) -> list[str]:
         f" energy is at most {small(moved)}.",
         "In an insertion to 40 mm with guide motion and a flip, the work of base, guide and the tissue on the bevel is"
         " compared with the stored energy and the energy dissipated by friction. The relative error decreases with the"
-        f" step, without friction with the power {power(problems.STEPS, gaps)}:",
+        f" step, without friction with the power {power(results.STEPS, gaps)}:",
         table(("step (mm)", *(f"friction {friction:g} mN/mm" for friction in found.balances)), rows),
     ]
 
 
-def solver(found: problems.Found) -> list[str]:
+def solver(found: results.Found) -> list[str]:
     """Return the section on the second solver."""
     rows = [
         (f"{h:g}", *(small(value) for value in gaps))
-        for h, gaps in list(zip(problems.ELEMENTS.tolist(), found.second, strict=True))[::2]
+        for h, gaps in list(zip(results.ELEMENTS.tolist(), found.second, strict=True))[::2]
     ]
-    orders = [power(problems.ELEMENTS, column) for column in found.second.T]
+    orders = [power(results.ELEMENTS, column) for column in found.second.T]
     return [
         "## A second solver",
         "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, with"
@@ -243,15 +244,15 @@ def solver(found: problems.Found) -> list[str]:
     ]
 
 
-def refinement(found: problems.Found) -> list[str]:
+def refinement(found: results.Found) -> list[str]:
     """Return the section on element, step and spacing."""
     key = {"element": "element_mm", "step": "step_mm", "spacing": "contact_spacing_mm"}
     rows = []
     for name, errors in found.refined.items():
-        sizes = problems.SIZES[name][:-1]
+        sizes = results.SIZES[name][:-1]
         (shipped,) = np.flatnonzero(sizes == problems.SHIPPED[name])
         rows.append((f"`{key[name]}`", f"{sizes[shipped]:g}", small(errors[shipped]), power(sizes, errors)))
-    finest = ", ".join(f"{problems.SIZES[name][-1]:g}" for name in problems.SIZES)
+    finest = ", ".join(f"{results.SIZES[name][-1]:g}" for name in results.SIZES)
     return [
         "## Refinement of an insertion",
         "An insertion to 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance of"
@@ -261,7 +262,7 @@ def refinement(found: problems.Found) -> list[str]:
     ]
 
 
-def space(found: in_space.Space) -> list[str]:
+def space(found: results.Space) -> list[str]:
     """Return the section on space."""
     gaps = np.max(found.solver, axis=0)
     rows = [
@@ -291,7 +292,7 @@ def space(found: in_space.Space) -> list[str]:
     ]
 
 
-def write(found: problems.Found, folder: Path) -> list[Path]:
+def write(found: results.Found, folder: Path) -> list[Path]:
     """Write validation.md and images/ to the folder and return the paths."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -307,7 +308,7 @@ def main() -> None:
         "--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of validation.md"
     )
     chosen = parser.parse_args()
-    found = problems.compute()
+    found = results.compute()
     print(summary(found), end="\n\n")
     for path in write(found, chosen.out):
         print(path)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+import validation_results as results
 from flexneedle.figures import style
 from reference import elastica
 from reference import validation as problems
@@ -15,7 +16,7 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MARKS = ("o", "s", "^", "D")
 
 
-def draw(found: problems.Found, folder: Path) -> list[Path]:
+def draw(found: results.Found, folder: Path) -> list[Path]:
     """Draw the three figures as PNG and SVG."""
     paths = []
     for name, draw_one in (("needle", draw_needle), ("model", draw_model), ("insertion", draw_insertion)):
@@ -51,16 +52,16 @@ def series(
     ax.plot(x, y, MARKS[k] + "-", color=COLOURS[k], markersize=3.5, linewidth=1.1, label=label)
 
 
-def draw_needle(ax: Any, errors: Any, found: problems.Found) -> None:
+def draw_needle(ax: Any, errors: Any, found: results.Found) -> None:
     """Draw bent cantilevers and their errors."""
     set_logarithmic(errors, "Tip error", "number of segments", "tip error / L")
     for k, (load, nodes) in enumerate(found.shapes.items()):
         ax.plot(*nodes.T, color=COLOURS[k], label=f"PL²/EI = {load:g}")
         ax.plot(*elastica.cantilever(load)[:2], MARKS[k], color=style.INK, markersize=5, fillstyle="none")
         distance = np.hypot(*found.cantilever[load][:, :2].T)
-        series(errors, k, problems.SEGMENTS, distance, f"PL²/EI = {load:g}")
-    guide_line(errors, problems.SEGMENTS, 2.0 * distance[0], -2.0, "second order")
-    errors.set_xticks(problems.SEGMENTS, [str(n) for n in problems.SEGMENTS])
+        series(errors, k, results.SEGMENTS, distance, f"PL²/EI = {load:g}")
+    guide_line(errors, results.SEGMENTS, 2.0 * distance[0], -2.0, "second order")
+    errors.set_xticks(results.SEGMENTS, [str(n) for n in results.SEGMENTS])
     errors.minorticks_off()
     ax.set_title("Cantilevers (markers: elastica)")
     ax.set_xlabel("x/L")
@@ -70,14 +71,14 @@ def draw_needle(ax: Any, errors: Any, found: problems.Found) -> None:
     errors.legend(loc="lower left")
 
 
-def draw_model(one: Any, two: Any, found: problems.Found) -> None:
+def draw_model(one: Any, two: Any, found: results.Found) -> None:
     """Draw the distance between the formulations over the slope, for one and two layers."""
     for ax, layers, title in ((one, 1, "Exact plant and model, one layer"), (two, 2, "Two layers")):
         set_logarithmic(ax, title, "largest slope of the tip (rad)", "")
         for k, (h, found_gaps) in enumerate(found.gaps[layers].items()):
             angle, lateral = np.array([(gap.angle, gap.lateral) for gap in found_gaps]).T
             series(ax, k, angle, lateral, f"segments of {h:g} mm")
-        middle = len(problems.SCALES) // 2
+        middle = len(results.SCALES) // 2
         start = lateral[middle] * (angle[0] / angle[middle]) ** 3
         guide_line(ax, angle, start, 3.0, "third power")
         ax.set_ylim(1e-6, 1.0)
@@ -87,20 +88,20 @@ def draw_model(one: Any, two: Any, found: problems.Found) -> None:
     one.legend(loc="upper left")
 
 
-def draw_insertion(ax: Any, other: Any, found: problems.Found) -> None:
+def draw_insertion(ax: Any, other: Any, found: results.Found) -> None:
     """Draw the refinement and the comparison with the second solver."""
     set_logarithmic(ax, "Refinement", "size / default size", "tip error against the finest (mm)")
     for k, (name, errors) in enumerate(found.refined.items()):
         shipped = problems.SHIPPED[name]
-        series(ax, k, problems.SIZES[name][:-1] / shipped, errors, f"{name} (default: {shipped:g} mm)")
+        series(ax, k, results.SIZES[name][:-1] / shipped, errors, f"{name} (default: {shipped:g} mm)")
     first = found.refined["element"][0]
     guide_line(ax, (4.0, 0.25), 2.0 * first, 2.0, "second order")
     ax.set_xticks([0.25, 0.5, 1, 2, 4], ["¼", "½", "1", "2", "4"])
     set_logarithmic(other, "Second solver", "segment length (mm)", "largest tip difference")
     for k, name in enumerate(("x (mm)", "y (mm)", "θ (rad)")):
-        series(other, k, problems.ELEMENTS, found.second[:, k], name)
-    guide_line(other, problems.ELEMENTS, 2.0 * found.second[0, 1], 2.0, "second order")
-    other.set_xticks(problems.ELEMENTS, [f"{h:g}" for h in problems.ELEMENTS])
+        series(other, k, results.ELEMENTS, found.second[:, k], name)
+    guide_line(other, results.ELEMENTS, 2.0 * found.second[0, 1], 2.0, "second order")
+    other.set_xticks(results.ELEMENTS, [f"{h:g}" for h in results.ELEMENTS])
     for one in (ax, other):
         one.minorticks_off()
         one.legend(loc="lower right")

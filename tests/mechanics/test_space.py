@@ -66,11 +66,6 @@ def test_a_turn_by_whole_quarters_is_exact(z, quarters):
     assert lt.turned(quarters * 0.5 * math.pi, z) == expected
 
 
-@given(z=st.complex_numbers(max_magnitude=1e3), angle=st.floats(-50.0, 50.0))
-def test_a_turn_is_a_multiplication_by_a_unit_number(z, angle):
-    assert lt.turned(angle, z) == pytest.approx(z * cmath.exp(1j * angle), abs=1e-11)
-
-
 @given(
     direction=angles, z=st.complex_numbers(max_magnitude=1e3), radial=st.floats(0.0, 9.0), across=st.floats(0.0, 9.0)
 )  # fmt: skip
@@ -199,16 +194,6 @@ def test_a_roll_by_half_a_turn_is_the_flip():
     np.testing.assert_array_equal(numbers(rolled), numbers(still))
 
 
-def test_a_quarter_roll_bends_the_path_out_of_the_plane():
-    """Towards +z, by as much as the bevel bends it from a straight needle's path in its plane."""
-    on = commands(15, 1.0)
-    on[0, 7] = 0.5 * math.pi
-    state, _ = carried_out(start(PHANTOM), commands(45, 1.0))
-    _, tips = carried_out(state, on)
-    assert (np.diff(tips[:, 4]) > 0.0).all()
-    assert tips[-1, 2] > 0.1
-
-
 def pushed(steps, depth=45.0, turns=0.0, scenario=PHANTOM):
     """Return the tips of an insertion to a depth (mm) in even steps, with an even spin of some turns from the start."""
     way = depth - scenario.setup.start_tip_x
@@ -222,34 +207,6 @@ def test_a_spin_does_not_depend_on_the_steps(turns):
     ends = [lateral(pushed(steps, turns=turns))[-1] for steps in (37, 148, 444)]
     assert np.abs(np.subtract(ends, ends[-1])).max() < 5e-3
     assert abs(ends[-1]) > 5e-3
-
-
-def test_a_fast_spin_goes_straight_in_inverse_proportion_to_its_speed():
-    """The spring's rest at b/(1 + iωℓ) is the nearer to the axis, the faster the bevel turns."""
-    still, *spun = (abs(lateral(pushed(148, turns=turns))[-1]) for turns in (0.0, 60.0, 120.0, 240.0))
-    assert spun[0] < 0.02 * still
-    np.testing.assert_allclose(np.divide(spun[:-1], spun[1:]), 2.0, rtol=0.02)
-
-
-@pytest.mark.parametrize("spinning", [1, 2])
-def test_a_duty_cycle_bends_the_path_in_proportion(spinning):
-    """Of four steps of ¼ mm some turn three times: the share of the others is left, half of it for half a cycle.
-
-    The spring's rest is linear in the bevel's direction, and whole turns have no mean; a small bevel, so that the
-    tissue is linear too. The mean over the four phases of a cycle at which the insertion may end.
-    """
-    small = PHANTOM.with_values({"needle.bevel.offset_mm": 0.04})
-    begun = carried_out(start(small), commands(40, 1.0))[0]
-    count = 4 * 34
-
-    def end(turning):
-        rows = commands(count, 0.25, spin=np.where(turning, 6.0 * math.pi, 0.0))
-        return lateral(carried_out(begun, rows)[1])[-1]
-
-    cycle = np.arange(count)
-    still, spun = end(cycle < 0), end(cycle >= 0)
-    shares = [(end((cycle + phase) % 4 < spinning) - spun) / (still - spun) for phase in range(4)]
-    assert np.mean(shares) == pytest.approx(1.0 - spinning / 4, abs=1e-3)
 
 
 def test_a_steady_spin_is_a_helix():
@@ -329,41 +286,6 @@ def test_work_of_base_and_guide_is_the_energy_stored(name):
     assert state.tip[0] < state.needle.channel.front
     assert abs(state.energy - energy) > 5e-3
     assert work == pytest.approx(state.energy - energy, rel=1e-5)
-
-
-@pytest.mark.parametrize(("index", "angle"), [(0, 0.8), (1, 2.1), (2, 0.0), (2, 2.1)])
-def test_the_gradient_of_the_energy_is_the_reaction(index, angle):
-    """Central differences in any direction across the axis."""
-    state, _ = carried_out(withdrawn(), commands(5, base=0.1, slope=1e-3j, guide=-0.1 + 0.2j))
-    h, along = (0.01, 1e-4, 0.01)[index], cmath.exp(1j * angle)
-    name = ("base", "slope", "guide")[index]
-    up, down = (carried_out(state, commands(1, **{name: side * h * along}))[0].energy for side in (1, -1))
-    expected = (forces(state)[index] * along.conjugate()).real
-    assert (up - down) / (2 * h) == pytest.approx(expected, rel=1e-4, abs=1e-7)
-    assert abs(expected) > 1e-6
-
-
-def test_forces_and_moments_balance_on_both_axes():
-    state, _ = carried_out(withdrawn(), commands(5, base=0.2j, guide=-0.3 + 0.1j))
-    tissue = state.mesh[state.mesh["x"] > 0.0]
-    base, moment, guide = forces(state)
-    arms = tissue["x"] - state.needle.boundary.base.x
-    assert np.abs(tissue["force"].imag).max() > 1e-4
-    assert abs(base + guide + tissue["force"].sum()) < 1e-9
-    assert abs(moment + guide * (GUIDE_X - state.needle.boundary.base.x) + tissue["force"] @ arms) < 1e-7
-
-
-def test_a_contact_pushes_against_its_compression():
-    """Force along −u, of the size of the law of |u|: tissue is the same in all directions."""
-    state, _ = carried_out(withdrawn(), commands(5, guide=0.4 - 0.2j))
-    behind = state.mesh["x"] > 0.0
-    u, force = state.compression[: behind.size][behind], state.mesh["force"][behind]
-    law, nodes = state.scenario.tissue[0], state.model.nodes[: behind.size][behind]
-    assert (nodes["law"] == 0).all()
-    whole = state.needle.solution.tip.x - nodes["x"] > nodes["reach"]
-    e = np.abs(u) / nodes["height"]
-    expected = -nodes["stiffness"] * nodes["height"] * law.force(e) * u / np.abs(u)
-    np.testing.assert_allclose(force[whole], expected[whole], rtol=1e-7, atol=1e-12)
 
 
 @pytest.mark.parametrize(("alpha", "modulus_kpa"), [(-47.0, 2.0), (80.0, 100.0)])

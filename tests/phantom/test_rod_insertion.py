@@ -17,7 +17,6 @@ from reference.validation import (
     inserted_tip,
     model_gap,
     order,
-    path_curvature,
     push,
     scaled,
     shot,
@@ -93,12 +92,6 @@ def test_steady_curvature_converges_to_its_closed_form(bevel_length):
     assert fine < coarse / 2.5
 
 
-def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
-    """And zero without an offset."""
-    assert path_curvature(1.0, 3.0, bevel=0.0) == 0.0
-    assert path_curvature(1.0, 3.0, bevel=0.02) == pytest.approx(2.0 * path_curvature(1.0, 3.0), rel=2e-3)
-
-
 @pytest.mark.parametrize(
     ("name", "sizes", "limits", "cell"),
     [
@@ -115,17 +108,6 @@ def test_an_insertion_hardly_depends_on_step_and_spacing(name, sizes, limits, ce
 
 
 # ---- entry and exit
-
-
-def test_the_spring_enters_the_skin_fully_compressed():
-    """docs/theory.md section 4, q = 0: the bevel deflects the tip with its full offset from the first cut on."""
-    needle = move(plant(), AHEAD, times=START + 1)
-    assert needle.tip[0] == pytest.approx(0.25, abs=1e-3)
-    ratio, drift = 0.25 / 3.0, needle.tip[1]
-    expected = 4.0 - drift * (1.0 - math.exp(-ratio)) / ratio
-    assert needle.state["offset"] @ needle.segments["tangent"][-2] == pytest.approx(0.0, abs=1e-12)
-    assert np.hypot(*needle.state["offset"][:2]) == pytest.approx(expected, rel=1e-3)
-    assert 0.0 < drift < 0.1
 
 
 def test_a_step_across_the_skin_may_be_long_or_short():
@@ -198,40 +180,6 @@ def test_a_flip_without_insertion_changes_only_the_bevel():
     np.testing.assert_allclose(move(one, BACK).tip, move(other, BACK, flip=True).tip, atol=1e-9)
     after = move(plant(), AHEAD, times=START + 100).tip[1]
     assert move(needle, AHEAD, times=20).tip[1] == pytest.approx(after, abs=1e-6)
-
-
-def test_a_retracted_needle_follows_its_channel_and_returns_to_the_same_position():
-    needle = inserted(plant(), 1.0, 30.0)
-    before, cut, count = needle.tip, needle.state["cut"], needle.count
-    move(needle, BACK, times=40)
-    assert (needle.state["cut"], needle.count) == (cut, count)
-    np.testing.assert_allclose(move(needle, AHEAD, times=40).tip, before, atol=1e-3)
-
-
-def test_the_bevels_spring_vanishes_as_the_tip_is_retracted():
-    """Over its length: 3 mm behind the front its force is zero."""
-    needle, parts = move(plant(), AHEAD, times=START + 120), []
-    for _ in range(16):
-        parts.append(np.linalg.norm(needle.segments["force"][-1]))
-        move(needle, BACK)
-    force = np.array(parts)
-    assert (np.diff(force[:13]) < 0.0).all()
-    assert force[0] > 1e-3
-    assert not force[13:].any()
-
-
-def test_stiffness_varies_with_the_depth_as_in_the_true_phantom():
-    """A factor on μ for each cell: of contact points and of the bevel's spring."""
-    variation = tuple(1.0 + 0.5 * (k % 2) for k in range(400))  # 0.25 mm each
-    needle = move(plant(IDEAL, variation=variation, cell=0.25), AHEAD, times=START + 60)
-    plain = move(plant(IDEAL), AHEAD, times=START + 60)
-    x = needle.channel["place"][: needle.count, 0]
-    expected = np.where((x / 0.25).astype(int) % 2 == 1, 1.5, 1.0)
-    ratio = needle.channel["stiffness"][: needle.count] / plain.channel["stiffness"][: needle.count]
-    np.testing.assert_allclose(ratio, expected)
-    stiffer = move(plant(IDEAL, variation=(1.5,), cell=0.25), AHEAD, times=START + 4)
-    firm = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
-    np.testing.assert_allclose(stiffer.tip, move(plant(IDEAL.with_values(firm)), AHEAD, times=START + 4).tip)
 
 
 def test_strain_energy_is_weighted_by_layer_and_counts_contact_points():

@@ -97,23 +97,6 @@ def test_a_spin_does_not_depend_on_the_step(rate):
     assert (np.linalg.norm(tips[:-1] - tips[-1], axis=1) < 1e-2).all()
 
 
-def test_a_fast_spin_holds_the_needle_straight():
-    """A turn per 5 mm: less than a tenth of the deflection without."""
-    still, fast = spun(0.25, 0.0).tip, spun(0.25, 2.0 * math.pi / 5.0).tip
-    assert abs(still[1]) > 1.0
-    assert np.linalg.norm(fast[1:]) < 0.1 * abs(still[1])
-
-
-def test_the_bevels_spring_after_a_long_spin_is_that_after_short_ones():
-    one, many = (
-        Inserted().move(db_x=1.0, times=40).move(db_x=2.0 / parts, spin=2.0 / parts, times=parts)
-        for parts in (1, 64)
-    )
-    np.testing.assert_allclose(one.s["offset"], many.s["offset"], atol=0.02)
-    assert np.linalg.norm(one.s["offset"]) > 3.0
-    assert abs(one.s["offset"][2]) > 1.0
-
-
 # ---- friction against rotation
 
 

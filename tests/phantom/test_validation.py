@@ -15,6 +15,7 @@ from reference.rods import Bench
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import validation as script
+import validation_results as results
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "validation.md"
@@ -24,26 +25,26 @@ NUMBER = re.compile(r"[+−-]?\d+(?:\.\d+)?(?:e[−-]?\d+)?")
 @pytest.fixture(scope="module")
 def made_up():
     """Synthetic results."""
-    angles = 0.05 * np.array(problems.SCALES)
+    angles = 0.05 * np.array(results.SCALES)
     gaps = [problems.Gap(float(a), float(a**3), float(a**3), -1e-3) for a in angles]
     balance = problems.Balance(4.0, 0.25, -0.05, needle=0.15, tissue=0.05, spring=0.0, friction=3.999)
     bench = Bench(segments=8).loaded(y=0.1)
-    falling = {name: 1e-4 * sizes[:-1] ** 2 for name, sizes in problems.SIZES.items()}
-    return problems.Found(
-        cantilever={load: np.outer(problems.SEGMENTS**-2.0, [1.0, 2.0, 3.0]) for load in problems.LOADS},
+    falling = {name: 1e-4 * sizes[:-1] ** 2 for name, sizes in results.SIZES.items()}
+    return results.Found(
+        cantilever={load: np.outer(results.SEGMENTS**-2.0, [1.0, 2.0, 3.0]) for load in problems.LOADS},
         shapes=dict.fromkeys(problems.LOADS, bench.nodes[:, :2] / 100.0),
         buckling=0.999,
-        gaps={layers: dict.fromkeys(problems.MESHES, gaps) for layers in (1, 2)},
-        curvature={length: [0.01, 0.002, 5e-4] for length in problems.BEVELS},
+        gaps={layers: dict.fromkeys(results.MESHES, gaps) for layers in (1, 2)},
+        curvature={length: [0.01, 0.002, 5e-4] for length in results.BEVELS},
         moves=dict.fromkeys(problems.MOVES, (1.0, 0.999)),
         balances={
-            friction: [replace(balance, base=4.0 + 0.01 * step) for step in problems.STEPS]
+            friction: [replace(balance, base=4.0 + 0.01 * step) for step in results.STEPS]
             for friction in (0.0, 5.0)
         },
-        second=np.outer(problems.ELEMENTS**2, [1e-6, 1e-4, 1e-5]),
+        second=np.outer(results.ELEMENTS**2, [1e-6, 1e-4, 1e-5]),
         rubbed=[2e-3, 1e-3],
         refined=falling,
-        space=in_space.Space(
+        space=results.Space(
             [1e-3 * np.array([16.0, 4.0, 1.0])],
             [1e-4, 2.5e-5, 6e-6],
             dict.fromkeys(in_space.SHARES, 0.99),
@@ -69,7 +70,7 @@ def section(text, name):
 
 
 def test_the_page_has_the_cantilevers_that_the_script_computes():
-    beams = {load: problems.cantilevers(load) for load in problems.LOADS}
+    beams = {load: results.cantilevers(load) for load in problems.LOADS}
     found = SimpleNamespace(
         cantilever={load: errors for load, (errors, _) in beams.items()},
         buckling=problems.buckling_factor(64),
@@ -85,7 +86,7 @@ def test_the_page_has_the_energies_that_the_script_computes():
     found = SimpleNamespace(
         moves={name: problems.energy_balance(name, 40) for name in problems.MOVES},
         balances={
-            f: [problems.insertion_balance(step, friction=f) for step in problems.STEPS] for f in (0.0, 5.0)
+            f: [problems.insertion_balance(step, friction=f) for step in results.STEPS] for f in (0.0, 5.0)
         },
     )
     text = "\n\n".join(script.wrapped(part) for part in script.energy(found))
@@ -94,7 +95,7 @@ def test_the_page_has_the_energies_that_the_script_computes():
 
 @pytest.mark.slow
 def test_the_page_is_what_the_script_writes():
-    assert_same(script.document(problems.compute()), PAGE.read_text(encoding="utf-8"))
+    assert_same(script.document(results.compute()), PAGE.read_text(encoding="utf-8"))
 
 
 def test_the_summary_has_computed_deflections_beside_the_published_ones(made_up):

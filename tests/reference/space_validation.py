@@ -1,7 +1,6 @@
 """Problems in space that validate the exact plant, for tests and the page (in a plane: `reference.validation`)."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,31 +16,8 @@ EULER = 4.0 * math.pi**2 * EI / LENGTH**2
 """Buckling load (N) of a rod clamped at both ends."""
 
 
-@dataclass(frozen=True)
-class Space:
-    """All results in space."""
-
-    solver: list[np.ndarray]  # distances of the tips (mm) from the second solver, by rod and SEGMENTS
-    helix: list[float]  # unbalanced moment per mm over EI κ², by HELIX_SEGMENTS
-    twist: dict[
-        float, float
-    ]  # moment that buckles a twisted rod over the closed form, by share of Euler's load
-    lag: float  # of the tip over the closed form, minus 1
-
-
 HELIX_SEGMENTS = (40, 80, 160)
 SHARES = (0.0, 0.5)
-
-
-def compute() -> Space:
-    """Compute all results."""
-    rods = [drawn(seed) for seed in range(3)]
-    return Space(
-        [np.array([solver_gap(rod, segments)[0] for segments in SEGMENTS]) for rod in rods],
-        [helix_residual(segments) for segments in HELIX_SEGMENTS],
-        {share: buckling_twist(share) for share in SHARES},
-        lag_error(),
-    )
 
 
 def drawn(seed):

@@ -8,7 +8,7 @@ import numpy as np
 from flexneedle import Control, Simulator, controls
 from flexneedle.phantom.draw import Truth
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, THETA
-from reference import closed_forms, elastica, space_validation
+from reference import closed_forms, elastica
 from reference.cases import EI, FOUNDATION, long_beam
 from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, planar, plant
 
@@ -305,90 +305,3 @@ def inside_length(needle) -> float:
     x = needle.nodes[:, 0]
     arc = needle.rod.segment * np.arange(x.size)
     return float(arc[-1] - np.interp(0.0, x, arc))
-
-
-# --- all of it, for the page
-
-SEGMENTS = np.array([16, 32, 64, 128, 256])
-SCALES = (2.0, 2**0.5, 1.0, 0.5**0.5, 0.5, 0.125**0.5, 0.25, 0.03125**0.5, 0.125)
-MESHES = {0.5: SHIPPED, 0.25: SMALL, 0.125: FINE}
-CUBIC = slice(3, 8)  # of SCALES: where the cube of the angle is most of the difference
-RESOLUTIONS, BEVELS = (1.0, 0.5, 0.25), (1.0, 3.0)
-STEPS = (0.5, 0.25, 0.125, 0.0625)
-ELEMENTS = np.array([2.0, 1.0, 0.5, 0.25, 0.125])
-SIZES = {  # of one kind, the rest as shipped; the last is what the others are compared with
-    "element": np.array([2.0, 1.0, 0.5, 0.25, 0.0625]),
-    "step": np.array([0.5, 0.25, 0.125, 0.0625, 0.015625]),
-    "spacing": np.array([1.0, 0.5, 0.25, 0.125]),
-}
-
-
-@dataclass(frozen=True)
-class Found:
-    """All results; sizes in mm, angles in rad, energies in mJ."""
-
-    cantilever: dict[float, np.ndarray]  # by load: errors of the tip (x/L, y/L, θ) by SEGMENTS
-    shapes: dict[float, np.ndarray]  # nodes over L
-    buckling: float
-    gaps: dict[int, dict[float, list[Gap]]]  # by layers and element, along SCALES
-    curvature: dict[float, list[float]]  # by bevel length: relative errors by RESOLUTIONS
-    moves: dict[str, tuple[float, float]]  # work and change of the stored energy
-    balances: dict[float, list[Balance]]  # by friction, along STEPS
-    second: np.ndarray  # largest distances from the second solver (x, y, θ) by ELEMENTS
-    rubbed: list[float]  # the same with friction at the end, for one and two parts of a step
-    refined: dict[str, np.ndarray]  # distances (mm) from the finest, by SIZES
-    space: space_validation.Space
-
-
-def compute() -> Found:
-    """Compute all results."""
-    beams = {load: cantilevers(load) for load in LOADS}
-    return Found(
-        cantilever={load: errors for load, (errors, _) in beams.items()},
-        shapes={load: nodes for load, (_, nodes) in beams.items()},
-        buckling=buckling_factor(64),
-        gaps={layers: {h: model_gaps(layers, h) for h in MESHES} for layers in (1, 2)},
-        curvature={b: [curvature_error(r, b) for r in RESOLUTIONS] for b in BEVELS},
-        moves={name: energy_balance(name, 40) for name in MOVES},
-        balances={f: [insertion_balance(step, friction=f) for step in STEPS] for f in (0.0, 5.0)},
-        second=second_solver(),
-        rubbed=[rubbed(parts) for parts in (1, 2)],
-        refined={name: refined(name) for name in SIZES},
-        space=space_validation.compute(),
-    )
-
-
-def cantilevers(load: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors of the tip by SEGMENTS, and the nodes of the finest over the length."""
-    errors = np.array([cantilever_error(load, n) for n in SEGMENTS.tolist()])
-    bench = Bench(length=100.0, segments=int(SEGMENTS[-1])).loaded(y=load * 1000.0 / 100.0**2)
-    return errors, bench.nodes[:, :2] / 100.0
-
-
-def model_gaps(layers: int, element: float) -> list[Gap]:
-    """Compare exact plant and controller's model along SCALES."""
-    return [model_gap(scale, layers, **MESHES[element]) for scale in SCALES]
-
-
-def second_solver() -> np.ndarray:
-    """Return the largest distances of the tip on the way, by ELEMENTS."""
-    expected = shot(ROUGH, wander())
-    paths = (stepped(ROUGH, wander(), h) for h in ELEMENTS.tolist())
-    return np.array([np.abs(path - expected).max(axis=0) for path in paths])
-
-
-def rubbed(parts: int) -> float:
-    """Return the distance of the tips (mm) after a push with ten times the friction, each step in some parts."""
-    scenario = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
-    ends = (
-        stepped(scenario, push(parts), 0.25),
-        shot(scenario, push(parts)),
-    )
-    return float(np.hypot(*(ends[0] - ends[1])[-1, :2]))
-
-
-def refined(name: str) -> np.ndarray:
-    """Return the distances of the tip from the tip with the finest size."""
-    cell = {"cell": 0.125} if name == "spacing" else {}
-    tips = np.array([inserted_tip(**{name: size}, **cell)[:2] for size in SIZES[name].tolist()])
-    return np.hypot(*(tips[:-1] - tips[-1]).T)

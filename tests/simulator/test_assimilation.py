@@ -51,27 +51,6 @@ def test_reaction_is_the_load_that_the_model_lacks(state):
     assert SIMULATOR.step(held, Control()).tip[1] < y + 0.3
 
 
-def test_channel_follows_the_measurement(state):
-    """The cut of the last step is laid anew, older points keep their rest."""
-    held = SIMULATOR.assimilate(state, np.add(state.tip[:2], [0.0, 0.3])).state
-    moved = (held.contacts.rest - state.contacts.rest)[:, 0]
-    assert moved[-1] > 0.1
-    assert not moved[:-1].any()
-
-
-@pytest.mark.parametrize("x", [-80.0, 3.2, 10.5])
-def test_measured_points_are_on_the_mesh(state, x):
-    """Contacts next to a laterally displaced point follow it; one far from it pulls the needle."""
-    curve = CubicHermiteSpline(*state.nodes.T[[X, Y, THETA]])
-    y = float(curve(x)) + 0.3
-    held = SIMULATOR.assimilate(state, state.tip[:2], [(x, y)]).state
-    assert held.converged
-    contacts = held.contacts
-    beside = np.abs(contacts.x - x) < 0.51
-    np.testing.assert_allclose(contacts.position[beside, 0], y, atol=0.05)
-    assert np.abs(held.nodes - state.nodes)[:, 1].max() > 0.1
-
-
 @pytest.mark.parametrize("x", [-80.0, 15.3])
 def test_nodes_pass_through_measured_points(state, x):
     """The needle state is the curve that met the measurement, in unloaded spans too."""

@@ -127,14 +127,6 @@ def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_t
         assert state.converged
 
 
-def test_a_small_clearance_is_nearly_none():
-    """Its effect on the tip is proportional to it."""
-    exact = loaded(0.0, 20, 1.0)[-1].tip
-    off = [np.abs(loaded(clearance, 20, 1.0)[-1].tip - exact).max() for clearance in (1e-3, 1e-2, 1e-1)]
-    assert off[0] > 0.0
-    np.testing.assert_allclose(np.divide(off[1:], off[:-1]), 10.0, rtol=0.1)
-
-
 def test_without_clearance_nothing_of_it_is_left():
     """Bit for bit, whatever wall the needle was on before."""
     bears = loaded(0.1, 10, 1.0)[-1]
@@ -152,14 +144,6 @@ def test_without_clearance_nothing_of_it_is_left():
     for name in ("tip", "loads", "iterations", "residual"):
         assert getattr(here.needle.solution, name) == getattr(there.needle.solution, name)
     assert off_centre(here) == 0.0
-
-
-def test_a_needle_without_a_guide_has_no_clearance():
-    bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
-    wide = bare.with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
-    none = bare.with_adaptation(Adaptation(np.zeros(1), np.ones(2)))
-    rows = controls(60, db_x=1.0)
-    np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
 
 
 @pytest.mark.parametrize("base_y", [0.0, 0.4])

@@ -50,13 +50,6 @@ def test_even_intervals_and_whole_steps_would_be_far_off(number, monkeypatch):
     assert abs(refined(scenario, 1.0) - fine) > max(0.1, 4.0 * abs(resolved - fine))
 
 
-@pytest.mark.parametrize("number", THIN)
-def test_the_length_of_the_steps_hardly_matters(number):
-    """At the spacing of a scenario, steps of 0.25 to 2 mm."""
-    scenario = world(number, "perfect")
-    assert np.ptp([end(scenario, step) for step in (0.25, 0.5, 1.0, 2.0)]) < 0.13
-
-
 def at(simulator, state, x):
     """The needle pushed until its tip is at x (mm)."""
     for _ in range(3):
