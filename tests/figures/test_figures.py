@@ -18,31 +18,11 @@ from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import ROLL, THETA
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
-from synthetic_readings import frame_of, held, with_readings
+from synthetic_readings import DISTORTED, held_from_the_start, watched, without_indicators
 
 PHANTOM = load_scenario("phantom")
 INSERTION = make_insertion()
 PLANS = [make_plan(), make_plan("steering")]
-DISTORTED = "field distorted: ref2 0.1457, to fall below 0.0492 (median over 1 s)"
-
-
-def watched(miss=0.06, indicator=lambda time: 0.13 if 4.0 <= time <= 8.0 else 0.03, holds=((4.7, 8.7),)):
-    """Return an insertion with readings of a tracker, held in some spans of time (s)."""
-    made = make_insertion(miss=miss)
-    periods = [with_readings(period, indicator) for period in made.periods]
-    is_held = [any(begin < period.time < end for begin, end in holds) for period in periods]
-    return replace(
-        made, periods=tuple(held(p) if hold else p for p, hold in zip(periods, is_held, strict=True))
-    )
-
-
-def held_from_the_start():
-    """Return an insertion that ended where it began; no reading was used."""
-    first = held(INSERTION.periods[0], DISTORTED)
-    still = [replace(first, index=k, time=0.2 * (k + 1)) for k in range(20)]
-    rejected = tuple(with_readings(period, verdict=DISTORTED) for period in still)
-    reason = f"held for 10.00 s (limit 10 s): {DISTORTED}"
-    return replace(INSERTION, periods=rejected, outcome="held", reason=reason)
 
 
 def without_rolls():
@@ -51,17 +31,6 @@ def without_rolls():
     controls[:, ROLL] = 0.0
     still = tuple(replace(p, applied=p.applied._replace(roll=0.0)) for p in INSERTION.periods)
     return replace(INSERTION, plan=replace(INSERTION.plan, controls=controls), periods=still)
-
-
-def without_indicators():
-    """Return an insertion with readings of a tracker none of which has an indicator."""
-    readings = watched(indicator=lambda _: None).periods[0].readings
-    frames = [frame_of(k, one.measurement.time, {"ref1": None}) for k, one in enumerate(readings)]
-    bare = tuple(
-        replace(one, measurement=replace(one.measurement, frame=frame))
-        for one, frame in zip(readings, frames, strict=True)
-    )
-    return replace(INSERTION, periods=tuple(replace(p, readings=bare) for p in INSERTION.periods))
 
 
 CASES = {
@@ -320,21 +289,15 @@ def with_tissue(*layers):
     return Scenario.from_values(PHANTOM.values() | {"tissue": tissue})
 
 
+NEAR, SHALLOW, DEEP = (40.0, 5.0), (20.5, -12.375), (95.125, 12.375)
 SCENARIOS = {
-    "a long name": lambda: PHANTOM.with_values({"name": "A phantom with a long name, " * 5}),
-    "a name without spaces": lambda: PHANTOM.with_values({"name": "without-spaces-" * 9}),
-    "no guide": lambda: PHANTOM.with_values({"setup.guide_to_skin_mm": None}),
-    "one layer": lambda: with_tissue(("a layer with a long name that fills the tissue", 0.0)),
-    "ten layers": lambda: with_tissue(*((f"layer {k}", 4.0) for k in range(10))),
-    "thin layers": lambda: with_tissue(*((f"layer {k}", 0.5 + 0.5 * k) for k in range(10))),
+    "a long name": (lambda: PHANTOM.with_values({"name": "A phantom with a long name, " * 5}), NEAR),
+    "a name without spaces": (lambda: PHANTOM.with_values({"name": "without-spaces-" * 9}), SHALLOW),
+    "no guide": (lambda: PHANTOM.with_values({"setup.guide_to_skin_mm": None}), DEEP),
+    "one layer": (lambda: with_tissue(("a layer with a long name that fills the tissue", 0.0)), NEAR),
+    "ten layers": (lambda: with_tissue(*((f"layer {k}", 4.0) for k in range(10))), SHALLOW),
+    "thin layers": (lambda: with_tissue(*((f"layer {k}", 0.5 + 0.5 * k) for k in range(10))), DEEP),
 }
-TARGETS = {"near": (40.0, 5.0), "shallow, lateral": (20.5, -12.375), "deep": (95.125, 12.375)}
-CROSSED = [
-    pytest.param(make, target, plans, id=f"{name}-{where}", marks=[] if k % 3 == j else pytest.mark.slow)
-    for k, (name, make) in enumerate(SCENARIOS.items())
-    for j, (where, target) in enumerate(TARGETS.items())
-    for plans in [k % 2 == 1]
-]
 
 
 @pytest.mark.parametrize(
@@ -344,13 +307,18 @@ def test_no_labels_overlap_or_are_cut(case):
     assert overlapping(drawn(case)) == []
 
 
-@pytest.mark.parametrize(("scenario", "target", "plans"), CROSSED)
-def test_no_labels_overlap_in_any_scenario(scenario, target, plans):
-    scenario, plan = scenario(), make_plan(target=target)
+@pytest.mark.parametrize(
+    ("name", "plans"),
+    [(name, k % 2 == 1) for k, name in enumerate(SCENARIOS)]
+    + [pytest.param(name, k % 2 == 0, marks=pytest.mark.long) for k, name in enumerate(SCENARIOS)],
+)
+def test_no_labels_overlap_in_any_scenario(name, plans):
+    make, target = SCENARIOS[name]
+    plan = make_plan(target=target)
     if plans:
-        figure = plan_figure(scenario, [plan, make_plan("steering", target)])
+        figure = plan_figure(make(), [plan, make_plan("steering", target)])
     else:
-        figure = insertion_figure(scenario, replace(make_insertion(plan, miss=1.4), seed=4294967295))
+        figure = insertion_figure(make(), replace(make_insertion(plan, miss=1.4), seed=4294967295))
     assert overlapping(figure) == []
 
 

@@ -62,7 +62,7 @@ def test_nodes_pass_through_measured_points(state, x):
 
 def test_order_of_measured_points_does_not_matter(state):
     """They are sorted, and the caller's list stays as it is."""
-    points = [(20.2, 3.0), (-30.0, 1.0), (5.1, 2.0)]
+    points = [(20.2, 3.0), (-20.0, 1.2), (-30.0, 1.0), (5.1, 2.0)]  # two of them between the same nodes
     kept = list(points)
     one = SIMULATOR.assimilate(state, state.tip[:2], points).state
     other = SIMULATOR.assimilate(state, state.tip[:2], points[::-1]).state
