@@ -59,9 +59,10 @@ def test_holds_are_spans_of_whole_periods():
 
 def test_rolls_of_less_than_5_degrees_have_no_mark():
     for degrees, count in ((4.0, 0), (-6.0, 1)):
-        command = INSERTION.periods[0].applied._replace(roll=np.radians(degrees))
+        command = INSERTION.periods[0].applied._replace(roll=np.radians(degrees), spin=0.3)
         first = replace(INSERTION.periods[0], applied=command)
-        assert len(applied_rolls(replace(INSERTION, periods=(first,)))) == count
+        found = applied_rolls(replace(INSERTION, periods=(first,)))
+        assert [roll.angle for roll in found] == [pytest.approx(first.roll - 0.3)] * count
     plan = make_plan()
     assert planned_rolls(replace(plan, controls=controls(len(plan.controls), db_x=1.0, roll=0.01))) == []
 

@@ -3,6 +3,7 @@
 import cmath
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,28 +11,68 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from flexneedle import load_scenario
+from flexneedle import Simulator, controls, load_scenario
 from flexneedle.mechanics import lateral as lt
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics import spring
+from flexneedle.types import THETA, X, Y, across
 from reference.cases import long_beam, numbers
 from reference.draws import draw_controls, draw_scenario
-from reference.space import (
-    Imposed,
-    carried_out,
-    commands,
-    forces,
-    lateral,
-    model_of,
-    slopes,
-    start,
-    turned_commands,
-)
+from reference.space_insertions import turned
 
 PHANTOM = load_scenario("phantom")
 seeds = st.integers(0, 10**6)
 angles = st.floats(-math.pi, math.pi)
-GUIDE_X = PHANTOM.setup.guide_x
+OUT_OF_PLANE = [2, 4]  # columns of a tip
+
+
+class Imposed(NamedTuple):
+    """Roll (rad) and boundary conditions of the needle at the start: lateral numbers y + iz in mm, rad and N."""
+
+    roll: float = 0.0
+    base: complex = 0.0
+    slope: complex = 0.0
+    guide: complex = 0.0
+    load: complex = 0.0
+
+    def turned(self, angle):
+        """Return the conditions turned about the axis (rad)."""
+        return Imposed(self.roll + angle, *(cmath.exp(1j * angle) * part for part in self[1:]))
+
+
+def exact(scenario=PHANTOM, axes=2, **constants):
+    """Return a simulator with other constants, which solves nearer to equilibrium than usual."""
+    scenario = scenario.with_values({"setup.axes": axes})
+    model = Simulator(scenario, 1)._model._replace(**{"slide": 1e-10, "tolerance": 1e-11, **constants})
+    return Simulator(scenario, 1, constants=model)
+
+
+def commands(count, advance=0.0, *, base=0.0, slope=0.0, guide=0.0, **rolls):
+    """Return commands (count, 9) of numbers, or of arrays (count,); base, slope and guide y + iz."""
+    columns = {"db_y": base, "db_theta": slope, "dg_y": guide}
+    real = {name: np.real(value) for name, value in columns.items()}
+    columns = {"db_z": base, "db_psi": slope, "dg_z": guide}
+    return controls(count, db_x=advance, **real, **{k: np.imag(v) for k, v in columns.items()}, **rolls)
+
+
+def started(simulator, imposed):
+    """Return the state at the start under imposed conditions."""
+    base, slope, load = ((z.real, z.imag) for z in map(complex, (imposed.base, imposed.slope, imposed.load)))
+    state = simulator.start(imposed.roll).with_estimate(base=base, slope=slope, tip_load=load)
+    return simulator.replay(state, commands(1, guide=imposed.guide))[0]
+
+
+UNLOADED = Imposed()
+
+
+def inserted(simulator, rows, imposed=UNLOADED):
+    """Return the state after commands (m, 9), and the tips (m, 5) on the way."""
+    return simulator.replay(started(simulator, imposed), rows)
+
+
+def forces(state):
+    """Return the forces (N) and the moment (N·mm), y + iz (3,), that hold base, base slope and guide."""
+    return np.array([complex(*pair) for pair in state.reactions[:3]])
 
 
 def drawn(seed, steps=60):
@@ -42,10 +83,10 @@ def drawn(seed, steps=60):
 
 
 def random_in_space(seed, steps=60):
-    """Return a random scenario, imposed conditions and commands that lie in no common plane."""
+    """Return a random simulator, imposed conditions and commands that lie in no common plane."""
     scenario, rows = drawn(seed, steps)
     guided, rng = scenario.setup.has_guide, np.random.default_rng((seed, 1))
-    bevel, base, slope, guide, load = np.exp(1j * rng.uniform(-np.pi, np.pi, 5)) * [1.0, 0.3, 2e-3, 0.4, 2e-3]
+    base, slope, guide, load = np.exp(1j * rng.uniform(-np.pi, np.pi, 4)) * [0.3, 2e-3, 0.4, 2e-3]
     other = drawn(seed + 1, steps)[1] if guided else 0.5 * rows
     for y, z in ((1, 2), (3, 4), (5, 6)):
         rows[:, z] = other[::-1, y]
@@ -53,7 +94,7 @@ def random_in_space(seed, steps=60):
         guide, base, rows[:, 5:7] = 0.0, 0.2 * base, 0.0
     rows[:, 7] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-4.0, 4.0, steps)
     rows[:, 8] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-9.0, 9.0, steps)
-    return scenario, Imposed(bevel, base, slope, guide, load), rows
+    return exact(scenario), Imposed(rng.uniform(-np.pi, np.pi), base, slope, guide, load), rows
 
 
 # ---- lateral numbers
@@ -89,7 +130,7 @@ def test_products_and_sizes_are_those_of_vectors(a, b):
 @pytest.mark.parametrize("spin", [0.0, 0.4, -2.0, 12.0])
 def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
     """ℓ q′ = b e^{iφ} − q along a step of 2.3 mm, with the bevel turning evenly and ending at its direction."""
-    model = model_of(PHANTOM)
+    model = exact()._model
     length, offset, step = model.bevel_length, model.bevel_offset, 2.3
     bevel, q0 = cmath.exp(0.7j), 0.3 - 1.1j
     tip, channel = nd.NodePose(10.0, 0j, 0j), nd.CutChannel(10.0, q0)
@@ -112,12 +153,10 @@ def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
 def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
     """Random insertions, to 1e-9 mm, with no motion at all out of that plane."""
     scenario, rows = drawn(seed)
-    imposed = Imposed(1.0, 0.2, 1e-3, 0.1 if scenario.setup.has_guide else 0.0, 1e-3)
-    (plane, tips), (space, there) = (
-        carried_out(start(scenario, imposed, across), rows) for across in (float, complex)
-    )
+    imposed = Imposed(0.0, 0.2, 1e-3, 0.1 if scenario.setup.has_guide else 0.0, 1e-3)
+    (plane, tips), (space, there) = (inserted(exact(scenario, axes), rows, imposed) for axes in (1, 2))
     np.testing.assert_allclose(there, tips, atol=1e-9)
-    assert not there[:, [2, 4]].any()
+    assert not there[:, OUT_OF_PLANE].any()
     assert not space.rest.imag.any()
     np.testing.assert_allclose(space.rest.real, plane.rest, atol=1e-9)
     assert space.energy == pytest.approx(plane.energy, rel=1e-7, abs=1e-12)
@@ -129,15 +168,15 @@ def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
 @given(seed=seeds, angle=angles)
 def test_turning_all_inputs_turns_the_needle(seed, angle):
     """Base, guide, bevel, load and every command, in random insertions with rolls and spins."""
-    scenario, imposed, rows = random_in_space(seed)
+    simulator, imposed, rows = random_in_space(seed)
     turn = cmath.exp(1j * angle)
-    one, tips = carried_out(start(scenario, imposed), rows)
-    other, there = carried_out(start(scenario, imposed.turned(angle)), turned_commands(rows, angle))
+    one, tips = inserted(simulator, rows, imposed)
+    other, there = inserted(simulator, turned(rows, angle), imposed.turned(angle))
     assert one.converged
     assert np.abs(tips[:, 2]).max() > 1e-4
-    np.testing.assert_allclose(there[:, 0], tips[:, 0], atol=1e-9)
-    np.testing.assert_allclose(lateral(there), turn * lateral(tips), atol=1e-9)
-    np.testing.assert_allclose(slopes(there), turn * slopes(tips), atol=1e-10)
+    np.testing.assert_allclose(there[:, X], tips[:, X], atol=1e-9)
+    np.testing.assert_allclose(across(there, Y), turn * across(tips, Y), atol=1e-9)
+    np.testing.assert_allclose(across(there, THETA), turn * across(tips, THETA), atol=1e-10)
     np.testing.assert_allclose(other.rest, turn * one.rest, atol=1e-9)
     assert other.energy == pytest.approx(one.energy, rel=1e-7)
 
@@ -146,11 +185,10 @@ def test_turning_all_inputs_turns_the_needle(seed, angle):
 @given(seed=seeds)
 def test_mirrored_inputs_mirror_the_needle(seed):
     """z → −z with rolls and spins the other way."""
-    scenario, imposed, rows = random_in_space(seed)
-    mirrored = rows.copy()
-    mirrored[:, [2, 4, 6, 7, 8]] *= -1.0
-    _, tips = carried_out(start(scenario, imposed), rows)
-    _, there = carried_out(start(scenario, Imposed(*np.conj(imposed))), mirrored)
+    simulator, imposed, rows = random_in_space(seed)
+    mirrored = rows * [1, 1, -1, 1, -1, 1, -1, -1, -1]
+    _, tips = inserted(simulator, rows, imposed)
+    _, there = inserted(simulator, mirrored, Imposed(-imposed.roll, *np.conj(imposed[1:])))
     np.testing.assert_allclose(there * [1, 1, -1, 1, -1], tips, atol=1e-10)
 
 
@@ -158,13 +196,11 @@ def test_mirrored_inputs_mirror_the_needle(seed):
 @given(angle=angles, bend=st.floats(-1.0, 1.0))
 def test_a_bent_needle_with_clearance_turns_as_well(angle, bend):
     """Natural bend and the circle of the guide."""
-    constants = {"curvature": 2.0 * bend / 150.0**2, "clearance": 0.08}
+    simulator = exact(curvature=complex(2.0 * bend / 150.0**2), clearance=0.08)
     rows = commands(50, 1.0, guide=0.06 * np.exp(0.3j * np.arange(50)), spin=0.05)
-    tips = []
-    for by in (0.0, angle):
-        state = start(PHANTOM, Imposed(bevel=1j, base=0.2).turned(by), **constants)
-        tips.append(carried_out(state, turned_commands(rows, by))[1])
-    np.testing.assert_allclose(lateral(tips[1]), cmath.exp(1j * angle) * lateral(tips[0]), atol=1e-6)
+    imposed = Imposed(roll=0.5 * math.pi, base=0.2)
+    tips = [inserted(simulator, turned(rows, by), imposed.turned(by))[1] for by in (0.0, angle)]
+    np.testing.assert_allclose(across(tips[1], Y), cmath.exp(1j * angle) * across(tips[0], Y), atol=1e-6)
 
 
 # ---- rolls and spins
@@ -172,25 +208,21 @@ def test_a_bent_needle_with_clearance_turns_as_well(angle, bend):
 
 def test_a_roll_by_half_a_turn_is_the_flip():
     """To the last bit: π, −π, 3π, or the bevel's direction reversed by hand; four quarters are none."""
-    before, _ = carried_out(start(PHANTOM), commands(48, 1.0, guide=0.03))
-    boundary = before.needle.boundary
-    reversed_ = before.needle._replace(boundary=boundary._replace(bevel=-boundary.bevel))
-    by_hand = replace(before, needle=reversed_)
-    on = commands(20, 1.0)
-    _, expected = carried_out(by_hand, on)
-    plane = start(PHANTOM, across=float)
-    flat = np.vstack([commands(48, 1.0, guide=0.03), on])
-    flat[48, 7] = math.pi
-    _, planar = carried_out(plane, flat)
-    for half in (math.pi, -math.pi, 3 * math.pi):
-        rolled = on.copy()
-        rolled[0, 7] = half
-        after, tips = carried_out(before, rolled)
+    simulator, on, before = exact(), commands(20, 1.0), commands(48, 1.0, guide=0.03)
+    begun, _ = inserted(simulator, before)
+    boundary = begun.needle.boundary
+    reversed_ = begun.needle._replace(boundary=boundary._replace(bevel=-boundary.bevel))
+    _, expected = simulator.replay(replace(begun, needle=reversed_), on)
+    flip = on.copy()
+    flip[0, 7] = math.pi
+    _, planar = inserted(exact(axes=1), np.vstack([before, flip]))
+    for half in (1, -1, 3):
+        after, tips = simulator.replay(begun, flip * [1, 1, 1, 1, 1, 1, 1, half, 1])
         assert after.needle.boundary.bevel == -1.0
         np.testing.assert_array_equal(tips, expected)
-        assert not tips[:, [2, 4]].any()
+        assert not tips[:, OUT_OF_PLANE].any()
         np.testing.assert_allclose(tips, planar[48:], atol=1e-9)
-    rolled, still = (carried_out(before, commands(4, roll=roll))[0] for roll in (0.5 * math.pi, 0.0))
+    rolled, still = (simulator.replay(begun, commands(4, roll=roll))[0] for roll in (0.5 * math.pi, 0.0))
     np.testing.assert_array_equal(numbers(rolled), numbers(still))
 
 
@@ -198,13 +230,13 @@ def pushed(steps, depth=45.0, turns=0.0, scenario=PHANTOM):
     """Return the tips of an insertion to a depth (mm) in even steps, with an even spin of some turns from the start."""
     way = depth - scenario.setup.start_tip_x
     rows = commands(steps, way / steps, spin=2.0 * math.pi * turns / steps)
-    return carried_out(start(scenario), rows)[1]
+    return inserted(exact(scenario), rows)[1]
 
 
 @pytest.mark.parametrize("turns", [0.5, -7.0])
 def test_a_spin_does_not_depend_on_the_steps(turns):
     """The same total spin in 37, 148 and 444 steps: the tip to 5 µm."""
-    ends = [lateral(pushed(steps, turns=turns))[-1] for steps in (37, 148, 444)]
+    ends = [across(pushed(steps, turns=turns), Y)[-1] for steps in (37, 148, 444)]
     assert np.abs(np.subtract(ends, ends[-1])).max() < 5e-3
     assert abs(ends[-1]) > 5e-3
 
@@ -215,13 +247,12 @@ def test_a_steady_spin_is_a_helix():
     scenario = long_beam(depth, spacing=1.0, bevel=0.01, bevel_length=3.0)
     turns = rate * (depth - scenario.setup.start_tip_x) / (2 * math.pi)
     tips = pushed(int(depth - scenario.setup.start_tip_x), depth, turns, scenario)
-    deep = tips[:, 0] > 150.0
-    x, y = tips[deep, 0], lateral(tips[deep])
-    curvature = np.diff(y, 2) / step**2
+    deep = tips[:, X] > 150.0
+    x, curvature = tips[deep, X][1:-1], np.diff(across(tips[deep], Y), 2) / step**2
     phase = np.unwrap(np.angle(curvature))
-    slope, offset = np.polyfit(x[1:-1], phase, 1)
+    slope, offset = np.polyfit(x, phase, 1)
     assert slope == pytest.approx(rate, rel=2e-3)
-    np.testing.assert_allclose(phase, slope * x[1:-1] + offset, atol=0.05)
+    np.testing.assert_allclose(phase, slope * x + offset, atol=0.05)
     np.testing.assert_allclose(np.abs(curvature), np.abs(curvature).mean(), rtol=0.05)
 
 
@@ -231,37 +262,29 @@ def test_a_steady_spin_is_a_helix():
 @settings(max_examples=6)
 @given(seed=seeds, clearance=st.floats(1e-2, 0.4))
 def test_the_circle_of_a_guide_pushes_towards_its_middle(seed, clearance):
-    """No needle is beyond it, and none that does not touch it is pushed; a push has no part along the circle."""
+    """The needle is within the circle, and pushed only where it touches it, without a part along the circle."""
     rng = np.random.default_rng(seed)
-    way = np.cumsum(rng.normal(0.0, 0.1, (2, 40)), axis=1)
-    rows = commands(40, 1.0, guide=rng.normal(0.0, 0.08, 40) + 1j * rng.normal(0.0, 0.08, 40), spin=way[0])
-    state = start(PHANTOM, Imposed(base=0.3j, slope=1e-3), clearance=clearance)
-    touched = set()
-    for row in rows:
-        state, _ = carried_out(state, row[None])
-        place = state.mesh["y"][state.mesh["x"] == GUIDE_X][0] - state.needle.boundary.guide
-        force = forces(state)[2]
+    way, guide = np.cumsum(rng.normal(0.0, 0.1, 40)), rng.normal(0.0, 0.08, (2, 40))
+    simulator, touched = exact(clearance=clearance), set()
+    state = started(simulator, Imposed(base=0.3j, slope=1e-3))
+    for row in commands(40, 1.0, guide=guide[0] + 1j * guide[1], spin=way):
+        state, _ = simulator.replay(state, row[None])
+        at_guide = state.mesh["x"] == PHANTOM.setup.guide_x
+        place = state.mesh["y"][at_guide][0] - state.needle.boundary.guide
+        push = forces(state)[2] * np.conj(place)
         assert state.converged
         assert abs(place) <= clearance + 1e-9
         touches = abs(place) > clearance - 1e-9
         touched.add(touches)
         if touches:
-            assert (force * np.conj(place)).real <= 1e-9
-            assert abs((force * np.conj(place)).imag) <= 1e-6 * abs(force)
+            assert push.real <= 1e-9
+            assert abs(push.imag) <= 1e-6 * abs(forces(state)[2])
         else:
-            assert force == 0.0
+            assert forces(state)[2] == 0.0
     assert True in touched
 
 
 # ---- work and energy
-
-
-def withdrawn():
-    """Return a needle bent out of every plane, then drawn back: its tip is past whole points, without its spring."""
-    rows = commands(58, 1.0, guide=0.02 - 0.03j)
-    rows[45, 7] = 1.1
-    state, _ = carried_out(start(PHANTOM), rows)
-    return carried_out(state, commands(10, -0.33))[0]
 
 
 MOVES = {
@@ -274,14 +297,15 @@ MOVES = {
 
 @pytest.mark.parametrize("name", MOVES)
 def test_work_of_base_and_guide_is_the_energy_stored(name):
-    """Trapezoid rule, y and z of all that moves; the slide of a tip without a spring costs nothing."""
-    state, steps = withdrawn(), 60
-    move = np.array(MOVES[name]) / steps
-    energy, work = state.energy, 0.0
-    row = commands(1, base=move[0], slope=move[1], guide=move[2])
-    for _ in range(steps):
+    """Trapezoid rule, y and z of all motions, of a needle drawn back: without its spring, its tip past whole points."""
+    simulator, rows = exact(), commands(58, 1.0, guide=0.02 - 0.03j)
+    rows[45, 7] = 1.1
+    state, _ = simulator.replay(inserted(simulator, rows)[0], commands(10, -0.33))
+    move = np.array(MOVES[name]) / 60
+    energy, work, row = state.energy, 0.0, commands(1, base=move[0], slope=move[1], guide=move[2])
+    for _ in range(60):
         before = forces(state)
-        state, _ = carried_out(state, row)
+        state, _ = simulator.replay(state, row)
         work += (0.5 * (before + forces(state)) * np.conj(move)).real.sum()
     assert state.tip[0] < state.needle.channel.front
     assert abs(state.energy - energy) > 5e-3
@@ -294,11 +318,10 @@ def test_steep_laws_converge_in_every_direction(alpha, modulus_kpa):
     layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}
     steep = {f"tissue.{i}.{key}": value for i in (0, 1) for key, value in layer.items()}
     scenario = PHANTOM.with_values({"needle.bevel.offset_mm": 13.0, **steep})
-    rows, ends = commands(70, 1.0, guide=0.2 * np.exp(0.4j * np.arange(70)), spin=0.3), []
+    simulator, ends = exact(scenario, slide=2e-5, tolerance=1e-7), []
+    rows = commands(70, 1.0, guide=0.2 * np.exp(0.4j * np.arange(70)), spin=0.3)
     for angle in (0.0, 1.3):
-        state = start(scenario, Imposed().turned(angle), slide=2e-5, tolerance=1e-7)
-        for row in turned_commands(rows, angle):
-            state, tips = carried_out(state, row[None])
-            assert state.converged
-        ends.append(lateral(tips)[-1])
+        found = simulator.rollout(simulator.start(angle), turned(rows, angle)[None], limits=False)
+        assert found.converged.all()
+        ends.append(across(found.tips[0], Y)[-1])
     assert ends[1] == pytest.approx(ends[0] * cmath.exp(1.3j), abs=1e-5)

@@ -114,10 +114,3 @@ def test_the_indicator_responds_to_a_gradient_and_not_to_a_shift():
     assert indicator(exact(mild, "ref1").coils, 0.01).max() < 1e-4
     slope = np.abs(Room(steep, 1).distortion("ref1", GRID)[:, 2]) / 50.0
     np.testing.assert_allclose(indicator(exact(steep, "ref1").coils, 0.01), slope, rtol=1e-2)
-
-
-def test_the_indicator_grows_as_the_plate_approaches():
-    tracker = environment(plate={"coils_mm": 2.0, "coils_pull": 1.0})
-    values = [indicator(exact(tracker, "ref1", plate=at).coils, 10.0) for at in (300.0, 200.0, 120.0, 80.0)]
-    assert (np.diff(values, axis=0) > 0.0).all()
-    assert np.max(values[0]) < 0.02
