@@ -11,7 +11,7 @@ from flexneedle.geometry.registration import identity
 from flexneedle.lab.rig.devices import clock
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor import core, protocol
 from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -356,8 +356,9 @@ def real_motors(settings, channels):
     """Motors in memory and in real time: the driver `stages:real_motors` of a rig file.
 
     notes: file of their commands; address: of the motors; suspended: file that, once it exists, makes the computer
-    appear to have been suspended for an hour.
+    appear to have been suspended for an hour. A client and ticks may be late, on a busy machine.
     """
+    core.HEARTBEAT_S = core._STALL_S = 60.0
     print("the stage is opened")
     stage = Noted(settings["notes"], channels)
     stage.address = settings["address"]

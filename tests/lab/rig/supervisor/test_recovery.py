@@ -163,5 +163,5 @@ def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, caps
     assert [state.on for state in read().values()] == [False, False, False]
     order("clear")
     begun = read()["C"].position
-    assert command("jog", "guide_y", "-1.5mm") == (0, "done")
+    assert command("jog", "guide_y", "-1.5mm", "--speed", "5") == (0, "done")
     assert read()["C"].position == pytest.approx(begun + 750.0, abs=5.0)  # counts, 500 a mm backwards
