@@ -58,8 +58,6 @@ def document(found: results.Found) -> str:
         *solver(found),
         *refinement(found),
         *space(found.space),
-        "## Limits",
-        LIMITS,
     ]
     return "\n\n".join(wrapped(part) for part in parts) + "\n"
 
@@ -74,12 +72,8 @@ def wrapped(text: str) -> str:
 INTRODUCTION = (
     "`python studies/validation.py` (`make validation`) compares the needle of the virtual phantom (`--phantom exact`,"
     " [theory](theory.md), section 11) with closed forms, a second solver and the controller's model. It writes this"
-    " page; the tests assert its values (`pytest tests/phantom`)."
-)
-LIMITS = (
-    "This page verifies that the equations are solved; it does not validate the tissue. The exact plant and the"
-    " controller's model share the tissue law (1), the springs normal to the needle and the rule of the bevel's rest"
-    " point, which only an experiment can validate."
+    " page; the tests assert its values (`pytest tests/phantom`). The page verifies that the equations are solved; only"
+    " an experiment can validate the tissue law and the rules of contact that plant and model share."
 )
 
 

@@ -21,7 +21,7 @@ _UNITS = {
     "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "counts_per_mm": "counts/mm", "counts_per_deg": "counts/°",
     "_mm_s2": "mm/s²", "_deg_s2": "°/s²", "_mm_s": "mm/s", "_deg_s": "°/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
     "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_ms": "ms", "_s": "s",
-    "_periods": "periods", "_mn": "mN", "_deg": "°",
+    "_mn": "mN", "_deg": "°",
 }  # fmt: skip
 _LARGEST = 1e6
 
