@@ -80,13 +80,13 @@ def taken(truth, numbers, times, positions):
     ("scenario", "turn"), [("phantom", 18_000), pytest.param("phantom3d", 7_000, marks=pytest.mark.slow)]
 )
 def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_path):
-    """Through 35 mm with the guide in two axes, and a roll; what is left between reading and truth is jitter."""
+    """Through 25 mm with the guide in two axes, and a roll; the remaining difference of reading and truth is jitter."""
     path, truth_path = rig_file(tmp_path), tmp_path / "truth.csv"
     with emulated_rig(path, scenario, "--seed", 3, "--truth", truth_path) as rig:
         prepared(rig)
         with Aurora(rig.ready["ready"]["aurora"], Monotonic()) as aurora:
             frames, _ = read_until(aurora, lambda found: len(found) > 40)
-            assert rig.ask("PR 50000,,2400,-1200;BGACD") == "::"
+            assert rig.ask("PR 30000,,2400,-1200;BGACD") == "::"
             rig.at_rest("ACD")
             assert rig.ask(f"PRB={turn};BGB") == "::"
             rig.at_rest("B")
@@ -101,18 +101,18 @@ def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_
     assert error.std() == pytest.approx(JITTER_MM, rel=0.12)
     assert np.abs(error).max() < 5.5 * JITTER_MM
     moving = np.linalg.norm(moved_by(truth, times), axis=1) > 5.0
-    assert np.count_nonzero(moving) > 100
+    assert np.count_nonzero(moving) > 60
     for part in (error, error[moving]):
         np.testing.assert_allclose(part.mean(axis=0), 0.0, atol=5.0 * JITTER_MM / math.sqrt(len(part)))
     assert np.abs(np.median(stamps - times)) < 0.015
     end = {name: float(place[-1]) for name, place in truth.positions.items()}
-    wanted = {"insertion": 35.0, "rotation": math.radians(turn / 100.0), "guide_y": 1.2, "guide_z": -0.6}
+    wanted = {"insertion": 25.0, "rotation": math.radians(turn / 100.0), "guide_y": 1.2, "guide_z": -0.6}
     assert end == pytest.approx(wanted, abs=1e-5)
-    assert truth.tips[-1, 0] - truth.tips[0, 0] == pytest.approx(35.0, abs=0.2)
+    assert truth.tips[-1, 0] - truth.tips[0, 0] == pytest.approx(25.0, abs=0.2)
     assert (truth.converged == 1.0).all()
     assert_written_often(truth)
     ended = rig.message("ended", device="phantom")["ended"]
-    assert ended["steps"] > 350
+    assert ended["steps"] > 250
 
 
 def assert_written_often(truth):
