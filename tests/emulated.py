@@ -23,7 +23,7 @@ def emulator(*arguments, end=signal.SIGINT, device="aurora"):
     command = [sys.executable, "-m", "flexneedle", "emulate", device, *arguments]
     process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
 
-    def tell(line):
+    def order(line):
         process.stdin.write(f"{line}\n")
         process.stdin.flush()
         while (answer := process.stderr.readline().strip()).startswith(CABLE):
@@ -31,7 +31,7 @@ def emulator(*arguments, end=signal.SIGINT, device="aurora"):
         return answer
 
     try:
-        yield process.stdout.readline().strip(), tell
+        yield process.stdout.readline().strip(), order
     finally:
         process.send_signal(end)
         _, errors = process.communicate(timeout=DEADLINE_S)
@@ -46,15 +46,15 @@ def emulated(*arguments, end=signal.SIGINT):
 
 
 def until(condition, seconds=DEADLINE_S):
-    """Ask again and again until the condition holds; fail at the deadline."""
+    """Wait until the condition holds; fail at the deadline."""
     deadline = monotonic() + seconds
     while not condition():
-        assert monotonic() < deadline, "the condition did not come about in time"
+        assert monotonic() < deadline, "the condition did not hold in time"
         Event().wait(0.002)
 
 
 def read_until(tracker, condition, seconds=DEADLINE_S):
-    """Return all frames up to when the condition on them holds, and the statuses seen meanwhile."""
+    """Return all frames until the condition on them holds, and the statuses meanwhile."""
     frames, statuses = [], set()
 
     def holds():
@@ -67,7 +67,7 @@ def read_until(tracker, condition, seconds=DEADLINE_S):
 
 
 def assert_true_and_new(frames, seed=0):
-    """Every frame is new and later than the one before, and no position is another than the emulated one."""
+    """Assert that every frame is new and later than the previous one, and that its positions are the emulated ones."""
     assert (np.diff([frame.number for frame in frames]) > 0).all()
     assert (np.diff([frame.time for frame in frames]) > 0).all()
     for frame in frames:

@@ -1,4 +1,4 @@
-"""A whole emulated rig in processes of its own, and a raw client of its controller."""
+"""A whole emulated rig in separate processes, and a raw client of its controller."""
 
 import json
 import os
@@ -17,8 +17,10 @@ START_S = 300.0  # the first run compiles the kernels, perhaps on a busy machine
 
 
 def rig_file(folder, **replaced):
-    """Write the emulated rig of the package with a free port and a link in the folder; return its path. replaced: texts
-    by the text that takes their place."""
+    """Write the emulated rig of the package with a free port and a link in the folder; return its path.
+
+    replaced: new text by the old one.
+    """
     text = (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text()
     for before, after in {
         "127.0.0.1:2323": "127.0.0.1:0",
@@ -33,7 +35,7 @@ def rig_file(folder, **replaced):
 
 
 class EmulatedRig:
-    """The processes and what they have reported so far; `ask` sends a line to the controller and returns its reply."""
+    """The processes and their messages; `ask` sends a line to the controller and returns its reply."""
 
     def __init__(self, process):
         self.process, self.messages, self._received, self._line = process, [], b"", None
@@ -42,7 +44,7 @@ class EmulatedRig:
         self.ready = self.message("ready")
 
     def message(self, key, **values):
-        """The first message with a key and these values, None if there is none yet."""
+        """Return the first message with a key and these values, None if there is none yet."""
         self._read()
         return next((m for m in self.messages if key in m and values.items() <= m.items()), None)
 
@@ -80,11 +82,11 @@ class EmulatedRig:
 
     @property
     def children(self):
-        """The processes that it has started."""
+        """The child processes."""
         return [psutil.Process(pid) for pid in self.ready["pids"].values()]
 
     def end(self, how=signal.SIGINT):
-        """End it; return exit status and errors."""
+        """End the processes; return exit status and errors."""
         if self._line is not None:
             self._line.close()
         if self.process.poll() is None:
@@ -117,7 +119,7 @@ def started(*arguments):
 
 @contextmanager
 def emulated_rig(*arguments):
-    """Run `flexneedle emulate rig` with these arguments, to its good end after Ctrl-C; no process is left."""
+    """Run `flexneedle emulate rig` with these arguments until Ctrl-C, after which no process is left."""
     rig = started(*arguments)
     children = rig.children
     try:

@@ -22,7 +22,7 @@ class Peer:
     lines: list = field(default_factory=list)
 
     def answer(self, line):
-        """What is sent in reply to a line."""
+        """Return the bytes that are sent in reply to a line."""
         self.lines.append(line)
         self.device, true = reply(advance_controller(self.device, 5), line)
         return true.encode() if self.damage is None else self.damage(line, true.encode())

@@ -5,7 +5,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from math import isfinite
 from statistics import median
-from typing import Protocol, TypeVar
+from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
@@ -24,16 +24,9 @@ from flexneedle.types import VISIBLE, Frame, is_reference
 _PAUSE_S = 0.01
 _READINGS = 5  # of the motors, for the time of a reply
 _MOST_UNMEASURED = (
-    0.1  # share of the frames in which a sensor has no position; one such frame is allowed in any case
+    0.1  # share of the frames in which a sensor has no position; one such frame is always allowed
 )
 _RATE_TOLERANCE = 0.1
-
-
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-Device = TypeVar("Device", bound=_Closable)
 
 
 @dataclass(frozen=True)
@@ -75,21 +68,17 @@ def check_rig(
 
 
 def check_device(
-    part: str, kind: str, connect: Callable[[], Device], read: Callable[[Device], list[Finding]]
+    part: str, kind: str, connect: Callable[[], Any], read: Callable[[Any], list[Finding]]
 ) -> list[Finding]:
     """Return the findings of one device; after a failure its error replaces the findings that are missing."""
     connected: list[Finding] = []
     try:
         with closing(connect()) as device:
-            connected = [Finding(part, "connection", f"{kind}{_format_identity(device)}")]
+            identity = getattr(device, "identity", "")
+            connected = [Finding(part, "connection", ", ".join(filter(None, (kind, identity))))]
             return connected + read(device)
     except FlexneedleError as error:
         return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
-
-
-def _format_identity(device: object) -> str:
-    identity = getattr(device, "identity", "")
-    return f", {identity}" if identity else ""
 
 
 def _file_findings(rig: RigFile) -> Iterator[Finding]:
@@ -102,9 +91,7 @@ def _file_findings(rig: RigFile) -> Iterator[Finding]:
 def _scenario_findings(rig: RigFile, wanted: IntendedInsertion) -> list[Finding]:
     problems = fit_problems(rig, wanted.scenario, wanted.strategy)
     name = wanted.scenario.name
-    found = [Finding("scenario", "fit", name, line) for line in problems] or [
-        Finding("scenario", "fit", name)
-    ]
+    found = [Finding("scenario", "fit", name, line) for line in problems or [""]]
     return [*found, _step_finding(rig, wanted.scenario)]
 
 
