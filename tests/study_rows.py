@@ -62,7 +62,7 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
         "case": case,
         **{key: value for key, value in values.items() if key != "name"},
         "controller": controller,
-        "plant": "exact",
+        "plant": values.get("plant", "exact"),
         "strategy": "manipulation",
         "target_depth_mm": depth,
         "target_lateral_mm": lateral,

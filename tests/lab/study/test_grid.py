@@ -144,7 +144,7 @@ def test_equal_targets_of_two_cases_have_the_same_seeds(study):
     for insertion in insertions(study(OWN_TARGETS)):
         seeds.setdefault(insertion.point.scenario.target.position, set()).add(insertion.seed)
     expected = {(30.0, 1.0, 2.0): {50, 51}, (40.0, 5.0, 0.0): {52, 53}, (35.0, 0.0, -1.0): {54, 55}}
-    assert seeds == expected  # the target of the scenario is that of the first case, too
+    assert seeds == expected  # the last case has the target of the first
 
 
 def test_a_case_may_have_its_reach_computed(study):

@@ -26,7 +26,7 @@ def journalled(folder):
 
 
 def agrees(insertion, row):
-    """Whether an insertion has the values of a row, to the last digit."""
+    """Return whether an insertion has the values of a row, to the last digit."""
     values = json.loads(json.dumps(plain(insertion_row(insertion))))
     return values == {name: row[name] for name in values}
 
@@ -200,31 +200,8 @@ def test_a_study_that_runs_has_the_rows_that_are_finished(copied):
         recompute(copied, other)
 
 
-@pytest.mark.parametrize("index", [-1, SIZE])
-def test_a_row_that_is_none_is_an_error_with_the_range(uninterrupted, index):
-    with pytest.raises(InputError, match=rf"study: row = {index}: must be from 0 to 15"):
-        recompute(uninterrupted, index)
-
-
-@pytest.mark.parametrize("outcome", ["refused", "error"])
-def test_a_row_without_an_insertion_is_an_error_with_its_reason(copied, outcome):
-    change_row(copied, 4, outcome=outcome, reason="no plan: FloatingPointError: overflow")
-    message = f"copied: row 4 has no insertion: {outcome}: no plan: FloatingPointError: overflow"
-    with pytest.raises(InputError, match=message):
-        recompute(copied, 4)
-
-
-def test_a_plan_that_is_missing_is_an_error_with_its_name(copied):
-    shutil.rmtree(copied / "plans")
-    with pytest.raises(InputError, match=r"copied: row 4: its plan plans/[0-9a-f]{16}\.json is missing$"):
-        recompute(copied, 4)
-    change(copied, "versions", source="0")
-    with pytest.raises(InputError, match=r"is missing; the study was made by other code$"):
-        recompute(copied, 4)
-
-
-def damage_definition(folder):
-    change(folder, "study", axes=3)
+def write(name, text):
+    return lambda folder: (folder / name).write_text(text)
 
 
 def other_settings(folder):
@@ -232,35 +209,40 @@ def other_settings(folder):
     change(folder, "study", values=values | {"plan.samples": -1})
 
 
-def other_size(folder):
-    change(folder, "study", insertions=3)
+def without_plans(folder):
+    shutil.rmtree(folder / "plans")
+    change(folder, "versions", source="0")
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("index", "damage", "message"),
     [
+        (-1, None, "copied: row = -1: must be from 0 to 15"),
+        (SIZE, None, "copied: row = 16: must be from 0 to 15"),
         (
-            lambda folder: (folder / "study.json").unlink(),
-            r"copied: contains no study: study\.json is missing",
-        ),
-        (lambda folder: (folder / "study.json").write_text("{"), r"copied/study\.json: cannot be read: "),
-        (damage_definition, r"copied/study\.json: damaged: "),
-        (other_settings, r"copied: row 0: plan\.samples = -1: must be "),
-        (other_size, "copied: insertions = 3: this version of flexneedle makes 16 of it: its rows cannot be"),
-        (
-            lambda folder: (folder / "journal.jsonl").unlink(),
-            r"journal\.jsonl: cannot be read: No such file or directory",
+            0,
+            lambda folder: change_row(folder, 0, outcome="error", reason="x"),
+            "row 0 has no insertion: error: x",
         ),
         (
-            lambda folder: (folder / "journal.jsonl").write_text("3\n"),
-            r"journal\.jsonl: damaged at line 1: not a ",
+            4,
+            without_plans,
+            r"row 4: its plan plans/[0-9a-f]{16}\.json is missing; the study was made by other code$",
         ),
+        (0, lambda folder: (folder / "study.json").unlink(), r"contains no study: study\.json is missing"),
+        (0, write("study.json", "{"), r"study\.json: cannot be read: "),
+        (0, lambda folder: change(folder, "study", axes=3), r"study\.json: damaged: "),
+        (0, other_settings, r"copied: row 0: plan\.samples = -1"),
+        (0, lambda folder: change(folder, "study", insertions=3), "copied: insertions = 3"),
+        (0, lambda folder: (folder / "journal.jsonl").unlink(), r"journal\.jsonl: cannot be read"),
+        (0, write("journal.jsonl", "3\n"), r"journal\.jsonl: damaged at line 1"),
     ],
 )
-def test_a_damaged_folder_is_an_error(copied, damage, message):
-    damage(copied)
+def test_a_row_that_cannot_be_computed_is_an_error(copied, index, damage, message):
+    if damage is not None:
+        damage(copied)
     with pytest.raises(InputError, match=message):
-        recompute(copied, 0)
+        recompute(copied, index)
 
 
 @pytest.mark.parametrize(
@@ -285,13 +267,6 @@ def test_what_differs_from_the_recorded_row_is_noted(copied, changed, recorded, 
     change(copied, "versions", **changed)
     change_row(copied, 2, **recorded)
     assert re.fullmatch(note if "\\" in note else re.escape(note), recompute(copied, 2).note)
-
-
-def test_a_row_of_an_earlier_version_may_lack_columns(copied):
-    found = journalled(copied)
-    kept = {name: found[2][name] for name in ("index", "true_error_mm", "outcome", "reason")}
-    (copied / "journal.jsonl").write_text(json.dumps(kept) + "\n")
-    assert recompute(copied, 2).note == ""
 
 
 def test_a_difference_in_the_last_digit_is_shown_with_all_digits(copied):

@@ -1,7 +1,6 @@
 """Studies on real worker processes: identical tables for any number of workers and interruptions."""
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -253,80 +252,11 @@ def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, t
     assert tables(tmp_path / "a") == tables(uninterrupted)
 
 
-def test_a_folder_with_a_study_is_not_overwritten(quick, uninterrupted):
-    with pytest.raises(
-        InputError, match="already contains a study: add --resume to continue it, or set another"
-    ):
-        run_study(quick, uninterrupted)
-
-
-def test_a_folder_with_other_files_is_rejected(quick, tmp_path):
-    (tmp_path / "thesis.tex").touch()
-    for resume in (False, True):
-        with pytest.raises(InputError, match="exists and is not an empty folder"):
-            run_study(quick, tmp_path, resume=resume)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "difference"),
-    [
-        ("repeats = 2", "repeats = 3", "repeats is 2 in the folder, 3 now"),
-        ("iterations = 2", "iterations = 3", "values.plan.iterations is 2 in the folder, 3 now"),
-        ("-0.5]", "-0.6]", r"axes.target is \[.*-0.5\]\] in the folder, \[.*-0.6\]\] now"),
-    ],
-)
-def test_another_study_cannot_resume_in_the_folder(quick, uninterrupted, tmp_path, old, new, difference):
-    changed = tmp_path / "changed.toml"
-    changed.write_text(quick.read_text().replace(old, new))
-    before = tables(uninterrupted)
-    with pytest.raises(InputError, match=f"cannot resume: {difference}"):
-        run_study(changed, uninterrupted, resume=True)
-    assert tables(uninterrupted) == before
-
-
-def test_other_package_versions_cannot_resume_a_study(quick, uninterrupted, monkeypatch):
-    monkeypatch.setattr("flexneedle.lab.study.folder.versions", lambda: {**versions(), "numba": "0.1"})
-    with pytest.raises(InputError, match=rf"versions.numba is {versions()['numba']} in the folder, 0.1 now"):
-        run_study(quick, uninterrupted, resume=True)
-
-
-def test_an_index_outside_the_study_is_rejected(quick, uninterrupted, tmp_path):
-    out = shutil.copytree(uninterrupted, tmp_path / "a")
-    text = (out / "journal.jsonl").read_text()
-    beyond = json.loads(text.splitlines()[0]) | {"index": SIZE}
-    (out / "journal.jsonl").write_text(f"{text}{json.dumps(beyond)}\n")
-    with pytest.raises(
-        InputError, match="damaged at line 17: index = 16: must be a whole number from 0 to 15"
-    ):
-        run_study(quick, out, resume=True)
-    assert tables(out) == tables(uninterrupted)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_killed_before_its_start_is_started_by_resume(quick, uninterrupted, tmp_path):
     (tmp_path / "journal.jsonl").touch()
     assert tables(run_study(quick, tmp_path, resume=True)) == tables(uninterrupted)
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ({"workers": 0}, "workers = 0: must be a whole number, at least 1; omit it for one per core"),
-        (
-            {"workers": 1.5},
-            "workers = 1.5: must be a whole number, at least 1; omit it for one per core",
-        ),
-        (
-            {"workers": 1, "scheduler": "tcp://host:1"},
-            "workers = 1: sets local processes: remove it, or remove the scheduler",
-        ),
-    ],
-)
-def test_workers_are_at_least_one_and_local(quick, tmp_path, options, line):
-    with pytest.raises(InputError) as caught:
-        run_study(quick, tmp_path / "a", **options)
-    assert str(caught.value) == line
 
 
 def test_a_plan_counts_once_in_the_time(uninterrupted):
@@ -335,3 +265,55 @@ def test_a_plan_counts_once_in_the_time(uninterrupted):
     assert time["plan_s"] == pytest.approx(timing[0]["plan_s"] + timing[-1]["plan_s"])
     total = sum(row["total_s"] for row in timing)
     assert time["control_s"] + time["plant_s"] + time["rest_s"] == pytest.approx(total)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "resume", "message"),
+    [
+        ("", "", False, "already contains a study"),
+        ("repeats = 2", "repeats = 3", True, "cannot resume: repeats is 2 in the folder, 3 now"),
+        (
+            "iterations = 2",
+            "iterations = 3",
+            True,
+            "cannot resume: values.plan.iterations is 2 in the folder, 3 now",
+        ),
+        (
+            "-0.5]",
+            "-0.6]",
+            True,
+            r"cannot resume: axes.target is \[.*-0.5\]\] in the folder, \[.*-0.6\]\] now",
+        ),
+    ],
+)
+def test_only_the_same_study_is_resumed_in_its_folder(
+    quick, uninterrupted, tmp_path, old, new, resume, message
+):
+    changed = tmp_path / "changed.toml"
+    changed.write_text(quick.read_text().replace(old, new))
+    before = tables(uninterrupted)
+    with pytest.raises(InputError, match=message):
+        run_study(changed, uninterrupted, resume=resume)
+    assert tables(uninterrupted) == before
+
+
+@pytest.mark.parametrize("name", ["numba", "source"])
+def test_other_versions_cannot_resume_a_study(quick, uninterrupted, monkeypatch, name):
+    monkeypatch.setattr("flexneedle.lab.study.folder.versions", lambda: {**versions(), name: "0.1"})
+    with pytest.raises(InputError, match=rf"versions.{name} is {versions()[name]} in the folder, 0.1 now"):
+        run_study(quick, uninterrupted, resume=True)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_with_other_files_is_rejected(quick, tmp_path, resume):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(InputError, match="exists and is not an empty folder"):
+        run_study(quick, tmp_path, resume=resume)
+
+
+@pytest.mark.parametrize(
+    "options", [{"workers": 0}, {"workers": 1.5}, {"workers": 1, "scheduler": "tcp://host:1"}]
+)
+def test_workers_are_at_least_one_and_local(quick, tmp_path, options):
+    with pytest.raises(InputError, match=f"^workers = {options['workers']}: "):
+        run_study(quick, tmp_path / "a", **options)

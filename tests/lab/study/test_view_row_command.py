@@ -44,7 +44,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def study(made, in_tmp, drawing, monkeypatch):  # noqa: ARG001
-    """A study of two rows in the folder `mine`; no row takes so long that its progress is shown."""
+    """A study of two rows in the folder `mine`; all rows are too quick for a progress display."""
     monkeypatch.setattr(view, "_SHORT_S", math.inf)
     return shutil.copytree(made, in_tmp / "mine")
 

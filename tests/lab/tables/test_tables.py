@@ -55,7 +55,7 @@ def written(tmp_path):
         (SEMICOLONS + "a;1.5;2\n", [("a", 1.5, 2.0)]),
         (SEMICOLONS + '"a;b";"1,5";2\n', [("a;b", 1.5, 2.0)]),
         ("sensor\tx_mm\ty_mm\na\t,5\t2\n", [("a", 0.5, 2.0)]),
-        (COMMAS + "a,,NaN\na,na,nan\na,null,None\na,N/A,#N/A\na,MISSING, \n", [("a", None, None)] * 5),
+        (COMMAS + "a,,NaN\na,NA,NAN\na,null,None\na,N/A,#N/A\na,MISSING, nan\n", [("a", None, None)] * 5),
     ],
 )
 def test_a_csv_file_is_read(written, text, rows):

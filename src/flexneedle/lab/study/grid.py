@@ -163,14 +163,14 @@ def load_study(source: str | Path | ExpandedStudy, worlds: tuple[int, int] | Non
 
 
 def restore_study(definition: Mapping[str, Any]) -> ExpandedStudy:
-    """Return the study of a recorded `definition`; a point is made when it is needed, which may be one of thousands.
+    """Return the study of a recorded `definition`; its points are made on first use.
 
-    Raises InputError if this version makes another number of insertions of it, or for one of its parts that is missing;
-    KeyError, TypeError, ValueError or AttributeError for values that are no definition.
+    Raises InputError if this version expands it to another number of insertions, or a custom part is missing; KeyError,
+    TypeError, ValueError or AttributeError for an invalid definition.
     """
     study = _make_study(definition, Scenario.from_values(definition["scenario"]))
     if len(study) != definition["insertions"]:
-        rule = f"this version of flexneedle makes {len(study)} of it: its rows cannot be assigned"
+        rule = f"this version of flexneedle expands it to {len(study)}: its rows cannot be assigned"
         raise InputError(to_line(Problem("insertions", definition["insertions"], rule)))
     return study
 
@@ -199,7 +199,7 @@ def _expand(file: StudyFile, base: Scenario) -> ExpandedStudy:
         "seeds": seeds,
     }
     study = _make_study(settings, base)
-    _ = study.points  # which are checked before anything runs
+    _ = study.points  # checked before anything runs
     return study
 
 
@@ -271,7 +271,7 @@ class _Parts:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Settings of a point, of which its scenario has not been made. chosen: values of the axes; kind: of a world."""
+    """Settings of a point before its scenario is made. chosen: values of the axes; kind: case and rig of a world."""
 
     case: str
     chosen: Mapping[str, Any]
@@ -283,7 +283,7 @@ class _Choice:
 
 
 class StudyGrid:
-    """The points of a study by number. Each is made when it is first asked for, and is the same from then on."""
+    """The points of a study by number, made on first use."""
 
     def __init__(self, parts: _Parts) -> None:
         self._parts, self._worlds = parts, cache(world)  # the same worlds for every controller
@@ -346,7 +346,7 @@ def _make_point(parts: _Parts, choice: _Choice, worlds: Callable[..., Scenario])
 
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
-    """Return whether a world has another guide than the rig, or none that this case or the controller needs."""
+    """Return whether the rig does not fit the guide of a world, or the case or the controller needs a guide."""
     return not has_rig(scenario, world_rig) or (
         not scenario.setup.has_guide
         and (world_case == STRUCTURE or find_controller(controller)[1].needs_guide)

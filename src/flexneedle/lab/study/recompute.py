@@ -1,4 +1,4 @@
-"""A row of a study computed again: a study keeps no periods, but a row follows from its settings, plan and seed."""
+"""Compute a row of a study again: a study keeps no periods, but settings, plan and seed determine the row."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _ERROR, _ROWS_FOLDER = "true_error_mm", "rows"
 class RecomputedRow:
     """The insertion of a row, computed again.
 
-    note: "" if the versions of the study give the recorded row to the last digit; else what differs, in one line.
+    note: "" if the versions are the study's and the row is the same to the last digit; else the difference in one line.
     """
 
     insertion: Insertion
@@ -39,8 +39,8 @@ def recompute(
 
     on_share: called after each control period with the share of the depth that the tip has reached, 0 to 1.
 
-    Raises InputError if the folder has no study, is damaged, or lacks a custom module, and for a row that is none
-    of the study, is not finished, or has no insertion; RunError if the insertion is refused, which the row was not.
+    Raises InputError if the folder has no study, is damaged, or lacks a custom module, or if the row does not exist, is
+    not finished, or has no insertion; RunError if the insertion is refused although the recorded one was not.
     """
     recorded = read_folder(folder)
     row, made_by = _find_row(recorded, index), _describe_version(recorded)
@@ -63,7 +63,7 @@ def recompute(
 
 
 def row_folder(study: Path, index: int) -> Path:
-    """Return the folder in a study's folder in which `flexneedle view` keeps a row that it has computed again."""
+    """Return the folder of a recomputed row, inside the folder of its study."""
     return study / _ROWS_FOLDER / f"row-{index:06d}"
 
 

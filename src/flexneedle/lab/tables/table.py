@@ -35,7 +35,7 @@ Rule = tuple[str, str]
 _MAGIC = b"PAR1"
 _THREADS = 4  # at most; each buffers 32 MB of a CSV file
 _NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
-_SPELLINGS = sorted({spelt for text in EMPTY for spelt in (text, text.upper(), text.title())} | {"NaN", " "})
+_EMPTY_FIELDS = ["", "NA", "N/A", "#N/A", "null", "NULL", "None", "missing", "MISSING"]  # besides nan in any case
 _MOST_REJECTED = 10_000
 _REASONS = {
     "MISSING COLUMNS": "has fewer fields than the header",
@@ -180,7 +180,7 @@ def _open_csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> 
     connection.execute(
         f"CREATE TEMP VIEW file AS SELECT * FROM read_csv({_literal(escape(str(path)))}, columns={kinds}, "
         f"auto_detect=false, header=true, skip={layout.skipped}, delim={_literal(layout.separator)}, quote='\"', "
-        f"escape='\"', nullstr={_SPELLINGS}, decimal_separator='{mark}', store_rejects=true, "
+        f"escape='\"', nullstr={_EMPTY_FIELDS}, decimal_separator='{mark}', store_rejects=true, "
         f"rejects_limit={_MOST_REJECTED})"
     )
     fields = {name: f"c{layout.header.index(text)}" for name, text in chosen.items()}

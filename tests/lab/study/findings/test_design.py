@@ -1,6 +1,5 @@
 """Factors of a study according to `study.json`, with the level of each row."""
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -72,28 +71,20 @@ def test_a_number_that_varies_is_an_axis_in_ascending_order(along):
     assert axis.codes.tolist() == [2, 2, 0, 0, 1, 1]
 
 
-def test_levels_without_rows_are_omitted(design):
-    axes = {"contact.spacing_mm": [2.0, 0.5, 1.0]}
-    rows = make_rows(axes=axes, targets=TARGETS, repeats=1)[:4]
-    assert design(rows, axes=axes).axes[0].names == ("0.5", "2")
-
-
-def test_gauges_are_ordered_from_thick_to_thin(along):
-    (axis,) = along({"needle.gauge": ["25G", "18G", "21G"]}).axes
-    assert axis.names == axis.titles == ("18G", "21G", "25G")
-    assert_allclose(axis.positions, [0, 1, 2])
-
-
-def test_booleans_are_names(along):
-    (axis,) = along({"monitor.enabled": [True, False]}).axes
-    assert axis.names == axis.titles == ("True", "False")
-
-
-def test_plants_and_strategies_are_axes_too(design):
-    rows = make_rows(targets=TARGETS, repeats=2)
-    for row in rows[::2]:
-        row["plant"] = "model"
-    assert described(design(rows, axes={"plant": ["model", "exact"]}))["plant"] == ("model", "exact")
+@pytest.mark.parametrize(
+    ("key", "values", "names"),
+    [
+        ("needle.gauge", ["25G", "18G", "21G"], ("18G", "21G", "25G")),
+        ("monitor.enabled", [True, False], ("True", "False")),
+        ("plant", ["model", "exact"], ("model", "exact")),
+        ("phantom.bevel_factor", [[0.5, 1.5], [0.0, 2.0]], ("0.5 to 1.5", "0 to 2")),
+    ],
+)
+def test_levels_of_other_kinds_are_names(along, key, values, names):
+    """Gauges from thick to thin, all others in the order of the rows."""
+    (axis,) = along({key: values, "tracker.jitter_mm": [0.1]}).axes
+    assert axis.names == axis.titles == names
+    assert_allclose(axis.positions, range(len(names)))
 
 
 @pytest.mark.parametrize("key", ["seed", "plan_seed", "target.depth_mm"])
@@ -102,16 +93,6 @@ def test_axes_of_seeds_and_targets_are_not_factors(design, key):
     for row in rows:
         row["plan_seed"] = row["seed"]
     assert described(design(rows, axes={key: [0, 1]})) == {"controller": (OURS,)}
-
-
-def test_two_axes_are_two_factors(along):
-    axes = {"contact.spacing_mm": [0.5, 1.0], "tracker.jitter_mm": [0.0, 0.07, 0.14]}
-    assert [axis.key for axis in along(axes).axes] == list(axes)
-
-
-def test_lists_are_levels_too(along):
-    (axis,) = along({"phantom.bevel_factor": [[0.5, 1.5], [0.0, 2.0]]}).axes
-    assert axis.names == ("0.5 to 1.5", "0 to 2")
 
 
 def test_cases_that_change_one_setting_each_are_cases(in_cases):
@@ -211,10 +192,3 @@ def test_a_value_within_an_environment_is_an_axis_beside_it(design):
         DISTANCE: ("80", "100"),
     }
     assert found.axes[1].label == "tracker environment plate: distance (mm)"
-
-
-def test_levels_of_rows_in_any_order_are_those_of_the_rows(along):
-    """Each row has the level of its own value."""
-    values = [0.3, 0.1, 0.2]
-    axis = along({"tracker.jitter_mm": values}).axes[0]
-    assert_allclose(axis.positions[axis.codes], np.repeat(values, len(TARGETS)))

@@ -192,7 +192,7 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
 
 
 def test_the_headline_includes_failures_and_misses_of_all_settings(report_on):
-    """Not only those of the first setting, which has no failure and no miss here; the study is incomplete."""
+    """The first setting alone has no failure and no miss here; the study is incomplete."""
     axes = {"contact.spacing_mm": [0.5, 1.0]}
     rows = make_rows(axes=axes, targets=TARGETS, repeats=5)
     for row in rows:
@@ -219,7 +219,7 @@ def test_the_headline_includes_failures_and_misses_of_all_settings(report_on):
 
 
 def in_space(rows):
-    """The rows as those of a study in space: targets at z = 2 mm."""
+    """Return the rows with targets in space, at z = 2 mm."""
     more = {"setup.axes": 2, "target.lateral_z_mm": 2.0, "target_lateral_z_mm": 2.0}
     return [row | more | {"tip_z_mm": 2.0 + row["true_error_mm"]} for row in rows]
 

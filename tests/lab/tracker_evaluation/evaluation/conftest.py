@@ -1,4 +1,4 @@
-"""What the tests of tables share."""
+"""Rows of a table for the tests."""
 
 import pytest
 
