@@ -35,7 +35,7 @@ Rule = tuple[str, str]
 _MAGIC = b"PAR1"
 _THREADS = 4  # at most; each buffers 32 MB of a CSV file
 _NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
-_EMPTY_FIELDS = ["", "NA", "N/A", "#N/A", "null", "NULL", "None", "missing", "MISSING"]  # besides nan in any case
+_EMPTY_FIELDS = ["", "NA", "N/A", "#N/A", "null", "NULL", "None", "missing", "MISSING"]  # and nan
 _MOST_REJECTED = 10_000
 _REASONS = {
     "MISSING COLUMNS": "has fewer fields than the header",
