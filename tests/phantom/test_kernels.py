@@ -30,7 +30,7 @@ preset, axes = sys.argv[1], int(sys.argv[2])
 compile_kernels(axes)
 before = signatures()
 assert all_compiled(axes)
-entries = "insertion._settle", "insertion._rollout", "insertion.energies", "shape.equal_arc_nodes", "equilibrium.step"
+entries = "insertion.settle", "insertion.rollout", "insertion.energies", "shape.equal_arc_nodes", "equilibrium.step"
 assert all(before[name] == 1 for name in entries), before
 quick = {"samples": 16, "iterations": 2}
 scenario = flexneedle.load_scenario(preset).with_values({

@@ -38,12 +38,12 @@ def same_future(one, other):
 )
 def test_copies_are_equal_and_have_the_same_future(state, duplicate):
     """Copied, deeply copied, pickled; no kernel is compiled for the copy."""
-    kernels = len(insertion._rollout.signatures)
+    kernels = len(insertion.rollout.signatures)
     twin = duplicate(state)
     assert twin == state
     assert hash(twin) == hash(state)
     assert same_future(twin, state)
-    assert len(insertion._rollout.signatures) == kernels
+    assert len(insertion.rollout.signatures) == kernels
 
 
 def test_states_compare_by_value(state):

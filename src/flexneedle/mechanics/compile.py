@@ -14,7 +14,7 @@ from numba.core import config as _numba_config
 
 from flexneedle import types
 
-_Function = TypeVar("_Function")  # a compiled function is called like the one that it was
+_Function = TypeVar("_Function")  # compiled functions keep their signature
 _njit: Any = nb.njit
 _config: Any = _numba_config  # its settings are not declared
 HERE = Path(__file__).parent
@@ -26,7 +26,7 @@ def cache_folder(home: Path) -> str:
     It is under NUMBA_CACHE_DIR, beside the code, or in the user's cache.
     """
     digest = hashlib.sha256(repr(_columns()).encode())
-    for folder in dict.fromkeys((HERE, home)):  # in this order, wherever they are
+    for folder in dict.fromkeys((HERE, home)):  # in this order, whatever their paths
         for source in sorted(folder.glob("*.py")):
             digest.update(source.read_bytes())
     beside = home / "__pycache__"
@@ -42,7 +42,7 @@ def _columns() -> list[tuple[str, int]]:
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that only other kernels call, and that makes no array.
+    """Compile a function that only kernels call and that allocates no array.
 
     Its caller owns the arrays: counting references to them would take a third of a step.
     """

@@ -20,7 +20,6 @@ from flexneedle.mechanics.needle import (
     NodePose,
     Plain,
     Work,
-    from_plain,
     to_plain,
 )
 from flexneedle.mechanics.shape import put, sample
@@ -107,20 +106,14 @@ def settled(
 
 
 @kernel
-def _settle(model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
+def settle(model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
+    """Call `settled` from outside of kernels; return the needle for `from_plain`."""
     return to_plain(settled(model, needle, rest, u, w, held))
-
-
-def settle(
-    model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
-) -> NeedleState:
-    """Call `settled` from outside of kernels."""
-    return from_plain(_settle(model, needle, rest, u, w, held))
 
 
 @inner
 def _end_of_part(model: Model, needle: NeedleState, advance: float, done: float) -> float:
-    """Return the share of a step at which its next part ends, `done` being the share so completed.
+    """Return the share of a step at which its next part ends, after the share `done`.
 
     Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state
     remains a continuous function of the command.
@@ -226,7 +219,7 @@ def _shape(
 
 
 @kernel
-def _rollout(
+def rollout(
     model: Model,
     start: NeedleState,
     rest0: Laterals,
@@ -240,6 +233,11 @@ def _rollout(
     last: int,
     out: Outputs,
 ) -> Plain:
+    """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1), and fill `out`.
+
+    Returns the needle after the last sample, for `from_plain`, with its `rest`, `u` and `w`, arrays as in `solve`. axes
+    (N, 2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.
+    """
     needle = start
     x, y, slope = (
         np.empty(rest0.size + 2),
@@ -261,25 +259,3 @@ def _rollout(
             if out.shapes.size > 0:
                 _shape(model, needle, w, x, y, slope, out.shapes[j, k])
     return to_plain(needle)
-
-
-def rollout(
-    model: Model,
-    start: NeedleState,
-    rest0: Laterals,
-    u0: Laterals,
-    rest: Laterals,
-    u: Laterals,
-    w: Work,
-    commands: Floats,
-    axes: Laterals,
-    first: int,
-    last: int,
-    out: Outputs,
-) -> NeedleState:
-    """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1).
-
-    Fills `out`. Returns the needle after the last sample, with its `rest`, `u` and `w`, arrays as in `solve`. axes (N,
-    2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.
-    """
-    return from_plain(_rollout(model, start, rest0, u0, rest, u, w, commands, axes, first, last, out))

@@ -12,7 +12,7 @@ from numba import types
 from numba.extending import overload
 
 Lateral = complex
-"""For mypy a float is one, too."""
+"""For mypy, a float also is one."""
 
 
 def _by_axes(plane: Callable[..., Any], space: Callable[..., Any]) -> Callable[..., Any]:
@@ -75,7 +75,7 @@ steady = _by_axes(
     lambda goal, rate, length: goal,
     lambda goal, rate, length: goal / complex(1.0, rate * length),
 )
-"""Steady value of what follows a `goal` turning by `rate` (rad/mm) with the relaxation length `length` (mm)."""
+"""Steady value of a quantity that follows a `goal` turning by `rate` (rad/mm), with relaxation length `length` (mm)."""
 
 stretched = _by_axes(lambda along, z, radial, tangential: radial * z, _stretched)
 """z with its part along the unit vector `along` times `radial`, and the part across it times `tangential`."""
@@ -84,7 +84,7 @@ one_stiffness = _by_axes(
     lambda u, radial, tangential, weight: radial,
     lambda u, radial, tangential, weight: weight * radial + (1.0 - weight) * tangential,
 )
-"""One stiffness for both axes, between that along the compression u and that across it: exact in the plane."""
+"""One stiffness for both axes, between the stiffnesses along and across the compression u: exact in the plane."""
 
 inexact = _by_axes(lambda u, radial, tangential, weight: 0.0, _inexact)
 """Largest relative error of `one_stiffness`: the part of a change that the next iteration corrects."""

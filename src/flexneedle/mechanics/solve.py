@@ -129,7 +129,7 @@ def _bearing(
     pulls = dot(force, last.wall) > 0.0
     off = distance <= model.clearance and (
         pulls or not bears
-    )  # a wall that pushes stays, however little it does
+    )  # a wall that pushes stays, however weak the push
     if off or (pulls and dot(free, last.wall) <= 0.0):
         return not bears, Bearing(times(0.0, y), give, y, force)
     wall = free / distance if distance > 0.0 else last.wall
@@ -153,8 +153,8 @@ def _iterate(
     """Carry out one iteration, in place.
 
     Returns tip, start of the next iteration, loads, first node being cut, distance left (mm), and whether the needle
-    bears on its guide as assumed. Without coupling it first searches where in the guide its own quadratic energy is
-    least: a line search towards that point descends, so that the needle cannot go from wall to wall in a cycle.
+    bears on its guide as assumed. Without coupling it first searches the position in the guide with the least quadratic
+    energy: a line search towards that position descends, so that the needle cannot alternate between the walls.
     """
     nodes = model.nodes
     tip_x = boundary.base.x + model.length - at.shortening

@@ -49,7 +49,7 @@ _SMALL_MM = 1e-8  # a Newton step below it is accepted without a line search
 _TRIALS = 16  # of the length of a Newton step
 _UPHILL = 4  # full steps that may lead uphill
 _SAME_RAD = 1e-3
-_SOFTER = 5  # powers of ten by which a guide is softer at first where a solve fails
+_SOFTER = 5  # powers of ten: first softening of the guide after a failed solve
 _ROLL_RAD = (
     0.5  # largest rotation in one solve where friction acts against it: its slip has the sign of the rotation
 )
@@ -154,7 +154,7 @@ def _iterate(rod: Rod, s: State, w: Records, channel: Records, count: int, befor
     """Iterate by Newton's method from the present frames; its iterations are added to those before.
 
     Along the round wall of the guide each descent would be short. So a few full steps may lead uphill, if the work of
-    the last of them is below half of the work of the first; else the solve returns to where it began with them.
+    the last of them is below half of the work of the first; otherwise the solve returns to its state before them.
     """
     move_nodes(rod, s, w)
     assemble(rod, s, w, channel, count, before, 1.0)
@@ -198,7 +198,7 @@ def _copy_frames(source: Floats, into: Floats) -> None:
 def solve(rod: Rod, s: State, w: Records, channel: Records, count: int, before: Before) -> None:
     """Solve for equilibrium with base, guide, bevel and loads of the state, in place.
 
-    Where that fails, from the start again with a guide that is soft at first, and then with guide and channel held at
+    If that fails, it starts again with a soft guide that becomes stiff in steps, then with guide and channel held at
     their segments: the force of a point changes its direction where the point changes its segment.
     """
     move_nodes(rod, s, w)
@@ -290,9 +290,9 @@ def _settle(rod: Rod, s: State, w: Records, channel: Records, count: int, roll: 
 def step(rod: Rod, s: State, w: Records, channel: Records, count: int, command: Floats) -> int:
     """Move base and guide by a command (the columns of `Control`), solve for equilibrium, cut; all in place.
 
-    s: a record of STATE; w (N + 1,) of SEGMENT; channel (M,) of POINT, of which the first `count` are there. Returns
-    the new count. A step that spins has parts of at most half a radian, since the force on the tip is that at the end
-    of a part. The roll belongs to the first of them; against friction it is at rest before them, in such parts, too.
+    s: a record of STATE; w (N + 1,) of SEGMENT; channel (M,) of POINT, of which the first `count` are used. Returns
+    the new count. A step that spins has parts of at most half a radian, since the force on the tip is taken at the end
+    of a part. The roll is in the first part; against friction it precedes the motion, in parts of the same size.
     """
     turns, parts = 0, max(1, math.ceil(abs(command[SPIN]) / _ROLL_RAD))
     if rod.rotation_friction > 0.0:

@@ -198,7 +198,7 @@ def new_offset(rod: Rod, s: State, before: Before) -> tuple[Vector, float]:
     spun = before.spin + s.twist - before.twist
     spun = min(max(spun, min(0.0, before.spin)), max(0.0, before.spin)) / max(advance, cut)
     lag, turned = spun * rod.bevel_length, spun * cut
-    # As complex numbers in the tip's frame: the goal b, what follows it steadily while it turns, S = b/(1 + i lag), and
+    # As complex numbers in the tip's frame: the goal b, its steady follower while it turns, S = b/(1 + i lag), and
     # both at the start of the cut, b e^(−i turned) and S e^(−i turned).
     re = rod.bevel_offset / (1.0 + lag * lag)
     im = -lag * re

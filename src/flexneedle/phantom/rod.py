@@ -37,7 +37,7 @@ STATE = np.dtype(
         ("roll", float),  # of the base since the start (rad)
         ("guide", float, 2),  # y and z (mm)
         ("softening", float),  # of the guide during a solve, 1: none
-        ("held", float),  # 1: guide and channel stay at the segments that they were at last
+        ("held", float),  # 1: guide and channel stay at their last segments
         ("guide_segment", np.int64),  # of the needle in the guide
         ("slide", float),  # last direction of axial motion, −1, 0, +1
         ("tip", float, 3),

@@ -99,7 +99,7 @@ def _stage(rod: Rod, row: Records, beyond: _Beyond, least: float, curved: float)
     # The hinge couples both rotations by [m]×/2 besides its stiffness b: with Y = S + [m]×/2 and M = b + S no small
     # difference of large numbers is left.
     last = ((s[0], s[1] - z, s[2] + y), (s[1] + z, s[3], s[4] - x), (s[2] - y, s[4] + x, s[5]))
-    # By rows of what they are multiplied with: δ_i = gain − nodeᵀ δp_i + δ_{i−1} − hingeᵀ δ_{i−1}.
+    # By rows of their factors: δ_i = gain − nodeᵀ δp_i + δ_{i−1} − hingeᵀ δ_{i−1}.
     gain = times(-1.0, of_rows(inv, plus(rest, moment)))
     node = (of_rows(inv, w[0]), of_rows(inv, w[1]), of_rows(inv, w[2]))
     hinge = (of_rows(inv, last[0]), of_rows(inv, last[1]), of_rows(inv, last[2]))

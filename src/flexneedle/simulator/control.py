@@ -72,7 +72,7 @@ class Limits:
     Attributes:
         step: Largest step of each column of travel, (7,).
         travel: Range of the sum of steps from the start, (7, 2).
-        half_turns: Key and value by which the needle rolls by half turns only, or "".
+        half_turns: Key and value that restrict the needle to half turns, or "".
         rotation: Largest angle from 0 to either side (rad).
         fixed: Reason why each column of travel may not move, or "".
     """

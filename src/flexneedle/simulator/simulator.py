@@ -132,10 +132,9 @@ class Simulator:
         out, work = insertion.outputs(1, len(rows)), self._work(state)
         start = state.needle, state.rest, state.compression
         driven = drive_along_entry(self.scenario, rows)[None]
-        needle = insertion.rollout(self._model, *start, *work, driven, self._axes(1), 0, 1, out)
-        return freeze_solve(
-            replace(state, roll=self._turn(state.roll, rows)), self._model, needle, *work
-        ), out.tips[0]
+        plain = insertion.rollout(self._model, *start, *work, driven, self._axes(1), 0, 1, out)
+        turned_state = replace(state, roll=self._turn(state.roll, rows))
+        return freeze_solve(turned_state, self._model, nd.from_plain(plain), *work), out.tips[0]
 
     def _axes(self, count: int, axes: ArrayLike | None = None) -> nd.Laterals:
         """Return the lines (count, 2) from which a deflection counts, of the type of the state's laterals."""
@@ -281,7 +280,8 @@ class Simulator:
 
     def _settle(self, state: State, merged: model.Model, held: Lateral) -> State:
         work = self._work(state)
-        return freeze_solve(state, merged, insertion.settle(merged, state.needle, *work, held), *work)
+        needle = nd.from_plain(insertion.settle(merged, state.needle, *work, held))
+        return freeze_solve(state, merged, needle, *work)
 
     def _check_mechanics(self, state: State) -> None:
         if state.scenario is self.scenario:
