@@ -1,21 +1,18 @@
 """Samples of studies/robustness.py and studies/plant_robustness.py, and that both detect failures."""
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import plant_robustness
+import robustness
 from flexneedle.phantom import plants
 from flexneedle.phantom.equilibrium import MAX_ITERATIONS
 from flexneedle.simulator.simulator import Rollout
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
-import plant_robustness
-import robustness
 
 MODEL = SimpleNamespace(study=robustness, count="--sequences", number="--batch", work="run_batch")
 PLANT = SimpleNamespace(study=plant_robustness, count="--insertions", number="--number", work="run_one")

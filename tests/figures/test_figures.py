@@ -107,7 +107,7 @@ def test_the_mark_of_the_guide_travel_is_upright_in_the_legend():
     assert marks["guide travel"].get_markevery() is None
 
 
-def test_paths_are_those_of_plan_and_record():
+def test_paths_are_from_plan_and_record():
     (scene,) = axes(drawn(), "scene")
     expected = {
         "planned path": INSERTION.plan.tips[:, :2],
@@ -172,7 +172,7 @@ def test_a_miss_is_drawn_at_the_end():
         ("without rolls", {"tracker, rejected", "bevel flip, planned", "bevel flip, applied"}),
     ],
 )
-def test_the_legend_names_what_is_drawn_and_nothing_else(case, missing):
+def test_the_legend_names_all_that_is_drawn_and_nothing_else(case, missing):
     known = ["estimated needle", "planned path", "bevel at the start", "target, circle of 1 mm radius"]
     known += ["earlier shapes", "true path", "estimated path", "tracker", "tracker, rejected"]
     known += ["bevel flip, planned", "bevel flip, applied", "guide travel"]

@@ -102,7 +102,7 @@ def test_arrows_are_the_directions_of_the_bevel(figure):
     np.testing.assert_allclose(found[0][0], INSERTION.plan.tips[0, :3])
 
 
-def test_titles_are_those_of_the_insertion_and_the_legend_names_what_is_drawn(figure):
+def test_titles_are_from_the_insertion_and_the_legend_names_all_marks(figure):
     assert "reached: the tip ended 0.070 mm from the target" in texts(figure)
     (legend,) = figure.legends
     assert names(legend) == [

@@ -120,7 +120,7 @@ def test_a_stretch_has_two_factors(direction, z, radial, across):
 
 
 @given(a=st.complex_numbers(max_magnitude=1e3), b=st.complex_numbers(max_magnitude=1e3))
-def test_products_and_sizes_are_those_of_vectors(a, b):
+def test_products_and_sizes_agree_with_vectors(a, b):
     assert lt.dot(a, b) == pytest.approx((a * b.conjugate()).real, rel=1e-12, abs=1e-9)
     assert lt.square(a) == lt.dot(a, a)
     assert lt.size(a) == pytest.approx(abs(a), rel=1e-12, abs=1e-150)

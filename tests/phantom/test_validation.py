@@ -1,7 +1,6 @@
 """docs/validation.md agrees with studies/validation.py, whose output is reproducible."""
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,13 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import validation as script
+import validation_results as results
 from reference import space_validation as in_space
 from reference import validation as problems
 from reference.rods import Bench
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
-import validation as script
-import validation_results as results
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "validation.md"

@@ -95,7 +95,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
 # ---- factors
 
 
-def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
+def test_factors_on_modulus_and_bevel_equal_another_scenario():
     other = PHANTOM.with_values(
         {
             "tissue.0.shear_modulus_kpa": 1.82 * 1.7, "tissue.1.shear_modulus_kpa": 3.63 * 0.6,

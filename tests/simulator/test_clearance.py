@@ -95,9 +95,7 @@ def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     clearance=st.floats(1e-3, 0.5), guide=st.floats(-0.5, 0.5),
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
 )  # fmt: skip
-def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
-    clearance, guide, base_y, base_turn
-):
+def test_between_the_walls_the_needle_takes_the_position_of_least_energy(clearance, guide, base_y, base_turn):
     """Each place is what a guide without clearance would prescribe."""
     start = EXACT.start().with_estimate(base=(base_y, 0.0), slope=(base_turn, 0.0))
     found = loose(clearance).step(start, Control(dg_y=guide))

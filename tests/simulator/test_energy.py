@@ -111,7 +111,7 @@ def test_work_of_drawing_back_is_the_energy_released():
     assert errors[1] < errors[0]
 
 
-def test_energy_scale_is_that_of_all_tissue_above_a_depth_displaced_by_a_millimetre():
+def test_the_energy_scale_is_of_all_tissue_above_a_depth_displaced_by_a_millimetre():
     """20 mm of the first layer and 10 of the second, the density of each from the law; weighted by layer."""
     phantom = load_scenario("phantom").with_values({"tissue.1.energy_weight": 3.0})
     stretch = 1.0 - 1.0 / 20.0

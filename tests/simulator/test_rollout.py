@@ -49,7 +49,7 @@ def test_bytes_do_not_depend_on_the_number_of_threads(controls):
             assert array.tobytes() == first.tobytes()
 
 
-def test_mean_square_deflection_is_that_of_the_nodes(controls):
+def test_mean_square_deflection_agrees_with_the_nodes(controls):
     """∫y² dx/L against Simpson's rule on a fine needle state."""
     simulator = Simulator(PHANTOM.with_values({"needle.nodes": 2001}))
     start = insert_to(simulator, 12.0)
@@ -67,7 +67,7 @@ def test_mean_square_deflection_is_that_of_the_nodes(controls):
 
 
 @pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
-def test_the_deflection_is_that_from_the_axis_of_the_entry(preset, controls):
+def test_the_deflection_counts_from_the_axis_of_the_entry(preset, controls):
     """Moved and tilted with the entry, and from a given line; a straight needle has none from its axis."""
     simulator = Simulator(preset)
     values = {"entry.lateral_mm": -4.0, "entry.slope_mrad": 30.0}

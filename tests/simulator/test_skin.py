@@ -75,7 +75,7 @@ def test_the_state_is_continuous_in_the_command(before, flip):
     assert (out.max(axis=0) < 0.02 * np.abs(change).max(axis=0)).all()
 
 
-def test_a_step_below_the_skin_is_that_of_its_parts():
+def test_a_step_below_the_skin_equals_its_parts():
     """One command of 1 mm from a part's end: the same as four of a quarter, the bevel rolled before the first."""
     simulator = Simulator(PHANTOM, threads=1)
     state = at(simulator, simulator.replay(simulator.start(), [Control(db_x=28.0, dg_y=0.3)])[0], 0.5)
