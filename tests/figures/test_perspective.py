@@ -1,4 +1,4 @@
-"""The figure in perspective: what is where, by its artists."""
+"""The figure in perspective: positions and sizes of its artists."""
 
 from dataclasses import replace
 

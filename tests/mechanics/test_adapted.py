@@ -90,7 +90,7 @@ ESTIMATES = {
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_contacts_and_tip_spring_have_the_tissue_along_their_intervals(estimate):
-    """Stiffness ∫3μw/h dx, whatever divides the interval; the spring is linear in it, over the bevel's length."""
+    """Stiffness ∫3μw/h dx, however the interval is divided; the spring is linear in that over the bevel's length."""
     changed = adapt(MODEL, estimate)
     expected = [
         along(node["x"] - node["reach"], node["x"] + node["reach"], estimate) for node in NODES[CONTACTS]

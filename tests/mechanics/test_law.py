@@ -101,7 +101,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(law, e):
 @settings(max_examples=100)
 @given(law=layers, e=compressions)
 def test_a_law_is_convex_and_finite(law, e):
-    """Stiffness positive wherever a point may be; force and energy positive, finite."""
+    """Stiffness, force and energy are positive and finite at any compression."""
     values = of(law, e)
     assert min(values) > 0.0
     assert all(map(math.isfinite, values))
@@ -113,7 +113,7 @@ def test_a_law_is_convex_and_finite(law, e):
 @settings(max_examples=100)
 @given(law=layers, e=compressions)
 def test_a_table_is_its_law(law, e):
-    """Force and energy to 1e-9. The stiffness, by which a solve only finds its way, to 1e-8, and 1e-7 for α < −18."""
+    """Force and energy to 1e-9. The stiffness, which only guides a solve, to 1e-8, and 1e-7 for α < −18."""
     rough = getattr(law, "alpha", 0.0) < -18.0
     energy, force, stiffness = tabled(law, e)
     expected = of(law, e)
@@ -149,7 +149,7 @@ def test_a_table_of_the_linear_law_is_exact():
 @settings(max_examples=100)
 @given(law=layers, cell=st.integers(1, CELLS))
 def test_a_table_is_continuous_from_cell_to_cell_and_at_its_limit(law, cell):
-    """Energy and force to rounding, the stiffness to what it may be off."""
+    """Energy and force to rounding, the stiffness to its accuracy."""
     edge = law.limit / CELLS * cell
     below, above = (tabled(law, edge * (1 + side * 1e-13)) for side in (-1, 1))
     np.testing.assert_allclose(below[:2], above[:2], rtol=5e-11)

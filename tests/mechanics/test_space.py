@@ -83,7 +83,7 @@ def drawn(seed, steps=60):
 
 
 def random_in_space(seed, steps=60):
-    """Return a random simulator, imposed conditions and commands that lie in no common plane."""
+    """Return a random simulator, imposed conditions and commands in no common plane."""
     scenario, rows = drawn(seed, steps)
     guided, rng = scenario.setup.has_guide, np.random.default_rng((seed, 1))
     base, slope, guide, load = np.exp(1j * rng.uniform(-np.pi, np.pi, 4)) * [0.3, 2e-3, 0.4, 2e-3]
@@ -102,7 +102,7 @@ def random_in_space(seed, steps=60):
 
 @given(z=st.complex_numbers(max_magnitude=1e3), quarters=st.integers(-9, 9))
 def test_a_turn_by_whole_quarters_is_exact(z, quarters):
-    """To the last bit, wherever the angle as a float is not exactly a quarter."""
+    """To the last bit, although the angle as a float is not exactly a quarter."""
     expected = z * (1.0, 1j, -1.0, -1j)[quarters % 4]
     assert lt.turned(quarters * 0.5 * math.pi, z) == expected
 
@@ -184,7 +184,7 @@ def test_turning_all_inputs_turns_the_needle(seed, angle):
 @settings(max_examples=5)
 @given(seed=seeds)
 def test_mirrored_inputs_mirror_the_needle(seed):
-    """z → −z with rolls and spins the other way."""
+    """z → −z with opposite rolls and spins."""
     simulator, imposed, rows = random_in_space(seed)
     mirrored = rows * [1, 1, -1, 1, -1, 1, -1, -1, -1]
     _, tips = inserted(simulator, rows, imposed)

@@ -1,4 +1,4 @@
-"""Textbook answers. Beams lie along x; EI in N·mm², k in N/mm² (foundation), P in N, lengths in mm."""
+"""Closed forms of textbooks. Beams are along x; EI in N·mm², k in N/mm² (foundation), P in N, lengths in mm."""
 
 import numpy as np
 

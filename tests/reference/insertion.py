@@ -1,6 +1,6 @@
 """An insertion from docs/theory.md the plain way: influence functions, dense full Newton, secant for the tip.
 
-The needle is a cantilever, and whatever touches it is a force on it. A unit force at distance b from the base
+The needle is a cantilever, and each contact is a force on it. A unit force at distance b from the base
 deflects it at distance a ≤ b by a²(3b − a)/6EI, and so by b²(3a − b)/6EI beyond it. That is exact, and well
 conditioned for forces as close together as you like. Nothing here is shared with flexneedle.mechanics.
 
@@ -16,55 +16,11 @@ import numpy as np
 
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import ROLL, Control
+from reference.ogden import Tissue, ogden
 
 TOLERANCE_MM = 1e-11
-_FLOOR = 0.3
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)  # exact to degree 5; |y'|² has degree 4
 _SPIN_X, _SPIN_W = np.polynomial.legendre.leggauss(64)  # for some turns of the bevel
-
-
-class Tissue(NamedTuple):
-    """Contact points or pieces of the tip spring, arrays (k,): Ogden's μ (MPa) and α, h (mm), volume V (mm³)."""
-
-    mu: np.ndarray
-    alpha: np.ndarray
-    h: np.ndarray
-    volume: np.ndarray
-
-    def take(self, which) -> "Tissue":
-        """Return the chosen entries."""
-        return Tissue(*(values[which] for values in self))
-
-
-class Response(NamedTuple):
-    """Tissue at a compression: energy (mJ), force on the needle (N), stiffness along and across it (N/mm)."""
-
-    energy: np.ndarray
-    force: np.ndarray
-    along: np.ndarray
-    across: np.ndarray
-
-
-def ogden(tissue: Tissue, u) -> Response:
-    """Return the response to the compression u (mm), y or y + iz: equations 1 to 3, with the floor."""
-    mu, alpha, h, volume = tissue
-    size = np.abs(u)
-    stretch = 1.0 - size / h
-    lam = np.maximum(stretch, _FLOOR)
-    beyond = (lam - stretch) * h
-    energy = volume * 2 * mu / alpha**2 * (2 * lam ** (-alpha / 2) + lam**alpha - 3)
-    push = 2 * mu * volume / (alpha * h) * (lam ** (-alpha / 2 - 1) - lam ** (alpha - 1))
-    stiffness = (
-        2
-        * mu
-        * volume
-        / (alpha * h**2)
-        * ((alpha - 1) * lam ** (alpha - 2) + (alpha / 2 + 1) * lam ** (-alpha / 2 - 2))
-    )
-    energy = energy + push * beyond + stiffness * beyond**2 / 2
-    push = push + stiffness * beyond
-    across = np.divide(push, size, out=stiffness.copy(), where=size > 0.0)
-    return Response(energy, -push * np.sign(u), stiffness, across)
 
 
 class End(NamedTuple):

@@ -167,7 +167,7 @@ def rows_of(count):
 
 @pytest.mark.parametrize("bend", [0.0, 0.5])
 def test_a_replay_is_repeated_steps_bit_for_bit(bend):
-    """From the start and from the midst."""
+    """From the start and from a state on the way."""
     simulator, rows = Simulator(PHANTOM, threads=1), rows_of(80)
     assert (rows[:, ROLL] > 0).sum() > 3
     estimated = adaptation(

@@ -21,7 +21,7 @@ def state():
 
 @pytest.mark.parametrize("offset", [-0.5, 1e-3, 0.8])
 def test_tip_is_held_where_it_was_measured(state, offset):
-    """y exactly; x is rigid, and what it lacks is returned."""
+    """y exactly; x is rigid, and its difference is returned."""
     x, y = state.tip[:2]
     held, innovation = SIMULATOR.assimilate(state, (x + 0.25, y + offset))
     assert held.tip[1] == y + offset

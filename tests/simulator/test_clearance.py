@@ -96,7 +96,7 @@ def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
 )  # fmt: skip
 def test_between_the_walls_the_needle_takes_the_position_of_least_energy(clearance, guide, base_y, base_turn):
-    """Each place is what a guide without clearance would prescribe."""
+    """A guide without clearance prescribes each position."""
     start = EXACT.start().with_estimate(base=(base_y, 0.0), slope=(base_turn, 0.0))
     found = loose(clearance).step(start, Control(dg_y=guide))
     places = guide + clearance * np.linspace(-1.0, 1.0, 21)
@@ -126,7 +126,7 @@ def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_t
 
 
 def test_without_clearance_nothing_of_it_is_left():
-    """Bit for bit, whatever wall the needle was on before."""
+    """Bit for bit, for a needle that was at any wall before."""
     bears = loaded(0.1, 10, 1.0)[-1]
     assert wall(bears) == -1.0
     solution = bears.needle.solution
@@ -161,7 +161,7 @@ def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
 
 
 def test_rollouts_converge_and_equal_steps():
-    """A guide that goes from wall to wall, rolls of the bevel, an uneven advance: bit for bit as one by one."""
+    """A guide that goes from wall to wall, rolls of the bevel, an uneven advance: bit for bit as in single steps."""
     rng = np.random.default_rng(4)
     advance, guide = rng.uniform(0.3, 1.0, (24, 60)), rng.uniform(-0.1, 0.1, (24, 60))
     roll = np.where(rng.random((24, 60)) < 0.05, np.pi, 0.0)

@@ -1,9 +1,9 @@
-"""Work and energy: what base, guide, held tip and the slide along the channel do is what is stored.
+"""The work of base, guide, held tip and the slide along the channel is the stored energy.
 
-The needle slides while it bends (equation 5), through a guide at rest, and that slide does work on
-whatever the tip leaves or meets: the spring that fades, the points that lose weight, a held tip that is on a
-slope. It is a 200th of the work for a millimetre or two of lateral motion. It vanishes where the tip is out of
-the bevel's spring and past the growth of the last point, and is counted by `axial_force` where it is not.
+The needle slides while it bends (equation 5), through a guide at rest, and the slide does work at the tip: on the
+fading spring, on points that lose weight, on the slope of a held tip. It is a 200th of the work of one or two
+millimetres of lateral motion, and 0 when the tip is out of the bevel's spring and past the growth of the last point.
+`axial_force` counts it.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
 
 
 def withdrawn(by):
-    """A bent needle, the bevel rolled on the way, then drawn back without cutting by `by` mm."""
+    """Return a bent needle, its bevel rolled during the insertion, drawn back without cutting by `by` mm."""
     state = insert_to(SIMULATOR, 17.0)
     state = SIMULATOR.step(state, Control(db_x=1.0, flip=True))
     state = repeat(SIMULATOR, state, Control(db_x=1.0, dg_y=0.02), 12)[-1]
@@ -33,12 +33,12 @@ def withdrawn(by):
 
 
 def lateral_forces(state):
-    """Work-conjugates of base y, base turn, guide y, held tip y."""
+    """Return the work-conjugates of base y, base turn, guide y, held tip y."""
     return np.array(state.reactions)[:, 0]
 
 
 def axial_force(state):
-    """∂(energy)/∂x_t at a needle whose base and guide stay: growing points, growing spring, a push on a slope."""
+    """Return ∂(energy)/∂x_t with base and guide at rest: growing points, growing spring, a push on a slope."""
     x, energy, front = state.mesh["x"], state.mesh["energy"], state.needle.channel.front
     behind = state.tip[0] - x
     growing = (x > 0.0) & (behind < PHANTOM.contact.spacing_mm / 2)

@@ -8,7 +8,7 @@ import pytest
 from flexneedle import load_scenario
 from reference.comparison import Pair, too_far, worst_gaps
 from reference.draws import draw_controls, draw_scenario, in_space
-from reference.insertion import Tissue, ogden
+from reference.ogden import Tissue, ogden
 
 PHANTOM = load_scenario("phantom")
 IN_SPACE = PHANTOM.with_values({"setup.axes": 2})

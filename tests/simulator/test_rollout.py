@@ -1,4 +1,4 @@
-"""Batches: the same bits as single steps, whatever the number of threads."""
+"""Rollouts: the same bits as single steps, for any number of threads."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Below the skin a free needle is held by little but its tip: cuts there are resolved, whatever the step."""
+"""Below the skin a free needle is held by little but its tip: cuts there are resolved for any step."""
 
 import numpy as np
 import pytest

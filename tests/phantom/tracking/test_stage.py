@@ -78,7 +78,7 @@ def test_without_an_orientation_the_tip_is_measured_only_with_offset_0():
 @given(angles=ANGLES, theta=st.floats(-1.0, 1.0), psi=st.floats(-1.0, 1.0))
 @hypothesis_settings(max_examples=30)
 def test_the_direction_of_the_sensor_is_the_needles(angles, theta, psi):
-    """As its slopes in the stage's frame, whatever the tracker's."""
+    """As slopes in the stage's frame, for any frame of the tracker."""
     to_stage = Rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.zeros(3))
     pose = Pose(1.0, 2.0, 3.0, theta, psi)
     sensor = tip_sensor_pose((1.0, 2.0, 3.0), pose.axis)
