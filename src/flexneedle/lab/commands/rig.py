@@ -158,21 +158,17 @@ def _add_off(commands: Commands) -> None:
         "the next motion switches the motors on.",
     )
     _add_rig(parser)
-    parser.add_argument(
-        "--yes", action="store_true", help="switch off without asking; needed without a terminal"
-    )
+    _add_yes(parser, "switch off")
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
+
+
+def _add_yes(parser: argparse.ArgumentParser, action: str = "move") -> None:
     parser.add_argument(
-        "rig",
-        metavar="RIG",
-        help="path of a rig file, or emulated",
+        "--yes", action="store_true", help=f"{action} without asking; needed without a terminal"
     )
-
-
-def _add_yes(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--yes", action="store_true", help="move without asking; needed without a terminal")
 
 
 # Check
@@ -185,10 +181,7 @@ def _check(args: argparse.Namespace) -> int:
     from flexneedle.lab.ros.check import check_ros
 
     rig, clock = load_rig(args.rig), WallClock()
-    findings = [
-        *check_rig(rig, clock, args.seconds, _wanted(args)),
-        *check_ros(rig, clock, args.seconds),
-    ]
+    findings = [*check_rig(rig, clock, args.seconds, _wanted(args)), *check_ros(rig, clock, args.seconds)]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
         print_json(_values(rig, findings))
@@ -214,13 +207,11 @@ def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
 
 
 def _print_findings(findings: Sequence[Finding]) -> None:
-    parts, items = (
-        max(map(len, column)) for column in zip(*((one.part, one.item) for one in findings), strict=True)
-    )
+    parts = max(len(one.part) for one in findings)
+    items = max(len(one.item) for one in findings)
     for one in findings:
-        verdict = f"PROBLEM  {one.part:{parts}}  {one.item:{items}}" if one.problem else ""
-        line = verdict or f"ok       {one.part:{parts}}  {one.item:{items}}"
-        print(f"{line}  {'; '.join(filter(None, (one.found, one.problem)))}")
+        verdict, found = "PROBLEM" if one.problem else "ok", "; ".join(filter(None, (one.found, one.problem)))
+        print(f"{verdict:7}  {one.part:{parts}}  {one.item:{items}}  {found}")
 
 
 def _counted(problems: int) -> str:
@@ -295,7 +286,7 @@ def _off(args: argparse.Namespace) -> int:
 def _read_positions(rig: RigFile) -> dict[str, float]:
     """Return the positions of the axes (mm or rad).
 
-    Raises DriverError if the driver has no such channel, or cannot be read.
+    Raises DriverError if the driver lacks a channel, or cannot be read.
     """
     from flexneedle.lab.rig.devices.opening import open_motors
 

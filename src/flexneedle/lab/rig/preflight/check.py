@@ -14,7 +14,7 @@ from flexneedle.lab.rig.preflight.moves import describe_uncertainty
 from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.lab.rig.supervisor.checks import resting_switch_problem
+from flexneedle.lab.rig.supervisor.checks import active_switches, resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
@@ -111,7 +111,8 @@ def check_motors(
     """Return the findings of a few readings of the motors. Raises DriverError if they cannot be read."""
     states, seconds = _read_motors(device, clock)
     found = [_reply_finding(rig, seconds)]
-    setups = _read_setups(device)
+    # Not every driver reports the setup of its controller.
+    setups: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
     positions: dict[str, float] = {}
     for name, axis in rig.axes.items():
         state = states.get(axis.channel)
@@ -123,7 +124,8 @@ def check_motors(
         if axis.channel in setups:
             found += _setup_findings(name, axis, setups[axis.channel])
         positions[name] = state.position / axis.scale
-    return found + _room_findings(rig, positions, wanted)
+    rooms = [] if wanted is None else room_problems(rig, wanted.scenario, positions, wanted.strategy)
+    return [*found, *(Finding(name, "room", "from here", line) for name, line in rooms)]
 
 
 def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
@@ -137,12 +139,6 @@ def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState]
     return states, median(times)
 
 
-def _read_setups(device: Motors) -> Mapping[str, MotorSetup]:
-    """Return the setup of the controller by channel; empty if its driver does not report it."""
-    found: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
-    return found
-
-
 def _reply_finding(rig: RigFile, seconds: float) -> Finding:
     tick = 1.0 / rig.loop.rate_hz
     late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
@@ -150,13 +146,15 @@ def _reply_finding(rig: RigFile, seconds: float) -> Finding:
 
 
 def _axis_findings(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
-    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _motion_problem(state))
-    yield Finding(
-        name, "position", _format_position(axis, state.position), _limit_problem(axis, state.position)
-    )
-    yield Finding(
-        name, "limit switches", _format_switches(state) or "none active", _switch_problem(name, axis, state)
-    )
+    moving = "moves, though this command does not move it" if state.moving else ""
+    problem = "; ".join(filter(None, (moving, state.stopped)))
+    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", problem)
+    position = state.position / axis.scale
+    problem = limits_problem(axis, position) if isfinite(position) else "is not a number"
+    yield Finding(name, "position", _format_position(axis, state.position), problem)
+    active = " and ".join(sorted(active_switches(state), reverse=True)) or "none active"
+    problem = resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
+    yield Finding(name, "limit switches", active, problem)
     if state.on:
         yield _following_finding(name, axis, state)
 
@@ -193,29 +191,9 @@ def _error_limit_finding(name: str, axis: Axis, setup: MotorSetup) -> Finding:
     return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
 
 
-def _motion_problem(state: MotorState) -> str:
-    moving = "moves, though this command does not move it" if state.moving else ""
-    return "; ".join(filter(None, (moving, state.stopped)))
-
-
 def _format_position(axis: Axis, counts: float) -> str:
     slack = f", {describe_uncertainty(axis)}" if axis.backlash else ""
     return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts){slack}"
-
-
-def _limit_problem(axis: Axis, counts: float) -> str:
-    position = counts / axis.scale
-    return limits_problem(axis, position) if isfinite(position) else "is not a number"
-
-
-def _format_switches(state: MotorState) -> str:
-    active = ("reverse", state.reverse_limit), ("forward", state.forward_limit)
-    return " and ".join(name for name, is_active in active if is_active)
-
-
-def _switch_problem(name: str, axis: Axis, state: MotorState) -> str:
-    """Return the problem of active limit switches; an axis may rest at the switch of its home."""
-    return resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
 
 
 def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
@@ -224,18 +202,6 @@ def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
     limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
     rule = "" if error <= most else f"{limit}: free the axis; the next motion begins where it then is"
     return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
-
-
-def _room_findings(
-    rig: RigFile, positions: Mapping[str, float], wanted: IntendedInsertion | None
-) -> list[Finding]:
-    """Return the axes from whose positions the insertion of a scenario could not start."""
-    if wanted is None:
-        return []
-    return [
-        Finding(name, "room", "from here", line)
-        for name, line in room_problems(rig, wanted.scenario, positions, wanted.strategy)
-    ]
 
 
 # Tracker

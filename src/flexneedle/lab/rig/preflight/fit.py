@@ -51,11 +51,7 @@ class AxisNeed:
 
 def axis_needs(scenario: Scenario, strategy: str, advance: float) -> tuple[AxisNeed, ...]:
     """Return the requirements for each linear axis, with the strategy of the plan and this advance (mm)."""
-    return (
-        _insertion_need(scenario, advance),
-        *_guide_needs(scenario, strategy),
-        *_base_needs(scenario, strategy),
-    )
+    return _insertion_need(scenario, advance), *_lateral_needs(scenario, strategy)
 
 
 def _needs_before_start(scenario: Scenario, strategy: str) -> tuple[AxisNeed, ...]:
@@ -102,12 +98,12 @@ def start_problems(
 
 
 def _room_problems(
-    rig: RigFile, needed_advance: Iterable[AxisNeed], positions: Mapping[str, float]
+    rig: RigFile, needs: Iterable[AxisNeed], positions: Mapping[str, float]
 ) -> list[tuple[str, str]]:
     axes = dict(rig.axes.items())
     return [
         (need.axis, line)
-        for need in needed_advance
+        for need in needs
         if need.axis in positions and need.axis in axes
         for line in _room_lines(axes[need.axis], need, positions[need.axis])
     ]
@@ -148,25 +144,21 @@ def _insertion_need(scenario: Scenario, advance: float) -> AxisNeed:
     )
 
 
-def _guide_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
-    setup = scenario.setup
-    moved = 0 if strategy == _STILL else setup.moved_guide_axes
-    why = f"the guide moves on {moved} axes" if moved > 1 else "the guide moves"
-    for name in ("guide_y", "guide_z")[:moved]:
-        reason = f"setup.max_guide_travel_mm is {setup.max_guide_travel_mm:g}, to either side"
-        step = "setup.max_guide_step_mm", setup.max_guide_step_mm
-        yield AxisNeed(name, setup.max_guide_travel_mm, reason, *step, why)
-
-
-def _base_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
-    setup, sigma = scenario.setup, scenario.plan.base_sigma_mm
-    if sigma == 0.0 or strategy == _STILL:
+def _lateral_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
+    """Yield the requirements for the axes of guide and base, which a plan that steers does not move."""
+    if strategy == _STILL:
         return
-    why = f"the base moves laterally with plan.base_sigma_mm = {sigma:g}"
-    for name in ("base_y", "base_z")[: setup.axes]:
-        reason = f"setup.max_base_travel_mm is {setup.max_base_travel_mm:g}, to either side"
-        step = "setup.max_base_step_mm", setup.max_base_step_mm
-        yield AxisNeed(name, setup.max_base_travel_mm, reason, *step, why)
+    setup, sigma = scenario.setup, scenario.plan.base_sigma_mm
+    moved = setup.moved_guide_axes
+    on = f" on {moved} axes" if moved > 1 else ""
+    for part, axes, why in (
+        ("guide", moved, f"the guide moves{on}"),
+        ("base", setup.axes if sigma else 0, f"the base moves laterally with plan.base_sigma_mm = {sigma:g}"),
+    ):
+        travel, step = getattr(setup, f"max_{part}_travel_mm"), getattr(setup, f"max_{part}_step_mm")
+        reason = f"setup.max_{part}_travel_mm is {travel:g}, to either side"
+        for name in (f"{part}_y", f"{part}_z")[:axes]:
+            yield AxisNeed(name, travel, reason, f"setup.max_{part}_step_mm", step, why)
 
 
 def _linear_problems(rig: RigFile, scenario: Scenario, need: AxisNeed) -> Iterator[Problem]:
@@ -174,15 +166,11 @@ def _linear_problems(rig: RigFile, scenario: Scenario, need: AxisNeed) -> Iterat
     if axis is None:
         yield Problem(f"axes.{need.axis}", None, f"missing: {need.why}")
         return
-    yield from _range_problems(axis, need)
-    yield from _speed_problems(axis, scenario, need)
-
-
-def _range_problems(axis: Axis, need: AxisNeed) -> Iterator[Problem]:
     low, high = axis.limits
     if need.width > high - low + _ROUNDING:
         rule = f"must be at least {need.width:.6g} wide: {need.reason}"
         yield Problem(f"axes.{need.axis}.range_mm", [low, high], rule)
+    yield from _speed_problems(axis, scenario, need)
 
 
 def _speed_problems(axis: Axis, scenario: Scenario, need: AxisNeed) -> Iterator[Problem]:
