@@ -1,15 +1,14 @@
 """Figures of studies hold what they must: judged by their artists, not by their pixels."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
 from matplotlib.collections import PatchCollection, PolyCollection
 from matplotlib.colors import to_hex
-from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
+from drawn import lines, overlapping, texts
 from flexneedle.figures.layout import look
 from flexneedle.lab.study.figures.comparison import DifferenceRow, draw_differences
 from flexneedle.lab.study.figures.distributions import draw_errors
@@ -29,133 +28,65 @@ def lognormal(middle, count=150, seed=0):
     return middle * np.exp(0.5 * np.random.default_rng(seed).normal(size=count))
 
 
+def panel(k, content, note="mean 0.06, 95 % 0.13, max 0.16 mm", alarm=""):
+    return Panel(NAMES[k], note, look(k).color, content, alarm)
+
+
 def target_panel(number=0, spread=0.1, repeats=10, targets=TARGETS, unfinished=()):
     rng = np.random.default_rng(number)
     there = np.repeat(targets, repeats, axis=0)
     tips = there + rng.normal(0.0, spread, there.shape)
     done = ~np.isin(np.arange(len(there)), unfinished)
     alarm = f"{len(unfinished)} not finished" if unfinished else ""
-    note = "mean 0.06, 95 % 0.13, max 0.16 mm"
-    return Panel(NAMES[number], note, look(number).color, TipPositions(there, tips, done), alarm)
+    return panel(number, TipPositions(there, tips, done), alarm=alarm)
+
+
+def sample(name, k, middle, count=150, missing=0, seed=0):
+    return ErrorSample(name, look(k), lognormal(middle, count, seed), count + missing)
 
 
 def samples(count=150):
-    return [
-        ErrorSample(name, look(k), lognormal(0.05 * (k + 1), count, k), count + (k == 2))
-        for k, name in enumerate(NAMES)
-    ]
+    return [sample(name, k, 0.05 * (k + 1), count, k == 2, k) for k, name in enumerate(NAMES)]
 
 
 def by_controller(rows):
     return draw_errors([Panel("", "", "#000000", rows)], "")
 
 
-def error_panels(number=7, count=30):
+def error_panels(number=7):
     levels = ("all", "25", "30", "35", "40", "45")
-    note, alarm = "mean 0.06, 95 % 0.13, max 0.16 mm", "2 not finished"
-    return [
-        Panel(
-            NAMES[k],
-            note,
-            look(k).color,
-            [ErrorSample(name, look(k), lognormal(0.05 * (k + 1), count, k), count) for name in levels],
-            alarm,
-        )
-        for k in range(number)
-    ]
+    contents = [[sample(name, k, 0.05 * (k + 1), 30, seed=k) for name in levels] for k in range(number)]
+    return [panel(k, content, alarm="2 not finished") for k, content in enumerate(contents)]
 
 
 def sweeps(number, names=("0", "0.5", "1", "1.5", "2"), missing=0):
     return [
-        Panel(
-            NAMES[k],
-            f"n = {40 * len(names)}",
-            look(k).color,
-            [
-                ErrorSample(name, look(k), lognormal(0.05 * (k + 1) * (m + 1), 40, m), 40 + missing)
-                for m, name in enumerate(names)
-            ],
-            f"{missing * len(names)} not finished" if missing else "",
-        )
+        panel(k, [sample(name, k, 0.05 * (k + 1) * (m + 1), 40, missing, m) for m, name in enumerate(names)])
         for k in range(number)
     ]
 
 
 def difference_panels(number, rows=12):
-    rng = np.random.default_rng(0)
-    return [
-        Panel(
-            NAMES[k],
-            "base case: mean 0.060 mm",
-            look(k).color,
-            [
-                DifferenceRow(f"phantom entry {row} doubled", look(k), m, m - 0.02, m + 0.02)
-                for row, m in enumerate(rng.normal(0.0, 0.05, rows).tolist())
-            ],
-        )
-        for k in range(number)
-    ]
-
-
-def share_panels(number, controllers=7, count=150):
-    return [
-        Panel(
-            ("perfect", "real", "structure")[k],
-            f"{count} worlds",
-            "#000000",
-            [
-                ErrorSample(NAMES[j], look(j), lognormal(0.05 * (j + 1), count, j), count + j)
-                for j in range(controllers)
-            ],
-        )
-        for k in range(number)
-    ]
+    means = np.random.default_rng(0).normal(0.0, 0.05, rows).tolist()
+    named = [(f"phantom entry {row} doubled", m, m - 0.02, m + 0.02) for row, m in enumerate(means)]
+    return [panel(k, [DifferenceRow(name, look(k), *ends) for name, *ends in named]) for k in range(number)]
 
 
 PLACES = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
 CLOSE = [f"{x:.3f}" for x in np.linspace(0, 1, 20)]
+DEPTH = "depth of the target (mm)"
 FIGURES = {
     "targeting, one": lambda: draw_targeting([target_panel(unfinished=(3,))]),
     "targeting, all": lambda: draw_targeting([target_panel(k, 0.2 * k, unfinished=(3, 9)) for k in range(7)]),
     "errors": lambda: by_controller(samples()),
-    "depths, one": lambda: draw_errors(error_panels(1), "depth of the target (mm)"),
-    "depths, all": lambda: draw_errors(error_panels(), "depth of the target (mm)"),
+    "depths, one": lambda: draw_errors(error_panels(1), DEPTH),
+    "depths, all": lambda: draw_errors(error_panels(), DEPTH),
     "sweep, one": lambda: draw_sweep(sweeps(1, missing=1), "G (mm)", PLACES),
     "sweep, all": lambda: draw_sweep(sweeps(7, missing=2), "mismatch", PLACES),
     "sweep, close": lambda: draw_sweep(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
-    "shares, three": lambda: draw_shares(share_panels(3)),
+    "shares, three": lambda: draw_shares([panel(k, samples(), "150 worlds") for k in range(3)]),
     "differences, all": lambda: draw_differences(difference_panels(7, 5), "more error (mm)"),
 }
-
-
-def shown_texts(figure):
-    """Return the visible texts with their boxes; labels of ticks beyond the ends of their axes are not drawn."""
-    renderer = figure.canvas.get_renderer()
-    figure.draw_without_rendering()
-    sides = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
-    ticks = [(tick, sorted(axis.get_view_interval())) for axis in sides for tick in axis.get_major_ticks()]
-    unseen = {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
-    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unseen]
-    return [(text.get_text(), Text.get_window_extent(text, renderer)) for text in texts]
-
-
-def overlapping(figure):
-    """Return pairs of texts that overlap, and texts that leave the figure."""
-    boxes, whole = shown_texts(figure), figure.bbox
-    cut = [
-        name
-        for name, box in boxes
-        if box.x0 < whole.x0 or box.x1 > whole.x1 or box.y0 < 0 or box.y1 > whole.y1
-    ]
-    return cut + [(a, b) for (a, one), (b, two) in combinations(boxes, 2) if one.overlaps(two)]
-
-
-def texts(figure):
-    return [name for name, _ in shown_texts(figure)]
-
-
-def lines(ax, label):
-    return [line for line in ax.get_lines() if line.get_label() == label]
 
 
 def dots(ax, label):
@@ -172,7 +103,7 @@ def test_no_labels_overlap(name):
 
 def test_circles_have_a_radius_of_1_mm_to_scale():
     figure = draw_targeting([target_panel(k) for k in range(3)])
-    shown_texts(figure)
+    figure.draw_without_rendering()
     for ax in figure.axes:
         (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
         boxes = [path.get_extents() for path in circles.get_paths()]
@@ -184,47 +115,47 @@ def test_circles_have_a_radius_of_1_mm_to_scale():
 
 
 def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
-    panel = target_panel(unfinished=(0, 7))
-    ax = draw_targeting([panel]).axes[0]
+    own = target_panel(unfinished=(0, 7))
+    ax = draw_targeting([own]).axes[0]
     (tips,) = dots(ax, TIP)
-    assert_allclose(tips.get_offsets(), panel.content.tips[panel.content.done])
+    assert_allclose(tips.get_offsets(), own.content.tips[own.content.done])
     (crosses,) = lines(ax, "final true tip, not finished")
-    assert_allclose(crosses.get_xydata(), panel.content.tips[[0, 7]])
+    assert_allclose(crosses.get_xydata(), own.content.tips[[0, 7]])
 
 
 def test_tips_far_outside_are_counted():
-    panel = target_panel()
-    panel.content.tips[:2] += 30.0
-    figure = draw_targeting([panel, target_panel(1)])
+    own = target_panel()
+    own.content.tips[:2] += 30.0
+    figure = draw_targeting([own, target_panel(1)])
     assert texts(figure).count("2 tips outside") == 1
     assert figure.axes[0].get_xlim()[1] == pytest.approx(45.0 + 6.0)
 
 
 def test_the_close_up_shows_where_tips_ended_from_their_targets():
-    panel = target_panel()
-    close = draw_targeting([panel]).axes[1]
-    assert_allclose(dots(close, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
-    farthest = np.hypot(*(panel.content.tips - panel.content.targets).T).max()
+    own = target_panel()
+    close = draw_targeting([own]).axes[1]
+    assert_allclose(dots(close, TIP)[0].get_offsets(), own.content.tips - own.content.targets)
+    farthest = np.hypot(*(own.content.tips - own.content.targets).T).max()
     assert close.get_xlim()[1] == pytest.approx(1.15 * farthest)
 
 
 def test_targets_that_are_many_are_laid_on_one_another():
     rng = np.random.default_rng(0)
     targets = rng.uniform((25.0, -5.0), (45.0, 5.0), (200, 2))
-    panel = target_panel(targets=targets, repeats=1)
-    ax = draw_targeting([panel]).axes[0]
+    own = target_panel(targets=targets, repeats=1)
+    ax = draw_targeting([own]).axes[0]
     (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
     assert len(circles.get_paths()) == 1
-    assert_allclose(dots(ax, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
+    assert_allclose(dots(ax, TIP)[0].get_offsets(), own.content.tips - own.content.targets)
 
 
 def test_unknown_tips_are_left_out():
-    panel = target_panel(unfinished=(0,))
-    panel.content.tips[0] = np.nan
-    drawn = [dot.get_offsets() for ax in draw_targeting([panel]).axes for dot in dots(ax, TIP)]
+    own = target_panel(unfinished=(0,))
+    own.content.tips[0] = np.nan
+    drawn = [dot.get_offsets() for ax in draw_targeting([own]).axes for dot in dots(ax, TIP)]
     places = np.concatenate([np.ma.filled(offsets, np.nan) for offsets in drawn])
     assert len(places) > 0
-    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(panel.content.tips) - 1)
+    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(own.content.tips) - 1)
 
 
 def test_rows_show_quartiles_median_mean_and_95_percent():
@@ -247,7 +178,7 @@ def test_rows_say_how_many_did_not_finish():
 def test_a_controller_has_one_colour_in_all_figures():
     color = to_hex(look(1).color)
     tips = draw_targeting([target_panel(k) for k in range(2)]).axes[1]
-    errors = draw_errors(error_panels(2), "depth of the target (mm)").axes[1]
+    errors = draw_errors(error_panels(2), DEPTH).axes[1]
     for ax, label in ((tips, TIP), (errors, "one insertion")):
         assert to_hex(dots(ax, label)[0].get_facecolor()[0]) == color
     _, median = lines(draw_sweep(sweeps(2), "x", PLACES).axes[0], "median")
@@ -287,11 +218,7 @@ def test_a_share_is_that_of_the_insertions_that_end_nearer():
     assert_allclose(line.get_xdata()[:3], [0.1, 0.2, 0.4])
     assert_allclose(line.get_ydata(), [25.0, 50.0, 75.0, 75.0])
     assert line.get_drawstyle() == "steps-post"
-
-
-def test_where_nothing_finished_the_share_is_zero():
-    row = ErrorSample("a", look(0), np.empty(0), 4)
-    (ax,) = draw_shares([Panel("real", "4 worlds", "#000000", [row])]).axes
+    (ax,) = draw_shares([Panel("real", "4 worlds", "#000000", [replace(row, errors=np.empty(0))])]).axes
     assert lines(ax, "a")[0].get_ydata().tolist() == [0.0]
 
 
@@ -344,6 +271,6 @@ def test_legends_name_what_is_drawn_and_nothing_else():
 
 
 def test_panels_below_and_left_have_the_labels_of_their_axes():
-    axes = draw_errors(error_panels(5), "depth of the target (mm)").axes
+    axes = draw_errors(error_panels(5), DEPTH).axes
     assert [bool(ax.get_xlabel()) for ax in axes] == [False, False, True, True, True]
     assert [bool(ax.get_ylabel()) for ax in axes] == [True, False, False, True, False]

@@ -1,6 +1,5 @@
 """Studies of worlds: an axis of numbers, each with its own scenario, target, phantom and reach."""
 
-from dataclasses import replace
 
 import pyarrow.parquet as pq
 import pytest
@@ -73,12 +72,6 @@ def test_a_world_has_the_phantom_of_its_number_in_every_case_and_with_every_cont
     study = load()
     seeds = [(study.insertion(index).point.world, study.insertion(index).seed) for index in range(len(study))]
     assert all(number == seed for number, seed in seeds)
-
-
-def test_repeats_have_their_own_phantoms(load):
-    study = load("repeats = 3\nfirst_seed = 7\n" + STUDY)
-    seeds = {study.insertion(index).seed for index in range(len(study))}
-    assert seeds == {7 + 3 * number + repeat for number in (FREE, GUIDED) for repeat in range(3)}
 
 
 def test_other_worlds_can_be_requested(load):
@@ -202,24 +195,15 @@ def _reach_rows(study):
 
 @pytest.mark.parametrize(
     ("outcome", "reach", "failure"),
-    [("done", 0.0, False), ("held", 0.3, True), ("refused", 1.2, False), ("failed", None, True)],
+    [
+        *(("done", 0.0, False), ("held", 0.3, True), ("refused", 1.2, False), ("failed", None, True)),
+        *(("held", 1.5, True), ("failed", 1.5, False), ("held", 2.1, False)),
+    ],
 )
 def test_an_unfinished_insertion_is_a_failure_if_the_target_is_within_reach(outcome, reach, failure):
-    assert is_failure({"outcome": outcome, "reach_mm": reach}) == failure
-
-
-@pytest.mark.parametrize(("outcome", "failure"), [("held", True), ("refused", False), ("failed", False)])
-def test_a_hold_is_a_failure_up_to_the_miss_at_which_a_controller_may_hold(outcome, failure):
-    row = {"outcome": outcome, "reach_mm": 1.5, "control.miss_limit_mm": 2.0}
-    assert is_failure(row) is failure
-    assert not is_failure(row | {"reach_mm": 2.1})
-
-
-def test_points_with_another_needle_have_another_reach(load):
-    point = load().points[0]
-    other = replace(point, scenario=point.scenario.with_values({"phantom.run_out_mm": 0.1}))
-    assert digest_reach_inputs(other) != digest_reach_inputs(point)
-    assert digest_plan_inputs(other) == digest_plan_inputs(point)
+    """Within 1 mm; for a hold within the miss at which a controller may hold."""
+    row = {"outcome": outcome, "reach_mm": reach, "control.miss_limit_mm": 2.0}
+    assert is_failure(row) == failure
 
 
 IN_SPACE = f"""
