@@ -1,6 +1,5 @@
 """Studies of worlds: an axis of numbers, each with its own scenario, target, phantom and reach."""
 
-
 import pyarrow.parquet as pq
 import pytest
 
