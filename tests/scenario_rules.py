@@ -8,129 +8,58 @@ HUGE = 10**400
 ABOVE_ZERO = "must be above 0"
 NUMBER = "must be a number"
 FINITE = "must be a finite number"
-POSITIVE = [
-    "needle.outer_diameter_mm",
-    "needle.length_mm",
-    "needle.youngs_modulus_gpa",
-    "needle.bevel.length_mm",
-    "setup.guide_to_skin_mm",
-    "setup.tip_to_skin_mm",
-    "setup.stroke_mm",
-    "setup.max_advance_mm",
-    "setup.max_guide_step_mm",
-    "setup.max_guide_travel_mm",
-    "setup.max_base_step_mm",
-    "setup.max_base_travel_mm",
-    "setup.max_base_turn_step_mrad",
-    "setup.insertion_speed_mm_s",
-    "setup.guide_speed_mm_s",
-    "setup.base_speed_mm_s",
-    "setup.base_turn_speed_mrad_s",
-    "setup.rotation_speed_deg_s",
-    "guard.guide_force_n",
-    "guard.needle_strain_percent",
-    "guard.past_target_mm",
-    "tissue[0].thickness_mm",
-    "tissue[1].shear_modulus_kpa",
-    "tissue[0].compression_length_mm",
-    "tissue[1].engaged_width_mm",
-    "contact.spacing_mm",
-    "plan.tolerance",
-    "control.depth_tolerance_mm",
-    "control.innovation_limit_mm",
-    "control.miss_limit_mm",
-    "control.hold_limit_s",
-    "control.hold_total_s",
-    "control.stale_after_s",
-    "control.adaptive_mpc.variation_length_mm",
-    "control.adaptive_mpc.cell_mm",
-    "control.adaptive_mpc.least_model_sd_mm",
-    "control.resolved_rate.lookahead_mm",
-    "monitor.indicator_limit",
-    "monitor.indicator_window_s",
-    "monitor.doubt_window_s",
-    "monitor.abort_after_s",
-    "monitor.speed_limit_mm_s",
-    "monitor.frozen_travel_mm",
-    "monitor.out_of_plane_limit_mm",
-    "control.broyden_mpc.max_guide_travel_mm",
-    "setup.max_rotation_deg",
-    "tracker.direction_jitter_mrad",
-    "control.adaptive_mpc.model_slope_sd_mrad",
-    "tracker.rate_hz",
-    "phantom.variation_length_mm",
-    "phantom.contact_spacing_mm",
-    "phantom.element_mm",
-    "phantom.step_mm",
-    "phantom.structure.compression_length_factor",
-    "phantom.structure.bevel_length_factor",
-]
-NOT_NEGATIVE = [
-    *(f"plan.{weight.key}" for weight in PLAN.settings()),
-    *(f"control.ce_mpc.{weight.key}" for weight in CE_MPC.settings()),
-    *(f"control.adaptive_mpc.{weight.key}" for weight in ADAPTIVE_MPC.settings()),
-    "needle.inner_diameter_mm",
-    "needle.bevel.offset_mm",
-    "tissue[0].energy_weight",
-    "plan.advance_sigma_mm",
-    "plan.guide_sigma_mm",
-    "plan.base_sigma_mm",
-    "plan.base_turn_sigma_mrad",
-    "plan.smoothing",
-    "control.ce_mpc.orientation_weight_mm",
-    "control.ce_mpc.curvature_per_m",
-    "control.load_gain",
-    "control.ce_mpc.flip_dead_band",
-    "control.start_offset_sd_mm",
-    "control.start_angle_sd_mrad",
-    "control.start_axial_sd_mm",
-    "control.adaptive_mpc.urgency",
-    "control.adaptive_mpc.unguided_reach_margin",
-    "control.adaptive_mpc.clearance_mm",
-    "control.adaptive_mpc.clearance_sd_mm",
-    "control.adaptive_mpc.model_sd",
-    "control.adaptive_mpc.bend_sd_mm",
-    "control.adaptive_mpc.run_out_sd_mm",
-    "control.adaptive_mpc.tilt_sd_mrad",
-    "entry.free_radius_mm",
-    "entry.free_slope_mrad",
-    "control.adaptive_mpc.modulus_log_sd",
-    "control.adaptive_mpc.bevel_sd",
-    "control.adaptive_mpc.boundary_sd_mm",
-    "control.adaptive_mpc.variation_sd",
-    "control.adaptive_mpc.residual_gain",
-    "control.bevel_only.curvature_per_m",
-    "control.bevel_only.flip_dead_band",
-    "control.resolved_rate.curvature_per_m",
-    "control.resolved_rate.flip_dead_band",
-    "control.resolved_rate.gain",
-    "control.resolved_rate.damping",
-    "control.broyden_mpc.update_gain",
-    "control.broyden_mpc.guide_weight",
-    "control.broyden_mpc.guide_effect",
-    "monitor.jump_margin_mm",
-    "monitor.lost_after_s",
-    "tracker.jitter_mm",
-    "tracker.tip_offset_mm",
-    "phantom.shear_modulus_variation",
-    "phantom.layer_shift_sd_mm",
-    "phantom.start_offset_sd_mm",
-    "phantom.start_angle_sd_mrad",
-    "phantom.start_offset_z_sd_mm",
-    "phantom.start_angle_z_sd_mrad",
-    "phantom.direction_spread_deg",
-    "phantom.start_axial_sd_mm",
-    "phantom.youngs_modulus_variation",
-    "phantom.initial_bend_mm",
-    "phantom.run_out_mm",
-    "phantom.guide_clearance_mm",
-    "phantom.friction_mn_per_mm",
-    "phantom.rotation_friction_mn",
-    "phantom.motor_resolution_mm",
-    "phantom.delay_periods",
-    "phantom.missing_fraction",
-    "phantom.tracker_bias_mm",
-]
+
+
+def _keys(table):
+    """Return the keys of a table with a section and its keys in each line."""
+    lines = (line.split(":") for line in table.strip().splitlines())
+    return [f"{section.strip()}.{key}" for section, keys in lines for key in keys.split()]
+
+
+POSITIVE = _keys("""
+    contact: spacing_mm
+    control: depth_tolerance_mm innovation_limit_mm miss_limit_mm hold_limit_s hold_total_s stale_after_s
+    control.adaptive_mpc: variation_length_mm cell_mm least_model_sd_mm model_slope_sd_mrad
+    control.broyden_mpc: max_guide_travel_mm
+    control.resolved_rate: lookahead_mm
+    guard: guide_force_n needle_strain_percent past_target_mm
+    monitor: indicator_limit indicator_window_s doubt_window_s abort_after_s speed_limit_mm_s frozen_travel_mm
+    monitor: out_of_plane_limit_mm
+    needle: outer_diameter_mm length_mm youngs_modulus_gpa
+    needle.bevel: length_mm
+    phantom: variation_length_mm contact_spacing_mm element_mm step_mm
+    phantom.structure: compression_length_factor bevel_length_factor
+    plan: tolerance
+    setup: guide_to_skin_mm tip_to_skin_mm stroke_mm max_advance_mm max_guide_step_mm max_guide_travel_mm
+    setup: max_base_step_mm max_base_travel_mm max_base_turn_step_mrad insertion_speed_mm_s guide_speed_mm_s
+    setup: base_speed_mm_s base_turn_speed_mrad_s rotation_speed_deg_s max_rotation_deg
+    tissue[0]: thickness_mm compression_length_mm
+    tissue[1]: shear_modulus_kpa engaged_width_mm
+    tracker: direction_jitter_mrad rate_hz
+""")
+_WEIGHTS = {"plan": PLAN, "control.ce_mpc": CE_MPC, "control.adaptive_mpc": ADAPTIVE_MPC}
+NOT_NEGATIVE = [f"{section}.{weight.key}" for section, cost in _WEIGHTS.items() for weight in cost.settings()]
+NOT_NEGATIVE += _keys("""
+    control: load_gain start_offset_sd_mm start_angle_sd_mrad start_axial_sd_mm
+    control.adaptive_mpc: urgency unguided_reach_margin clearance_mm clearance_sd_mm model_sd bend_sd_mm
+    control.adaptive_mpc: run_out_sd_mm tilt_sd_mrad modulus_log_sd bevel_sd boundary_sd_mm variation_sd
+    control.adaptive_mpc: residual_gain
+    control.bevel_only: curvature_per_m flip_dead_band
+    control.broyden_mpc: update_gain guide_weight guide_effect
+    control.ce_mpc: orientation_weight_mm curvature_per_m flip_dead_band
+    control.resolved_rate: curvature_per_m flip_dead_band gain damping
+    entry: free_radius_mm free_slope_mrad
+    monitor: jump_margin_mm lost_after_s
+    needle: inner_diameter_mm
+    needle.bevel: offset_mm
+    phantom: shear_modulus_variation layer_shift_sd_mm start_offset_sd_mm start_angle_sd_mrad start_offset_z_sd_mm
+    phantom: start_angle_z_sd_mrad direction_spread_deg start_axial_sd_mm youngs_modulus_variation initial_bend_mm
+    phantom: run_out_mm guide_clearance_mm friction_mn_per_mm rotation_friction_mn motor_resolution_mm
+    phantom: delay_periods missing_fraction tracker_bias_mm
+    plan: advance_sigma_mm guide_sigma_mm base_sigma_mm base_turn_sigma_mrad smoothing
+    tissue[0]: energy_weight
+    tracker: jitter_mm tip_offset_mm
+""")
 COUNTS = {
     "monitor.references": (0, 100),
     "needle.nodes": (2, 10_000),
