@@ -24,7 +24,7 @@ READING = PHANTOM.tracker.period
 HELD, RESTING = "held: measurement missing: tip not measured", "waiting for the last reading"
 
 
-class Tank:
+class RecordedPhantom:
     """A phantom with recorded driver calls, and a tracker with modified and recorded batches."""
 
     status = VISIBLE

@@ -6,7 +6,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import DEFAULT
-from insertions import PHANTOM, Stage, Tank, run
+from insertions import PHANTOM, RecordedPhantom, Stage, run
 
 
 @pytest.fixture(scope="session")
@@ -17,29 +17,29 @@ def plan():
 @pytest.fixture(scope="session")
 def real(plan):
     """An insertion by the default controller with undelayed readings, and the record of its tracker."""
-    tank = Tank(plan.roll)
-    return run(plan, tank.rig(), controller=DEFAULT), tank
+    recorded = RecordedPhantom(plan.roll)
+    return run(plan, recorded.rig(), controller=DEFAULT), recorded
 
 
 @pytest.fixture(scope="session")
 def quick(plan):
     """An insertion as `real` by a quick controller, for replays that any controller can serve."""
-    tank = Tank(plan.roll)
-    return run(plan, tank.rig()), tank
+    recorded = RecordedPhantom(plan.roll)
+    return run(plan, recorded.rig()), recorded
 
 
 @pytest.fixture(scope="session")
 def late(plan):
     """An insertion as `real` with readings delayed by a control period."""
-    tank = Tank(plan.roll, delay=0.2)
-    return run(plan, tank.rig(), controller=DEFAULT), tank
+    recorded = RecordedPhantom(plan.roll, delay=0.2)
+    return run(plan, recorded.rig(), controller=DEFAULT), recorded
 
 
 @pytest.fixture(scope="session")
 def replayed(plan, real):
     """A replay of `real` without its phantom: only readings and applied commands."""
-    tank = real[1]
-    return run(plan, Stage(tank.tape, tank.applied).rig(), controller=DEFAULT)
+    recorded = real[1]
+    return run(plan, Stage(recorded.tape, recorded.applied).rig(), controller=DEFAULT)
 
 
 @pytest.fixture(scope="session")

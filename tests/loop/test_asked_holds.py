@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.loop.events import Gate
-from insertions import PHANTOM, READING, Tank, run
+from insertions import PHANTOM, READING, RecordedPhantom, run
 from tanks import STRAIGHT
 
 WHY = "nobody is in control"
@@ -25,30 +25,32 @@ class Asked(Gate):
 
 
 def inserted(plan, gate, scenario=PHANTOM, depth=-20.0):
-    tank, numbers = Tank(plan.roll), count()
+    recorded, numbers = RecordedPhantom(plan.roll), count()
     method = Controller(
         "numbered", "advances", decide=lambda *_: (Decision(STRAIGHT, f"number {next(numbers)}"), None)
     )
     target = replace(plan, target=(depth, 0.0, 0.0))
-    return run(target, tank.rig(), scenario, controller=method, force=True, gate=gate), tank
+    return run(target, recorded.rig(), scenario, controller=method, force=True, gate=gate), recorded
 
 
 def test_the_needle_rests_while_it_is_held_and_then_continues(plan):
     free, _ = inserted(plan, Asked())
-    done, tank = inserted(plan, Asked(*range(6, 16)))  # two calls for each of the first three moves
+    done, recorded = inserted(plan, Asked(*range(6, 16)))  # two calls for each of the first three moves
     held = [period for period in done.periods if period.action == "hold"]
     assert [period.index for period in held] == list(range(3, 13))
     assert {period.decision for period in held} == {f"held: {WHY}"}
     assert done.held_s == pytest.approx(10 * READING)
     assert done.outcome == free.outcome == "done"
-    assert [command for _, command in tank.moves] == [p.command for p in free.periods if p.action == "move"]
+    assert [command for _, command in recorded.moves] == [
+        p.command for p in free.periods if p.action == "move"
+    ]
 
 
 def test_a_decision_made_before_the_hold_is_not_carried_out(plan):
-    done, tank = inserted(plan, Asked(7))  # after the fourth decision
+    done, recorded = inserted(plan, Asked(7))  # after the fourth decision
     assert [period.action for period in done.periods[:5]] == ["move", "move", "move", "hold", "move"]
     assert done.periods[4].decision == "number 4"
-    assert len(tank.moves) == sum(period.action == "move" for period in done.periods)
+    assert len(recorded.moves) == sum(period.action == "move" for period in done.periods)
 
 
 def test_the_hold_counts_towards_the_limit_of_all_holds(plan):

@@ -12,8 +12,8 @@ from insertions import (
     PHANTOM,
     READING,
     STILL,
+    RecordedPhantom,
     Stage,
-    Tank,
     acted,
     blind,
     loop,
@@ -68,8 +68,8 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan):
             batch = spoiler(batch)
         return batch
 
-    tank = Tank(plan.roll, spoil=spoil)
-    done = run(plan, tank.rig(), controller=DEFAULT)
+    recorded = RecordedPhantom(plan.roll, spoil=spoil)
+    done = run(plan, recorded.rig(), controller=DEFAULT)
     assert done.outcome == "done"
     assert done.true_error_mm < 1.0
     for begin, verdict, _ in spells:
@@ -85,7 +85,9 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan):
         assert [period.decision for period in held] == [
             f"held: measurement {each.verdict}" for each in failed
         ]
-        assert not [time for time, _ in tank.moves if failed[0].time - 1e-9 <= time < held[-1].time - 1e-9]
+        assert not [
+            time for time, _ in recorded.moves if failed[0].time - 1e-9 <= time < held[-1].time - 1e-9
+        ]
         assert len({period.true_tip for period in (failed[0], *held)}) == 1
         assert {period.innovation for period in failed} == {(0.0, 0.0, 0.0)}
         for period in failed[1:]:
@@ -99,8 +101,8 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan):
 
 @pytest.mark.parametrize(("verdict", "fault"), FAULTS.items(), ids=FAULTS)
 def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault):
-    tank = Tank(plan.roll, spoil=between(3.01, math.inf, fault))
-    done = run(plan, tank.rig())
+    recorded = RecordedPhantom(plan.roll, spoil=between(3.01, math.inf, fault))
+    done = run(plan, recorded.rig())
     failed = bad(done)
     assert (done.outcome, done.reached) == ("held", False)
     assert done.reason.startswith("held for 1.0")
@@ -109,14 +111,14 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
     assert failed[-1].index == done.periods[-1].index
     assert failed[-1].time - failed[0].time == pytest.approx(1.0, abs=1e-6)
     assert len(failed) == 41  # of 25 ms each after the first
-    assert tank.moves[-1][0] < failed[0].time
+    assert recorded.moves[-1][0] < failed[0].time
     assert done.periods[0].verdict.ok
 
 
 @pytest.mark.parametrize("limit", [0.1, 12.0])  # in 12 s there are more readings than periods in a run
 def test_the_hold_limit_is_that_of_the_scenario(plan, limit):
     scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
-    failed = bad(run(plan, Tank(plan.roll, spoil=between(1.0, math.inf, lost)).rig(), scenario))
+    failed = bad(run(plan, RecordedPhantom(plan.roll, spoil=between(1.0, math.inf, lost)).rig(), scenario))
     assert failed[-1].time - failed[0].time == pytest.approx(limit, abs=READING)
 
 
@@ -127,7 +129,7 @@ def test_all_holds_together_have_a_limit(plan):
     def spoil(batch):
         return tuple(one for one in batch if one.time % 1.0 <= 0.6 or one.time < 1.0)
 
-    done = run(plan, Tank(plan.roll, spoil=spoil).rig(), scenario)
+    done = run(plan, RecordedPhantom(plan.roll, spoil=spoil).rig(), scenario)
     assert done.outcome == "held"
     assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.5 s): missing")
     assert 0.5 - 1e-6 <= done.held_s <= 0.5 + READING + 1e-6
@@ -141,7 +143,7 @@ def test_the_limits_of_age_and_innovation_are_those_of_the_scenario(plan):
         return replace(measurement, time=measurement.time - 0.05, y=measurement.y + 1.2)
 
     def verdicts(scenario):
-        done = run(plan, Tank(plan.roll, spoil=between(8.0, 8.4, offset)).rig(), scenario)
+        done = run(plan, RecordedPhantom(plan.roll, spoil=between(8.0, 8.4, offset)).rig(), scenario)
         return {str(period.verdict).split(":")[0] for period in done.periods}
 
     assert verdicts(PHANTOM) == {"ok"}
@@ -162,18 +164,18 @@ def test_a_bad_reading_among_good_ones_is_not_used(plan, quick):
 
 
 def test_a_bad_last_reading_holds_although_earlier_ones_were_good(plan, quick):
-    _, tank = quick
-    done = run(plan, Stage(loop(spoilt_tape(tank.tape, -1, garbled)), tank.applied).rig())
+    _, recorded = quick
+    done = run(plan, Stage(loop(spoilt_tape(recorded.tape, -1, garbled)), recorded.applied).rig())
     assert done.outcome == "held"
     assert str(done.periods[0].verdict) == "not a number: y nan"
 
 
 def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, quick):
     """The needle is held there, and done with the next good reading."""
-    done, tank = quick
-    *way, last = tank.tape
+    done, recorded = quick
+    *way, last = recorded.tape
     again = (replace(last[-1], time=last[-1].time + READING),)
-    rig = Stage([*way, (garbled(last[-1]),), again], tank.applied).rig()
+    rig = Stage([*way, (garbled(last[-1]),), again], recorded.applied).rig()
     held = run(plan, rig)
     assert [str(period.verdict) for period in held.periods[-2:]] == ["not a number: y nan", "ok"]
     assert len(held.periods) == len(done.periods) + 1
@@ -189,7 +191,7 @@ def test_a_frozen_sensor_holds_the_driven_needle_within_a_period(plan, begin):
         frozen_at.extend(measurement for measurement in batch if measurement.time >= begin)
         return tuple(replace(s, x=frozen_at[0].x, y=frozen_at[0].y) if s.time >= begin else s for s in batch)
 
-    done = run(plan, Tank(plan.roll, spoil=spoil).rig())
+    done = run(plan, RecordedPhantom(plan.roll, spoil=spoil).rig())
     assert done.outcome == "held"
     first = bad(done)[0]
     assert str(first.verdict).startswith("frozen: ")

@@ -4,13 +4,13 @@ import pytest
 
 from flexneedle.errors import CommandError, DriverError, RefusedError, RunError
 from flexneedle.results import Outcome
-from insertions import Tank, facts, first_periods, run
+from insertions import RecordedPhantom, facts, first_periods, run
 
 LOST = DriverError("galil 10.0.0.5:23: no reply within 0.1 s")
 LAST = 6
 
 
-class Failing(Tank):
+class Failing(RecordedPhantom):
     """A rig whose driver, tracker or stop raises an error after some calls; it counts its stops."""
 
     def __init__(self, roll, **errors):
@@ -42,7 +42,7 @@ def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, par
     done = run(plan, rig.rig())
     assert (done.outcome, done.reason, rig.stops) == (Outcome.FAILED, str(LOST), 1)
     assert len(done.periods) == kept
-    expected = first_periods(kept, plan, Tank(plan.roll).rig())
+    expected = first_periods(kept, plan, RecordedPhantom(plan.roll).rig())
     assert [facts(period) for period in done.periods] == [facts(period) for period in expected]
     assert done.summary == f"failed after {kept} periods: {LOST}"
     assert not done.reached

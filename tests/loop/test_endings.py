@@ -17,8 +17,8 @@ from flexneedle.types import Measurement
 from insertions import (
     PHANTOM,
     STILL,
+    RecordedPhantom,
     Stage,
-    Tank,
     first_periods,
     moving,
     of_any_scenario,
@@ -33,16 +33,16 @@ def missing_by(plan, miss):
 
 
 def test_a_plan_that_misses_by_more_than_a_millimetre_is_rejected_unless_forced(plan):
-    tank = Tank(plan.roll)
+    recorded = RecordedPhantom(plan.roll)
     with pytest.raises(
         RunError, match=r"misses the target by 1\.01 mm .*limited by setup\.max_guide_step_mm"
     ):
-        run(missing_by(plan, 1.01), tank.rig(), controller="open-loop")
-    assert tank.moves == []
+        run(missing_by(plan, 1.01), recorded.rig(), controller="open-loop")
+    assert recorded.moves == []
     with pytest.raises(RunError):
         flexneedle.insert(PHANTOM, missing_by(plan, 1.01), seed=2001, controller="open-loop")
     for miss, force in ((1.01, True), (0.99, False)):
-        rig = Tank(plan.roll).rig()
+        rig = RecordedPhantom(plan.roll).rig()
         assert first_periods(1, missing_by(plan, miss), rig, force=force, controller="open-loop")
 
 
@@ -50,7 +50,7 @@ def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan
     """The miss of the plan does not apply to the phantom's needle; the insertion itself predicts the miss."""
     assert CONTROLLERS[DEFAULT].predicts
     assert not any(method.predicts for name, method in CONTROLLERS.items() if name != DEFAULT)
-    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.roll).rig(), controller=DEFAULT)
+    assert first_periods(1, missing_by(plan, 1.01), RecordedPhantom(plan.roll).rig(), controller=DEFAULT)
 
 
 class Stuck(Stage):
@@ -78,7 +78,7 @@ def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(
 
 def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
     monkeypatch.setattr(State, "converged", property(lambda _: False))
-    done = run(plan, Tank(plan.roll).rig())
+    done = run(plan, RecordedPhantom(plan.roll).rig())
     assert done.outcome == "failed"
     assert done.reason.startswith("the model did not converge")
     assert len(done.periods) == 1
@@ -94,7 +94,7 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
     monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)
-    done = run(plan, Tank(plan.roll).rig(), controller=DEFAULT)
+    done = run(plan, RecordedPhantom(plan.roll).rig(), controller=DEFAULT)
     assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
     assert {period.applied for period in done.periods[-3:]} == {STILL}
     assert done.periods[-1].decision == "held: no path converges on the fitted model"
@@ -102,14 +102,14 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
 
 def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
     """The controller has no access to the plant: the insertion continues, but its periods are not converged."""
-    tank = Tank(plan.roll)
+    recorded = RecordedPhantom(plan.roll)
     lost_after = 1.0
 
     def truth():
-        return tank.phantom.condition()._replace(converged=tank.phantom.now() < lost_after)
+        return recorded.phantom.condition()._replace(converged=recorded.phantom.now() < lost_after)
 
     in_air = replace(plan, target=(-20.0, 0.0, 0.0))
-    done = run(in_air, Rig(tank.phantom, tank, tank, truth), force=True)
+    done = run(in_air, Rig(recorded.phantom, recorded, recorded, truth), force=True)
     assert done.outcome == "done"
     assert [period.converged for period in done.periods] == [p.time < lost_after for p in done.periods]
     assert {period.converged for period in done.periods} == {True, False}
@@ -117,15 +117,15 @@ def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
 
 def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 40.0, "target.depth_mm": 10.0})
-    tank = Tank(plan.roll, scenario=short)
-    done = run(of_any_scenario(plan), tank.rig(), short)
-    assert sum(command.db_x for _, command in tank.moves) == pytest.approx(40.0, abs=0.01)
+    recorded = RecordedPhantom(plan.roll, scenario=short)
+    done = run(of_any_scenario(plan), recorded.rig(), short)
+    assert sum(command.db_x for _, command in recorded.moves) == pytest.approx(40.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate.x
     assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
     assert not done.reached
 
 
-class Rounding(Tank):
+class Rounding(RecordedPhantom):
     """A driver with a resolution of 0.05 mm in the guide."""
 
     def apply(self, command, duration):
@@ -135,14 +135,14 @@ class Rounding(Tank):
 
 def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
     known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
-    tank = Rounding(plan.roll, scenario=known)
-    done = run(plan, tank.rig(), known)
+    recorded = Rounding(plan.roll, scenario=known)
+    done = run(plan, recorded.rig(), known)
     assert any(period.command.dg_y != period.applied.dg_y for period in done.periods)
     applied = np.cumsum([period.applied.dg_y for period in done.periods])
     np.testing.assert_allclose([period.guide[0] for period in done.periods], applied, atol=1e-12)
     advance = sum(period.applied.db_x for period in done.periods)
     assert done.periods[-1].base.x == pytest.approx(PHANTOM.start_base_x + advance)
-    assert [period.applied for period in moving(done)] == tank.applied
+    assert [period.applied for period in moving(done)] == recorded.applied
     assert done.outcome == "done"
 
 

@@ -40,10 +40,10 @@ def test_a_period_with_the_field_in_doubt_moves_without_a_correction(plan, quick
 
 def test_after_an_arrival_in_doubt_the_needle_rests_until_the_field_is_clean(plan, quick, tape):
     """Five of eight readings in 0.2 s must be clean."""
-    done, tank = quick
-    last = framed(tank.tape[-1], 0.2)
+    done, recorded = quick
+    last = framed(recorded.tape[-1], 0.2)
     rests = [framed([replace(last[-1], time=last[-1].time + k * READING)], 0.02) for k in range(1, 9)]
-    held = run(plan, Stage([*tape[:-1], last, *rests], tank.applied).rig(), UNNAMED)
+    held = run(plan, Stage([*tape[:-1], last, *rests], recorded.applied).rig(), UNNAMED)
     assert held.outcome == "done"
     assert len(held.periods) == len(done.periods) + 5
     assert [period.decision for period in held.periods[-5:]] == [RESTING] * 5

@@ -11,7 +11,7 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.record.fields import to_row
 from flexneedle.scenario.worlds import world
 from flexneedle.types import Control
-from insertions import PHANTOM, STILL, Tank, moving, of_any_scenario, run
+from insertions import PHANTOM, STILL, RecordedPhantom, moving, of_any_scenario, run
 
 SECONDS = PHANTOM.control.hold_limit_s
 HELD = "held: no path to the target found"
@@ -34,19 +34,19 @@ def in_air(plan):
 
 def inserted(plan, misses, sd=0.1, *, force=True, scenario=PHANTOM):
     """An insertion with such a controller."""
-    tank = Tank(plan.roll, scenario=scenario)
-    return run(plan, tank.rig(), scenario, controller=predicting(misses, sd), force=force), tank
+    recorded = RecordedPhantom(plan.roll, scenario=scenario)
+    return run(plan, recorded.rig(), scenario, controller=predicting(misses, sd), force=force), recorded
 
 
 def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_reason(plan):
     """The needle rests from the first such decision; the reason gives the miss, the limit and the remedy."""
-    done, tank = inserted(plan, [0.0] * 5 + [3.0], force=False)
+    done, recorded = inserted(plan, [0.0] * 5 + [3.0], force=False)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss +3.00 ± 0.10 mm is beyond")
     assert "control.miss_limit_mm = 2 " in done.reason
     assert done.reason.endswith("to insert anyway: flexneedle insert --force")
     assert done.summary.endswith(done.reason)
-    assert len(tank.moves) == 5
+    assert len(recorded.moves) == 5
     stopped = [period for period in done.periods if period.decision.startswith(HELD)]
     assert [period.index for period in stopped] == list(range(5, 5 + len(stopped)))
     assert {period.applied for period in stopped} == {period.command for period in stopped} == {STILL}
@@ -65,17 +65,17 @@ def test_the_duration_of_the_hold_is_that_of_the_scenario(plan):
 def test_a_hold_ends_when_a_path_is_found_again(plan):
     """Held for less than the limit; the next hold has the whole limit again."""
     misses = [0.0] * 3 + [3.0] * 10 + [0.0] * 3 + [3.0]
-    done, tank = inserted(plan, misses, force=False)
-    assert len(tank.moves) == 6
+    done, recorded = inserted(plan, misses, force=False)
+    assert len(recorded.moves) == 6
     assert done.outcome == "held"
     last = max(period.time for period in done.periods if not period.decision.startswith(HELD))
     assert done.periods[-1].time - last == pytest.approx(SECONDS, abs=2.0 * PHANTOM.tracker.period)
 
 
 def test_force_continues_with_a_warning(plan):
-    done, tank = inserted(in_air(plan), [3.0], force=True)
+    done, recorded = inserted(in_air(plan), [3.0], force=True)
     assert done.outcome == "done"
-    assert len(tank.moves) >= 8
+    assert len(recorded.moves) >= 8
     assert done.warning == "predicted miss +3.00 ± 0.10 mm: likely beyond 1 mm"
     assert to_row(done.periods[-1])["warning"] == done.periods[-1].warning
     assert sum(bool(period.warning) for period in moving(done)) > len(moving(done)) - 4
@@ -119,8 +119,8 @@ def test_an_unreachable_target_is_held(plan):
     narrow = PHANTOM.with_values(
         {"setup.max_guide_travel_mm": 0.1, "needle.bevel.offset_mm": 0.5, "target.lateral_mm": 0.0}
     )
-    tank = Tank(plan.roll, scenario=narrow)
-    done = run(of_any_scenario(plan), tank.rig(), narrow, controller=DEFAULT)
+    recorded = RecordedPhantom(plan.roll, scenario=narrow)
+    done = run(of_any_scenario(plan), recorded.rig(), narrow, controller=DEFAULT)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss -")
     assert done.periods[-1].estimate.x < 0.0  # it is known before the needle enters
@@ -147,7 +147,7 @@ def test_the_depth_is_reached_with_an_axial_start_error(plan, controller, gap):
         if key.startswith("phantom.") and "structure" not in key
     }
     scenario = PHANTOM.with_values(nothing)
-    tank = Tank(plan.roll, scenario=scenario.with_values({"setup.tip_to_skin_mm": 28.5 + gap}))
-    done = run(plan, tank.rig(), scenario, controller=controller)
+    recorded = RecordedPhantom(plan.roll, scenario=scenario.with_values({"setup.tip_to_skin_mm": 28.5 + gap}))
+    done = run(plan, recorded.rig(), scenario, controller=controller)
     assert done.outcome == "done"
     assert done.periods[-1].true_tip.x == pytest.approx(plan.target[0], abs=0.1)

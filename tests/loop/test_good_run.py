@@ -19,8 +19,8 @@ from insertions import (
     PHANTOM,
     READING,
     STILL,
+    RecordedPhantom,
     Stage,
-    Tank,
     commanded_and_estimated,
     facts,
     first_periods,
@@ -31,16 +31,16 @@ from insertions import (
 
 
 def test_record_is_complete_for_every_period(plan, real):
-    done, tank = real
+    done, recorded = real
     assert (done.outcome, done.reason) == ("done", "")
     assert done.plan is plan
     assert [period.index for period in done.periods] == list(range(len(done.periods)))
     times = [period.time for period in done.periods]
     assert all(np.diff(times) > 0.0)
-    assert times[-1] == pytest.approx(tank.phantom.now())
-    assert [period.command for period in moving(done)] == [command for _, command in tank.moves]
-    assert [period.applied for period in moving(done)] == tank.applied
-    for period, batch in zip(done.periods, tank.tape, strict=True):
+    assert times[-1] == pytest.approx(recorded.phantom.now())
+    assert [period.command for period in moving(done)] == [command for _, command in recorded.moves]
+    assert [period.applied for period in moving(done)] == recorded.applied
+    for period, batch in zip(done.periods, recorded.tape, strict=True):
         assert period.measurement == batch[-1]
         assert str(period.verdict) == "ok"
         np.testing.assert_allclose(
@@ -62,12 +62,12 @@ def test_record_is_complete_for_every_period(plan, real):
 
 
 def test_the_record_ends_with_the_true_state(plan, real):
-    done, tank = real
-    condition = tank.phantom.condition()
+    done, recorded = real
+    condition = recorded.phantom.condition()
     assert done.true_error_mm == pytest.approx(math.dist(condition.tip[:3], plan.target))
-    last = tank.tape[-1][-1]
+    last = recorded.tape[-1][-1]
     assert done.residual_mm == pytest.approx(math.dist((last.x, last.y), plan.target[:2]))
-    assert done.flips == sum(command.rolls for _, command in tank.moves)
+    assert done.flips == sum(command.rolls for _, command in recorded.moves)
     assert done.periods[-1].true_strain_energy == condition.strain_energy
     assert done.periods[-1].true_stretch == condition.least_stretch < 1.0
     assert all(np.diff([period.true_stretch for period in done.periods]) <= 0.0)
@@ -135,15 +135,15 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
 
 def test_on_period_gets_each_period_as_it_ends(plan):
     periods = []
-    tank = Tank(plan.roll)
+    recorded = RecordedPhantom(plan.roll)
     part = replace(plan, target=(-20.0, 0.0, 0.0))
 
     def watch(period):
         periods.append(period)
         moved = [one for one in periods if one.command != STILL]
-        assert len(tank.moves) == len(moved)  # before the next one moves
+        assert len(recorded.moves) == len(moved)  # before the next one moves
 
-    done = run(part, tank.rig(), listeners=[on_period(watch)], force=True)
+    done = run(part, recorded.rig(), listeners=[on_period(watch)], force=True)
     assert done.periods == tuple(periods)
     assert len(periods) > 5
 
@@ -153,8 +153,8 @@ def test_on_period_gets_each_period_as_it_ends(plan):
 
 def test_replayed_readings_give_the_same_commands(plan, real, replayed):
     """Without any phantom, and with another one: the controller has access only to readings and applied commands."""
-    done, tank = real
-    other, stage = Tank(plan.roll, seed=2777), Stage(tank.tape)
+    done, recorded = real
+    other, stage = RecordedPhantom(plan.roll, seed=2777), Stage(recorded.tape)
     rig = Rig(other.phantom, other, stage, other.phantom.condition)
     swapped = run(plan, rig, controller=DEFAULT)
     for again in (replayed, swapped):
@@ -167,11 +167,11 @@ def test_replayed_readings_give_the_same_commands(plan, real, replayed):
 
 def test_other_readings_give_other_commands(plan, real):
     """The replay is sensitive: an error of 1.5 mm in one reading changes the commands that follow."""
-    done, tank = real
+    done, recorded = real
     at = 40
-    changed = [replace(tank.tape[at][-1], y=tank.tape[at][-1].y + 1.5)]
-    tape = [*tank.tape[:at], (*tank.tape[at][:-1], *changed), *tank.tape[at + 1 :]]
-    rig = Stage(tape, tank.applied).rig()
+    changed = [replace(recorded.tape[at][-1], y=recorded.tape[at][-1].y + 1.5)]
+    tape = [*recorded.tape[:at], (*recorded.tape[at][:-1], *changed), *recorded.tape[at + 1 :]]
+    rig = Stage(tape, recorded.applied).rig()
     other = first_periods(at + 2, plan, rig, controller=DEFAULT)
     same = [one.command == two.command for one, two in zip(done.periods, other, strict=False)]
     assert same == [True] * (at + 1) + [False]

@@ -15,7 +15,7 @@ from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import STILL, Control
-from insertions import PHANTOM, Tank, run
+from insertions import PHANTOM, RecordedPhantom, run
 from observed import begun, in_tissue
 
 FAR = {"setup.max_guide_travel_mm": 60.0, "setup.max_guide_step_mm": 2.0}
@@ -140,9 +140,9 @@ def wild(begin_at, command):
 def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan):
     """Also with `force`."""
     scenario = PHANTOM.with_values(FAR)
-    tank = Tank(plan.roll, scenario=scenario)
+    recorded = RecordedPhantom(plan.roll, scenario=scenario)
     aside = replace(plan, scenario=None, target=(30.0, 0.0, 0.0))
-    done = run(aside, tank.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=True)
+    done = run(aside, recorded.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=True)
     assert done.outcome is Outcome.HELD
     assert done.reason.startswith(("guard: needle strain", "guard: tissue stretch"))
     held = [period for period in done.periods if period.decision.startswith("held: guard: ")]
@@ -158,7 +158,7 @@ def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan):
 
 def test_a_controller_that_does_not_stop_is_held_behind_the_target(plan):
     short = replace(plan, target=(5.0, 0.0, 0.0))
-    done = run(short, Tank(plan.roll).rig(), controller=wild(100.0, STILL), force=True)
+    done = run(short, RecordedPhantom(plan.roll).rig(), controller=wild(100.0, STILL), force=True)
     assert done.outcome is Outcome.HELD
     assert "mm past the target > 2 mm" in done.reason
     assert 5.0 < done.periods[-1].true_tip.x <= 7.2
@@ -179,7 +179,9 @@ def test_a_hold_ends_with_a_command_that_the_guard_admits(plan):
     method = Controller(
         "doubting", "advances, then retreats", decide=decide, arrived=lambda _, memory, __: memory[1] == 4
     )
-    done = run(replace(plan, target=(5.0, 0.0, 0.0)), Tank(plan.roll).rig(), controller=method, force=True)
+    done = run(
+        replace(plan, target=(5.0, 0.0, 0.0)), RecordedPhantom(plan.roll).rig(), controller=method, force=True
+    )
     back = next(period.index for period in done.periods if period.decision == "back")
     actions = [period.action for period in done.periods[back - 5 : back + 1]]
     assert actions == [Action.MOVE, *[Action.HOLD] * 4, Action.MOVE]

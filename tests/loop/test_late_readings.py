@@ -22,7 +22,7 @@ from insertions import (
 
 def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late):
     """The readings of the last move arrive a period later; the record ends with a reading at rest."""
-    done, tank = late
+    done, recorded = late
     assert (done.outcome, done.reason) == ("done", "")
     rests = [period for period in done.periods if period.decision == RESTING]
     assert rests
@@ -31,12 +31,12 @@ def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late
     assert arrival.decision != RESTING
     assert arrival.estimate.x >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
     assert {(period.command, period.applied) for period in rests} == {(STILL, STILL)}
-    assert len(tank.moves) == len(moving(done))
+    assert len(recorded.moves) == len(moving(done))
     assert {period.true_tip for period in rests} == {arrival.true_tip}
     assert done.periods[-1].measurement.time > arrival.time - 1e-6
     assert all(period.measurement.time < arrival.time - 1e-6 for period in done.periods[: -len(rests)])
     assert done.periods[-1].time == pytest.approx(arrival.time + 0.2)
-    assert tank.phantom.now() == done.periods[-1].time
+    assert recorded.phantom.now() == done.periods[-1].time
     off = np.subtract((done.periods[-1].measurement.x, done.periods[-1].measurement.y), arrival.true_tip[:2])
     assert np.abs(off).max() < 4.0 * PHANTOM.tracker.jitter_per_axis
 
@@ -47,37 +47,37 @@ def test_without_a_delay_there_is_no_rest(real):
 
 def test_delayed_readings_are_used_at_their_time_of_measurement(late, real):
     """Innovations are as small as without a delay, although the needle moves by 1 mm per period."""
-    for done, tank in (late, real):
+    for done, recorded in (late, real):
         off = np.array([period.innovation for period in done.periods[20:]])
         assert np.sqrt((off**2).mean(axis=0)).max() < 0.15
         assert all(str(period.verdict) == "ok" for period in done.periods)
-        assert tank.tape[30][-1].time == pytest.approx(
-            done.periods[30].time - (0.2 if tank is late[1] else 0.0)
+        assert recorded.tape[30][-1].time == pytest.approx(
+            done.periods[30].time - (0.2 if recorded is late[1] else 0.0)
         )
 
 
 def test_readings_in_transit_during_a_move_are_not_stale(plan, late):
     """The oldest are 0.375 s old when read, with a limit of 0.3 s: they arrived during the move and are valid."""
-    done, tank = late
+    done, recorded = late
 
     def estimates(tape, scenario=PHANTOM):
-        periods = first_periods(12, plan, Stage(tape, tank.applied).rig(), scenario, controller=DEFAULT)
+        periods = first_periods(12, plan, Stage(tape, recorded.applied).rig(), scenario, controller=DEFAULT)
         return [period.estimate for period in periods]
 
     real = [period.estimate for period in done.periods[:12]]
     patient = PHANTOM.with_values({"control.stale_after_s": 10.0})
-    assert estimates(tank.tape) == real
-    assert estimates(tank.tape, patient) == real
-    assert estimates([batch[-1:] for batch in tank.tape]) != real
+    assert estimates(recorded.tape) == real
+    assert estimates(recorded.tape, patient) == real
+    assert estimates([batch[-1:] for batch in recorded.tape]) != real
 
 
 def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):
     """The needle has arrived: there is no further move."""
-    done, tank = late
-    tape, rests = list(tank.tape), sum(period.decision == RESTING for period in done.periods)
+    done, recorded = late
+    tape, rests = list(recorded.tape), sum(period.decision == RESTING for period in done.periods)
     spoilt = tuple(map(blind, tape[-1]))
     again = [replace(sample, time=sample.time + READING) for sample in tape[-1]]
-    held = run(plan, Stage([*tape[:-1], spoilt, again], tank.applied).rig(), controller=DEFAULT)
+    held = run(plan, Stage([*tape[:-1], spoilt, again], recorded.applied).rig(), controller=DEFAULT)
     assert held.outcome == "done"
     assert len(held.periods) == len(done.periods) + 1
     assert [period.decision for period in held.periods[-rests - 1 :]] == [*[RESTING] * rests, HELD]

@@ -11,7 +11,7 @@ from flexneedle.estimation.moves import Move, position_along
 from flexneedle.results import Outcome
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion
-from insertions import PHANTOM, Stage, Tank, run
+from insertions import PHANTOM, RecordedPhantom, Stage, run
 
 THINKING_S = 0.1
 
@@ -27,7 +27,7 @@ def straight(before):
     return Controller("straight", "advances without a roll", decide=decide)
 
 
-class Overshooting(Tank):
+class Overshooting(RecordedPhantom):
     """A driver that reports slightly more than the command, as encoders do."""
 
     def apply(self, command, duration):
@@ -46,9 +46,9 @@ def test_a_driver_that_reports_more_than_a_step_does_not_end_the_insertion(plan,
 @pytest.mark.parametrize("thinking", [0.0, THINKING_S])
 def test_the_time_of_a_decision_is_no_motion(plan, thinking):
     """The clock runs while the controller decides, and the readings are compared with a needle at rest."""
-    tank = Tank(plan.roll)
-    slow = straight(lambda: thinking and tank.phantom.wait(thinking))
-    done = run(plan, tank.rig(), controller=slow, force=True)
+    recorded = RecordedPhantom(plan.roll)
+    slow = straight(lambda: thinking and recorded.phantom.wait(thinking))
+    done = run(plan, recorded.rig(), controller=slow, force=True)
     off = [period.estimate.x - period.true_tip.x for period in done.periods][20:]
     assert len(off) >= 30
     assert abs(np.mean(off)) <= 0.03
@@ -85,10 +85,10 @@ def test_motors_are_stopped_after_an_interrupt_or_an_error(plan, error):
 
 
 def test_motors_are_stopped_at_the_end(plan):
-    tank = Tank(plan.roll)
+    recorded = RecordedPhantom(plan.roll)
     stops = []
-    tank.stop = lambda: stops.append(tank.phantom.now())
-    done = run(plan, tank.rig())
+    recorded.stop = lambda: stops.append(recorded.phantom.now())
+    done = run(plan, recorded.rig())
     assert stops == [done.periods[-1].time]
 
 

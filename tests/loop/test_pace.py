@@ -12,7 +12,7 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.simulator.control import Limits
 from flexneedle.simulator.pace import roll_time, travel_time
 from flexneedle.types import COLUMNS, Control
-from insertions import PHANTOM, READING, Tank, first_periods
+from insertions import PHANTOM, READING, RecordedPhantom, first_periods
 from tanks import STRAIGHT, TURN, tank, tip
 
 SPACE = PHANTOM.with_values({"setup.axes": 2})
@@ -84,7 +84,7 @@ def test_a_period_lasts_as_long_as_its_motion(plan):
         TURN: 0.5 + READING,
         Control(db_x=1.0, flip=True): 0.7,
     }
-    rig = Tank(plan.roll).rig()
+    rig = RecordedPhantom(plan.roll).rig()
     periods = first_periods(
         1 + len(commands), plan, rig, controller=scripted([STRAIGHT, *commands]), force=True
     )

@@ -4,13 +4,13 @@ import pytest
 
 from flexneedle.results import Outcome
 from flexneedle.types import STILL, Motion
-from insertions import PHANTOM, Tank, run
+from insertions import PHANTOM, RecordedPhantom, run
 
 WHY = "frozen: 4 identical readings while the tip travelled 0.31 mm"
 FIRST = 5
 
 
-class Withholding(Tank):
+class Withholding(RecordedPhantom):
     """A rig that carries out only a share of some commands. times: numbers of these commands."""
 
     def __init__(self, roll, times, share=0.0):
@@ -30,14 +30,14 @@ class Withholding(Tank):
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
 def test_a_command_that_is_never_carried_out_ends_the_insertion_as_held_with_the_reason(plan, share):
-    tank = Withholding(plan.roll, range(FIRST, 10_000), share)
-    done = run(plan, tank.rig(), controller="open-loop")
+    recorded = Withholding(plan.roll, range(FIRST, 10_000), share)
+    done = run(plan, recorded.rig(), controller="open-loop")
     assert (done.outcome, done.reason) == (Outcome.HELD, WHY)
     limit, reading = PHANTOM.control.hold_limit_s, PHANTOM.tracker.period
     assert done.periods[-1].decision == f"held by the rig: {WHY}"
-    last = tank.moves[FIRST][0]
-    assert limit - 0.5 <= tank.phantom.now() - last <= limit + 0.5
-    assert len(tank.moves) - FIRST <= limit / reading + 2
+    last = recorded.moves[FIRST][0]
+    assert limit - 0.5 <= recorded.phantom.now() - last <= limit + 0.5
+    assert len(recorded.moves) - FIRST <= limit / reading + 2
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])

@@ -1,7 +1,7 @@
 """Conformance kit of the port `Motors`, of the driver of a rig file."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic, sleep
 from typing import Any
@@ -91,6 +91,17 @@ class MotorsConformance:
         state = self._rest(motors)
         self._require_at("the end of a motion", state.position, goal)
         return state
+
+    def _calls(self, motors: Motors, position: float) -> dict[str, Callable[[], Any]]:
+        """Return the calls of the first motor that need the device, by name."""
+        return {
+            "read": motors.read,
+            "set_speed": lambda: motors.set_speed(self._channel, self.speed, self.acceleration),
+            "follow": lambda: motors.follow({self._channel: position}),
+            "stop": motors.stop,
+            "power": lambda: motors.power(self._channel, True),
+            "define": lambda: motors.define(self._channel, position),
+        }
 
     def _require_at(self, name: str, position: float, wanted: float) -> None:
         require(
@@ -274,15 +285,7 @@ class MotorsConformance:
         """Require that no call takes longer than `reply_s`."""
         with self._open(on=True) as motors:
             begin = self._read(motors).position
-            calls: Mapping[str, Callable[[], Any]] = {
-                "read": motors.read,
-                "set_speed": lambda: motors.set_speed(self._channel, self.speed, self.acceleration),
-                "follow": lambda: motors.follow({self._channel: begin}),
-                "stop": motors.stop,
-                "power": lambda: motors.power(self._channel, True),
-                "define": lambda: motors.define(self._channel, begin),
-            }
-            for name, call in calls.items():
+            for name, call in self._calls(motors, begin).items():
                 self._rest(motors)
                 start = self.now()
                 call()
@@ -293,15 +296,7 @@ class MotorsConformance:
         motors = self.make()
         try:
             self.disconnect(motors)
-            calls: Mapping[str, Callable[[], Any]] = {
-                "read": motors.read,
-                "set_speed": lambda: motors.set_speed(self._channel, self.speed, self.acceleration),
-                "follow": lambda: motors.follow({self._channel: 0.0}),
-                "stop": motors.stop,
-                "power": lambda: motors.power(self._channel, True),
-                "define": lambda: motors.define(self._channel, 0.0),
-                "reconnect": motors.reconnect,
-            }
+            calls = {**self._calls(motors, 0.0), "reconnect": motors.reconnect}
             for name, call in calls.items():
                 with require_error(f"{name} without a device", DriverError):
                     call()

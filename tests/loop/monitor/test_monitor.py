@@ -346,39 +346,34 @@ def test_the_last_good_reading_is_returned_until_it_is_stale_and_only_with_a_fra
     assert bare.last_good(0.0, 0.3) is None
 
 
+def gone(time):
+    """A frame without the tip."""
+    return Measurement(time, None, None, None, frame(time, tip=None))
+
+
+def checked(monitor, measurement):
+    return monitor.check(measurement, at_rest, measurement.time, 0.3, 2.0)
+
+
 def test_a_tip_missing_in_a_few_frames_is_accepted():
     monitor, _ = observed(Monitor(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
     last = monitor.good
 
-    def lost(time, by=monitor):
-        return by.last_good_before_dropout(Measurement(time, None, None, None, frame(time, tip=None)), MISSED)
+    def accepted(measurement, verdict=MISSED, by=monitor):
+        return by.last_good_before_dropout(measurement, verdict)
 
-    assert lost(last.time + 0.1) == last
-    assert lost(last.time + 0.125) is None
-    assert lost(last.time + 0.1, Monitor(SETTINGS)) is None  # never measured
-    assert (
-        monitor.last_good_before_dropout(Measurement(last.time + 0.025, None, None), MISSED) is None
-    )  # no frame
-    assert monitor.last_good_before_dropout(last, Verdict()) is None  # not lost
-    again = Measurement(last.time, None, None, None, frame(last.time, tip=None))
-    for kind in (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER):
-        assert (
-            monitor.last_good_before_dropout(again, Verdict(kind, "of this kind")) is None
-        )  # no information on the tip
+    assert accepted(gone(last.time + 0.1)) == last
     off = replace(monitor, settings=SETTINGS.model_copy(update={"enabled": False}))
-    assert lost(last.time + 0.025, off) is None
-
-
-def test_a_tip_missing_after_a_jump_does_not_take_that_back():
-    monitor, _ = observed(Monitor(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
-    last = monitor.good
-    time = last.time + 0.025
-    off = Measurement(time, last.x, last.y + 9.0, last.z, frame(time))
-    monitor, verdict = monitor.check(off, at_rest, time, 0.3, 2.0)
-    assert not verdict.ok
-    gone = Measurement(time + 0.025, None, None, None, frame(time + 0.025, tip=None))
-    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
-    assert monitor.last_good_before_dropout(gone, verdict) is None
+    for refused in (
+        accepted(gone(last.time + 0.125)),
+        accepted(gone(last.time + 0.1), by=Monitor(SETTINGS)),  # never measured
+        accepted(Measurement(last.time + 0.025, None, None)),  # no frame
+        accepted(last, Verdict()),  # not lost
+        accepted(gone(last.time), Verdict(VerdictKind.STALE, "old")),  # no information on the tip
+        accepted(gone(last.time), Verdict(VerdictKind.NOT_A_NUMBER, "nan")),
+        accepted(gone(last.time + 0.025), by=off),
+    ):
+        assert refused is None
 
 
 @pytest.mark.parametrize(
@@ -388,6 +383,7 @@ def test_a_tip_missing_after_a_jump_does_not_take_that_back():
         (0.025, {"time": math.nan}, 3),
         (0.025, {"time": -5.0}, 3),  # stale
         (0.025, {}, 2),  # the frame before, again
+        (0.025, {"y": 9.0}, 3),  # a jump
         (1.5, {"y": 9.0}, 3),  # a jump, which the window of the indicators has left
     ],
 )
@@ -400,17 +396,17 @@ def test_a_tip_missing_after_any_rejected_reading_holds_the_needle(seconds, valu
     monitor, verdict = monitor.check(bad, at_rest, time, 0.3, 2.0)
     assert not verdict.ok
     assert verdict.kind is not VerdictKind.MISSING
-    gone_at = time + seconds
-    gone = Measurement(gone_at, None, None, None, frame(gone_at, tip=None))
-    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
+    missing = gone(time + seconds)
+    monitor, verdict = checked(monitor, missing)
     assert verdict.kind is VerdictKind.MISSING
-    assert monitor.last_good_before_dropout(gone, verdict) is None
-    good = Measurement(gone_at + 0.025, last.x, last.y, last.z, frame(gone_at + 0.025))
-    monitor, verdict = monitor.check(good, at_rest, good.time, 0.3, 2.0)
+    assert monitor.last_good_before_dropout(missing, verdict) is None
+    later = missing.time + 0.025
+    good = Measurement(later, last.x, last.y, last.z, frame(later))
+    monitor, verdict = checked(monitor, good)
     assert verdict.ok
-    gone = Measurement(good.time + 0.025, None, None, None, frame(good.time + 0.025, tip=None))
-    monitor, verdict = monitor.check(gone, at_rest, gone.time, 0.3, 2.0)
-    assert monitor.last_good_before_dropout(gone, verdict) == good
+    missing = gone(later + 0.025)
+    monitor, verdict = checked(monitor, missing)
+    assert monitor.last_good_before_dropout(missing, verdict) == good
 
 
 def test_a_disabled_monitor_still_rejects_missing_and_improbable_readings():
