@@ -23,40 +23,35 @@ def straight(slope, start=-3.5):
     return replace(PLAN, tips=np.column_stack([depth, slope * depth, still, slope + 0.01 * depth, still]))
 
 
-def test_the_entry_angle_is_that_at_the_skin():
-    assert straight(atan(0.2)).entry_angle == pytest.approx(atan(0.2), abs=1e-12)
-    assert straight(-0.1, start=-7.0).entry_angle == pytest.approx(-0.1, abs=1e-12)
-    assert straight(-0.1, start=0.0).entry_angle == pytest.approx(-0.1, abs=1e-12)
+@pytest.mark.parametrize(("slope", "start"), [(atan(0.2), -3.5), (-0.1, -7.0), (-0.1, 0.0)])
+def test_the_entry_angle_is_the_slope_at_the_skin(slope, start):
+    assert straight(slope, start).entry_angle == pytest.approx(slope, abs=1e-12)
+    assert np.isnan(straight(slope, start=-20.0).entry_angle)  # the tip remains outside
 
 
-def test_a_tip_outside_the_skin_has_no_entry_angle():
-    assert np.isnan(straight(0.1, start=-20.0).entry_angle)
+UNKNOWN_TIP = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
 
 
-def test_a_plan_that_misses_names_distance_and_limit():
-    missing = replace(PLAN, target=(40.0, 8.0, 0.0), limit="setup.stroke_mm = 60")
-    assert missing.summary == (
-        "MISSES the target: best distance 2.990 mm, more than 1 mm, limited by setup.stroke_mm = 60"
-    )
-    assert PLAN.summary == "reaches the target to 0.010 mm"
-
-
-def test_the_summary_of_an_insertion_is_one_line():
-    assert make_insertion().summary == "reached: the tip ended 0.070 mm from the target"
-    assert (
-        make_insertion(miss=1.0).summary == "MISSED: the tip ended 1.010 mm from the target, more than 1 mm"
-    )
-    assert (
-        make_insertion(outcome="held", reason="no sample", periods=3).summary
-        == "held after 3 periods: no sample"
-    )
-    unknown_tip = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
-    assert unknown_tip.summary == "done: neither the true tip nor a reading of it is known"
+@pytest.mark.parametrize(
+    ("record", "summary"),
+    [
+        (PLAN, "reaches the target to 0.010 mm"),
+        (
+            replace(PLAN, target=(40.0, 8.0, 0.0), limit="setup.stroke_mm = 60"),
+            "MISSES the target: best distance 2.990 mm, more than 1 mm, limited by setup.stroke_mm = 60",
+        ),
+        (make_insertion(), "reached: the tip ended 0.070 mm from the target"),
+        (make_insertion(miss=1.0), "MISSED: the tip ended 1.010 mm from the target, more than 1 mm"),
+        (make_insertion(outcome="held", reason="no sample", periods=3), "held after 3 periods: no sample"),
+        (UNKNOWN_TIP, "done: neither the true tip nor a reading of it is known"),
+    ],
+)
+def test_the_summary_is_one_line(record, summary):
+    assert record.summary == summary
 
 
 def test_missing_values_are_null():
-    unknown_tip = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
-    result = insertion_result(unknown_tip)
+    result = insertion_result(UNKNOWN_TIP)
     unknown = {name for name, value in result.items() if value is None}
     errors = {"true_error_mm", "residual_mm"}
     parts = {"phantom", "rig", "disturbed", "tip_true_mm", "tip_measured_mm", "strain_energy_mj", "warning"}
@@ -65,11 +60,6 @@ def test_missing_values_are_null():
     empty = Insertion(PLAN, 0, (), Outcome("failed"), "")
     assert insertion_result(empty)["steps"] == 0
     assert insertion_timing(empty)["period_ms"] == {"p50": None, "p99": None, "max": None}
-
-
-def test_the_result_has_the_names_of_controller_and_phantom():
-    result = insertion_result(replace(make_insertion(), controller="ce-mpc", phantom="model"))
-    assert (result["controller"], result["phantom"]) == ("ce-mpc", "model")
 
 
 def test_one_unconverged_period_is_not_hidden():

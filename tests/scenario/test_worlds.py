@@ -140,12 +140,6 @@ def test_each_kind_of_structural_mismatch_is_as_likely():
     np.testing.assert_allclose(count, len(guided) / 5, atol=35)
 
 
-@given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
-@many_worlds
-def test_a_world_is_found_by_its_name(number, case):
-    assert load_scenario(f"world:{number}:{case}") == world(number, case)
-
-
 def test_the_name_of_a_real_world_needs_no_case():
     assert load_scenario("world:100012") == load_scenario("world:100012:real") == world(100012)
 
@@ -225,8 +219,8 @@ def test_every_driver_has_the_same_target_and_directions_are_uniform():
 
 @given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
 @many_worlds
-def test_a_world_in_space_is_found_by_its_name(number, case):
-    for rig in rigs(number):
+def test_a_world_is_found_by_its_name(number, case):
+    for rig in (PLANE, *rigs(number)):
         assert load_scenario(f"world:{number}:{case}:{rig}") == world(number, case, rig)
 
 

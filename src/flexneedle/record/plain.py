@@ -21,7 +21,9 @@ _STORED_ELSEWHERE = ("seconds", "scenario")
 def plain(value: Any) -> Any:
     """Return a value in JSON types: dicts, lists, text, numbers, booleans, null."""
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        numbers = value.tolist()
+        is_finite = value.dtype.kind in "biu" or (value.dtype.kind == "f" and np.isfinite(value).all())
+        return numbers if is_finite else plain(numbers)  # the check is much faster than a look at each number
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -32,10 +34,10 @@ def plain(value: Any) -> Any:
 
 
 def plan_values(plan: Plan) -> dict[str, Any]:
-    """Return a plan as plain values, without its scenario and wall-clock time; arrays (mm, rad, mJ) come last."""
+    """Return a plan by field, without its scenario and wall-clock time; arrays (mm, rad, mJ) come last."""
     names = [field.name for field in fields(plan) if field.name not in _STORED_ELSEWHERE]
     ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
-    return {name: plain(getattr(plan, name)) for name in ordered}
+    return {name: getattr(plan, name) for name in ordered}
 
 
 def plan_from_values(values: Mapping[str, Any]) -> Plan:

@@ -40,7 +40,7 @@ class InsertionJob:
 
 @dataclass(frozen=True)
 class PlanResult:
-    """A plan as plain values and its planning time (s), or the reason why there is none."""
+    """A plan by field and its planning time (s), or the reason why there is none."""
 
     values: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
