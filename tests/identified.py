@@ -99,7 +99,7 @@ NEEDLES = {
 
 
 def readings(needle, before, after, start, count, noise, rng):
-    """Of an even move of one second; a bevel rolls before its move, and the run-out with it."""
+    """Return readings of an even move of one second; the bevel, and the run-out with it, rolls before the move."""
     parts = (np.arange(count) + 1) / count
     out = needle.measured(after) - after.tip[:2]
     first, last = before.tip[:2] + out, after.tip[:2] + out

@@ -21,7 +21,7 @@ from tasks import task_of
 
 
 def weights(scenario, plan, x, memory=None):
-    """Of the terms of the cost at a depth of the tip."""
+    """Return the weights of the cost's terms with the tip at a depth."""
     simulator = Simulator(scenario, threads=1)
     state = simulator.start()
     while state.tip[0] < x:
@@ -56,7 +56,7 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
 
 
 def test_near_the_target_a_large_miss_gets_no_more_urgent(quick_plan):
-    """From the depth on at which a correction takes no effect."""
+    """From there on a correction takes no effect."""
     late, later = (weights(PHANTOM, quick_plan, x)[0]["large miss"] for x in (36.0, 38.0))
     assert late == later == pytest.approx((adaptive_mpc.UNCORRECTED / 40.0) ** -1.5 - 1.0)
 
@@ -118,7 +118,7 @@ def test_what_is_expected_above_zero_is_the_integral(mean, sd):
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("roll", [0.0, math.pi])
 def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quick_plan, side, roll):
-    """To a target near the end of what the bevel can reach."""
+    """The target is near the end of the bevel's reach."""
     simulator = Simulator(BARE, threads=1)
     state = simulator.replay(simulator.start(roll), controls(1, db_x=31.0))[0]
     estimate = estimate_of(state, BARE)

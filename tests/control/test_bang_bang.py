@@ -54,13 +54,6 @@ def test_closest_approach_is_that_of_the_path_in_small_steps(pose, target, curva
     assert nearest(at(*pose), curvature, target) == pytest.approx(expected, abs=2e-3)
 
 
-def test_closest_approach_to_a_circle_by_hand():
-    """A radius of 100 round (0, 100): the target at (60, 20) is exactly on it, (60, 30) inside by 100 − √8500."""
-    start = np.zeros(5)
-    assert nearest(start, 0.01, (60.0, 20.0)) == pytest.approx(0.0, abs=1e-12)
-    assert nearest(start, 0.01, (60.0, 30.0)) == pytest.approx(100.0 - math.sqrt(8500.0))
-
-
 @pytest.mark.parametrize("curvature", [-0.01, 0.0, 0.01])
 def test_a_target_behind_is_as_near_as_it_is_now(curvature):
     assert nearest(at(40.0, 5.0, 0.0), curvature, (37.0, 1.0)) == pytest.approx(5.0)

@@ -31,7 +31,7 @@ def aimed(plan, state, lateral, ahead=20.0):
     return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + lateral), 0.0))
 
 
-def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, estimated, along):
+def test_it_advances_by_full_steps_and_moves_nothing_laterally(quick_plan, estimated, along):
     for steps in (0, 20, 50):
         given = command(quick_plan, estimated(along(quick_plan, steps)))
         assert given == Control(db_x=1.0, roll=given.roll)
@@ -61,7 +61,7 @@ def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
     assert command(away, estimate, curvature_per_m=0.0).roll == 0.0  # both paths are the same line
 
 
-def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
+def test_the_rule_gets_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
     calls, rule = [], bang_bang.choose_roll
 
     def spied(*args, **options):

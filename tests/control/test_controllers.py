@@ -93,7 +93,7 @@ def test_towards_a_path_beyond_its_reach_the_guide_moves_to_the_end_of_that_and_
 
 @pytest.mark.parametrize("name", ["open-loop", "ce-mpc", "resolved-rate", "broyden-mpc"])
 def test_planned_motion_of_the_base_is_followed(quick_plan, estimated, name):
-    """To where the plan has it at the tip's depth; the other methods steer with guide or bevel alone."""
+    """The base moves to its planned place at the tip's depth; the other controllers leave it alone."""
     moving = quick_plan.controls.copy()
     moving[:60, [DB_Y, DB_THETA]] = 0.02, 1e-4
     plan = replace(quick_plan, controls=moving)

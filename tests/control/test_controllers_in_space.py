@@ -19,7 +19,7 @@ DEPTH, OFF = 30.0, 1.5
 
 
 def scenario_of(direction=0.6, off=OFF, **changes):
-    """To a target in a direction (rad) across the axis."""
+    """Return a scenario with a target in a direction (rad) across the axis."""
     return PERFECT.with_values(
         {
             "setup.axes": 2,

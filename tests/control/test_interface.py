@@ -18,7 +18,7 @@ def test_a_command_of_any_sequence_becomes_plain_numbers(kind):
 
 
 def test_decisions_with_a_predicted_shape_can_be_compared():
-    """By their commands and figures; the shape follows from them."""
+    """Commands and figures are compared; the shape follows from them."""
 
     def decision(command, sd):
         shape = Shape(np.zeros((3, 5)), np.full((3, 2), sd))

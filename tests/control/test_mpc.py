@@ -99,7 +99,7 @@ def test_past_the_target_nothing_moves_any_more(plan, along):
 
 
 def test_spread_is_that_of_the_first_guide_step(plan, along):
-    """Not of the advance, which is fixed here, nor of a guide that can't move."""
+    """The advance is fixed here; a guide that cannot move has no spread."""
     state = along(plan, 30)
     fixed = PHANTOM.with_values({"plan.advance_sigma_mm": 0.0})
     assert 1e-3 < choose(plan, state, fixed).spread < 0.5
@@ -168,7 +168,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
 
 
 def test_the_guide_stays_within_its_travel_from_the_entry_on_each_axis():
-    """Of a needle that enters off both axes, by different distances."""
+    """The needle enters off both axes, by different distances."""
     entry = {"entry.lateral_mm": -2.0, "entry.lateral_z_mm": 5.0, "target.lateral_z_mm": 5.0}
     scenario = PHANTOM.with_values({"setup.axes": 2, "setup.max_guide_travel_mm": 8.0} | entry)
     state = Simulator(scenario, 1).start()

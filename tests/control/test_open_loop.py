@@ -38,7 +38,7 @@ def replayed(plan, estimated, scenario=PHANTOM, motor=truncated):
     return commands, np.array(places)
 
 
-def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, estimated):
+def test_positions_follow_the_plan_through_a_motor_that_stops_short(quick_plan, estimated):
     """Never more than one resolution behind; repeating the steps themselves loses some at each."""
     planned = np.cumsum(quick_plan.controls[:, MOTORS], axis=0)
     _, places = replayed(quick_plan, estimated)
@@ -62,7 +62,7 @@ def test_bevel_rolls_where_planned(quick_plan, estimated):
     assert [k for k, command in enumerate(commands) if command.roll > 0.0] == [12, 40]
 
 
-def test_what_the_tracker_sees_changes_nothing(quick_plan, estimated, along):
+def test_readings_change_nothing(quick_plan, estimated, along):
     task, state = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), along(quick_plan, 20)
     blind = OPEN.decide(task, 20, estimated(state), RNG)[0].command
     seeing = OPEN.decide(

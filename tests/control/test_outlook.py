@@ -102,16 +102,6 @@ def test_it_is_never_below_the_unexplained_part_and_grows_with_a_miss_that_stays
     assert outlook.sd(estimate, TARGET, -miss, guided=guided) == sd
 
 
-def test_nearer_the_target_fewer_readings_are_to_come():
-    precision, curves = two_parameters()
-    sds = []
-    for now in (-20.0, 0.0, 15.0, 30.0, 35.0):
-        outlook, estimate = linear(precision, curves, now, variance=0.02)
-        sds.append(np.sqrt(outlook.sd_to_come(estimate, TARGET) ** 2 - floor(estimate) ** 2))
-    assert (np.diff(sds) >= 0.0).all()
-    assert sds[-1] > 2.0 * sds[0]
-
-
 # ---- its derivatives
 
 

@@ -107,7 +107,7 @@ def test_the_sample_that_corrects_nothing_is_the_current_path(quick_plan, along,
 
 
 def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
-    """From none at the tip on; small enough that no limit is met."""
+    """They begin with 0 at the tip and are small enough to stay within the limits."""
     state = started(-10.0)
     corrections = 0.4 * np.cos(np.arange(1.0, KNOTS.size + 1))
     ahead = ahead_of(quick_plan, state, level())
@@ -169,7 +169,7 @@ def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, g
 
 @pytest.mark.parametrize("guide", [0.0, 1.5])
 def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
-    """From here to the target: no jump where the roll goes from one step of the rollout to the next."""
+    """There is no jump where the roll moves from one step of the rollout to the next."""
     simulator = Simulator(PHANTOM, threads=1)
     state = started(12.0, guide)
     ahead = ahead_of(quick_plan, state, level(guide=guide))
@@ -179,15 +179,6 @@ def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
     ends = simulator.rollout(state, ahead.controls(z)[0], limits=False).tips[:, -1, Y]
     assert np.ptp(ends) > 1.0
     assert np.abs(np.diff(ends)).max() < 0.01 * np.ptp(ends)
-
-
-def test_a_roll_is_made_at_its_own_depth(quick_plan):
-    ahead = ahead_of(quick_plan, started(10.0), level())
-    z = ahead.current[None].repeat(3, axis=0)
-    z[:, KNOTS.size] = 11.0, 17.3, 30.01
-    controls, depth = ahead.controls(z)
-    rolls = [depth[k, :-1][controls[k, :, ROLL] > 0.0].tolist() for k in range(3)]
-    assert np.ravel(rolls) == pytest.approx([11.0, 17.3, 30.01])
 
 
 def test_two_rolls_at_one_place_cancel(quick_plan):
@@ -298,15 +289,6 @@ def test_the_advance_ends_where_the_next_roll_is_due(quick_plan):
         command, after = ahead.first_command(ahead.path)
         assert command.db_x == pytest.approx(advance, abs=1e-6)
         assert (command.roll, depths(after)) == (0.0, [roll])
-
-
-def test_every_step_is_the_longest_but_before_rolls_and_at_the_end(quick_plan):
-    simulator = Simulator(PHANTOM, threads=1)
-    _, advances, end, _ = carried_out(quick_plan, level(20.25), started(10.0), simulator)
-    assert end.tip[0] == pytest.approx(40.0, abs=1e-6)
-    short = [advance for advance in advances if advance < 1.0 - 1e-9]
-    assert len(short) <= 4
-    assert min(advances) > 0.0
 
 
 @pytest.mark.parametrize("left", [0.7, 0.02, 1e-6])

@@ -13,7 +13,7 @@ import flexneedle
 from flexneedle.control.controllers import CONTROLLERS, resolved_rate
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_X, DG_Y, ROLL, Control, X, Y
+from flexneedle.types import DB_X, DG_Y, ROLL, STILL, Control, X, Y
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -66,7 +66,7 @@ def damped_inverse(jacobian, damping):
 
 @given(jacobian=st.floats(-2, 2), damping=st.floats(1e-3, 1))
 def test_damped_inverse_is_the_least_squares_solution(jacobian, damping):
-    """Of J u = 1 and λ u = 0 together: J / (J² + λ²)."""
+    """J u = 1 and λ u = 0 together have the solution J / (J² + λ²)."""
     expected = jacobian / (jacobian**2 + damping**2)
     assert damped_inverse(jacobian, damping) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
@@ -161,6 +161,12 @@ def test_the_path_is_led_to_the_target_at_its_end(quick_plan):
     assert resolved_rate.planned_offset(goal, 50.0).tolist() == [6.0, 0.0]
     x, y = quick_plan.tips[-5, :2]
     assert resolved_rate.planned_offset(goal, float(x)).tolist() == [pytest.approx(y), 0.0]
+
+
+def test_at_the_target_depth_nothing_moves(quick_plan, along, estimated):
+    state = along(quick_plan, 60)
+    past = replace(quick_plan, target=(float(state.tip[0]), 9.0, 0.0))
+    assert decide(past, estimated(state)).command == STILL
 
 
 def test_a_look_ahead_of_less_than_a_step_is_one_step(quick_plan, along, estimated):

@@ -116,15 +116,6 @@ class NotInToml(Section):
     gains: tuple[float, float] = (1.0, 2.0)
 
 
-class ByName:
-    """An observer that cannot be hashed."""
-
-    __hash__ = None
-
-    def begin(self, task):
-        """Nothing."""
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -137,9 +128,3 @@ class ByName:
 def test_a_controller_that_cannot_work_is_refused(change, named):
     with pytest.raises(InputError, match=named):
         replace(OWN, **change)
-
-
-def test_an_observer_may_be_of_any_kind():
-    """Also one that cannot be hashed."""
-    own = replace(OWN, observer=ByName())
-    assert check_tables(PHANTOM.with_values({"control.my_pid.gain": 0.5}), own) is not None

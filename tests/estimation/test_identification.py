@@ -214,7 +214,7 @@ def test_known_parameters_are_not_fitted():
 
 @pytest.mark.parametrize("base_x", [2.0, -2.0])
 def test_an_error_along_the_axis_is_recovered(base_x):
-    """Of twice the prior's standard deviation: the tip is at its depth, with the tissue that is there."""
+    """The error is twice the prior's standard deviation; the tip is at its true depth."""
     needle = Needle(base_x=base_x, base_y=0.2, modulus=(1.3, 0.8))
     estimate, states = followed(needle, 50)
     assert estimate.axial == pytest.approx(base_x, abs=0.01)

@@ -20,7 +20,6 @@ from identified import (
     Needle,
     commands,
     fitted,
-    followed,
     off_the_prior,
     predicted,
     readings,
@@ -40,7 +39,7 @@ def finely(estimate):
 
 
 def test_derivatives_agree_with_central_differences():
-    """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
+    """Derivatives of the readings by every parameter, off the prior; with small steps they agree closely."""
     estimate, readings = off_the_prior()
     fine = replace(estimate, prior=replace(estimate.prior, steps=1e-3 * estimate.prior.steps))
     jacobian, close = fit.jacobian_of(finely(estimate)), fit.jacobian_of(finely(fine))
@@ -313,9 +312,3 @@ def test_readings_increase_no_uncertainty():
         assert np.linalg.eigvalsh(prior - estimate.covariance).min() > -1e-9
     assert volumes[0] < np.linalg.slogdet(prior)[1]
     assert volumes[-1] < volumes[len(volumes) // 2] < volumes[0]
-
-
-def test_readings_make_the_next_one_less_uncertain():
-    start = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
-    few, many = (followed(Needle(), count, scenario=PHANTOM)[0] for count in (2, 20))
-    assert start.tip_sd > few.tip_sd > many.tip_sd > 0.0

@@ -124,7 +124,7 @@ def test_the_bevel_turns_with_rolls_and_spins():
 
 
 def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted):
-    """At a time before the last roll of a quarter turn: off the axis as the bevel was then."""
+    """Before the last quarter turn the tip is off the axis in the bevel's former direction."""
     estimate, _ = fitted
     estimate = replace(estimate, residual=0.0)
     end = estimate.moves[-1].ended
@@ -206,7 +206,7 @@ def test_a_variance_of_a_direction_is_the_mean_of_both_axes():
 
 
 def test_reported_variances_become_those_of_the_mean():
-    """Of four readings a quarter; unknown if one of them does not report its own."""
+    """The mean of four readings has a quarter of the variance, unknown if one reading reports none."""
     covariance = ((8.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 12.0))
     readings = tuple(Measurement(0.1 * k, 1.0, 2.0, 3.0, covariance=covariance) for k in range(4))
     move = Move(0.0, 0.4, Control(1.0), readings)

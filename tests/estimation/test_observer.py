@@ -57,7 +57,7 @@ def test_an_estimate_from_air_predicts_the_first_depths():
 
 
 def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
-    """Against the normal equations of all periods at once, on a needle whose tip is linear in the base."""
+    """Compared with the normal equations of all periods, on a needle whose tip is linear in the base."""
     simulator, noise = Simulator(PHANTOM), PHANTOM.tracker.jitter_per_axis
     truth, estimate = start_with(PHANTOM, base=(0.7,), slope=(-0.002,)), begun(simulator)
     information, moment = np.diag([0.5**-2, 0.003**-2]), np.zeros(2)
@@ -158,7 +158,7 @@ def test_the_start_along_the_axis_and_its_variance_are_found(base_x):
 
 
 def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long():
-    """From the skin by drift x², from a reading at s by drift (x² − s²), each beside what the start leaves."""
+    """The path adds drift x² from the skin, drift (x² − s²) from a reading at s, to the uncertainty of the start."""
     simulator = Simulator(PHANTOM)
     estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
     updated = estimate.move(Motion(AHEAD, 0.0, 1.0)).observe(

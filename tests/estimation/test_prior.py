@@ -101,7 +101,7 @@ def test_a_needle_without_a_bevel_has_no_factor_to_bound():
 
 @pytest.mark.parametrize("number", range(12))
 def test_a_prior_is_proper_in_any_world(number):
-    """Of full rank, its mean within its bounds, a depth from which each parameter matters."""
+    """It has full rank, a mean within its bounds, and a depth from which each parameter matters."""
     scenario = world(number)
     prior = Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings, scenario.target.depth_mm)
     assert (np.linalg.eigvalsh(prior.precision) > 0.0).all()

@@ -44,7 +44,7 @@ def test_the_tip_rests_in_a_roll_and_travels_after_it():
 
 
 def test_a_reading_between_two_moves_is_one_of_the_end_of_the_first():
-    """So it is on the side of the bevel before a roll that follows."""
+    """It is on the bevel's side before a roll that follows."""
     moves = Move.of(Motion(AHEAD, 0.0, 0.5)), Move.of(ROLLED), Move.of(Motion(AHEAD, 3.0, 4.0))
     assert owners(moves, -1.0, 0.5, 0.8, 1.0, 1.7, 2.0, 2.9, 3.1, 9.0) == [0, 0, 0, 0, 1, 1, 1, 2, 2]
 
@@ -154,7 +154,7 @@ def test_in_a_roll_the_predicted_tip_goes_round_the_axis():
 
 
 def test_the_measured_tip_after_a_roll_is_on_the_side_of_the_bevel():
-    """Also if the newest reading is of the middle of the roll."""
+    """The newest reading is from the middle of the roll."""
     needle = Needle(run_out=-0.15)
     estimate, _ = rolled(needle, (34,), 36)
     end = estimate.moves[-1].ended

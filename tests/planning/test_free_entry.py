@@ -57,7 +57,7 @@ def test_the_entry_of_a_plan_is_legal(scenario, entry, off, strategy):
 @given(which=st.integers(0, len(CASES) - 1), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=60)
 def test_every_sample_of_the_entry_is_legal(which, seed):
-    """And one that is legal by itself, as most are, is not changed by the limits."""
+    """Random samples are moved into the limits."""
     free = aimed(*CASES[which])
     problem = make_problem(free, free.target.position, "steering")
     bounds = entry_bounds(problem)

@@ -70,13 +70,6 @@ def test_a_driver_of_half_turns_has_no_other_rolls():
     assert plan.error_mm < 0.1
 
 
-@pytest.mark.parametrize("limit", [60.0, 180.0])
-def test_a_limited_rotation_is_kept(limit):
-    plan = planned(2.8, off=1.0, setup__guide_axes=1, setup__max_rotation_deg=limit)
-    angle = plan.roll + np.append(0.0, np.cumsum(plan.controls[:, ROLL]))
-    assert np.abs(angle).max() <= math.radians(limit) + 1e-9
-
-
 # ---- the entry
 
 

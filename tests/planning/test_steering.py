@@ -62,7 +62,7 @@ def end(z, side, p=None):
 
 @pytest.mark.parametrize(("z", "side"), [((), 1.0), ((0.3,), -1.0), ((0.25, 0.9), 1.0)])
 def test_rolls_are_made_at_their_depths(z, side):
-    """Against the double integral of ±κ by hand: a roll at depth r changes the end by −κ (20 − r)²."""
+    """By the double integral of ±κ, a roll at depth r changes the end by −κ (20 − r)²."""
     expected = side * BEND * (200.0 + sum((-1) ** (k + 1) * (20.0 - 20.0 * r) ** 2 for k, r in enumerate(z)))
     assert end(z, side) == pytest.approx(expected, rel=1e-12)
 
@@ -120,7 +120,7 @@ def test_beyond_reach_the_bevel_stays_on_the_targets_side(side):
 
 
 def test_more_rolls_are_made_where_they_pay():
-    """To the middle of the reach, with a charge for the square of y on the way: three rolls swing less than one."""
+    """On the way to the middle of the reach y² is charged: three rolls swing less than one."""
 
     def swinging(controls, start=1.0):
         return kinematic(controls, start, lambda y: np.cumsum(y**2, axis=1))

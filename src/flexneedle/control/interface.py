@@ -68,7 +68,7 @@ class Decision:
 
 
 def _plain_command(command: Any) -> Control:
-    """Return the command with plain floats, whatever the types of its numbers."""
+    """Return the command with plain floats."""
     try:
         row = Control.of(map(float, command))
     except (TypeError, ValueError, InputError):

@@ -126,7 +126,7 @@ class Corrected:
 
     @property
     def _rests_unread(self) -> bool:
-        """Whether the last move was none, and no reading of it has arrived."""
+        """Whether the last move was a rest, and no reading of it has arrived."""
         return bool(self.moves) and self.moves[-1].applied == STILL and not self.moves[-1].measurements
 
     def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
@@ -172,9 +172,9 @@ def _follow(at: Corrected, done: Move) -> Corrected:
     return _fit_start(at, predicted, measured[Y:] - predicted.tip[Y : Z + 1], noise)
 
 
-def _innovation(before: Floats, carry_out: Floats, done: Move, measurement: Measurement) -> Floats:
-    """Return reading less prediction at its time (mm), the move being even, shape (3,)."""
-    here, there = before[: Z + 1], carry_out[: Z + 1]
+def _innovation(before: Floats, after: Floats, done: Move, measurement: Measurement) -> Floats:
+    """Return the reading minus the prediction at its time (3,), mm, for an even move."""
+    here, there = before[: Z + 1], after[: Z + 1]
     expected: Floats = here + done.part(measurement.time) * (there - here)
     return np.asarray(tip_of(measurement)) - expected
 

@@ -12,7 +12,7 @@ from flexneedle.simulator.simulator import Simulator
 class Task:
     """A plan, the scenario's model, and the controller's own settings.
 
-    settings: checked, of the class `Controller.settings`; None for a controller without any.
+    settings: checked, of the class `Controller.settings`; None for a controller without settings.
     """
 
     simulator: Simulator

@@ -39,7 +39,7 @@ def _keep_steepness(problem: PlanProblem, slope: Laterals) -> None:
 
 
 def _keep_travel(problem: PlanProblem, point: Laterals, slope: Laterals) -> None:
-    """Move entries (N,) from which the target is beyond the lateral travel towards `home`, no further than need be."""
+    """Move entries (N,) from which the target is beyond the lateral travel towards `home`, as far as necessary."""
     depth, home = problem.target[0], problem.home
     off = problem.across - point - slope * depth
     least = problem.across - home[0] - home[1] * depth

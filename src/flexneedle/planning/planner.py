@@ -114,7 +114,7 @@ def sketch(
     """Search once for an insertion to the scenario's target, as `plan` does, for a quick preview.
 
     A target that is missed is not searched again, and neither the states between nor what limits the plan are found.
-    The bevel alone gets one roll at most, which reaches whatever several reach.
+    The bevel alone gets at most one roll, which reaches every target that several reach.
     """
     simulator, goal = Simulator(scenario, threads), scenario.target.position
     problem = make_problem(scenario, goal, strategy)

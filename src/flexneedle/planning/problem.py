@@ -89,10 +89,10 @@ class PlanProblem:
     def direction(self) -> complex:
         """Direction in which the bevel alone steers: from the needle's axis to the target; y with half turns.
 
-        Where a limit keeps a free entry from moving straight to the target: from the nearest axis that is free.
+        Where a limit keeps a free entry from moving straight to the target: from the nearest permitted axis.
         """
-        aside = abs((self.left * self.across.conjugate()).imag)
-        across = self.left if aside > ROUNDING * abs(self.across) ** 2 else self.across
+        off = abs((self.left * self.across.conjugate()).imag)
+        across = self.left if off > ROUNDING * abs(self.across) ** 2 else self.across
         return 1.0 if self.half_turns or across == 0.0 else across / abs(across)
 
     @property

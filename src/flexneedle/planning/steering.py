@@ -2,8 +2,8 @@
 
 The end of the tip is a continuous function of the depth of a roll. A roll at the skin is an insertion with the other
 side, a roll at the target one without a roll; so by the intermediate value theorem one roll reaches every target
-between the ends of the two insertions without any, and no sequence of rolls is needed to find it. More rolls can only
-lower the cost.
+between the ends of the two insertions without a roll, and no sequence of rolls is needed to find it. More rolls can
+only lower the cost.
 
 With less than half a turn to either side the bevel cannot face each direction and its opposite, so angles are searched
 as well. The ends of insertions with one angle are on an arc, and the reach of the bevel is its convex hull. One roll
