@@ -90,9 +90,9 @@ def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, al
     assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
 
 
-def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
-    """For as long as a reading takes to come in, and a control step; the command waits."""
-    decisions, _, _ = carried_out(quick_plan, QUICK)
+def test_it_rests_four_two_and_one_steps_before_the_target(short_plan):
+    """It rests for the delay of a reading and a control step; the command waits."""
+    decisions, _, _ = carried_out(short_plan, short_plan.scenario)
     rests = [k for k, decision in enumerate(decisions) if decision.rest > 0.0]
     left = [sum(decision.command.db_x for decision in decisions[k:] if not decision.rest) for k in rests]
     np.testing.assert_allclose(left, [4.0, 2.0, 1.0], atol=1.0)
@@ -305,10 +305,10 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     assert np.mean(misses) < 0.4 * blind
 
 
-def test_on_the_exact_model_it_ends_at_the_target_and_stays_as_certain(quick_plan):
+def test_on_the_exact_model_it_ends_at_the_target_and_stays_as_certain(short_plan):
     """The readings are the model's: corrections to come were counted on from the start."""
-    decisions, truth, _ = carried_out(quick_plan, PHANTOM)
-    assert abs(truth.tip[Y] - 5.0) < 0.1
+    decisions, truth, _ = carried_out(short_plan, short_plan.scenario)
+    assert abs(truth.tip[Y] - short_plan.target[1]) < 0.1
     last = [decision for decision in decisions if np.isfinite(decision.miss)][-1]
     assert abs(last.miss) < 0.1
     sds = np.array([decision.miss_sd for decision in decisions])

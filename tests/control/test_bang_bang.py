@@ -72,49 +72,34 @@ def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, theta, latera
     assert here == mirrored
 
 
-def flips(bevel, target, *, band=0.0, noise=0.0, curvature=0.001, pose=(0.0, 0.0, 0.0)):
-    return wants_flip(at(*pose), bevel, curvature, target, band, noise)[0]
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_bevel_rolls_towards_the_target_and_stays_there(side):
-    assert flips(-1, (40.0, 3.0)) is True
-    assert flips(1, (40.0, 3.0)) is False
-    assert flips(1, (40.0, -3.0)) is True
-    assert flips(-1, (40.0, -3.0)) is False
-    # What counts is where the tip's own line meets the target, not the side of the axis.
-    assert flips(1, (40.0, 3.0 * side), pose=(0.0, 0.0, 0.2)) is True
-    assert flips(1, (40.0, 3.0 * side), pose=(0.0, 0.0, -0.2)) is False
-
-
-def test_dead_band_is_a_share_of_the_separation_of_the_paths():
-    """κ = 1/m, 40 mm ahead: the paths pass 0.8 mm lateral each, 1.6 mm apart. With the target at −y the other
-    path is nearer by 2y, until it is beyond it: 1.2 mm of advantage at −0.6 mm are 0.75 of the separation."""
-    assert flips(1, (40.0, -0.6), band=0.70) is True
-    assert flips(1, (40.0, -0.6), band=0.80) is False
-    assert flips(1, (40.0, -5.0), band=0.95) is True
-    # A quarter of the distance: the same share at a sixteenth of the offset.
-    assert flips(1, (10.0, -0.6 / 16), band=0.70) is True
-    assert flips(1, (10.0, -0.6 / 16), band=0.80) is False
-
-
-def test_the_noise_of_the_tracker_widens_the_dead_band():
-    assert flips(1, (40.0, -0.6), noise=0.55) is True
-    assert flips(1, (40.0, -0.6), noise=0.65) is False
-    assert flips(1, (40.0, -0.6), band=0.35, noise=0.3) is True  # 0.35 · 0.8 + 0.3 < 0.6
-    assert flips(1, (40.0, -0.6), band=0.45, noise=0.3) is False
-
-
-def test_a_target_far_off_the_line_rolls_the_bevel_however_near_it_is():
-    """The two paths part by 0.025 mm over the last 5 mm; a gain of that size can't be asked for."""
-    assert flips(1, (5.0, -0.3), band=0.8, noise=0.12) is True
-    assert flips(1, (5.0, -0.1), band=0.8, noise=0.12) is False
-
-
-def test_without_advantage_or_curvature_or_with_the_target_behind_the_bevel_stays():
-    assert flips(1, (40.0, 0.0)) is False
-    assert flips(1, (40.0, -3.0), curvature=0.0) is False
-    assert flips(1, (-1.0, -3.0)) is False
+@pytest.mark.parametrize(
+    ("rolls", "bevel", "target", "changes"),
+    [
+        # Towards the target, where it stays.
+        (True, -1, (40.0, 3.0), {}), (False, 1, (40.0, 3.0), {}),
+        (True, 1, (40.0, -3.0), {}), (False, -1, (40.0, -3.0), {}),
+        # By the tip's own line, not by the side of the axis.
+        (True, 1, (40.0, -3.0), {"theta": 0.2}), (True, 1, (40.0, 3.0), {"theta": 0.2}),
+        (False, 1, (40.0, -3.0), {"theta": -0.2}), (False, 1, (40.0, 3.0), {"theta": -0.2}),
+        # κ = 1/m: 40 mm ahead the paths are 1.6 mm apart. At y = −0.6 mm the other one is nearer by 1.2 mm: 0.75.
+        (True, 1, (40.0, -0.6), {"band": 0.7}), (False, 1, (40.0, -0.6), {"band": 0.8}),
+        (True, 1, (40.0, -5.0), {"band": 0.95}),
+        # A quarter of the distance: the same share at a sixteenth of the offset.
+        (True, 1, (10.0, -0.6 / 16), {"band": 0.7}), (False, 1, (10.0, -0.6 / 16), {"band": 0.8}),
+        # Noise widens the band: 0.35 · 0.8 mm + 0.3 mm < 0.6 mm < 0.45 · 0.8 mm + 0.3 mm.
+        (True, 1, (40.0, -0.6), {"noise": 0.55}), (False, 1, (40.0, -0.6), {"noise": 0.65}),
+        (True, 1, (40.0, -0.6), {"band": 0.35, "noise": 0.3}), (False, 1, (40.0, -0.6), {"band": 0.45, "noise": 0.3}),
+        # Over the last 5 mm the paths part by 0.025 mm, too little to ask for as a gain.
+        (True, 1, (5.0, -0.3), {"band": 0.8, "noise": 0.12}), (False, 1, (5.0, -0.1), {"band": 0.8, "noise": 0.12}),
+        # No advantage, no curvature, the target behind the tip.
+        (False, 1, (40.0, 0.0), {}), (False, 1, (40.0, -3.0), {"curvature": 0.0}), (False, 1, (-1.0, -3.0), {}),
+    ],
+)  # fmt: skip
+def test_the_bevel_rolls_where_the_gain_is_beyond_the_dead_band(rolls, bevel, target, changes):
+    given = {"theta": 0.0, "curvature": 0.001, "band": 0.0, "noise": 0.0} | changes
+    pose = at(0.0, 0.0, given["theta"])
+    found, _ = wants_flip(pose, bevel, given["curvature"], target, given["band"], given["noise"])
+    assert found is rolls
 
 
 def test_reason_gives_both_misses():

@@ -175,7 +175,7 @@ def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effec
 
 @pytest.mark.parametrize("delay", [1, 2])
 @pytest.mark.parametrize(("slope", "effect"), [(0.05, 1.0), (-0.03, 1.0), (0.03, 0.8)])
-def test_a_linear_needle_is_learnt_and_kept_on_its_path(quick_plan, slope, effect, delay):
+def test_a_linear_needle_is_identified_and_kept_on_its_path(quick_plan, slope, effect, delay):
     """Readings are held against the inputs of when they were taken: a late one costs no accuracy."""
     tips, _, memory = linear_run(straight(quick_plan, 0.0), slope, effect, delay=delay)
     assert np.abs(tips[:3, 1]).max() > 0.02
@@ -194,7 +194,7 @@ def test_with_another_effect_of_the_guide_than_first_estimated_it_swings_and_set
     assert np.abs(tips[50:, 1]).max() < 0.04
 
 
-def test_a_path_aside_is_reached_by_guide_steps_within_their_limit(quick_plan):
+def test_a_lateral_path_is_reached_by_guide_steps_within_their_limit(quick_plan):
     tips, inputs, _ = linear_run(straight(quick_plan, 2.0), 0.0, 0.7)
     assert np.abs(np.diff(inputs[:, 1])).max() == pytest.approx(0.5)
     assert tips[-1, 1] == pytest.approx(2.0, abs=1e-3)
@@ -212,7 +212,7 @@ def test_before_the_first_reading_it_goes_straight_on(quick_plan):
     assert memory.last_update is None
 
 
-def test_an_old_reading_is_not_learnt_from_again():
+def test_an_old_reading_updates_nothing():
     memory = bm.JacobianEstimate(
         np.eye(2), ((0.0, 28.5, 0.0),), (np.array([0.0, 0.0]), np.array([28.5, 0.0]))
     )

@@ -24,12 +24,12 @@ PLANE, SPACE = (flexneedle.load_scenario(name).with_values(FEW) for name in ("ph
 DEPTH = 40.0
 STEEP = {"entry.slope_mrad": 190.0, "entry.free_slope_mrad": 100.0}
 CORNER = {**STEEP, "entry.slope_z_mrad": -190.0}
-ASIDE = {"entry.lateral_mm": 14.0, "entry.free_radius_mm": 5.0}
+LATERAL = {"entry.lateral_mm": 14.0, "entry.free_radius_mm": 5.0}
 NEAR = {"entry.free_radius_mm": 5.0}
 BOTH = {"entry.free_radius_mm": 5.0, "entry.free_slope_mrad": 100.0}
 CASES = [
-    (PLANE, STEEP, (8.0,)), (PLANE, STEEP, (20.0,)), (PLANE, ASIDE, (5.0,)), (PLANE, ASIDE, (-5.5,)),
-    (PLANE, NEAR, (20.0,)), (PLANE, NEAR, (19.0,)), (SPACE, CORNER, (20.0, -9.0)), (SPACE, ASIDE, (-5.0, 3.0)),
+    (PLANE, STEEP, (8.0,)), (PLANE, STEEP, (20.0,)), (PLANE, LATERAL, (5.0,)), (PLANE, LATERAL, (-5.5,)),
+    (PLANE, NEAR, (20.0,)), (PLANE, NEAR, (19.0,)), (SPACE, CORNER, (20.0, -9.0)), (SPACE, LATERAL, (-5.0, 3.0)),
     (SPACE, NEAR, (18.0, 18.0)), (SPACE, BOTH, (19.0, -19.0)), (SPACE, BOTH, (1.0, 2.0)),
 ]  # fmt: skip
 

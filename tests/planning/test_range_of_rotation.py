@@ -128,6 +128,7 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
         (270.0, [170.0, -170.0, 20.0], [170.0, 190.0, 20.0]),
         (270.0, [170.0, -100.0, -60.0], [170.0, 260.0, -60.0]),
         (270.0, [-150.0, 100.0, 80.0], [-150.0, -260.0, 80.0]),
+        (90.0, [20.0, 22.0, 60.0], [20.0, 60.0]),  # a roll below 0.1 rad is not made
     ],
 )
 def test_rolls_take_the_shortest_way_that_the_range_has(most, wanted, expected):

@@ -81,7 +81,8 @@ def choose_roll(
         across = target_from_tip(pose, target)[1]
         towards = across if across != 0.0 else bevel
         angles = [within(float(np.angle(one * bevel.conjugate()))) for one in (towards, -towards)]
-        ends = ((closest_approach(pose, curvature, _turn_bevel(bevel, one), target), one) for one in angles)
+        bevels = [bevel * cmath.rect(1.0, one) for one in angles]
+        ends = zip((closest_approach(pose, curvature, one, target) for one in bevels), angles, strict=True)
         (roll, angle), off = min(ends), closest_approach(pose, 0.0, bevel, target)
         gain = keep - roll
         rolled = (
@@ -89,10 +90,6 @@ def choose_roll(
         )
     why = f"predicted miss {keep:.3f} mm if kept, {roll:.3f} mm if rolled"
     return (angle, f"bevel rolled: {why}") if rolled else (0.0, f"bevel kept: {why}")
-
-
-def _turn_bevel(bevel: complex, angle: float) -> complex:
-    return bevel * cmath.rect(1.0, angle)
 
 
 class BevelRule(Section):

@@ -100,10 +100,6 @@ class Observer(Protocol):
         ...
 
 
-def _no_memory(_task: Task) -> None:
-    """Return None."""
-
-
 @dataclass(frozen=True, eq=False)
 class Controller:
     """Definition of a controller.
@@ -133,7 +129,7 @@ class Controller:
     observer: Observer = _CORRECTED_MODEL
     _: KW_ONLY
     decide: Callable[[Task, Any, Estimate, np.random.Generator], tuple[Decision, Any]]
-    begin: Callable[[Task], Any] = _no_memory
+    begin: Callable[[Task], Any] = lambda _task: None
     arrived: Callable[[Task, Any, Estimate], bool] = is_at_depth
     settings: type[Section] | None = None
     needs_guide: bool = False

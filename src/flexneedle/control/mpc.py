@@ -19,7 +19,7 @@ from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.simulator.control import MOVES, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, X
+from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, X, Y, Z
 
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
@@ -100,6 +100,12 @@ def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
     poses = np.stack([np.interp(index, np.arange(last + 1), plan.tips[:, k]) for k in range(5)], axis=1)
     rows = np.minimum(np.floor(at + 1e-9).astype(int) + np.arange(steps), last)
     return poses, np.concatenate([plan.controls, [STILL]])[rows]
+
+
+def planned_offset(plan: Plan, depth: float | Floats) -> Floats:
+    """Return y and z (2, …), mm, of the planned path at depths (…), mm, with the target as its end."""
+    known, *lateral = (np.append(plan.tips[:-1, k], plan.target[k]) for k in (X, Y, Z))
+    return np.array([np.interp(depth, known, values) for values in lateral], dtype=float)
 
 
 def steps_to_planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:

@@ -10,8 +10,7 @@ from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.prior import Prior, Priors, Slots
 from flexneedle.estimation.readings import MoveMeans
-from flexneedle.estimation.sensor import Sensor
-from flexneedle.estimation.sensors import sensors_of
+from flexneedle.estimation.sensors import Sensor, sensors_of
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State

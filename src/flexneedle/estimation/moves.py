@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.estimation.sensor import Sensor
-from flexneedle.estimation.sensors import SENSORS
+from flexneedle.estimation.sensors import SENSORS, Sensor
 from flexneedle.types import STILL, Control, Floats, Measurement, Motion, Point, Pose, X, Y, Z
 
 _KEPT = 100  # readings of a move at rest that are kept one by one

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.control.interface import Controller, Decision, travel_left
-from flexneedle.control.mpc import steps_to_planned_base
+from flexneedle.control.mpc import planned_offset, steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
@@ -142,7 +142,7 @@ def solve_guide_moves(
     path, and `guide_weight` times the squared guide steps.
     """
     n, axes = len(ahead), guide.size
-    goal = np.array([np.interp(tip[0] + ahead, *_planned_path(plan, k)) for k in range(1, tip.size)])
+    goal = planned_offset(plan, tip[0] + ahead)[: tip.size - 1]
     effort = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
     matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort)])
     left = goal - tip[1:, None] - np.multiply.outer(jacobian[1:, 0], ahead)
@@ -154,12 +154,6 @@ def solve_guide_moves(
     lower, upper = np.maximum(-furthest, -reach - place), np.minimum(furthest, reach - place)
     moves = bounded_least_squares(matrix, right, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
     return moves.reshape(axes, n).T, float(np.sum((matrix @ moves - right) ** 2))
-
-
-def _planned_path(plan: Plan, k: int) -> tuple[Floats, Floats]:
-    """Return the depths and lateral positions (column k) of the planned path, with the target as its end."""
-    depth, lateral = (np.append(plan.tips[:-1, column], plan.target[column]) for column in (0, k))
-    return depth, lateral
 
 
 def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:

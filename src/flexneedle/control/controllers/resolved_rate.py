@@ -16,7 +16,7 @@ import numpy as np
 from flexneedle.control import bang_bang
 from flexneedle.control.guide import guide_reach
 from flexneedle.control.interface import Controller, Decision, travel_left
-from flexneedle.control.mpc import steps_to_planned_base
+from flexneedle.control.mpc import planned_offset, steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
@@ -107,14 +107,6 @@ def guide_jacobian(
     end, *moved = simulator.rollout(state, tried).tips[:, -1]
     across = np.array(moved)[:, Y : Z + 1]
     return end, (across[::2] - across[1::2]).T / (2.0 * disturbance)
-
-
-def planned_offset(plan: Plan, x: float) -> Floats:
-    """Return the lateral position y, z (mm) of the planned path at depth x, with the target as its end."""
-    depth = np.append(plan.tips[:-1, X], plan.target[0])
-    return np.array(
-        [np.interp(x, depth, np.append(plan.tips[:-1, k], plan.target[k])) for k in (Y, Z)], dtype=float
-    )
 
 
 def solve_damped(jacobian: Floats, off: Floats, damping: float) -> Floats:
