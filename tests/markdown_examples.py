@@ -1,9 +1,9 @@
 """The examples of a Markdown page: its fenced blocks, run in order in one folder, and the outputs that it shows.
 
-A block of `python` is executed, one of `sh` or `bash` is run by the shell; a block of `text` that follows at once is
-what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the
+Python executes a block of `python`, the shell a block of `sh` or `bash`; a block of `text` that follows directly is
+its output. `title="NAME"` makes a block a file of this name instead. A comment `<!-- no-run: REASON -->` in the
 line above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
-A line `--8<-- "NAME"` stands for the file docs/examples/NAME, as on the site.
+A line `--8<-- "NAME"` is replaced by the file docs/examples/NAME, as on the site.
 
     python tests/markdown_examples.py docs/tutorial.md      # writes the outputs that its examples print into the page
 """
@@ -39,7 +39,7 @@ _RELATIVE, _ABSOLUTE = 0.01, 0.002
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: language, code, file name or "", reason why it is not run or "", and what it prints or None.
+    """A fenced block: language, code, file name or "", reason for not running it or "", and its output or None.
 
     span: of the output in the page; line: of the block.
     """
@@ -77,7 +77,7 @@ def blocks(page: str) -> list[Block]:
 
 
 def printed(page: list[Block], folder: Path) -> Iterator[tuple[Block, str]]:
-    """Run the blocks of a page in a folder, which is the current one; yield each with what it prints."""
+    """Run the blocks of a page in the current folder; yield each with its output."""
     names: dict[str, object] = {"__name__": "example"}
     for block in page:
         if block.title:
@@ -105,9 +105,9 @@ def _shell(block: Block, folder: Path) -> str:
 
 
 def same(shown: str, real: str) -> str:
-    """Return "" if a page shows what an example prints, else the first line that differs.
+    """Return "" if a page shows the output of an example, else the first line that differs.
 
-    `…` in a line matches any text, a line of it alone for any lines. Numbers may differ by 1 % or by 0.002, for
+    `…` in a line matches any text, `…` alone any lines. Numbers may differ by 1 % or by 0.002, because
     the last digits differ between processors.
     """
     wanted, got = (text.rstrip("\n").splitlines() for text in (shown, real))
@@ -142,7 +142,7 @@ def _literal(text: str) -> str:
 
 
 def rewritten(page: str, folder: Path) -> str:
-    """Return the page with the outputs that its examples print, where they are not the same."""
+    """Return the page with real outputs where they differ."""
     changes = [
         (block.span, _merged(block.output, real))
         for block, real in printed(blocks(page), folder)
@@ -154,14 +154,14 @@ def rewritten(page: str, folder: Path) -> str:
 
 
 def _merged(shown: str, real: str) -> str:
-    """The real output, with the lines of the page that agree with it, `…` in them included."""
+    """Return the real output, with the lines of the page, `…` included, that agree with it."""
     old, new = shown.splitlines(), [line.rstrip() for line in real.rstrip("\n").splitlines()]
     pairs = zip(old, new, strict=True) if len(old) == len(new) else (("", line) for line in new)
     return "".join(f"{kept if _same_line(kept, line) else line}\n" for kept, line in pairs)
 
 
 def main() -> None:
-    """Write the real outputs into the pages that are named."""
+    """Write the real outputs into the pages of the command line."""
     sys.path.insert(0, "")
     for path in map(Path.absolute, map(Path, sys.argv[1:])):
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

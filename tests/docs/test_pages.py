@@ -12,7 +12,7 @@ import pytest
 from flexneedle.cli.main import build_parser
 from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 
-# Pages that take more than about 5 s, and the longest of them.
+# Pages that take more than about 5 s, and the longest pages.
 LONG = {"emulate.md", "index.md"}
 SLOW = {
     "controllers.md",
@@ -58,7 +58,7 @@ def test_examples_run_and_print_what_the_page_shows(name, folder):
 
 
 def commands() -> list[tuple[str, str]]:
-    """All command lines of the pages, indented or in a block, without redirections, comments and what is piped."""
+    """All command lines of the pages, indented or in a block, without redirections, comments and pipes."""
     shell = [(name, b.code) for name, found in BLOCKS.items() for b in found if b.language in SHELL]
     indented = [
         (name, line) for name, text in TEXTS.items() for line in re.findall(r"^ {4}\S.*$", text, re.MULTILINE)
@@ -71,7 +71,7 @@ def commands() -> list[tuple[str, str]]:
     ]
 
 
-def test_every_command_is_one():
+def test_every_command_of_the_pages_parses():
     failures = []
     for name, line in commands():
         try:
@@ -82,8 +82,7 @@ def test_every_command_is_one():
     assert failures == []
 
 
-def test_options_of_studies_and_benchmarks_are_theirs():
-    """As the scripts themselves explain them."""
+def test_scripts_of_the_pages_have_the_options_shown():
     shown = {
         match
         for text in TEXTS.values()
@@ -103,7 +102,7 @@ def test_options_of_studies_and_benchmarks_are_theirs():
             )
 
 
-def test_every_make_target_is_one():
+def test_make_has_every_target_of_the_pages():
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     named = {
         target
@@ -124,7 +123,7 @@ def test_few_blocks_are_not_run_and_each_has_a_reason():
     assert len(skipped) < 12
 
 
-def test_the_links_of_the_readme_exist():
+def test_the_files_that_the_readme_links_exist():
     targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", TEXTS["README.md"])
     assert targets
     assert [target for target in targets if not (ROOT / target).exists()] == []
@@ -140,7 +139,7 @@ def test_the_links_of_the_readme_exist():
         ("…\nmiddle\n…", "1\nmiddle\n2\n3"),
     ],
 )
-def test_outputs_agree_up_to_last_digits_spaces_and_what_is_left_out(shown, real):
+def test_outputs_agree_up_to_last_digits_spaces_and_ellipses(shown, real):
     assert same(shown, real) == ""
 
 

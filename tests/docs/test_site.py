@@ -15,6 +15,7 @@ import command_reference
 import flexneedle
 import math_fence
 import rig_reference
+import rig_states
 import scenario_reference
 from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
@@ -33,12 +34,14 @@ def entries(nav: object) -> Iterator[str]:
         yield from [item] if isinstance(item, str) else entries(*item.values())
 
 
-def test_the_scenario_reference_is_that_of_the_schema():
-    assert scenario_reference.PAGE.read_text(encoding="utf-8") == scenario_reference.page(), "make docs"
+@pytest.mark.parametrize("generator", [scenario_reference, rig_reference, command_reference])
+def test_generated_pages_are_up_to_date(generator):
+    assert generator.PAGE.read_text(encoding="utf-8") == generator.page(), "make docs"
 
 
-def test_the_rig_reference_is_that_of_the_models():
-    assert rig_reference.PAGE.read_text(encoding="utf-8") == rig_reference.page(), "make docs"
+def test_the_page_on_safety_has_the_present_table_of_states():
+    text = rig_states.PAGE.read_text(encoding="utf-8")
+    assert rig_states.page(text) == text, "make docs"
 
 
 def test_every_section_and_every_key_of_a_rig_has_advice():
@@ -58,10 +61,6 @@ def test_the_rig_of_the_reference_can_do_what_the_paper_needs(tmp_path):
     path = tmp_path / example.title
     path.write_text(example.code, encoding="utf-8")
     assert fit_problems(load_rig(path), load_scenario("phantom")) == []
-
-
-def test_the_command_reference_is_the_help():
-    assert command_reference.PAGE.read_text(encoding="utf-8") == command_reference.page(), "make docs"
 
 
 def test_every_section_has_advice_and_every_key_a_description():
@@ -130,7 +129,7 @@ def test_a_formula_is_drawn_with_its_number():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The built site, from a copy of what it is made of."""
+    """The built site, from a copy of its sources."""
     root = tmp_path_factory.mktemp("site")
     for name in ("docs", "src", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -153,7 +152,7 @@ def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(site):
     assert len(pages) > 30
     assert [path.name for path, text in pages.items() if loads.search(text)] == []
     assert [text[:80] for text in styles if re.search(r"url\(['\"]?https?:|@import", text)] == []
-    assert [path.name for path, text in pages.items() if "```" in text] == [], "a block that is none"
+    assert [path.name for path, text in pages.items() if "```" in text] == [], "a fence is shown as text"
 
 
 @pytest.mark.long
