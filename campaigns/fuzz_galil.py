@@ -317,11 +317,7 @@ ACTIONS: dict[str, Callable[[GalilMotors, Random], object]] = {
     "reconnect": lambda motors, _: motors.reconnect(),
 }
 CALLS = ("read", "read", "follow", *ACTIONS)
-PARTS: dict[str, Part] = {
-    "parser": parser_inputs,
-    "controller": controller_inputs,
-    "driver": driver_inputs,
-}
+PARTS: dict[str, Part] = {"parser": parser_inputs, "controller": controller_inputs, "driver": driver_inputs}
 
 if __name__ == "__main__":
     sys.exit(main(__doc__, PARTS))

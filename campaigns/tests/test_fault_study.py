@@ -211,18 +211,21 @@ def test_the_time_of_a_guide_that_stalls_counts_from_the_last_motion_of_the_base
     assert not good(BY_NAME["guide stalls"], found | {"from_motion_s": 0.95})
 
 
+def stalled_base(detected, guide, moves=()):
+    """The row of a base that stalls, while guide_y moves at times (begin in s, mm) for 0.2 s."""
+    states = (9.0, "inserting", ""), (detected, "fault", "insertion: off")
+    found = evidence("stall", *states, outcome="failed", moves=moves)
+    time = found.truth.time
+    found.truth.positions["guide_y"] = sum(mm * np.clip((time - at) / 0.2, 0.0, 1.0) for at, mm in guide)
+    return found.row() | {"axis": "insertion"}
+
+
 @pytest.mark.parametrize(("fault_to_step", "seconds"), [(0.7, 0.1), (0.0, 0.1), (-0.1, 0.0)])
 def test_the_time_of_a_base_that_stalls_counts_from_its_next_step_which_the_guide_shows(
     fault_to_step, seconds
 ):
     step = INJECTED + fault_to_step
-    found = evidence(
-        "stall", (9.0, "inserting", ""), (step + 0.1, "fault", "insertion: off"), outcome="failed"
-    )
-    time = found.truth.time
-    place = 0.01 * np.clip((time - step) / 0.2, 0.0, 1.0) + 0.01 * (time > step - 1.0)
-    found.truth.positions["guide_y"] = place
-    shown = found.row() | {"axis": "insertion"}
+    shown = stalled_base(step + 0.1, [(step, 0.01), (step - 1.2, 0.01)])
     assert shown["detection_s"] == pytest.approx(max(0.0, fault_to_step + 0.1))
     assert shown["from_motion_s"] == pytest.approx(seconds, abs=0.005)
     assert good(BY_NAME["stall"], shown)
@@ -239,12 +242,7 @@ def test_the_time_of_a_base_that_stalls_counts_from_its_next_step_which_the_guid
     ],
 )
 def test_a_base_that_stalls_may_be_missed_in_no_step(moves, seconds):
-    found = evidence(
-        "stall", (9.0, "inserting", ""), (11.0, "fault", "insertion: off"), outcome="failed", moves=moves
-    )
-    time = found.truth.time
-    found.truth.positions["guide_y"] = sum(np.clip((time - at) / 0.2, 0.0, 1.0) for at in (9.9, 10.4, 10.8))
-    shown = found.row() | {"axis": "insertion"}
+    shown = stalled_base(11.0, [(9.9, 1.0), (10.4, 1.0), (10.8, 1.0)], moves)
     assert shown["from_motion_s"] == pytest.approx(seconds, abs=0.005)
     assert not good(BY_NAME["stall"], shown)
 
@@ -380,7 +378,7 @@ list(resume_rows(Path({file!r}), [1, 2, 3], run, 2, lambda task: {{"task": task}
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_no_process_is_left_after_an_interrupt(tmp_path, number):
     text = INTERRUPTED.format(studies=str(Path(study.__file__).parent), file=str(tmp_path / "rows.jsonl"))
     study_of = subprocess.Popen(

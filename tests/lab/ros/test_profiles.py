@@ -18,6 +18,7 @@ from flexneedle.lab.ros.profile import (
     load_profile,
 )
 
+TOPIC, SHAPE = {"topic": "/t", "frame": "skin"}, "/flexneedle/needle/shape"
 NAMES = ["neutral", "smartneedle", "smartneedle-fbg"]
 SMARTNEEDLE = {
     "publish.shape": ("/needle/state/current_shape", "geometry_msgs/msg/PoseArray", "mm"),
@@ -89,26 +90,21 @@ def test_the_fibre_optic_needle_publishes_its_own_shape():
     listed = {key: topic.topic for key, topic in topics_of("smartneedle-fbg").items()}
     assert listed["subscribe.shape"] == "/needle/state/current_shape"
     assert listed["publish.predicted_shape"] == "/needle/state/predicted_shape"
-    poses = {"publish.shape", "publish.skin_entry", "publish.needle_pose", "publish.guide_pose"}
-    assert not poses & set(listed)
+    assert not {f"publish.{key}" for key in ("shape", "skin_entry", "needle_pose", "guide_pose")} & set(
+        listed
+    )
 
 
 @pytest.mark.parametrize(
     ("changes", "key"),
     [
-        ({"publish__tip": {"topic": "tip", "frame": "skin"}}, 'publish.tip.topic = "tip"'),
-        ({"publish__tip": {"topic": "/a b", "frame": "skin"}}, 'publish.tip.topic = "/a b"'),
-        ({"publish__tip": {"topic": "/tip", "frame": "nose"}}, 'publish.tip.frame = "nose"'),
-        ({"publish__tip": {"topic": "/tip", "frame": "skin", "unit": "in"}}, 'publish.tip.unit = "in"'),
-        ({"publish__tipp": {"topic": "/tip", "frame": "skin"}}, "publish.tipp = {…}"),
-        (
-            {"publish__shape": {"topic": "/s", "frame": "skin", "spacing_mm": 0.0}},
-            "publish.shape.spacing_mm = 0.0",
-        ),
-        (
-            {"subscribe__shape": {"topic": "/flexneedle/needle/shape", "frame": "skin"}},
-            'subscribe.shape.topic = "/flexneedle/needle/shape"',
-        ),
+        ({"publish__tip": TOPIC | {"topic": "tip"}}, 'publish.tip.topic = "tip"'),
+        ({"publish__tip": TOPIC | {"topic": "/a b"}}, 'publish.tip.topic = "/a b"'),
+        ({"publish__tip": TOPIC | {"frame": "nose"}}, 'publish.tip.frame = "nose"'),
+        ({"publish__tip": TOPIC | {"unit": "in"}}, 'publish.tip.unit = "in"'),
+        ({"publish__tipp": TOPIC}, "publish.tipp = {…}"),
+        ({"publish__shape": TOPIC | {"spacing_mm": 0.0}}, "publish.shape.spacing_mm = 0.0"),
+        ({"subscribe__shape": TOPIC | {"topic": SHAPE}}, f'subscribe.shape.topic = "{SHAPE}"'),
         ({"frames__skin": {"id": "skin", "x": "z"}}, 'frames.skin = ["z", "y", "z"]'),
         ({"frames__skin": {"id": "skin", "y": "-y"}}, 'frames.skin = ["x", "-y", "z"]'),
         ({"frames__skin": {"id": ""}}, "frames.skin.id"),

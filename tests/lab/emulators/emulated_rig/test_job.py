@@ -15,12 +15,7 @@ from flexneedle.lab.emulators.emulated_rig.motors import address_of, make_contro
 from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle
 from flexneedle.lab.emulators.emulated_rig.phantom import draw_phantom, make_sensor
 from flexneedle.lab.emulators.emulated_rig.rig import split_fault
-from flexneedle.lab.emulators.emulated_rig.stream import (
-    ChannelEnded,
-    Record,
-    receive_records,
-    send_record,
-)
+from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
 from flexneedle.lab.emulators.emulated_rig.tracker import noise_of, port_of
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.rig_file import RIGS, RigFile, load_rig

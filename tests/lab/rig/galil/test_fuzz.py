@@ -71,10 +71,7 @@ REPLY = st.one_of(
 )
 
 
-@settings(
-    max_examples=150,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(answer=REPLY, name=st.sampled_from(sorted(fuzz_galil.ACTIONS)), seed=st.integers(0, 100))
 def test_any_reply_is_a_state_that_was_sent_or_an_error_in_time(driven, answer, name, seed):
     motors, device = driven

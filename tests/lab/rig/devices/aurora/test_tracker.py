@@ -99,32 +99,6 @@ def test_at_40_hz_no_frame_is_lost_and_each_is_correct(path):
     assert_times_of_measurement(frames)
 
 
-def missed_while_suspended(aurora, process):
-    """Return the number of frames lost while a process is suspended for six frame periods."""
-    read_until(aurora, at_least(5))
-    before = aurora.counts.missed
-    process.suspend()
-    until(lambda: aurora.status != VISIBLE)
-    process.resume()
-    read_until(aurora, at_least(10))
-    return aurora.counts.missed - before
-
-
-@pytest.mark.slow
-def test_a_suspended_emulator_loses_no_frames_and_a_suspended_link_does():
-    """The clock of the emulated device stops meanwhile, but not the clock of the link.
-
-    A machine under load may stop either process as well; each is suspended until the effect is observed.
-    """
-    with emulated("--seed", "1") as path, Aurora(path, WallClock()) as aurora:
-        device, link = process_of("emulate aurora --seed 1"), process_of("aurora.link")
-        until(lambda: missed_while_suspended(aurora, device) <= 2)
-        before = aurora.counts.missed
-        until(lambda: missed_while_suspended(aurora, link) >= 5)
-        assert aurora.counts.missed >= before + 5
-        assert aurora.counts.reconnections == 0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.4, 0.6])
 def test_a_tracker_with_replies_beyond_the_timeout_gives_no_frames(delay):
@@ -136,10 +110,7 @@ def test_a_tracker_with_replies_beyond_the_timeout_gives_no_frames(delay):
 
 
 def test_old_firmware_is_read_in_text_and_ports_can_be_named():
-    with (
-        emulated("--no-bx", "--sensors", "3") as path,
-        Aurora(path, WallClock(), ("ref1", "tip")) as aurora,
-    ):
+    with emulated("--no-bx", "--sensors", "3") as path, Aurora(path, WallClock(), ("ref1", "tip")) as aurora:
         frames, _ = read_until(aurora, at_least(10))
     assert set(frames[0].readings) == {"ref1", "tip", "port3"}
     assert statuses_of(frames) == [VISIBLE]
