@@ -112,33 +112,28 @@ def configure(address, line):
         assert connection.recv(100) == b":" * (1 + line.count(";"))
 
 
-@pytest.mark.parametrize(
-    ("setup", "why", "note"),
-    [
-        ("OEA=0", "insertion: the motor does not follow: 0.", HELD),
-        ("OEA=1;ERA=100", "insertion: the motor is off", "^$"),
-    ],
-)
-def test_an_axis_that_was_blocked_or_switched_off_moves_again_after_reset_and_arm(
-    controller, setup, why, note
-):
+def test_an_axis_that_was_blocked_or_switched_off_moves_again_after_reset_and_arm(controller):
     address, order = controller
-    configure(address, setup)
     driver = DeviceSection(kind="galil", address=address, reply_timeout_ms=1000.0)
     with SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver})) as supervisor:
-        supervisor.arm()
-        order("fault stall=A")
-        at = supervisor.positions["insertion"]
-        with pytest.raises(DriverError, match=why):
-            supervisor.move_to("insertion", at + 5.0)
-        supervisor.stop()
-        supervisor.reset()
-        assert re.match(note, supervisor.arm())
-        motor = supervisor.report.axes["insertion"].motor
-        assert (motor.on, motor.commanded) == (True, motor.position)
-        order("clear")
-        supervisor.move_to("insertion", at + 2.0)
-        assert supervisor.positions["insertion"] == pytest.approx(at + 2.0, abs=0.02)
+        for setup, why, note in (
+            ("OEA=0", "insertion: the motor does not follow: 0.", HELD),
+            ("OEA=1;ERA=100", "insertion: the motor is off", "^$"),
+        ):
+            configure(address, setup)
+            supervisor.arm()
+            order("fault stall=A")
+            at = supervisor.positions["insertion"]
+            with pytest.raises(DriverError, match=why):
+                supervisor.move_to("insertion", at + 5.0)
+            supervisor.stop()
+            supervisor.reset()
+            assert re.match(note, supervisor.arm())
+            motor = supervisor.report.axes["insertion"].motor
+            assert (motor.on, motor.commanded) == (True, motor.position)
+            order("clear")
+            supervisor.move_to("insertion", at + 2.0)
+            assert supervisor.positions["insertion"] == pytest.approx(at + 2.0, abs=0.02)
 
 
 def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, capsys, tmp_path):

@@ -62,7 +62,7 @@ class SupervisorClient(SupervisorConnection):
         A motor at rest that is more than its largest error from its commanded position is switched off and on again,
         so that it is held at its position. Returns a note about it, or "".
         """
-        self._check_follower()
+        self._check_listener()
         refused = None
         try:
             self._request(protocol.ArmCommand(deepest))
@@ -150,7 +150,7 @@ class SupervisorClient(SupervisorConnection):
         return done
 
     def _carry_out(self, made: Callable[[int], protocol.Request]) -> protocol.MotionResult:
-        self._check_follower()  # before anything begins to move
+        self._check_listener()  # before anything begins to move
         self._number += 1
         number = self._number
         self._send(made(number))

@@ -97,7 +97,7 @@ class SupervisorConnection:
 
     @property
     def pid(self) -> int:
-        """Number of the supervisor's process."""
+        """Identifier of the process of the supervisor."""
         return self._process.pid
 
     @property
@@ -178,7 +178,7 @@ class SupervisorConnection:
             if self._ended is not None:
                 raise self._end_error()
             if not stopped:
-                self._check_follower()
+                self._check_listener()
             if self._latest is not None:
                 silent = monotonic() - self._latest_at
                 if silent > _SILENT_S and not self._await_late_report():
@@ -209,7 +209,7 @@ class SupervisorConnection:
         if state is SupervisorState.STOPPED:
             raise StoppedError(f"stopped: {why}")
 
-    def _check_follower(self) -> None:
+    def _check_listener(self) -> None:
         """Raise the exception of `on_report`, before anything moves. The rig can still be stopped."""
         if self._failed is not None:
             self._failure_raised = True
