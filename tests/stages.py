@@ -305,6 +305,14 @@ class Bench:
         """Arguments of the calls of the motors with this name."""
         return [call[1:] for call in self.stage.calls if call[0] == name]
 
+    def assert_rests(self):
+        """Assert that motors are stopped and stay where they are."""
+        self.tick(20)
+        at = {channel: motor.position for channel, motor in self.stage.motors.items()}
+        self.tick(40)
+        assert at == {channel: motor.position for channel, motor in self.stage.motors.items()}
+        assert self.core.at_rest
+
     def place(self, channel, counts):
         """Let a motor rest at a position."""
         motor = self.stage.motors[channel]

@@ -15,22 +15,6 @@ AHEAD = Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
 LOST = (math.nan, 0.0, 0.0)
 
 
-@pytest.fixture
-def bench():
-    made = Bench().armed()
-    made.tick(3)
-    return made
-
-
-def assert_rests(bench):
-    """Assert that the needle rests."""
-    bench.tick(20)
-    at = bench.position("insertion")
-    bench.tick(40)
-    assert bench.position("insertion") == at
-    assert bench.core.at_rest
-
-
 @pytest.mark.parametrize(
     ("tip", "seconds", "why"),
     [
@@ -53,7 +37,7 @@ def test_a_bad_reading_holds_the_needle(bench, tip, seconds, why):
     assert done.begun < done.ended <= bench.clock.now()
     speed = done.travelled["insertion"] / (done.ended - done.begun)
     assert speed == pytest.approx(0.5, rel=0.1)
-    assert_rests(bench)
+    bench.assert_rests()
 
 
 @pytest.mark.parametrize(("bad", "why"), [("late", "stale: 0.4"), ("indicator", "field distorted: ref1 0.")])
@@ -95,14 +79,14 @@ def test_a_held_needle_moves_only_after_a_new_step_with_good_readings(bench):
     bench.step(expected=AHEAD)
     bench.camera.tip = lambda _: (0.5, 5.0, 0.0)
     bench.until(1)
-    assert_rests(bench)
+    bench.assert_rests()
     bench.step(2, expected=AHEAD)
     done = bench.until(2)
     assert (done.why[:10], done.travelled["insertion"]) == ("innovation", 0.0)
     bench.camera.tip = lambda time: (0.5, 0.0, 1e-3 * time)
     bench.tick(200)
     assert bench.state is SupervisorState.HOLDING
-    assert_rests(bench)
+    bench.assert_rests()
     bench.step(3, expected=AHEAD)
     assert bench.until(3).why == ""
     assert bench.state is SupervisorState.INSERTING
@@ -148,7 +132,7 @@ def test_a_roll_is_completed_when_the_needle_is_held(bench):
     assert done.why.startswith("not a number: x nan")
     assert done.travelled["rotation"] == pytest.approx(math.pi, abs=0.02)
     assert done.travelled["insertion"] == 0.0
-    assert_rests(bench)
+    bench.assert_rests()
 
 
 def test_during_a_roll_the_tip_is_expected_at_rest(bench):

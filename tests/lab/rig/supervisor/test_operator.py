@@ -8,13 +8,6 @@ from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from stages import Bench, rig_file
 
 
-@pytest.fixture
-def bench():
-    made = Bench().armed()
-    made.tick(3)
-    return made
-
-
 def test_an_axis_is_jogged_and_the_base_only_retracts(bench):
     bench.move("guide_y", 3.0, 2.0)
     assert bench.state is SupervisorState.JOGGING

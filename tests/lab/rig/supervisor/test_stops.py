@@ -9,23 +9,6 @@ from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from stages import TICK_S, Bench, rig_file
 
-
-@pytest.fixture
-def bench():
-    made = Bench().armed()
-    made.tick(3)
-    return made
-
-
-def assert_rests(bench):
-    """Assert that motors are stopped and stay where they are."""
-    bench.tick(20)
-    at = {channel: motor.position for channel, motor in bench.stage.motors.items()}
-    bench.tick(40)
-    assert at == {channel: motor.position for channel, motor in bench.stage.motors.items()}
-    assert bench.core.at_rest
-
-
 # Faults of motors
 
 
@@ -63,7 +46,7 @@ def test_a_fault_of_a_motor_during_a_step_stops_all_of_them(bench, change, why):
     bench.stage.lost, bench.stage.motors = False, kept
     if why.endswith("nan"):
         bench.place("C", 0.0)
-    assert_rests(bench)
+    bench.assert_rests()
     assert abs(bench.position("insertion") - at) <= 0.5
 
 
@@ -153,7 +136,7 @@ def test_a_lost_controller_is_reconnected_and_stopped_before_a_reset_is_accepted
     bench.tick(20)
     assert len(bench.calls("stop")) > before
     assert bench.calls("reconnect")
-    assert_rests(bench)
+    bench.assert_rests()
     bench.reset()
     assert bench.state is SupervisorState.IDLE
 
@@ -171,7 +154,7 @@ def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
     bench.stage.motors["A"].speed, bench.stage.motors["A"].target = 5000.0, 50_000.0
     bench.tick(3)
     assert len(bench.calls("stop")) > before
-    assert_rests(bench)
+    bench.assert_rests()
     assert bench.position("insertion") < 1.0
 
 
@@ -188,7 +171,7 @@ def test_a_stop_is_repeated_until_motors_rest_and_a_second_one_is_sent_at_once(b
     bench.tick(15)
     assert bench.calls("stop")
     assert bench.why == "one"
-    assert_rests(bench)
+    bench.assert_rests()
 
 
 @pytest.mark.parametrize("every", [1, 2, 7, 60])  # ticks: a ROS node repeats a stop until it is reported
@@ -231,7 +214,7 @@ def test_a_limit_switch_that_becomes_active_while_its_motor_rests_is_a_fault(ben
     assert bench.why == f"guide_y: at rest, {names} limit switch active"
     assert bench.until(1).state is SupervisorState.FAULT
     assert bench.position("insertion") < 1.0
-    assert_rests(bench)
+    bench.assert_rests()
 
 
 def test_a_limit_switch_that_becomes_active_as_its_motion_ends_is_a_fault(bench):
@@ -319,7 +302,7 @@ def test_after_a_stop_nothing_moves_until_the_rig_is_reset_and_armed(bench, inse
         done = bench.until(1)
         assert (done.state, done.why) == (SupervisorState.STOPPED, "the keyboard")
         assert 0.0 < done.travelled["insertion"] < 1.0
-    assert_rests(bench)
+    bench.assert_rests()
     bench.step(2)
     assert bench.refusal.startswith("step: refused while stopped: the keyboard")
     bench.armed()
@@ -335,7 +318,7 @@ def test_a_motion_without_a_heartbeat_is_stopped(bench):
     assert bench.state is SupervisorState.STOPPED
     assert bench.why.startswith("no heartbeat of the controller for 0.5")
     assert bench.position("insertion") < 1.3
-    assert_rests(bench)
+    bench.assert_rests()
 
 
 def test_an_insertion_without_a_command_is_stopped(bench):
