@@ -21,9 +21,9 @@ _UNITS = {SECONDS: " s", MM: " mm", RATIO: ""}
 
 @dataclass(frozen=True)
 class FaultKind:
-    """A kind of fault: its description, the detail if none is given, and what the detail may be.
+    """A kind of fault: its description, default detail, and the form of the detail.
 
-    form: SECONDS, BYTE, MM, RATIO, or what the detail names ("sensor", one of `choices`); "": it takes none.
+    form: SECONDS, BYTE, MM, RATIO, or the noun of the detail ("sensor", one of `choices`); "": no detail.
     """
 
     text: str
@@ -141,7 +141,7 @@ class FaultSchedule:
         return active_faults((*begun, *self.ordered), now)
 
     def obey(self, line: str, now: float) -> str:
-        """Inject the fault of a line from `now` (s) on, or end all; return what was done. Raises InputError."""
+        """Inject the fault of a line from `now` (s) on, or end all; return its description. Raises InputError."""
         fault = parse_order(line, self.kinds, now)
         if fault is None:
             self.scheduled = self.ordered = ()

@@ -62,7 +62,7 @@ class EmulatorSession:
         self.schedule = FaultSchedule(aurora.FAULTS, self.faults)
 
     def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; of the scheduled ones none before tracking first begins."""
+        """Return the active faults by kind; scheduled ones begin with tracking."""
         return {fault.kind: fault for fault in self._active_faults(now)}
 
     def _active_faults(self, now: float) -> tuple[Fault, ...]:

@@ -13,7 +13,7 @@ from flexneedle.scenario.model import Scenario
 
 @dataclass(frozen=True)
 class EmulationJob:
-    """A rig, the scenario of its phantom, the seed of what is drawn, and the file of the true states or None.
+    """A rig, the scenario of its phantom, the seed of the draw, and the file of the true states or None.
 
     faults: texts of scheduled faults by device, "aurora" or "galil".
     """

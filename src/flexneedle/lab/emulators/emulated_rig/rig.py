@@ -96,7 +96,7 @@ class EmulatedRig:
                         self._say({"device": name, **message})
 
     def _start(self, name: str, ends: tuple[socket.socket, ...]) -> Any:
-        """Start a process and wait until it is ready; return what it reports then."""
+        """Start a process and wait until it is ready; return its report."""
         descriptors = tuple(end.fileno() for end in ends)
         part = self._parts[name] = ChildProcess(f"{__package__}.{_MODULES[name]}", descriptors=descriptors)
         part.channel.send(self._job)

@@ -1,7 +1,7 @@
 """Emulated controller on TCP, with its time and faults. It runs until interrupted.
 
 Its motors run in real time, also while this process is not scheduled: before each command, and every few milliseconds,
-the samples are made up to the present.
+all samples up to the present are computed.
 """
 
 import os
@@ -68,7 +68,7 @@ _CHATTER = b" 17.0000\r\n"
 
 
 Observer = Callable[[float, Sequence[float], bool], None]
-"""Called with a time (s, monotonic), the travel of each motor since power-on (counts, whatever its position is called),
+"""Called with a time (s, monotonic), the travel of each motor since power-on (counts, independent of DP),
 and whether one moves, or has been commanded to, from then on."""
 
 
@@ -95,7 +95,7 @@ class GalilSession:
         self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; of the scheduled ones none before the first motion."""
+        """Return the active faults by kind; scheduled ones begin with the first motion."""
         return {fault.kind: fault for fault in self._active_faults(now)}
 
     def _active_faults(self, now: float) -> tuple[Fault, ...]:
@@ -283,7 +283,7 @@ class TcpServer:
         self.clients.remove(client)
 
     def send_due(self, now: float) -> None:
-        """Send the replies that are due; what a connection does not take at once is lost."""
+        """Send the replies that are due; data that a connection does not accept at once are lost."""
         for client in list(self.clients):
             while client.due and client.due[0][0] <= now:
                 try:

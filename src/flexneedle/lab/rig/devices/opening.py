@@ -197,7 +197,7 @@ class GuardedDevice:
         self._name, self._owner, self._device, self._rules = name, owner, device, rules
 
     def __getattr__(self, part: str) -> Any:
-        """Return a part of the device, guarded. Raises AttributeError where the device has none."""
+        """Return a part of the device, guarded. Raises AttributeError if the device lacks it."""
         with convert_exceptions(f"{self._name}: {part}"):
             value = getattr(self._device, part, _NONE)
         if value is _NONE:
@@ -216,7 +216,7 @@ class GuardedDevice:
                 value = call(*given, **named)
         except DriverError:
             raise
-        except FlexneedleError as error:  # such as one of a function of this package which the device calls
+        except FlexneedleError as error:  # of a function of this package that the device calls
             raise DriverError(make_printable(f"{self._name}: {part}: {one_line(error)}")) from error
         rule = self._rules.get(part)
         return value if rule is None else self._checked(f"{part}()", rule, value)
@@ -233,7 +233,7 @@ class GuardedDevice:
 
 
 def text_rule(value: object) -> str:
-    """Return the rule that a value breaks which must be text."""
+    """Return the rule that a value breaks that must be text."""
     return "" if isinstance(value, str) else f"must be text, not {_kind(value)}"
 
 

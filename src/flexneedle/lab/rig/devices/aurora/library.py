@@ -142,7 +142,7 @@ class AuroraDevice:
         return form[1].decode(), form[2].decode()
 
     def reading(self, command: str, handle: int) -> tuple[int, int, int, tuple[float, ...]]:
-        """Return frame number, kind (0: measured; else ndicapi's reason for none), port status and pose.
+        """Return frame number, kind (0: measured; else ndicapi's reason for a missing pose), port status and pose.
 
         command: "BX" or "TX", the command of the last reply. The pose is q0, qx, qy, qz, x, y, z (mm), indicator.
         """

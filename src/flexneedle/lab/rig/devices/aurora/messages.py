@@ -33,7 +33,7 @@ def message_channel(end: socket.socket) -> MessageChannel:
 
 
 def parse(data: bytes) -> Message:
-    """Return the message in data of a link. Raises ValueError if it is none."""
+    """Return the message in data of a link. Raises ValueError for an invalid one."""
     try:
         return _MESSAGE.validate_json(data)
     except ValidationError:

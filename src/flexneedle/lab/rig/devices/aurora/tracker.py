@@ -29,7 +29,7 @@ class Aurora:
 
     clock: of the run, in real time. names: of the sensors at ports 1, 2, ….
     After a failure of the line `status` gives the reason, and the link reconnects until frames arrive again. A link is
-    also ended if it sends what is not a message, or a frame that is not new.
+    also ended if it sends an invalid message, or a frame that is not new.
     Raises InputError if there is no such port or ndicapi is not installed, RunError if no tracker replies there.
     """
 
@@ -107,7 +107,7 @@ class Aurora:
         try:
             try:
                 self._listen(link)
-            finally:  # also if it sent what is no message, and would continue
+            finally:  # also if it sent an invalid message, and would continue
                 code = link.end(_STOP_S, terminate=not link.channel.ended)
             self._record_end(code, link.last_line())
         finally:

@@ -27,7 +27,7 @@ def format_operands(name: str, letters: str) -> str:
 
 
 def make_query(letter: str) -> tuple[str, int]:
-    """Return what to ask for the setup of an axis, and the number of its answers."""
+    """Return the query for the setup of an axis, and the number of its answers."""
     return f"MG {','.join(f'_{name}{letter}' for name in _SETUP)}", len(_SETUP)
 
 

@@ -1,8 +1,8 @@
 """The TCP line to a Galil controller: a line of commands, and the replies to them, within a time limit.
 
-A reply belongs to the line before it and to no other. Where that is in doubt (no reply in time, garbled or surplus
-bytes, a message that was not asked for, a broken connection), the connection is closed, so that what comes late is
-attributed to nothing; until `open`, every call is refused.
+A reply belongs to the line before it and to no other. If this is in doubt (no reply in time, garbled or surplus bytes,
+an unsolicited message, a broken connection), the connection is closed, so that late data are attributed to no command;
+every call is refused until `open`.
 """
 
 import socket
@@ -26,9 +26,9 @@ _REMEDY = "check the power, the cable and the address of the controller, and sta
 
 
 class Link:
-    """A connection to a controller. It opens none by itself. Not for several threads.
+    """A connection to a controller, which `open` makes. Not for several threads.
 
-    farewell: a line that is sent before a connection is closed because of a failure, its replies not waited for: the
+    farewell: a line that is sent before a connection is closed because of a failure, without waiting for replies: the
     stop of motors whose state is unknown. Deadlines are times of the monotonic clock; a reply that is there in time
     counts even if this process notices it late. Raises DriverError if the host is unknown (that look-up, and no later
     call, may take seconds).
@@ -59,7 +59,7 @@ class Link:
         return self._socket is not None
 
     def open(self, deadline: float) -> None:
-        """Drop the connection, if there is one, and open a new one. Raises DriverError."""
+        """Open a new connection in place of an open one. Raises DriverError."""
         self.close()
         connection = socket.socket(self._family, socket.SOCK_STREAM)
         try:

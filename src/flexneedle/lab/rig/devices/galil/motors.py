@@ -47,10 +47,10 @@ def factory(settings: Mapping[str, Any], channels: Sequence[str]) -> "GalilMotor
 class GalilMotors:
     """Motors by channel, the axis letters A to H. Positions are whole counts: targets are rounded to the nearest.
 
-    Connecting enables no motor and moves none. Each call takes at most the reply timeout. Where a reply is missing, or
-    is not one to what was asked, the connection is closed until `reconnect`, after one more stop for the motors if this
-    object has commanded anything: who only reads stops nobody's motion. Use it as a context manager, or call `close`.
-    Not for several threads.
+    Connecting enables no motor and moves none. Each call takes at most the reply timeout. If a reply is missing or does
+    not match the commands, the connection is closed until `reconnect`. Before that the motors are stopped, if this
+    object has commanded anything: a driver that only reads stops no motion of another program. Use it as a context
+    manager, or call `close`. Not for several threads.
 
     settings, channels: see `factory`. Raises DriverError if the controller cannot be reached or is not fit: a stepper,
     whose position is not measured, or a format of positions (PF) or sample time (TM) other than the default.
@@ -234,7 +234,7 @@ class GalilMotors:
     def stop(self) -> None:
         """Stop all channels at once; motors stay powered.
 
-        They slow down with their deceleration. A further call, after the time that this takes, aborts what still moves:
+        They slow down with their deceleration. A further call, after the time that this takes, aborts remaining motion:
         AB 1, which stops all axes of the controller without deceleration, and switches off motors with OE.
         """
         deadline = self._deadline()
@@ -268,7 +268,7 @@ class GalilMotors:
     def set_speed(self, channel: str, speed: float, acceleration: float) -> None:
         """Limit speed (counts/s) and acceleration (counts/s²) of present and later motions.
 
-        They are rounded down to what the controller has: speeds to multiples of 2, accelerations to multiples of 1024.
+        They are rounded down to the controller's steps: speeds to multiples of 2, accelerations to multiples of 1024.
         The deceleration is the acceleration; a controller refuses to change it during a motion to a position.
         """
         self._check_channel(channel)

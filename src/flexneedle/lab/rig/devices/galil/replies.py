@@ -20,7 +20,7 @@ _SEPARATOR = re.compile(r", *| +")
 
 
 class GarbledError(ValueError):
-    """Bytes that are no reply to what was asked. The message has the reason."""
+    """Bytes that are not a reply to the commands. The message has the reason."""
 
 
 @dataclass(frozen=True)
