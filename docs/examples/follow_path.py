@@ -1,4 +1,4 @@
-"""Follow the planned path of the guide, corrected by a share of the tip's deviation."""
+"""Follow the planned path of the guide, corrected for the tip's deviation."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ class Settings(Section):
     """Section `control.follow_path`."""
 
     gain: float = 0.8
-    """Correction of the guide per deviation of the tip from the planned path (mm/mm)."""
+    """Correction of the guide per deviation of the tip (mm/mm)."""
 
 
 def decide(task, rolls, estimate, rng):
-    """Advance by a full step; move guide and bevel as planned for that depth, and correct the guide."""
+    """Advance by a full step; move guide and bevel as planned, and correct the guide."""
     setup, plan = task.scenario.setup, task.plan
     advance = min(setup.max_advance_mm, travel_left(task.scenario, plan, estimate.state))
     x, depth = estimate.tip[X], plan.tips[:, X]

@@ -45,7 +45,7 @@ class Stage:
         self.time = now
 
     def read(self):
-        """Return the present state of each channel; on hardware, ask the controller, never repeat an old answer."""
+        """Return the present state of each channel; on hardware, never an old answer."""
         self.advance()
         return {
             channel: MotorState(m.position, m.position, moving=abs(m.goal - m.position) > 0.5, on=m.on)
