@@ -23,7 +23,7 @@ ADAPTIVE = CONTROLLERS["adaptive-mpc"]
 
 
 def estimate_of(state, scenario=PHANTOM, **fields):
-    """An estimate that the needle is so."""
+    """An estimate of this state."""
     begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.roll))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 

@@ -42,7 +42,7 @@ WAVES = tuple(
 
 
 def commands(count):
-    """Advance by 1 mm a move; the guide goes here and there."""
+    """Advances by 1 mm, with a guide that moves to and fro."""
     guide = 0.12 * np.sin(0.35 * np.arange(count)) + 0.05
     return [Control(db_x=1.0, dg_y=float(guide[k]), flip=k in ROLLS) for k in range(count)]
 
@@ -110,7 +110,7 @@ def readings(needle, before, after, start, count, noise, rng):
 
 
 def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2, rows=None):
-    """The estimate after some moves, the readings coming a number of moves late; the needle's states."""
+    """The estimate after some moves with readings that are some moves late, and the needle's states."""
     rows, rng = rows or commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
     estimate = Identification().begin(begun_with(Simulator(scenario, threads)))
@@ -131,7 +131,7 @@ def fitted(name, count=70):
 
 
 def ahead(estimate, needle, states, scenario=QUIET, steps=8):
-    """Errors (mm) of the measured tip after further steps, of the estimate and of the prior's mean; no readings."""
+    """Errors (mm) of the tip after further steps without readings, by the estimate and by the prior's mean."""
     plain = Needle(modulus=(1.0,) * len(needle.modulus), shift=(0.0,) * len(needle.shift))
     nominal, own = plain.simulator(scenario), needle.simulator(scenario)
     naive = nominal.start()

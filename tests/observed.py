@@ -16,7 +16,7 @@ AHEAD = Control(db_x=1.0)
 
 
 def start_with(scenario, **corrections):
-    """A needle in air whose base isn't where the model has it."""
+    """A needle in air whose base differs from the model's."""
     simulator = Simulator(scenario)
     return simulator.step(simulator.start().with_estimate(**corrections), Control())
 
@@ -45,7 +45,7 @@ def readings_between(before, after, start=0.0, count=4):
 
 
 def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
-    """Advance plant and estimate together; the estimates, and the innovations of each period."""
+    """Advance plant and estimate together; return both and the innovations of each period."""
     rng = np.random.default_rng(0)
     command = AHEAD._replace(dg_y=guide)
     innovations = []

@@ -12,7 +12,7 @@ def task_of(simulator, plan, controller=DEFAULT):
 
 
 def begun_with(simulator, roll=0.0, controller=DEFAULT):
-    """A task whose plan has no more than the needle's roll and a target: enough for an observer."""
+    """A task whose plan has only the needle's roll and a target, which an observer needs."""
     target = simulator.scenario.target.position
     return task_of(simulator, SimpleNamespace(roll=roll, target=target), controller)
 

@@ -18,8 +18,12 @@ def test_a_target_that_one_search_misses_is_planned_with_each_width():
     assert row["after_s"] > row["before_s"] > 0.0
 
 
-def test_the_edge_is_where_the_needle_ends_at_most_at_the_largest_lateral_offset(monkeypatch):
+@pytest.mark.long
+def test_the_edge_is_where_the_needle_ends():
     assert far_targets.edge(world(1), 6.8, -1.0) == pytest.approx(7.65, abs=0.1)
+
+
+def test_the_edge_is_at_most_at_the_largest_lateral_offset(monkeypatch):
     for end, edge in ((-99.0, world(4).setup.max_lateral), (1.0, 0.0)):
         monkeypatch.setattr(far_targets, "once", lambda *_, y=end: SimpleNamespace(tip_mm=(11.5, y, 0.0)))
         assert far_targets.edge(world(4), 11.5, -1.0) == edge

@@ -96,7 +96,7 @@ def test_runs_with_different_periods_are_compared_at_the_same_time():
 
 
 def test_the_deviation_from_a_path_is_lateral_and_at_the_same_depth():
-    """Half as fast on the same path is no deviation, 0.3 mm beside it is 0.3 mm."""
+    """Half the speed on the same path is no deviation; a path 0.3 mm beside it deviates by 0.3 mm."""
     fast, slow = record([0.0] * 10), record([0.0] * 10, step=0.4)
     beside = record([0.0] * 10, [[k, 0.3] for k in range(10)], step=0.4)
     assert study.path_deviation(fast, slow, 1.0) == pytest.approx(0.0, abs=1e-12)

@@ -39,7 +39,7 @@ def inserted(simulator):
 
 
 def ends(state, *, first=0.0, then=0.0):
-    """y + iz of the tip at the target's depth: rolled by angles (rad) before the next step and before the second."""
+    """y + iz of the tip at the target's depth, with rolls (rad) before the next step and before the second."""
     rows = controls(1, 60, db_x=0.5)
     rows[0, 0, ROLL], rows[0, 2, ROLL] = first, then
     tips = SIMULATOR.rollout(state, rows, limits=False).tips[0]
@@ -67,9 +67,9 @@ def test_it_aims_from_where_the_current_path_ends_to_the_target(state, offset):
 @pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -2.0])
 @pytest.mark.parametrize("beyond", [3.0, -0.2])
 def test_the_reach_after_a_step_is_a_disc(state, direction, beyond):
-    """Without uncertainty: the distance from the disc, for a roll at once towards the target or away from it.
+    """Without uncertainty the expected distance is the distance from the disc, after a roll towards or away.
 
-    The disc by four directions of the bevel after that roll, on the same model.
+    The reference is a disc through four directions of the bevel after that roll, on the same model.
     """
     rolled = {
         side: [ends(state, first=side, then=turn) for turn in np.arange(4) * 0.5 * math.pi]
@@ -109,7 +109,7 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
 
 
 def test_the_disc_is_charged_with_a_margin_of_its_uncertainty(state):
-    """Three times as uncertain, more of the target is expected beyond it."""
+    """With three times the uncertainty the expected distance is larger."""
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
     task, estimate, memory, ahead = prepared(state, middle + 2.0)
     estimate = replace(estimate, precision=1e-8 * estimate.precision)
@@ -134,9 +134,7 @@ def outlook(state):
 
 
 def test_the_deviations_of_the_shape_are_those_of_needles_drawn_from_the_estimate(outlook):
-    """Each is corrected by its own miss but for a rest of some deviation on each axis; 1.4 times as far from the
-    estimate as its covariance has it.
-    """
+    """Each drawn needle is 1.4 times as far off as the covariance, and corrects its own miss but for a rest."""
     estimate, derivatives, lever = outlook
     rng, rest = np.random.default_rng(4), 0.3
     drawn = 1.4 * rng.multivariate_normal(
@@ -153,7 +151,7 @@ def test_the_deviations_of_the_shape_are_those_of_needles_drawn_from_the_estimat
 
 
 def test_the_deviation_of_the_miss_is_that_on_one_axis(outlook):
-    """The mean over both of needles drawn from the estimate."""
+    """The reference is the mean over both axes of needles drawn from the estimate."""
     estimate, derivatives, _ = outlook
     rng = np.random.default_rng(5)
     drawn = rng.multivariate_normal(

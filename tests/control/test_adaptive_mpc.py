@@ -77,7 +77,7 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
 
 @pytest.mark.parametrize("offset", [-1.0, 1.0])
 def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, along, offset):
-    """With a base clamp that is off, where the plan's guide would miss."""
+    """The base clamp is off, so that the planned guide would miss."""
     estimate = estimate_of(along(quick_plan, 20, base=(offset,)), ACCURATE)
     ahead = adaptive_mpc.Ahead.of(
         task_of(estimate.nominal, quick_plan), estimate.state, path_of_plan(quick_plan)
@@ -160,7 +160,7 @@ def test_a_roll_stays_planned_until_the_needle_has_rolled(quick_plan, along, car
 
 
 def test_the_predicted_miss_is_the_miss_of_the_path_found(quick_plan, along):
-    """Carried out on the model that is estimated: to rollouts with long steps."""
+    """The path is carried out on the estimated model, whose rollouts have longer steps."""
     estimate = estimate_of(along(quick_plan, 45))
     decision, memory = decided(quick_plan, estimate)
     task, state, path = task_of(estimate.nominal, quick_plan), estimate.state, memory.path
@@ -174,7 +174,7 @@ def test_the_predicted_miss_is_the_miss_of_the_path_found(quick_plan, along):
 
 
 def test_an_offset_of_the_axis_shifts_the_target(quick_plan, along):
-    """A tip measured 0.2 mm off the model's, and the target with it: the same command."""
+    """If the measured tip and the target are 0.2 mm off, the command is the same."""
     state = along(quick_plan, 45)
     here = decide(quick_plan, estimate_of(state))
     beside = replace(quick_plan, target=(quick_plan.target[0], quick_plan.target[1] + 0.2, 0.0))
@@ -197,7 +197,7 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
 
 
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
-    """Tissue thrice as stiff asks for another guide step, from the same state."""
+    """In tissue three times as stiff the guide step differs from the same state."""
     estimate = estimate_of(along(quick_plan, 55, base=(0.3,)))
     stiff = replace(
         estimate, simulator=estimate.nominal.with_adaptation(Adaptation(np.zeros(1), np.full(2, 3.0)))
@@ -207,7 +207,7 @@ def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
 
 
 def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monkeypatch):
-    """At the start, and where the miss is likely to be beyond the limit; not otherwise."""
+    """A longer search is made at the start, and where the miss is likely to exceed the limit."""
     efforts, search = [], adaptive_mpc.search_path
 
     def spied(*args):
@@ -273,7 +273,7 @@ def test_the_stroke_is_what_was_commanded_wherever_the_base_began(quick_plan, al
 
 
 def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
-    """There is no tissue to spare."""
+    """No tissue is displaced there."""
     shallow = replace(quick_plan, target=(0.05, 0.1, 0.0))
     decision = decide(shallow, estimate_of(Simulator(PHANTOM, 1).start()))
     assert np.isfinite([*decision.command, decision.cost, decision.miss, decision.miss_sd]).all()
@@ -346,7 +346,7 @@ def test_deciding_changes_neither_estimate_nor_plan_nor_memory(quick_plan, along
 @pytest.mark.long
 @pytest.mark.parametrize("number", [31, pytest.param(68, marks=pytest.mark.slow)])
 def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number):
-    """There the tip moves by millimetres within a step, and a reading is not on the chord of its move."""
+    """The tip moves by millimetres within a step, so that a reading is not on the chord of its move."""
     scenario = world(number, "perfect")
     plan = flexneedle.plan(scenario, seed=0)
     assert (

@@ -36,7 +36,7 @@ def estimates(plan, controller, steps):
 
 @pytest.mark.parametrize("steps", [0, 15, 26])
 def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
-    """All of guide, base and rolls; the shape at its end is the plan's, to the length of a step at each roll."""
+    """Guide, base and rolls are complete; the final shape is the plan's, but for the length of a step at each roll."""
     task, estimate = estimates(plan, "open-loop", steps)
     rows = remaining_controls(task, estimate)
     left = plan.controls[steps:]
@@ -53,7 +53,7 @@ def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
 
 
 def test_the_base_goes_to_its_planned_pose(plan):
-    """In the rest of a plan that moves it along and turns it about every axis that it has."""
+    """The plan moves and turns the base on every axis of the scenario."""
     columns = [DB_Y, DB_THETA] if plan.scenario.setup.axes == 1 else [DB_Y, DB_Z, DB_THETA, DB_PSI]
     rows = plan.controls.copy()
     rows[:, columns] = 1e-3 * np.arange(1, 1 + len(columns))

@@ -26,7 +26,7 @@ def command(plan, estimate, **settings):
 
 
 def aimed(plan, state, lateral, ahead=20.0):
-    """The plan with a target at these distances ahead of a tip and lateral of its line (mm)."""
+    """The plan with a target at these distances (mm) ahead of a tip and off its line."""
     x, y, _, theta, _ = state.tip
     return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + lateral), 0.0))
 
@@ -49,7 +49,7 @@ def test_the_bevel_rolls_to_the_target_in_tissue_and_stays_in_air(quick_plan, es
 
 
 def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
-    """Off the line by a share of half the paths' separation: the dead band decides, of that curvature."""
+    """The target is off the line by a share of half the paths' separation, which the curvature sets."""
     state = along(quick_plan, 50)
     half = 0.5 * 10e-3 * 20.0**2
     estimate = estimated(state)

@@ -130,7 +130,7 @@ def test_free_of_limits_and_weight_the_prediction_meets_the_path_at_every_step(q
 
 
 def test_the_cost_of_guide_steps_by_hand(quick_plan):
-    """One step to a path with a lateral offset of 0.2 mm, effect 1, weight 1: half of it."""
+    """With one step, effect 1 and weight 1 the guide takes half of a lateral offset of 0.2 mm."""
     found, cost = moves(straight(quick_plan, 0.2), np.eye(2), (10.0, 0.0), steps=1, guide_weight=1.0)
     assert found[0] == pytest.approx(0.1)
     assert cost == pytest.approx(0.02)
@@ -176,7 +176,7 @@ def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effec
 @pytest.mark.parametrize("delay", [1, 2])
 @pytest.mark.parametrize(("slope", "effect"), [(0.05, 1.0), (-0.03, 1.0), (0.03, 0.8)])
 def test_a_linear_needle_is_identified_and_kept_on_its_path(quick_plan, slope, effect, delay):
-    """Readings are held against the inputs of when they were taken: a late one costs no accuracy."""
+    """Readings are compared with the inputs at their time, so that late ones cost no accuracy."""
     tips, _, memory = linear_run(straight(quick_plan, 0.0), slope, effect, delay=delay)
     assert np.abs(tips[:3, 1]).max() > 0.02
     np.testing.assert_allclose(tips[20:, 1], 0.0, atol=5e-3)

@@ -110,7 +110,7 @@ def noise():
 
 @pytest.mark.parametrize("name", FIELD)
 def test_mirrored_plan_and_readings_give_mirrored_commands(short_plan, mirrored, estimated, name):
-    """Into tissue of another stiffness, with flips where the controller makes them."""
+    """The tissue has another stiffness; the controllers that flip do."""
     plant = short_plan.scenario.with_values({f"tissue.{k}.shear_modulus_kpa": 5.0 for k in (0, 1)})
     scenario = short_plan.scenario.with_values({"control.resolved_rate.curvature_per_m": 3.0})
     here, end = drive(name, short_plan, scenario, estimated, noise(), steps=30, plant=plant)
@@ -129,7 +129,7 @@ def test_the_end_is_at_the_target_depth(short_plan, estimated, name):
 
 
 def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, estimated):
-    """In tissue thrice as stiff as planned for, where the plan alone misses."""
+    """The tissue is three times as stiff as planned, so that the plan alone misses."""
     plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 6.0 for k in (0, 1)})
     blind, *steered = (
         abs(drive(name, quick_plan, PHANTOM, estimated, [0.0] * 80, steps=80, plant=plant)[1].tip[Y] - 5.0)

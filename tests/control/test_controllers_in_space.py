@@ -86,7 +86,7 @@ def test_a_controller_reaches_a_target_off_both_axes(plans, rig, controller, mos
 
 @pytest.mark.parametrize("controller", ["ce-mpc", "resolved-rate", "broyden-mpc"])
 def test_the_guide_moves_about_its_home_on_each_axis(plans, controller):
-    """Mounted off both axes by more than the guide's travel, with the plan moved there: the same commands."""
+    """If needle and plan are moved by more than the guide's travel, the commands stay the same."""
     y, z = -4.0, 7.0
     near = {"setup__max_guide_travel_mm": 3.0, "tracker__jitter_mm": 0.0}
     entry = {"entry__lateral_mm": y, "entry__lateral_z_mm": z}
@@ -179,7 +179,7 @@ def test_a_certain_miss_in_space_is_beyond_the_limit_or_not():
 
 
 def test_the_predicted_shape_ends_at_the_predicted_miss(plans):
-    """In each period: nodes to the target's depth; the end of the axis is as uncertain as the miss and the run-out."""
+    """The predicted nodes end at the target's depth, and are as uncertain there as the miss and the run-out."""
     done = inserted(plans["two axes"].scenario, "adaptive-mpc", plan=plans["two axes"])
     predicted = [period for period in done.periods if math.isfinite(period.miss_sd)]
     assert len(predicted) > 20

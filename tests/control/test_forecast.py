@@ -81,7 +81,7 @@ def warned(decisions):
 
 
 def test_several_likely_misses_in_a_row_make_a_warning():
-    """One alone does not, nor do as many with a good one in between."""
+    """One alone does not, nor do as many with a good decision in between."""
     bad, good = predicting(3.0, 0.5), predicting(0.1, 0.1)
     lines = warned([bad] * 5)
     first = next(k for k, line in enumerate(lines) if line)
@@ -91,7 +91,7 @@ def test_several_likely_misses_in_a_row_make_a_warning():
 
 
 def test_it_is_likely_from_a_probability_of_one_half_on():
-    """With a small standard deviation: where the predicted miss itself is beyond 1 mm, on either side."""
+    """With a small standard deviation, that is where the predicted miss itself exceeds 1 mm."""
     for miss, likely in ((0.999, 0), (1.001, 1), (-0.999, 0), (-1.001, 1)):
         assert count_likely_misses(predicting(miss, 0.05), 0) == likely
     assert count_likely_misses(predicting(1.5, 0.05), 4) == 5

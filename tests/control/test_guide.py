@@ -68,7 +68,7 @@ def test_the_refusal_comes_before_the_plan(tmp_path):
 
 
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
-    """With a base clamp that is off, which it would move the guide for otherwise."""
+    """The base clamp is off; otherwise the controller would move the guide."""
     state = along(steered, 40, base=(1.0,))
     choice = mpc.choose_step(
         Simulator(PHANTOM, 1), steered, state, CeMpc(), roll=0.0, rng=np.random.default_rng(0)

@@ -134,7 +134,7 @@ def test_cost_is_that_of_the_chosen_steps(plan, along):
 
 
 def test_each_step_is_compared_with_the_planned_guide_step(plan, along):
-    """With nothing but the guide's cost it repeats the plan, before a primitive's end and after it."""
+    """With only the guide's cost it repeats the plan, before the end of a primitive and after it."""
     alone = {
         "control.ce_mpc.horizon": 1,
         "control.ce_mpc.guide_weight": 1e6,
@@ -220,7 +220,7 @@ def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, estimated
 
 
 def test_planned_base_steps_are_followed_and_caught_up_with():
-    """A base step that was missed is made good, as fast as the limits allow, which hold for its travel too."""
+    """A missed base step is made up for as fast as the limits of step and travel allow."""
     plan = flexneedle.plan(PHANTOM.with_values({"plan.base_sigma_mm": 0.1, "plan.iterations": 2}), seed=3)
     scenario = PHANTOM.with_values({"setup.max_base_step_mm": 0.2})
     moved = np.cumsum(plan.controls[:, DB_Y])

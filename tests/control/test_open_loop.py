@@ -18,13 +18,13 @@ MOTORS = [DB_X, DG_Y]
 
 
 def truncated(moved, row, grid=0.01):
-    """A row as motors carry it out that stop at the last multiple of `grid` on the way."""
+    """A row as carried out by motors that stop at the last multiple of `grid` on the way."""
     ends = (moved + row) / grid
     return np.where(row >= 0.0, np.floor(ends + 1e-6), np.ceil(ends - 1e-6)) * grid - moved
 
 
 def replayed(plan, estimated, scenario=PHANTOM, motor=truncated):
-    """Commands, and where base x and guide stood after each, through a driver with a motor."""
+    """Commands, and the positions of base x and guide after each, with a driver's motor."""
     task = task_of(Simulator(scenario, threads=1), plan, "open-loop")
     state, memory = task.simulator.start(plan.roll), OPEN.begin(task)
     commands, places = [], []
@@ -39,7 +39,7 @@ def replayed(plan, estimated, scenario=PHANTOM, motor=truncated):
 
 
 def test_positions_follow_the_plan_through_a_motor_that_stops_short(quick_plan, estimated):
-    """Never more than one resolution behind; repeating the steps themselves loses some at each."""
+    """They lag by at most one resolution; repeated steps would lose some at each."""
     planned = np.cumsum(quick_plan.controls[:, MOTORS], axis=0)
     _, places = replayed(quick_plan, estimated)
     assert places.shape == planned.shape
@@ -79,7 +79,7 @@ def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, es
 
 
 def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, estimated):
-    """A plan of a larger setup: slower and with less lateral travel, without an exception."""
+    """A plan of a larger setup is carried out slower and with less lateral travel."""
     tight = {"setup.max_guide_step_mm": 0.02, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
     commands, places = replayed(quick_plan, estimated, PHANTOM.with_values(tight))
     assert max(abs(command.dg_y) for command in commands) <= 0.02

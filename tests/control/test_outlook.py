@@ -17,7 +17,7 @@ GRID = np.arange(-30.0, 60.0)
 
 
 def linear(precision, curves, now=0.0, variance=1e-3):
-    """Outlook and estimate of a linear problem: the tip is at the parameters' sum, each times its curve (K, g)."""
+    """Outlook and estimate of a linear problem: the tip is the sum of the parameters times their curves (K, g)."""
     setup = SimpleNamespace(max_advance_mm=1.0)
     estimate = SimpleNamespace(
         precision=np.asarray(precision),
@@ -74,7 +74,7 @@ def test_in_space_it_is_the_deviation_on_an_axis(now, miss):
 
 
 def test_after_the_last_correction_the_uncertainty_stays():
-    """Nothing more becomes known."""
+    """No further reading counts."""
     precision, curves = two_parameters()
     outlook, estimate = linear(precision, curves, now=TARGET - ol.UNCORRECTED)
     end = curves[:, GRID == TARGET].ravel()

@@ -51,7 +51,7 @@ def started(x, guide=0.0, simulator=None):
 
 
 def test_the_first_path_is_the_plans(quick_plan):
-    """The guide at every depth, the bevel rolled where the plan rolls it."""
+    """It has the guide's position at every depth, and the plan's rolls."""
     controls = quick_plan.controls.copy()
     controls[:, ROLL] = 0.0
     controls[[12, 40, 60], ROLL] = np.pi
@@ -79,7 +79,7 @@ def test_no_roll_of_the_plan_is_lost(quick_plan):
 
 
 def test_depths_ascend_where_a_plan_stands_still(quick_plan):
-    """Steps without an advance, as where only the guide is moved."""
+    """The plan has steps without an advance, in which only the guide moves."""
     tips, guide = quick_plan.tips.copy(), quick_plan.guide
     tips[5:8, 0] = tips[4, 0]
     path = path_of_plan(replace(quick_plan, tips=tips))
@@ -92,7 +92,7 @@ def test_depths_ascend_where_a_plan_stands_still(quick_plan):
 
 @pytest.mark.parametrize("steps", [0, 20, 45, 66])
 def test_the_sample_that_corrects_nothing_is_the_current_path(quick_plan, along, steps):
-    """The same guide at the ends of the steps, the same rolls."""
+    """Guide positions at the ends of the steps and rolls are the same."""
     state = along(quick_plan, steps)
     x = float(state.tip[0])
     path = replace(path_of_plan(quick_plan), rolls=rolls_at(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
@@ -119,7 +119,7 @@ def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
 
 
 def test_the_path_found_is_the_current_path_of_the_next_period(quick_plan, along):
-    """Any sample, made the current path, is the sample that corrects nothing."""
+    """Any sample that becomes the current path is the sample that corrects nothing."""
     state = along(quick_plan, 30)
     ahead = ahead_of(quick_plan, state)
     for z in propose_samples(ahead, 48, np.random.default_rng(2)):
@@ -146,7 +146,7 @@ def test_the_path_found_is_the_current_path_of_the_next_period(quick_plan, along
 )
 @hypothesis_settings(max_examples=60)
 def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, guide, offset):
-    """Wherever the current path has the guide, in or out of reach."""
+    """The current path may have the guide out of reach."""
     state = started(x, guide * REACH)
     path = level(x + 3.0, 35.0, guide=offset)
     ahead = ahead_of(quick_plan, state, path)
@@ -182,7 +182,7 @@ def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
 
 
 def test_two_rolls_at_one_place_cancel(quick_plan):
-    """Those before and after them do not."""
+    """Rolls before and after them stay."""
     for rolls, left in [((20.0, 20.0), []), ((10.0, 20.0, 20.0, 30.0), [10.0, 30.0]), ((20.0,) * 3, [20.0])]:
         ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
         assert depths(ahead.correct(ahead.current)) == left
@@ -203,7 +203,7 @@ def test_rolls_near_each_other_are_all_made(quick_plan, rolls):
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
-    """None, or one that steering leaves where it is."""
+    """There is no guide, or the plan is for steering."""
     for plan, scenario in ((quick_plan, BARE), (replace(quick_plan, strategy="steering"), PHANTOM)):
         state = started(10.0, simulator=Simulator(scenario, threads=1))
         ahead = ahead_of(plan, state, scenario=scenario)
@@ -257,7 +257,7 @@ def test_proposals_are_around_the_current_path_which_is_the_first(quick_plan, ro
 
 
 def carried_out(plan, path, state, simulator):
-    """Depths at which the bevel rolls, the advances, and the state at the target, the model carrying out the path."""
+    """Depths of the rolls, advances, and the state at the target, of the path carried out on the model."""
     rolls, advances, task = [], [], task_of(simulator, plan)
     for _ in range(200):
         ahead = Ahead.of(task, state, path)
@@ -275,7 +275,7 @@ def carried_out(plan, path, state, simulator):
     "rolls", [(), (20.0,), (10.0001,), (12.03, 12.4, 12.9), (10.5, 17.77, 31.0, 39.5), (-20.0, 15.0)]
 )
 def test_rolls_are_executed_once_at_their_depth(quick_plan, rolls):
-    """Within a tenth of a control step; of those that the tip has passed one is made at once."""
+    """They are made within a tenth of a control step; a roll that the tip has passed is made at once."""
     simulator = Simulator(PHANTOM, threads=1)
     made, _, end, left = carried_out(quick_plan, level(*rolls), started(10.0), simulator)
     assert made == pytest.approx(np.maximum(rolls, 10.0).tolist(), abs=0.1 * PHANTOM.setup.max_advance_mm)

@@ -59,7 +59,7 @@ def angles_of(ahead, rows):
 @given(seed=SAMPLES)
 @settings(max_examples=8)
 def test_every_sample_is_within_the_limits_of_the_rig(rig, seed):
-    """Guide, on its axes alone, and rotation; the depths grow to the target."""
+    """The guide moves on its axes only, the rotation stays in its range, and the depths increase to the target."""
     ahead, scenario = ahead_of(rig)
     rows, depth = ahead.controls(propose_samples(ahead, 24, np.random.default_rng(seed), 0.3 - 1.0j))
     limits = Limits.of(scenario)
@@ -94,7 +94,7 @@ def test_the_first_sample_is_the_current_path(rig):
 
 
 def test_a_knot_moves_the_guide_on_its_own_axis():
-    """0.1 mm at the last knot of z: z alone, in proportion between the knots."""
+    """0.1 mm at the last knot of z change z alone, in proportion between the knots."""
     ahead, _ = ahead_of("two axes")
     z = ahead.current
     z[2 * KNOTS.size - 1] += 0.1
@@ -126,7 +126,7 @@ def test_two_half_turns_that_are_due_cancel():
 @given(seed=SAMPLES)
 @settings(max_examples=15)
 def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
-    """Random rolls at depths that differ: at every place beyond a step's length of a roll."""
+    """The rolls are random, at different depths."""
     ahead, _ = ahead_of("two axes")
     rng = np.random.default_rng(seed)
     z = ahead.current
@@ -145,7 +145,7 @@ def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
 @example(seed=115)  # rolls that share the last step
 @settings(max_examples=20)
 def test_no_roll_goes_the_long_way_round(seed):
-    """Whatever angles a sample has, if the driver turns without limit; also of several rolls that are due at once."""
+    """Samples may have any angle, and several rolls may be due at once."""
     ahead, _ = ahead_of("two axes", roll=2.0)
     rng = np.random.default_rng(seed)
     samples = propose_samples(ahead, 24, rng)
@@ -183,7 +183,7 @@ def test_pairs_of_rolls_point_to_either_side_of_the_aim(rig):
 
 @pytest.mark.parametrize("rig", ["two axes", "half turns"])
 def test_the_constant_samples_roll_by_half_a_turn_at_most_twice(rig):
-    """Before the first step or not, and after it or not; the guide stays on the path."""
+    """The half turns are before the first step, after it, both or neither; the guide stays on the path."""
     ahead, _ = ahead_of(rig)
     rows = ahead.constant
     half = np.count_nonzero(rows[:, :, ROLL], axis=1)

@@ -60,7 +60,7 @@ def test_the_target_from_the_tip_turns_with_everything(theta, psi, turn, x, y, z
 
 @given(roll=ANGLES, y=PLACES, z=PLACES)
 def test_a_needle_that_rolls_freely_aims_at_the_target_or_away_from_it(roll, y, z):
-    """Straight ahead, without dead band: rolled, its path passes no farther from the target than any other."""
+    """Without a dead band the chosen path passes no farther from the target than any other."""
     pose, bevel, target = np.zeros(5), cmath.exp(1j * roll), (30.0, y, z)
     angle, why = choose_roll(pose, bevel, 0.004, target, 0.0, 0.0, within=float)
     chosen = closest_approach(pose, 0.004, bevel * cmath.exp(1j * angle), target)
@@ -100,7 +100,7 @@ def test_where_the_driver_cannot_aim_the_best_possible_roll_is_made_or_none():
 
 
 def test_half_turns_are_all_that_the_papers_driver_is_asked_for():
-    """Whatever the direction of the target."""
+    """The targets are in several directions."""
     for y, z in ((5.0, 0.0), (-5.0, 1.0), (0.5, 5.0)):
         angle, _ = choose_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, y, z), 0.0, 0.0)
         assert angle in (0.0, math.pi)

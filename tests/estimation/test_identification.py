@@ -64,13 +64,13 @@ def test_it_predicts_a_needle_with_other_constants(name):
 
 @pytest.mark.usefixtures("all_fresh")
 def test_with_fresh_derivatives_it_follows_the_tip_closely():
-    """Otherwise the estimate differs by what derivatives of a few periods ago leave."""
+    """Derivatives of a few periods ago would leave a difference."""
     estimate, states = followed(NEEDLES["all"], 70)
     assert estimate.tip[Y] == pytest.approx(NEEDLES["all"].measured(states[-1])[1], abs=5e-3)
 
 
 def test_at_rest_the_tip_is_found_with_derivatives_that_are_renewed_alternately():
-    """A few periods of readings, no moves."""
+    """Readings of a few periods without a move are enough."""
     estimate, states = fitted("all")
     x, y = NEEDLES["all"].measured(states[-1]).tolist()
     for k in range(8):
@@ -82,7 +82,7 @@ def test_at_rest_the_tip_is_found_with_derivatives_that_are_renewed_alternately(
     ("needle", "share"), [(NEEDLES["all"], 0.4), (Needle(modulus=(1.0, 2.0), shift=(-3.0,)), 0.1)]
 )
 def test_it_predicts_with_the_noise_of_a_tracker(needle, share):
-    """One with a boundary between different layers displaced by 3 mm, two standard deviations."""
+    """The boundary of the second needle is displaced by 3 mm, two standard deviations."""
     noise = PHANTOM.tracker.jitter_per_axis
     estimate, states = followed(needle, 70, scenario=PHANTOM, noise=noise, per_move=8)
     left, naive = ahead(estimate, needle, states, PHANTOM)
@@ -100,7 +100,7 @@ def test_the_modulus_along_the_depth_is_found():
 
 
 def test_tissue_ahead_of_the_tip_is_estimated_as_far_as_it_is_correlated():
-    """Towards the prior's mean by exp(−cell/length) a cell."""
+    """The estimate decays towards the prior's mean by exp(−cell/length) per cell."""
     short = QUIET.with_values({"control.adaptive_mpc.variation_length_mm": 4.0})
     for (estimate, _), length in (
         (fitted("modulus along the depth", 66), 10.0),
@@ -116,7 +116,7 @@ def test_tissue_ahead_of_the_tip_is_estimated_as_far_as_it_is_correlated():
 
 
 def test_the_readings_tell_run_out_base_and_bend_apart():
-    """Run-out jumps with the bevel; the rest shows along the path, some of it only in part."""
+    """The run-out jumps with the bevel; base and bend show along the path."""
     needle, found = NEEDLES["all"], fitted("all")[0].parameters
     assert found[AT.run_out] == pytest.approx(needle.run_out, abs=0.02)
     assert np.sign(found[[AT.base, AT.bend]]).tolist() == [np.sign(needle.base_y), np.sign(needle.bend)]
@@ -124,7 +124,7 @@ def test_the_readings_tell_run_out_base_and_bend_apart():
 
 @pytest.mark.xfail(reason="in air the fit may stay at the other wall of the guide")
 def test_in_air_the_wall_that_the_needle_bears_on_is_found():
-    """With a tracker that is nearly exact, whatever the start: the tip of one more move is predicted."""
+    """A nearly exact tracker should lead to the wall from any start."""
     rows = [Control(db_x=1.0, dg_y=0.03 * float(np.sin(0.3 * k))) for k in range(27)]
     off = []
     for seed in (4, 8, 12):
@@ -137,7 +137,7 @@ def test_in_air_the_wall_that_the_needle_bears_on_is_found():
 
 
 def test_a_base_offset_alone_is_found_by_its_lever():
-    """In air the tip goes y = b (1 − lever): the effect of base y and base θ together is identified, not each."""
+    """In air y = b (1 − lever): only the joint effect of base y and base θ is identified."""
     needle = Needle(base_y=0.5)
     estimate, states = followed(needle, 20)
     np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-3)
@@ -190,7 +190,7 @@ def test_a_noisier_reading_moves_the_estimate_less():
 
 
 def test_known_parameters_are_not_fitted():
-    """Standard deviations of 0."""
+    """Their standard deviations are 0."""
     sure = {
         f"control.adaptive_mpc.{key}": 0.0
         for key in (
@@ -224,7 +224,7 @@ def test_an_error_along_the_axis_is_recovered(base_x):
 
 @pytest.mark.long
 def test_the_error_along_the_axis_is_as_large_as_its_standard_deviation():
-    """Over 60 needles and their noise, drawn from the prior and the tracker's distribution."""
+    """The ratio is 1 over 60 needles and their noise, drawn from the prior and the tracker's distribution."""
     scenario = PHANTOM.with_values(
         {"control.adaptive_mpc.model_sd": 0.0, "control.adaptive_mpc.least_model_sd_mm": 1e-4}
     )

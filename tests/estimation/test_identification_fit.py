@@ -63,7 +63,7 @@ def test_derivatives_agree_with_central_differences():
 
 
 def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
-    """Over the depth passed and a few steps ahead."""
+    """It covers the depth passed and a few steps ahead."""
     estimate, _ = fitted("all", 50)
     assert len(estimate.perturbed) > 3
     forward = [Control(db_x=1.0)] * 4
@@ -114,7 +114,7 @@ def test_derivatives_from_the_stops_equal_derivatives_from_the_start():
 
 
 def test_the_stops_are_states_on_the_way():
-    """Bit for bit as stepped, at the start, before the move into the tissue, and every eight moves in it."""
+    """They equal the stepped states bit for bit, before the move into the tissue and every eight moves in it."""
     estimate, _ = off_the_prior()
     states = stepped(estimate.parameters, commands(55), estimate.axial)
     assert [first for first, _ in estimate.stops] == [0, 28, 36, 44, 52]
@@ -124,7 +124,7 @@ def test_the_stops_are_states_on_the_way():
 
 
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
-    """Least squares of readings and prior stacked, each over its standard deviation."""
+    """The reference is the least-squares solution of readings and prior, each over its standard deviation."""
     estimate, readings = off_the_prior("bend")
     y = estimate.tips[:, Y]
     bends = np.abs(np.diff(np.concatenate([y[:1], y, y[-1:]]), n=2))
@@ -196,7 +196,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
 @pytest.mark.parametrize("factor", [-1.0, 1e-3])
 def test_a_wrong_step_is_not_taken(monkeypatch, factor):
-    """A Jacobian that leads to a step the other way, or far too far: no parameter moves for the worse."""
+    """A wrong Jacobian leads the other way, or far too far; the fit does not become worse."""
     estimate, readings = off_the_prior()
     jacobian = fit.jacobian_of
     monkeypatch.setattr(fit, "jacobian_of", lambda *args: factor * jacobian(*args))
@@ -278,7 +278,7 @@ def test_the_low_pass_follows_the_newest_and_forgets():
 
 
 def prior_sd_of_the_tip(estimate):
-    """Standard deviation (mm) of the tip's lateral position at the start: each parameter moved on its own, by hand."""
+    """Standard deviation (mm) of the tip's lateral position at the start, by moving one parameter after another."""
     prior = estimate.prior
     slope = np.zeros(prior.mean.size)
     start = stepped(prior.mean, [])[0].tip[Y]
@@ -291,7 +291,7 @@ def prior_sd_of_the_tip(estimate):
 
 
 def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior():
-    """Across, and along the axis."""
+    """The standard deviation is for both directions, across and along the axis."""
     estimate = Identification().begin(begun_with(Simulator(QUIET, 1)))
     across = prior_sd_of_the_tip(estimate)
     assert across > 0.1

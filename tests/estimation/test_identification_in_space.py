@@ -34,7 +34,7 @@ BASE, SLOPE, BEND, RUN_OUT, TILT = 0.4 - 0.3j, 0.002 + 0.003j, 0.3 + 0.2j, 0.05 
 
 
 def moves(count, turn=0.0, roll=None, guided=True):
-    """Advance by 1 mm a move; the guide in some direction, rolls by odd angles."""
+    """Moves of 1 mm with the guide in some direction, and rolls by odd angles."""
     rows = []
     for k in range(count):
         guide = (0.1 * math.sin(0.3 * k) + 0.06j * math.cos(0.2 * k)) * complex(
@@ -82,7 +82,7 @@ def fitted():
 
 
 def test_it_finds_clamp_bend_and_run_out_on_both_axes(fitted):
-    """In their own directions, relative to the bevel for what turns with the needle; the tip to 5 µm."""
+    """Bend and run-out are relative to the bevel; the tip is found to 5 µm."""
     estimate, states = fitted
     slots = estimate.slots
     np.testing.assert_allclose(estimate.parameters[slots.run_out], [RUN_OUT.real, RUN_OUT.imag], atol=0.01)
@@ -94,7 +94,7 @@ def test_it_finds_clamp_bend_and_run_out_on_both_axes(fitted):
 
 
 def test_the_estimate_turns_with_the_needle(fitted):
-    """All of it turned by 90° about the axis: the same parameters for what turns with the needle, turned ones else."""
+    """If all is turned by 90° about the axis, bend and run-out stay, base and slope turn."""
     estimate, _ = fitted
     turned, _ = followed(62, turn=math.pi / 2)
     slots = estimate.slots
@@ -110,14 +110,14 @@ def test_the_estimate_turns_with_the_needle(fitted):
 
 
 def test_the_other_axis_of_a_needle_in_the_plane_stays_at_rest():
-    """The scenario's own needle: nothing to find, no innovation on either axis."""
+    """The scenario's own needle leaves the parameters at their means."""
     estimate, states = followed(40, truth=False)
     np.testing.assert_allclose(estimate.parameters, estimate.prior.mean, atol=2e-4)
     np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-4)
 
 
 def test_the_bevel_turns_with_rolls_and_spins():
-    """After each control, from its direction before them."""
+    """The directions are after each control."""
     rows = flexneedle.controls(2, roll=[0.0, 1.0], spin=[0.25, 0.5])
     expected = np.exp(1j * (0.4 + np.array([0.25, 1.75])))
     np.testing.assert_allclose(bevel_directions(np.exp(0.4j), rows, 2), expected, rtol=1e-12)
@@ -139,7 +139,7 @@ def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted)
 
 
 def test_a_scenario_without_directions_has_no_place_for_their_tilt():
-    """With them, two more parameters before the bevel's factor; a direction that is not in use changes nothing."""
+    """Directions add two parameters before the bevel's factor; a direction that is not in use changes nothing."""
     without, with_ = Slots.of(QUIET), Slots.of(DIRECTED)
     assert with_.bevel == without.bevel + 2
     assert without.tilt.start == without.tilt.stop
@@ -229,7 +229,7 @@ def test_the_start_along_the_axis_follows_the_variance_along_the_axis(ahead, acr
 
 
 def test_a_second_axis_makes_the_distance_of_the_next_reading_larger():
-    """The variance of the distance is that along the axis and that on each lateral axis."""
+    """The variance of the distance is the sum over the axes."""
     plane = flexneedle.load_scenario("phantom")
     one, two = (
         StateCorrection().begin(begun_with(Simulator(plane.with_values({"setup.axes": axes}), 1)))
@@ -242,7 +242,7 @@ def test_a_second_axis_makes_the_distance_of_the_next_reading_larger():
 
 @pytest.mark.parametrize("turn", [0.0, math.pi / 2])
 def test_the_correction_of_the_state_finds_the_clamp_in_air_on_both_axes(turn):
-    """With small tracker noise: base position and slope, and the tip."""
+    """The tracker's noise is small."""
     estimate, states = followed(25, turn=turn, observer=StateCorrection())
     assert states[-1].tip[0] < 0.0
     off = RUN_OUT * states[-1].bevel

@@ -31,7 +31,7 @@ from tasks import begun_with
 
 @pytest.mark.parametrize("off", [1.9, -1.9])
 def test_parameters_stay_within_four_standard_deviations(off):
-    """Readings far off laterally, in air and in tissue, and a solve that still converges."""
+    """The readings are far off laterally, in air and in tissue; the solve still converges."""
     rows = commands(50)
     states = Needle().inserted(PHANTOM, rows)
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
@@ -69,7 +69,7 @@ def test_mirrored_readings_give_the_mirrored_estimate():
 
 
 def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
-    """In air: an estimated bend of the free needle and a run-out show on the other side."""
+    """In air, an estimated bend of the free needle and a run-out are on the other side afterwards."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
     estimate = Identification().begin(begun_with(simulator))
@@ -124,7 +124,7 @@ def test_late_readings_lead_to_the_same_estimate():
 
 
 def test_the_estimate_is_the_fitted_insertion_carried_out_again():
-    """Bit for bit: base at the start, and each step with the needle and tissue that were fitted."""
+    """Stepping from the fitted start with the fitted needle and tissue gives the same bits."""
     estimate, _ = fitted("all", 50)
     states = stepped(estimate.parameters, commands(50), estimate.axial)
     assert states[-1] == estimate.state

@@ -46,7 +46,7 @@ def assert_same_estimate(one, other):
 @pytest.mark.parametrize("count", [1, 4])
 @pytest.mark.parametrize("depth", [10, 26, 40])
 def test_late_readings_correct_as_if_they_had_come_in_time(depth, count, late):
-    """Bit for bit, in air, through the skin and in tissue, once they are all in."""
+    """The estimates are the same bit for bit once all readings have arrived."""
     simulator = Simulator(PHANTOM)
     state = in_tissue(simulator, depth)
     readings = noisy_readings(state, simulator, count, np.random.default_rng(3))
@@ -99,7 +99,7 @@ def test_readings_out_of_order_and_split_over_calls_count_the_same(depth):
 
 
 def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
-    """One at the end of a move to that move; one from before the start to the first, one from after to the last."""
+    """A reading at the end of a move belongs to that move, an early one to the first, a late one to the last."""
     estimate = begun(Simulator(PHANTOM))
     for k in range(3):
         estimate = estimate.move(Motion(AHEAD, float(k), k + 1.0))

@@ -33,7 +33,7 @@ def test_a_move_moves_the_needle_as_the_driver_did():
 
 @pytest.mark.parametrize(("base_y", "base_turn"), [(0.6, 0.0), (0.0, 0.004), (-0.5, 0.003)])
 def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, base_turn):
-    """Guide at rest: the tip shows one combination of the two, and that is what the path needs."""
+    """With the guide at rest the tip shows one combination of the two, the one that the path needs."""
     simulator, plant = Simulator(QUIET), Simulator(QUIET)
     truth = start_with(QUIET, base=(base_y,), slope=(base_turn,))
     assert abs(truth.tip[Y]) > 0.01
@@ -86,7 +86,7 @@ def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
 
 @pytest.mark.parametrize("load", [0.003, -0.003])
 def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(load):
-    """A force on the tip that the model lacks: its prediction errs at first and no more at the end."""
+    """The model lacks a force on the tip: its prediction errs at first, and no longer at the end."""
     simulator = Simulator(QUIET)
     state = in_tissue(simulator)
     _, estimate, innovations = follow(state, begun(simulator, state), simulator, 30, force=load)
@@ -107,7 +107,7 @@ def test_without_estimating_the_load_the_offset_stays(gain, estimates):
 
 
 def test_stiffer_tissue_than_estimated_leaves_little_offset():
-    """A disturbance that grows slowly as the needle goes in: a twentieth of what is left without estimating it."""
+    """The disturbance grows slowly with depth; the load estimate leaves a fraction of the offset."""
     left = []
     for gain in (PHANTOM.control.load_gain, 0.0):
         soft, stiff = (
@@ -175,7 +175,7 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
 @pytest.mark.parametrize("axial", [0.0, 1.0])
 @pytest.mark.parametrize("off", [(0.4, 0.3), (-0.6, -0.2)])
 def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):
-    """The tip is where it was measured, and what the move cut rests on the line to it."""
+    """The tip is where it was measured, and new contacts rest on the line to it."""
     simulator = Simulator(PHANTOM)
     start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
     moved = start.move(Motion(AHEAD, 0.0, 1.0))
@@ -192,7 +192,7 @@ def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along
 
 
 def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
-    """A tip that goes evenly and readings that are off by 0.1, 0.2 and 0.6: the innovation is 0.3."""
+    """For an even move and readings that are off by 0.1, 0.2 and 0.6 the innovation is 0.3."""
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator, in_tissue(simulator))
     predicted = estimate.move(Motion(Control(db_x=1.0, dg_y=0.3), 7.0, 9.0))
@@ -261,7 +261,7 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
 
 @pytest.mark.parametrize(("name", "estimates"), [("ce-mpc", False), ("resolved-rate", True)])
 def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(name, estimates):
-    """In air no base offset, in tissue no load; the others keep both."""
+    """It has no base offset in air and no load in tissue; the other controllers keep both."""
     simulator = Simulator(PHANTOM)
     begin = CONTROLLERS[name].observer.begin(begun_with(simulator, controller=name))
     for steps in (10, 40):
@@ -291,6 +291,6 @@ def test_without_a_reading_the_estimate_stays_and_the_innovation_is_zero():
     ids=str,
 )
 def test_the_uncertainty_of_the_path_is_that_of_a_needle_on_the_axis(entry):
-    """The bevel bends the needle from its axis, wherever that is: by as much within a few percent."""
+    """The bevel bends the needle from its axis by the same amount within a few percent."""
     drift, on_axis = (begun(Simulator(PHANTOM.with_values(each))).drift for each in (entry, {}))
     assert drift == pytest.approx(on_axis, rel=0.03)

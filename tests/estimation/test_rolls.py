@@ -96,7 +96,7 @@ def test_what_is_left_to_turn_falls_evenly_in_a_roll_and_in_a_spin(motion, times
     [((0.0, 0.5, 1.0), -1j / 3.0), ((0.0, 0.25), -0.5 - 0.25 * math.sqrt(2.0) * (1.0 + 1.0j))],
 )
 def test_readings_of_a_half_turn_have_the_mean_direction_of_the_bevel(parts, facing):
-    """Relative to that after it: −1 before it, −i in the middle; of that the plane has the real part."""
+    """Relative to the direction after the roll: −1 before it, −i in the middle; in the plane, the real part."""
     roll, _ = Move.parts_of(ROLLED)
     move = roll.with_readings(tuple(at(*(1.0 + 0.6 * part for part in parts))))
     plane, space = (MoveMeans.of([move], "tip position", -1.0, axes) for axes in (1, 2))
@@ -106,7 +106,7 @@ def test_readings_of_a_half_turn_have_the_mean_direction_of_the_bevel(parts, fac
 
 
 def rolling(needle, before, after, begun):
-    """Readings of a move of 0.2 s, before it a roll of 0.4 s if the bevel turns; and the motion without its control."""
+    """Readings of a move of 0.2 s, after a roll of 0.4 s if the bevel turns, and the times of the motion."""
     here, there, side = before.tip[:2], after.tip[:2], np.array([0.0, needle.run_out * after.bevel.real])
     turns = after.bevel != before.bevel
     turned = begun + 0.4 * turns
@@ -119,7 +119,7 @@ def rolling(needle, before, after, begun):
 
 
 def rolled(needle, rolls, count, used=lambda _turning: True):
-    """The estimate after moves with rolls that take time; used: whether its readings are, by whether it rolls."""
+    """The estimate after moves with rolls that take time; used: whether readings count, by whether the needle rolls."""
     rows, now = [Control(db_x=1.0, flip=k in rolls) for k in range(count)], 0.0
     states = needle.inserted(QUIET, rows)
     estimate = Identification().begin(begun_with(Simulator(QUIET, 1)))
@@ -132,7 +132,7 @@ def rolled(needle, rolls, count, used=lambda _turning: True):
 
 @pytest.mark.parametrize("used", [lambda _: True, lambda turning: not turning], ids=["used", "left out"])
 def test_with_rolls_that_take_time_the_run_out_is_found(used):
-    """Most readings are of the first half of each roll: as readings of its end they would bend the estimate."""
+    """Most readings are from the first half of a roll; taken for readings of its end they would bend the estimate."""
     needle = Needle(run_out=-0.15)
     estimate, truth = rolled(needle, (34, 40, 46, 52), 56, used)
     assert abs(estimate.run_out - needle.run_out) <= 0.01

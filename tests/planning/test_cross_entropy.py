@@ -71,7 +71,7 @@ def test_smoothing_takes_the_old_moments_of_the_last_iteration():
 
 @pytest.mark.parametrize(("elite", "mean"), [(1, 1.0), (2, 1.5), (3, 2.0), (5, 3.0)])
 def test_elite_are_the_samples_of_least_cost(elite, mean):
-    """Samples 1 to 5 cost as much as they are; handed over in disorder."""
+    """The cost of a sample is its value; they are in disorder."""
     values = [4.0, 1.0, 5.0, 3.0, 2.0]
     search_state = after(values, [(v, 0) for v in values], elite=elite, smoothing=0.0)
     assert search_state.mean[0] == pytest.approx(mean)
@@ -133,7 +133,7 @@ def test_a_coordinate_without_sigma_stays_at_its_mean():
 @given(seed=st.integers(0, 2**32), failing=st.floats(0.0, 1.0))
 @hypothesis_settings(max_examples=60)
 def test_the_best_is_never_worse_than_any_sample(seed, failing):
-    """With a share of samples that fail, too."""
+    """A share of the samples fails."""
     rng = np.random.default_rng(seed)
     costs: list[float] = []
     sampled: list[np.ndarray] = []
@@ -181,7 +181,7 @@ def test_with_only_failed_samples_the_gaussian_stays(bad):
 
 @pytest.mark.parametrize(("spread", "converged"), [(0.0999, True), (0.1001, False)])
 def test_converged_once_the_elite_costs_spread_by_a_share_of_the_first_iterations(spread, converged):
-    """A spread of 4 at first and a tolerance of a tenth: 0.4 will do, whatever the level of the costs."""
+    """The first spread is 4 and the tolerance a tenth: 0.4 is enough at any level of the costs."""
     settings = ce.Settings(3, 2, 9, 0.0, 0.1, np.full(1, -9.0), np.full(1, 9.0))
     samples = np.array([[1.0], [2.0], [3.0]])
     first = ce.update(ce.start(np.zeros(1), np.ones(1)), settings, samples, np.array([2.0, 5.0, -2.0]))
@@ -192,7 +192,7 @@ def test_converged_once_the_elite_costs_spread_by_a_share_of_the_first_iteration
 
 
 def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
-    """The first iteration whose elite is finite does: a spread of 1 at first, then a tenth of it."""
+    """The first iteration with a finite elite sets the scale: a spread of 1, then a tenth of it."""
     settings = replace(FREE, samples=4, elite=2, tolerance=0.1)
     samples = np.arange(8.0).reshape(4, 2)
     search_state, converged = ce.start(np.zeros(2), np.ones(2)), []

@@ -42,7 +42,7 @@ def aimed(scenario, entry, off):
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
 @pytest.mark.parametrize(("scenario", "entry", "off"), CASES)
 def test_the_entry_of_a_plan_is_legal(scenario, entry, off, strategy):
-    """The plan's scenario is checked as any other when it is made; its controls keep their limits."""
+    """The plan's scenario has been checked; its controls keep their limits."""
     free = aimed(scenario.with_values(SHORT), entry, off)
     plan = flexneedle.plan(free, strategy=strategy, threads=1)
     chosen = plan.scenario.entry
@@ -71,7 +71,7 @@ def test_every_sample_of_the_entry_is_legal(which, seed):
 
 
 def test_with_the_bevel_alone_a_limit_of_the_slope_turns_the_bevel_to_what_is_left():
-    """The slope may leave 1 mm along −z; the bevel turns there, not towards the target of the present axis."""
+    """The slope may leave 1 mm along −z; the bevel turns there, not from the present axis to the target."""
     plan = flexneedle.plan(aimed(SPACE, CORNER, (8.0, -9.0)), strategy="steering", threads=1)
     assert plan.scenario.entry.slope_z_mrad == pytest.approx(-200.0)
     assert math.degrees(plan.roll) % 180.0 == pytest.approx(90.0)
@@ -91,7 +91,7 @@ def test_a_target_that_no_free_entry_brings_into_reach_is_refused():
 )  # fmt: skip
 @settings(max_examples=100)
 def test_the_nearest_entry_is_as_near_as_any(off, radius, slope, now):
-    """Compared with a few hundred others that are free."""
+    """It is compared with a few hundred other permitted entries."""
     entry = Entry(slope_mrad=now[0], slope_z_mrad=now[1], free_radius_mm=radius, free_slope_mrad=slope)
     place, most = complex(*off), 5.0
 

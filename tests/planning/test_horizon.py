@@ -65,7 +65,7 @@ def test_the_result_has_its_terms_and_rollout():
 
 
 def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
-    """The same samples, the same bytes as the method called by hand."""
+    """Cross-entropy called by hand gives the same samples and bytes."""
     settings = ce.Settings(**vars(SEARCH), lower=VARIABLES.lower, upper=VARIABLES.upper)
     by_hand = ce.minimize(
         lambda z: evaluate_cost(TERMS, rigid(controls(z))),

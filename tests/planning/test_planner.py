@@ -66,7 +66,7 @@ def test_each_target_of_the_paper_is_reached_within_the_limits_of_the_scenario(t
 
 @pytest.mark.parametrize(("target", "strategy"), [(LATERAL, "manipulation"), ((40.0, 1.5), "steering")])
 def test_record_is_what_the_simulator_does_with_its_controls(target, strategy):
-    """On the named needle, also where only the bevel steers."""
+    """It does on the scenario's needle, also where only the bevel steers."""
     plan = planned(target, strategy)
     states = states_of(plan)
     np.testing.assert_array_equal(plan.tips, [state.tip for state in states])
@@ -152,7 +152,7 @@ def test_a_sketch_of_a_target_out_of_reach_is_not_reached():
 
 
 def test_manipulation_enters_at_an_angle_towards_the_target():
-    """Slope at the skin, and of the side of the target; straight ahead it enters straight."""
+    """The slope at the skin is to the target's side; towards a target straight ahead it is 0."""
     assert planned(LATERAL).entry_angle > 0.01
     assert planned((40.0, -5.0)).entry_angle < -0.01
     assert abs(planned((40.0, 0.0)).entry_angle) < 0.012
@@ -199,7 +199,7 @@ def test_without_guide_and_base_both_strategies_are_the_same_search():
 
 
 def test_a_search_that_still_improves_continues_as_long_as_the_scenario_allows():
-    """Four iterations are usual here, and far too few."""
+    """The usual number, four iterations, is far too few here."""
     usual = {"plan.samples": 32, "plan.iterations": 4}
     first, later = (coarse(usual | {"plan.max_iterations": most}) for most in (1, 200))
     assert (first.iterations, first.converged) == (4, False)
@@ -229,7 +229,7 @@ def test_a_target_out_of_reach_is_reported_with_the_limit(target, strategy, chan
 
 
 def test_stroke_is_named_when_it_binds():
-    """A straight needle would just get there; 28 mm lateral costs 3 mm more than that."""
+    """A straight needle would just reach the depth; 28 mm lateral take 3 mm more."""
     plan = coarse(
         {"setup.max_guide_travel_mm": 30.0, "plan.iterations": 8, "plan.max_iterations": 8}, (81.5, 28.0)
     )
@@ -309,7 +309,7 @@ NEAR_THE_SKIN = {
 
 @pytest.mark.parametrize(("scenario", "target"), NEAR_THE_SKIN.values(), ids=NEAR_THE_SKIN)
 def test_a_target_near_the_skin_that_one_search_misses_is_reached(scenario, target, monkeypatch):
-    """With one history of both searches, in which the best cost never rises."""
+    """Both searches have one history, in which the best cost never rises."""
     calls, found, carry_out = [], [], planner._carry_out
     monkeypatch.setattr(planner, "_carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
     plan = flexneedle.plan(scenario, target, progress=calls.append)

@@ -35,7 +35,7 @@ def planned(direction=0.0, off=3.0, strategy="manipulation", **changes):
 
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
 def test_a_target_in_another_direction_has_the_same_plan_turned(strategy):
-    """Guide on two axes, any roll: nothing prefers a direction but the limits of a step, one for each axis."""
+    """With a guide on two axes and any roll, only the limits of a step prefer a direction."""
     first, turn = planned(0.3, strategy=strategy), 1.9
     second = planned(0.3 + turn, strategy=strategy)
     assert second.cost == pytest.approx(first.cost, rel=1e-3)
@@ -76,7 +76,7 @@ def test_a_driver_of_half_turns_has_no_other_rolls():
 @pytest.mark.parametrize("strategy", ["manipulation", "steering"])
 @pytest.mark.parametrize("axes", [1, 2])
 def test_a_free_entry_is_chosen_within_its_bounds(strategy, axes):
-    """The plan's scenario has it, and is carried out from there."""
+    """The plan's scenario has the chosen entry, and the needle starts on it."""
     values = {"entry__free_radius_mm": 4.0, "entry__free_slope_mrad": 40.0, "setup__axes": axes}
     plan = planned(0.0 if axes == 1 else 0.8, off=4.0, strategy=strategy, **values)
     entry = plan.scenario.entry
@@ -123,7 +123,7 @@ def test_an_insertion_begins_where_the_plan_enters():
 
 @pytest.mark.parametrize("axes", [1, 2])
 def test_a_sample_of_the_entry_is_a_line_within_its_disc(axes):
-    """Base and guide on it; corners of the bounds lie on the circle, in the direction of the frame."""
+    """Base and guide are on the line; corners of the bounds are on the circle, in the frame's direction."""
     goal = (30.0, 0.0, 0.0)
     one = np.ones(7)
     problem = PlanProblem(

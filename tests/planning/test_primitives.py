@@ -167,7 +167,7 @@ def test_each_weight_scales_its_own_term_alone():
 
 
 def test_first_turn_is_free_and_padding_costs_nothing():
-    """A start with −1 isn't charged; nor is what the needle would do in steps that do nothing."""
+    """A start with −1 is not charged, nor are steps that do nothing."""
     assert terms(primitives(*[(1, 0, 0, 0, -1, 0)] * 3))["flips"] == 0.0
     shorter = replace(PROBLEM, travel=9.0)
     found = terms(primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), padded, problem=shorter)
@@ -226,7 +226,7 @@ def test_the_start_roll_is_separate_from_the_first_step(sign):
 
 
 def test_bounds_of_the_search_keep_the_steps():
-    """No step above the longest, none of a primitive below half of it but by rounding up the count."""
+    """No step exceeds its limit, and the number of steps is bounded."""
     wild = replace(PROBLEM, sigma=np.array([5.0, 5.0, 1.0, 5.0, 9.0, 9.0]))
     evaluated = []
 
@@ -257,7 +257,7 @@ def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
 
 
 def test_wider_samples_span_the_largest_steps_of_what_is_free():
-    """The base is fixed; longest step, ε and share stay as they are; a deviation beyond the largest step does, too."""
+    """Fixed inputs, longest step, ε, share, and a deviation beyond the largest step stay as they are."""
     np.testing.assert_array_equal(widen_search(PROBLEM).sigma, [0.1, 0.0, 0.0, 0.5, 1.0, 0.3])
     wide = replace(PROBLEM, sigma=np.array([0.1, 0.9, 0.001, 0.25, 1.0, 0.3]))
     np.testing.assert_array_equal(widen_search(wide).sigma, [0.1, 0.9, 0.005, 0.5, 1.0, 0.3])

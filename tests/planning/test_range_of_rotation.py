@@ -34,7 +34,7 @@ def planned(off, strategy=STEER, seed=0, **changes):
 
 
 def assert_legal(plan):
-    """Start roll and every step, as the simulator checks them."""
+    """Assert that the start roll and every step keep the simulator's limits."""
     limits = Limits.of(plan.scenario)
     start = np.zeros((1, 9))
     start[0, ROLL] = plan.roll
@@ -73,7 +73,7 @@ def test_a_target_behind_the_range_is_aimed_at_from_within_it(strategy):
 
 
 def test_where_half_a_turn_is_in_the_range_the_plan_is_that_of_a_free_driver():
-    """The same angles; rolls go to and fro."""
+    """The angles are the same; rolls go to and fro."""
     free, limited = (
         planned(-0.4 + 0.3j, setup__max_rotation_deg=most, plan__flip_weight=0.0) for most in (None, 180.0)
     )
@@ -83,7 +83,7 @@ def test_where_half_a_turn_is_in_the_range_the_plan_is_that_of_a_free_driver():
 
 
 def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
-    """Limits that a user can check: REACH all round, REACH cos 60° towards angle 0 at the least."""
+    """The messages state REACH, and REACH cos 60°, the least towards angle 0."""
     near, side, far = (
         planned(off, setup__max_rotation_deg=60.0).limit
         for off in (0.3 * REACH + 0j, 0.8j * REACH, 2.0 * REACH + 0j)
@@ -105,7 +105,7 @@ def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
     ],
 )  # fmt: skip
 def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most, angle, least, greatest):
-    """On an axis that is off and steep."""
+    """The axis is lateral and steep."""
     scenario = SPACE.with_values(
         {"setup.max_rotation_deg": most, "entry.lateral_mm": 3.0, "entry.slope_z_mrad": 50.0}
     )
@@ -186,7 +186,7 @@ def test_the_limit_of_a_rig_is_named(off, strategy, changes, limit):
 
 
 def test_a_range_that_keeps_the_bevel_from_z_is_named():
-    """Deeper: there the bevel would reach 1.6 mm along z, with angles up to 10° 0.3 mm."""
+    """At this depth the bevel would reach 1.6 mm along z; with angles up to 10° it reaches 0.3 mm."""
     scenario = SPACE.with_values({"setup.guide_axes": 1, "setup.max_rotation_deg": 10.0})
     plan = flexneedle.plan(scenario, (40.0, 1.0, 1.6), MOVE, threads=1)
     assert plan.error_mm > 1.0

@@ -40,7 +40,7 @@ def problem(lateral, energy_weight=0.0, **changes):
 
 
 def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
-    """A tip that bends with ±BEND in tissue, integrated exactly over each step; `charge` makes an energy of y."""
+    """A tip that bends by ±BEND in tissue, integrated exactly over each step; `charge` returns an energy for y."""
     advance = controls[:, :, DB_X]
     facing = start * np.cumprod(np.cos(controls[:, :, ROLL]), axis=1)
     x = np.cumsum(advance, axis=1) - 8.0
