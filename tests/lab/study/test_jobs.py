@@ -61,18 +61,6 @@ def test_a_row_has_the_results_of_the_insertion(point, plan):
     assert row["total_s"] > row["control_s"] + row["plant_s"] > 0.0
 
 
-def test_unconverged_periods_are_counted(point, plan, monkeypatch):
-    def insert(*args, **options):
-        insertion = flexneedle.insert(*args, **options)
-        spoilt = [replace(period, converged=period.index not in (2, 5)) for period in insertion.periods]
-        return replace(insertion, periods=tuple(spoilt), outcome="failed", reason="did not converge")
-
-    monkeypatch.setattr(jobs, "insert", insert)
-    row = only_row(InsertionJob(point, plan, "", ((0, 11),)))
-    assert (row["unconverged_periods"], row["outcome"], row["reason"]) == (2, "failed", "did not converge")
-    assert row["true_error_mm"] is not None
-
-
 def test_a_plan_that_misses_is_refused_in_a_row_without_results(point, plan):
     tips = plan.tips + np.array([0.0, 1.5, 0.0, 0.0, 0.0])
     point = replace(point, controller="open-loop")
@@ -159,20 +147,12 @@ def test_a_plan_is_read_from_disk_unchanged(point, tmp_path):
 
 def test_a_damaged_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").write_text('{"seconds": 1}')
-    with pytest.raises(InputError, match=r"a\.json: damaged: KeyError 'plan': remove it to plan again"):
-        StudyPlans(tmp_path).plan("a")
-
-
-def test_a_folder_in_place_of_a_plan_is_an_error_with_its_path(tmp_path):
-    (tmp_path / "a.json").mkdir()
-    with pytest.raises(InputError, match=r"a\.json: cannot be read: Is a directory: remove it to plan again"):
-        StudyPlans(tmp_path).plan("a")
-
-
-def test_a_file_in_place_of_the_plans_folder_is_an_error_before_planning(tmp_path):
-    (tmp_path / "plans").touch()
-    with pytest.raises(InputError, match=r"plans: not a folder, needed for the plans: move it away"):
-        StudyPlans(tmp_path / "plans")
+    (tmp_path / "b.json").mkdir()
+    for key, reason in (("a", "damaged: KeyError 'plan'"), ("b", "cannot be read: Is a directory")):
+        with pytest.raises(InputError, match=rf"{key}\.json: {reason}: remove it to plan again"):
+            StudyPlans(tmp_path).plan(key)
+    with pytest.raises(InputError, match=r"a\.json: not a folder, needed for the plans"):
+        StudyPlans(tmp_path / "a.json")
 
 
 UNKNOWN = dict.fromkeys(RESULT_COLUMNS) | {"warning": "", "outcome": "held", "reason": ""}

@@ -3,8 +3,6 @@
 from collections import Counter
 
 import numpy as np
-import pyarrow.csv
-import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -94,12 +92,6 @@ def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
     assert not np.allclose(*(column(table, "y_mm")[:5] for table in (both, alone)))
 
 
-def test_two_environments_have_independent_noise():
-    twins = [environment(name=name, tip={"jitter_mm": 0.1}) for name in ("one", "other")]
-    one, other = np.split(column(measure_grid(twins, SMALL), "x_mm"), 2)
-    assert (one != other).all()
-
-
 def test_two_sensors_have_independent_noise():
     both = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
     table = measure_grid([both], Experiment(points=2, samples=500))
@@ -118,18 +110,6 @@ def test_same_seed_same_bytes(tmp_path, suffix):
     assert one == same != other
 
 
-def test_csv_and_parquet_hold_the_same_table(tmp_path):
-    table = measure_grid([load_environment("noisy")], Experiment(points=2, samples=30))
-    text, columns = tmp_path / "a.csv", tmp_path / "a.parquet"
-    write_table(table, text)
-    write_table(table, columns)
-    for read in (pyarrow.csv.read_csv(text), pq.read_table(columns)):
-        assert read.column_names == list(COLUMNS)
-        for name in COLUMNS:
-            np.testing.assert_array_equal(read[name].to_numpy(), table[name])
-    assert pq.read_table(columns)["indicator"].null_count == np.isnan(table["indicator"]).sum()
-
-
 # ---- what is refused
 
 
@@ -141,8 +121,3 @@ def test_two_environments_with_the_same_name_are_refused():
 def test_too_many_samples_are_refused():
     with pytest.raises(InputError, match="200000000 samples: must be at most"):
         measure_grid([load_environment("ideal")], Experiment(points=10, samples=100_000, repeats=1))
-
-
-def test_an_unknown_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"must end in \.csv or \.parquet"):
-        write_table(measure_grid([environment()], SMALL), tmp_path / "a.xlsx")

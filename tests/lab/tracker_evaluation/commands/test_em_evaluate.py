@@ -150,16 +150,6 @@ def test_check_finds_both_environments_by_name(capsys, tmp_path):
     assert "no environment 'off': choose with --off and --on from on, quiet" in err
 
 
-def test_check_compares_few_and_differing_points(capsys, tmp_path):
-    few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
-    assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
-    other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
-    values = json.loads(run(capsys, "em", "check", other, "--json")[1])
-    assert values["results"][0]["paired"] is False
-    low, high = values["results"][0]["difference_interval"]
-    assert low < 0.0 < high
-
-
 def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
     rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
     table = write_csv(tmp_path / "t.csv", rows)

@@ -41,52 +41,26 @@ def test_a_custom_environment_appears_by_its_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("arguments", "message"),
     [
-        ("length_mm = 80\n", "mine.toml: name: missing"),
-        ('name = "a"\nlenght_mm = 80\n', "unknown key; did you mean length_mm?"),
-        ('name = "a"\nlength_mm = 0\n', "mine.toml: length_mm = 0: must be above 0"),
-        ("name = \n", "mine.toml: not TOML"),
+        (("--environment", "mine.toml"), "unknown key; did you mean length_mm?"),
+        (("--environment", "nosy"), "no such environment (choices: ideal, noisy)"),
+        (("--environment", "."), "is a directory, not an environment file"),
+        (("--out", "out.txt"), "must end in .csv or .parquet"),
+        (("--out", "mine.csv"), "mine.csv: already exists"),
+        (("--out", "nodir/foo.csv"), "the folder nodir does not exist"),
     ],
 )
-def test_an_invalid_environment_file_gives_one_line(tmp_path, capsys, content, message):
-    mine = tmp_path / "mine.toml"
-    mine.write_text(content)
-    assert simulate(*FEW, "--environment", mine, "--out", tmp_path / "out.csv") == 2
+def test_bad_input_gives_one_line(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text('name = "a"\nlenght_mm = 80\n')
+    (tmp_path / "mine.csv").write_text("mine")
+    assert simulate(*FEW, *arguments) == 2
     complaint = capsys.readouterr().err
     assert message in complaint
     assert complaint.count("\n") == 1
-    assert not (tmp_path / "out.csv").exists()
-
-
-def test_an_unknown_environment_is_refused_with_the_choices(tmp_path, capsys):
-    assert simulate("--environment", "nosy", "--out", tmp_path / "out.csv") == 2
-    message = "nosy: no such file, and no such environment (choices: ideal, noisy)"
-    assert message in capsys.readouterr().err
-
-
-def test_a_folder_is_no_environment(tmp_path, capsys):
-    assert simulate("--environment", tmp_path, "--out", tmp_path / "out.csv") == 2
-    assert "is a directory, not an environment file" in capsys.readouterr().err
-
-
-def test_the_suffix_is_checked_before_the_work(tmp_path, capsys):
-    assert simulate("--out", tmp_path / "out.txt") == 2
-    assert "must end in .csv or .parquet" in capsys.readouterr().err
-
-
-def test_an_existing_table_is_not_overwritten(tmp_path, capsys):
-    out = tmp_path / "precious.csv"
-    out.write_text("mine")
-    assert simulate(*FEW, "--out", out) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
-    assert out.read_text() == "mine"
-
-
-def test_a_missing_folder_is_bad_input(tmp_path, capsys):
-    out = tmp_path / "nodir" / "foo.csv"
-    assert simulate(*FEW, "--out", out) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: the folder {out.parent} does not exist\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.csv", "mine.toml"]
+    assert (tmp_path / "mine.csv").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])

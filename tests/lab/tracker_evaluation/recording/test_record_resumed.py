@@ -16,7 +16,7 @@ from flexneedle.lab.tracker_evaluation.recording.record import open_session
 from recordings import ALL, GRID, Stage, assert_complete, rows_of, run
 
 
-@pytest.mark.parametrize("stopped_after", range(7))
+@pytest.mark.parametrize("stopped_after", [0, 1, 5, 6])
 def test_an_interrupted_recording_resumes_at_the_next_point(grid, out, stopped_after):
     stage = Stage()
     move = stage.move
@@ -39,7 +39,7 @@ def test_an_interrupted_recording_resumes_at_the_next_point(grid, out, stopped_a
     assert (np.diff([float(row["time_s"]) for row in rows_of(out)]) >= 0).all(), "times continue"
 
 
-@pytest.mark.parametrize("cut", [1, 20, 200, 400, 1000, 2000, 4000])
+@pytest.mark.parametrize("cut", [1, 20, 400, 4000])
 def test_a_table_truncated_anywhere_is_completed(grid, out, cut):
     run(out, grid, Stage())
     whole = out.stat().st_size
@@ -62,14 +62,6 @@ def test_a_table_is_unchanged_until_rows_are_added(grid, out):
     with open_session(out, grid):
         pass
     assert out.read_bytes() == b"", "the file existed before"
-
-
-def test_zero_bytes_left_by_a_power_cut_are_dropped(grid, out):
-    run(out, grid, Stage())
-    with out.open("ab") as file:
-        file.write(bytes(500))
-    run(out, grid, Stage())
-    assert_complete(out)
 
 
 def test_a_complete_table_is_unchanged(grid, out):

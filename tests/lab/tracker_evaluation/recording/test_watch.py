@@ -60,9 +60,13 @@ def test_a_custom_check_receives_the_history():
     assert snapshots[-1].verdict == "400"
 
 
-def test_it_stops_after_the_given_seconds():
-    clock, snapshots = Clock(), []
-    assert watch_tracker(Replay(frames(60), clock), clock, snapshots.append, seconds=0.5) == 20
+def test_it_stops_after_the_given_seconds_or_at_the_end_of_a_replay():
+    clock = Clock()
+    assert watch_tracker(Replay(frames(60), clock), clock, lambda _: None, seconds=0.5) == 20
+    clock, tracker = Clock(), Silent()
+    tracker.status = ENDED
+    assert watch_tracker(tracker, clock, lambda _: None, seconds=3.0) == 0
+    assert clock.time == 0.0
 
 
 def test_without_frames_the_status_is_shown_periodically():
@@ -70,13 +74,6 @@ def test_without_frames_the_status_is_shown_periodically():
     assert watch_tracker(Silent(), clock, snapshots.append, seconds=3.0) == 0
     assert 4 <= len(snapshots) <= 6
     assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
-
-
-def test_it_stops_at_the_end_of_a_replay():
-    clock, tracker = Clock(), Silent()
-    tracker.status = ENDED
-    assert watch_tracker(tracker, clock, lambda _: None, seconds=3.0) == 0
-    assert clock.time == 0.0
 
 
 def test_what_is_recorded_can_be_replayed(tmp_path):
@@ -93,12 +90,14 @@ def test_what_is_recorded_can_be_replayed(tmp_path):
     assert kept[7].readings["ref1"].indicator == 0.02
 
 
-def test_a_recording_overwrites_nothing(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "rule"), [("kept.csv", "already exists"), ("kept.parquet", "the output is CSV")]
+)
+def test_a_recording_is_a_new_csv_file(tmp_path, name, rule):
     (tmp_path / "kept.csv").write_text("mine")
-    clock = Clock()
-    with pytest.raises(InputError, match="already exists"):
-        watch_tracker(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
-    assert (tmp_path / "kept.csv").read_text() == "mine"
+    with pytest.raises(InputError, match=rule):
+        watch_tracker(Replay(frames(1), Clock()), Clock(), lambda _: None, record=tmp_path / name)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("kept.csv", "mine")]
 
 
 def verdict(history, settings=None, distorted=False):
@@ -165,13 +164,6 @@ def test_the_verdict_follows_the_monitor_of_a_held_insertion():
     ]
 
 
-def test_a_recording_is_a_csv(tmp_path):
-    clock = Clock()
-    with pytest.raises(InputError, match="the output is CSV"):
-        watch_tracker(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
-    assert not (tmp_path / "kept.parquet").exists()
-
-
 def sensors(*names, indicator=0.02):
     return [
         Frame(n / 40, n, {name: SensorReading((0.0, 0.0, 0.0), None, indicator) for name in names})
@@ -179,7 +171,7 @@ def sensors(*names, indicator=0.02):
     ]
 
 
-def test_without_a_number_all_present_references_are_used():
+def test_without_a_given_number_all_present_references_are_used():
     def check(frames):
         return make_field_check()(frames, False)[0]
 
@@ -188,8 +180,5 @@ def test_without_a_number_all_present_references_are_used():
     assert "field not known" in check(sensors("tip")), "no reference"
     assert check(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
     assert check(sensors("tip", "tip2", "ref1")) == VISIBLE, "a second sensor in the needle is no reference"
-
-
-def test_the_number_of_references_can_be_set():
     assert "field not known: 1 of 2" in make_field_check(2)(sensors("tip", "ref1"), False)[0]
     assert make_field_check(0)(sensors("tip"), False) == (VISIBLE, False)
