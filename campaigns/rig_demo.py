@@ -50,7 +50,7 @@ class Result:
 
 
 def measure(scenario: str, seed: int, out: Path) -> Result:
-    """Carry out one insertion on the emulated rig, and the same on the virtual one."""
+    """Carry out one insertion on the emulated and on the virtual rig."""
     with tempfile.TemporaryDirectory() as folder, witness() as seen:
         file = _scenario_file(scenario, Path(folder))
         found = run_insertion(Path(folder), file, seed, out)
@@ -78,7 +78,7 @@ def measure(scenario: str, seed: int, out: Path) -> Result:
 
 
 def _scenario_file(scenario: str, folder: Path) -> Path:
-    """The preset in a file; in space with the range in which the rig can roll the needle."""
+    """Return the file of the preset; in space, rotation is limited to the range of the rig."""
     made = flexneedle.load_scenario(scenario)
     if not made.setup.half_turns:
         made = made.with_values({"setup.max_rotation_deg": _ROTATION_DEG})
@@ -120,7 +120,7 @@ def main() -> None:
 
 
 def _exceeded(results: Sequence[Result]) -> Iterator[str]:
-    """A line for each bound that is exceeded."""
+    """Return a line for each exceeded bound."""
     undone = sum(one.outcome != "done" for one in results)
     growth = float(np.mean([one.true_error - one.simulated_error for one in results]))
     slowest, missed = max(one.tick_99 for one in results), sum(one.unexplained for one in results)

@@ -80,7 +80,7 @@ class Rig:
 
 
 def draw_case(number: int) -> Rig:
-    """The rig of a number."""
+    """Return the rig of a number."""
     rng = np.random.default_rng([_STREAM, number])
     has_guide, in_space, any_angle, preset = rng.random(4) < (0.8, 0.4, 0.5, 0.3)
     guides = 0 if not has_guide else 1 + int(in_space and rng.random() < 0.7)
@@ -94,7 +94,7 @@ def draw_case(number: int) -> Rig:
 
 
 def _preset(rng: np.random.Generator, guides: int, *, in_space: bool, any_angle: bool) -> Scenario:
-    """The preset phantom; with a guide that does not move, its target is within reach of the bevel."""
+    """Return the preset phantom; for a guide that does not move, with a target within reach of the bevel."""
     depth, lateral = (
         float(rng.uniform(25.0, 45.0)),
         float(rng.uniform(-5.0, 5.0) if guides else rng.uniform(-1.0, 1.0)),
@@ -132,7 +132,7 @@ def _world(number: int, guides: int, *, in_space: bool, any_angle: bool) -> Scen
 def _rig(
     rng: np.random.Generator, name: str, scenario: Scenario, guides: int, *, any_angle: bool
 ) -> dict[str, Any]:
-    """The values of a rig file with room for the scenario."""
+    """Return the values of a rig file whose travel suffices for the scenario."""
     setup, values = scenario.setup, RIGS.shipped("emulated")
     low = -round(float(rng.uniform(0.0, 5.0)), 1)
     across = round(setup.max_guide_travel_mm + float(rng.uniform(0.1, 5.0)), 1)
@@ -249,14 +249,14 @@ def _compare(found: Inserted, rig: Rig) -> dict[str, Any]:
 
 
 def is_bad(row: dict[str, Any]) -> bool:
-    """Return whether an insertion failed, or was held where the simulated one is done."""
+    """Return whether an insertion failed, or was held although the simulated one finished."""
     if row["outcome"] == "held":
         return row["simulated_outcome"] == _DONE
     return bool(row["outcome"] != _DONE)
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown: outcomes, quantiles of the errors, ticks, motion in the queue, and insertions that are not done."""
+    """Return Markdown: outcomes, quantiles of the errors, ticks, motion in the queue, and unfinished insertions."""
     outcomes = Counter(row["outcome"] for row in rows)
     both = [row for row in rows if row["outcome"] == _DONE == row["simulated_outcome"]]
     parts = [
@@ -309,7 +309,7 @@ def _queues(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def format_row(row: dict[str, Any]) -> str:
-    """A row in a line."""
+    """Return a row as a line."""
     error, simulated = row.get("true_error_mm", math.nan), row.get("simulated_error_mm", math.nan)
     queued = ", ".join(f"{axis} {way:.3g}" for axis, way in row["queued"].items() if way)
     return (
@@ -350,7 +350,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the rigs that are missing, and print the summary; exit status 1 if one is bad, or has no row."""
+    """Run the missing rigs and print the summary; exit status 1 if a rig is bad or has no row."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

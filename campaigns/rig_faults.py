@@ -29,7 +29,7 @@ from rig_trials import Row, resume_rows
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the trials that are missing, and print the table; exit status 1 if one was not as required."""
+    """Run the missing trials and print the table; exit status 1 if a trial violated a requirement."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def format_row(row: Row, faults: Sequence[Fault]) -> str:
-    """Return a row in a line."""
+    """Return a row as a line."""
     wrong = problems(_fault_of(row, faults), row)
     detection = "" if row["detection_s"] is None else f" after {row['detection_s']:.3f} s"
     return (

@@ -72,7 +72,7 @@ Row = dict[str, Any]
 
 
 def resume(path: Path, key: Row, run: Callable[[], Row]) -> Row:
-    """The row with these values in a file of rows (JSON, a line each); where it is missing it is made and appended."""
+    """Return the row with these values from a file of rows (JSON lines); a missing row is made and appended."""
     rows = map(json.loads, path.read_text().splitlines()) if path.exists() else ()
     found = next((row for row in rows if key.items() <= row.items()), None)
     if found is not None:
@@ -85,7 +85,7 @@ def resume(path: Path, key: Row, run: Callable[[], Row]) -> Row:
 
 @contextmanager
 def rig_with(section: str, seed: int, out: Path) -> Iterator[EmulatedRig]:
-    """An emulated rig with a section in its file. out: folder of the record; one that was interrupted is removed."""
+    """Serve an emulated rig with a section in its file. out: folder of the record; an interrupted record is removed."""
     shutil.rmtree(out, ignore_errors=True)
     with tempfile.TemporaryDirectory() as folder:
         text = shipped_rig().replace("[tracker]", f"{section}\n\n[tracker]")
@@ -98,7 +98,7 @@ def rig_with(section: str, seed: int, out: Path) -> Iterator[EmulatedRig]:
 
 @contextmanager
 def subscribers(count: int) -> Iterator[list[int]]:
-    """Processes that subscribe to all topics of `neutral`; the first is slow. Gives their messages, once ended."""
+    """Run subscribers to all topics of `neutral`, the first a slow one; their messages are complete at the end."""
     command = [sys.executable, BENCHMARKS / "ros.py", "--profile", "neutral", "--subscriber"]
     others = [subprocess.Popen([*command, kind], stdin=_PIPE, stdout=_PIPE) for kind in KINDS[:count]]
     received: list[int] = []
@@ -137,7 +137,7 @@ def cost(seed: int, count: int, out: Path) -> Row:
 
 
 class Operator:
-    """A process that publishes on the topics of stops and arms, once it has found the insertion."""
+    """Run a process that publishes on the topics of stops and arms, after it has found the insertion."""
 
     def __init__(self) -> None:
         command = [sys.executable, BENCHMARKS / "ros_stop.py", "--publisher"]
@@ -152,7 +152,7 @@ class Operator:
         self._process.communicate()
 
     def publish(self, order: str) -> float:
-        """Publish as an order such as `stop true` demands; return the time (s, monotonic)."""
+        """Publish for an order such as `stop true`; return the time (s, monotonic)."""
         self._process.stdin.write(f"{order} 0\n")
         self._process.stdin.flush()
         return float(self._process.stdout.readline())
@@ -188,7 +188,7 @@ def _await_line(process: "subprocess.Popen[bytes]", text: bytes) -> None:
 
 
 def _kill_node(pid: int) -> float:
-    """Kill the ROS node of an insertion; return when."""
+    """Kill the ROS node of an insertion and return the time."""
     children = psutil.Process(pid).children()
     node = next(child for child in children if "flexneedle.lab.ros.node" in child.cmdline())
     now = monotonic()
@@ -216,13 +216,13 @@ def _judge(truth: TruthRecord, sent: float, run: Row) -> Row:
 
 
 def good(row: Row) -> bool:
-    """Return whether an insertion ended as it must."""
+    """Return whether an insertion ended as required."""
     stopped = row["status"] == _INTERRUPTED and not isnan(row["reported_ms"])
     return bool(stopped and row["rests"] and row["moved_after_mm"] <= _MOST_MM)
 
 
 def costs_nothing(row: Row) -> bool:
-    """Return whether an insertion is done, with no tick left out but for stalls of the machine and no late decision."""
+    """Return whether an insertion finished without a late decision and without missed ticks, except during stalls."""
     return bool(row["outcome"] == "done" and row["unexplained"] == 0 and row["late"] == 0)
 
 
@@ -251,7 +251,7 @@ def costs(pairs: int, first: int, out: Path) -> bool:
 
 
 def stops(count: int, out: Path) -> bool:
-    """Run insertions that are stopped, and print their table and a summary; return whether all ended as they must."""
+    """Run and stop insertions, print their table and a summary; return whether all ended as required."""
     print("stop           no   mm/s  reported      rest    moved  after the report  reason")
     rows: dict[str, list[Row]] = {how: [] for how in STOPS}
     for timing, how in product(range(count), STOPS):
@@ -276,7 +276,7 @@ def _line(how: str, name: str, row: Row) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is missing, and print both tables; exit status 1 if an insertion was not as required."""
+    """Run missing insertions and print both tables; exit status 1 if an insertion violated a requirement."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""Processes for studies of rigs: an emulated rig, an insertion on it, and a witness of the machine's own stalls."""
+"""Processes for studies of rigs: an emulated rig, an insertion on it, and a witness of the stalls of the machine."""
 
 import json
 import math
@@ -64,7 +64,7 @@ class Lines:
 
 @dataclass
 class EmulatedRig:
-    """An emulated rig that serves: its rig file, its orders, and the file of the true states."""
+    """A running emulated rig: its rig file, its orders, and the file of the true states."""
 
     process: subprocess.Popen[bytes]
     lines: Lines
@@ -94,7 +94,7 @@ class EmulatedRig:
 
 
 def shipped_rig() -> str:
-    """The rig file of the package for an emulated rig."""
+    """Return the rig file of the package for an emulated rig."""
     return (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text()
 
 
@@ -145,7 +145,7 @@ def insertion(
 
 
 def wait_for_end(process: subprocess.Popen[bytes], seconds: float = END_S) -> tuple[int, str, str]:
-    """Wait for the end of an insertion; return its exit status and what it has printed on stdout and stderr.
+    """Wait for the end of an insertion; return its exit status, stdout and stderr.
 
     One that hangs is killed; stderr has where each of its threads was.
     """
@@ -182,7 +182,7 @@ class Inserted:
 
     @property
     def reason(self) -> str:
-        """Return why it ended as it did, in one line."""
+        """Return the reason for the end, in one line."""
         printed = self.errors.strip().splitlines() if self.status not in (0, 1) else ()
         return str(self.run.get("reason") or "") or next(reversed(printed), "")
 
@@ -192,7 +192,7 @@ class Inserted:
         return (self.run.get("timing") or {}).get("ticks") or {}
 
     def unexplained(self, seen: "Witness") -> int:
-        """Stalls of the ticks at which the witness was not late, too."""
+        """Stalls of the ticks during which the witness was not late."""
         return sum(not seen.explains(one["time_s"], one["late_s"]) for one in self.ticks.get("stalls", ()))
 
 
@@ -218,7 +218,7 @@ def run_insertion(
 
 
 def axial_innovation(record: Insertion) -> float:
-    """Mean axial innovation (mm) of the periods with good readings."""
+    """Return the mean axial innovation (mm) of the periods with good readings."""
     found = [one.innovation[0] for one in record.periods if one.verdict.ok and one.readings]
     return float(np.mean(found)) if found else float("nan")
 
@@ -277,7 +277,7 @@ def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
 
 
 def _end(pool: ThreadPoolExecutor) -> None:
-    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between."""
+    """Cancel tasks, and end all child processes until no task runs, since a task may start further processes."""
     closing = Thread(target=pool.shutdown, kwargs={"cancel_futures": True})
     closing.start()
     wait_for_end = set[psutil.Process]()
@@ -301,7 +301,7 @@ class Witness:
     text: str | None = None
 
     def explains(self, time: float, late: float) -> bool:
-        """Return whether it was late, too, by at least half as much, when a tick began late at this time."""
+        """Return whether the witness was late by at least half as much when a tick began late at this time."""
         begun = time - late - 0.005
         return any(begun <= at <= time + 0.05 and gap >= 0.5 * late for at, gap in self._stalls())
 
@@ -314,7 +314,7 @@ class Witness:
 
 @contextmanager
 def witness() -> Iterator[Witness]:
-    """Watch the machine: a process with the priority of the supervisor sleeps 1 ms again and again."""
+    """Detect stalls of the machine: a process with the priority of the supervisor repeatedly sleeps 1 ms."""
     with tempfile.TemporaryDirectory() as folder:
         found = Witness(Path(folder) / "stalls")
         with found.file.open("wb") as file:
@@ -328,7 +328,7 @@ def witness() -> Iterator[Witness]:
 
 
 def watch() -> None:
-    """Print each stall of more than 5 ms: when it ended, and how long it was."""
+    """Print the end and the length of each stall of more than 5 ms."""
     set_realtime_priority()
     before = monotonic()
     while True:
@@ -355,7 +355,7 @@ def is_at_rest(truth: TruthRecord, seconds: float = 0.5, most: float = 0.005) ->
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """A percentile of values; NaN of none."""
+    """Return a percentile of values, NaN without values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("nan")
 

@@ -70,7 +70,7 @@ LATE = replace(CONTROLLERS[DEFAULT], name="late", decide=_decide)
 
 @dataclass(frozen=True)
 class Job:
-    """An insertion: its pair, and how much longer a decision takes (ms)."""
+    """An insertion: its pair, and the additional time of a decision (ms)."""
 
     pair: int
     decision_ms: int
@@ -96,7 +96,7 @@ def scenario_of(pair: int) -> tuple[str, tuple[str, ...]]:
 
 
 def measure(job: Job, out: Path, seen: Witness) -> dict[str, Any]:
-    """Carry out one insertion; return its row."""
+    """Carry out one insertion and return its row."""
     scenario, options = scenario_of(job.pair)
     record = out / f"{job.pair}-{job.decision_ms}"
     shutil.rmtree(record, ignore_errors=True)
@@ -175,7 +175,7 @@ class Line:
 
 
 def complete(rows: Sequence[dict[str, Any]]) -> dict[int, list[dict[str, Any]]]:
-    """The rows of the pairs that are done with every time, by time, in the order of the pairs."""
+    """Return the rows of the pairs that finished with every time, by time, in the order of the pairs."""
     done = {(row["pair"], row["decision_ms"]): row for row in rows if row["outcome"] == "done"}
     pairs = sorted(
         pair for pair in {row["pair"] for row in rows} if all((pair, ms) in done for ms in DECISIONS_MS)
@@ -184,7 +184,7 @@ def complete(rows: Sequence[dict[str, Any]]) -> dict[int, list[dict[str, Any]]]:
 
 
 def mean_with_interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Mean and the ends of its 95 % interval: the percentiles of the means of 10,000 draws with replacement."""
+    """Return the mean and the ends of its 95 % interval: percentiles of the means of 10,000 draws with replacement."""
     drawn = np.random.default_rng(0).choice(values, (_DRAWS, len(values))).mean(axis=1)
     low, high = np.percentile(drawn, (2.5, 97.5))
     return float(values.mean()), float(low), float(high)
@@ -196,7 +196,7 @@ def tail(least: int, count: int) -> float:
 
 
 def count_held(rows: Sequence[dict[str, Any]], ms: int) -> tuple[int, int]:
-    """Return the numbers of pairs that are held with a delay and done without, and the other way round."""
+    """Return the numbers of pairs that are held only with a delay, and only without."""
     outcomes = {(row["pair"], row["decision_ms"]): row["outcome"] for row in rows}
     both = Counter(
         (outcomes[pair, ms], outcomes.get((pair, DECISIONS_MS[0]))) for pair, at in outcomes if at == ms
@@ -205,7 +205,7 @@ def count_held(rows: Sequence[dict[str, Any]], ms: int) -> tuple[int, int]:
 
 
 def lines(rows: Sequence[dict[str, Any]]) -> Iterator[Line]:
-    """A line for each time; none before the first pair is complete."""
+    """Yield a line for each time; none before the first pair is complete."""
     paired = complete(rows)
     base = np.array([row["true_error_mm"] for row in paired[DECISIONS_MS[0]]])
     if not len(base):
@@ -285,7 +285,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the insertions that are missing, and print the table; exit status 1 if one is not as required."""
+    """Run the missing insertions and print the table; exit status 1 if an insertion violates a requirement."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -74,7 +74,7 @@ class TrueParameters:
 
 @cache
 def field_factor() -> np.ndarray:
-    """Return Cholesky factor of the covariance of a smooth unit field at the grid points and VOLUME_POINTS."""
+    """Return the Cholesky factor of the covariance of a smooth unit field at the grid points and VOLUME_POINTS."""
     points = np.concatenate([GRID, VOLUME_POINTS])
     squared_distance = ((points[:, None] - points[None]) ** 2).sum(axis=2)
     return np.linalg.cholesky(np.exp(-squared_distance / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(points)))
@@ -130,7 +130,7 @@ def draw_table(
 
 
 def evaluate_table(table: Columns) -> dict[str, tuple[float, tuple[float, float]]]:
-    """Return estimate and interval of each parameter."""
+    """Return the estimate and interval of each parameter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "table.parquet"
         write_table(table, path)

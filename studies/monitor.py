@@ -178,7 +178,7 @@ def tip_distance(one: RunRecord, other: RunRecord, time: float) -> float:
 def path_deviation(one: RunRecord, other: RunRecord, time: float) -> float:
     """Return the lateral distance (mm) of the true tip at a time (s) from the path of another run, at the same depth.
 
-    Not at the same time: a controller may rest, so that two runs on the same path are at different depths.
+    Depths are compared instead of times, since a controller may rest.
     """
     depth, lateral = (np.interp(time, one.time, one.tip[:, k]) for k in (0, 1))
     path = np.maximum.accumulate(other.tip[:, 0]), other.tip[:, 1]

@@ -82,7 +82,7 @@ class PhantomParameters:
 
 
 def parameters_of(scenario: Scenario, seed: int) -> PhantomParameters:
-    """Return parameters of the phantom of an insertion."""
+    """Return the parameters of the phantom of an insertion."""
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]))
     factors = [
         real.shear_modulus_kpa / layer.shear_modulus_kpa
@@ -277,7 +277,7 @@ def of_folder(folder: Path, source: str | None) -> ExpandedStudy:
 def repeat_in_variants(
     pool: Executor, plans: StudyPlans, worst: Sequence[StudyInsertion], samples: int
 ) -> list[list[list[Ending]]]:
-    """Return endings of the worst insertions in each variant with each sample (N, variants, samples)."""
+    """Return the endings of the worst insertions in each variant with each sample (N, variants, samples)."""
     calls = [
         [
             [
