@@ -288,4 +288,4 @@ def test_the_help_names_the_defaults(capsys):
         cli.main(["insert", "--help"])
     message = " ".join(capsys.readouterr().out.split())
     assert f"(default: {DEFAULT})" in message
-    assert all(f"{kind}," in message for kind in PLANTS)
+    assert all(f"{kind} (" in message for kind in PLANTS)

@@ -79,10 +79,10 @@ def _add_galil(commands: Commands) -> None:
         "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
     )
     galil.add_argument(
-        "--port", type=_port, default=0, metavar="N", help="port to listen on (default: one that is free)"
+        "--port", type=_port, default=0, metavar="N", help="port to listen on (default: any free port)"
     )
     _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
-    add_seed(galil, "seed of changed bytes")
+    add_seed(galil, "seed of the changed bytes")
 
 
 def _add_rig(commands: Commands) -> None:
@@ -127,7 +127,7 @@ def _add_fault(parser: argparse.ArgumentParser, fault: str, page: str, *, device
 
 def _port(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text) <= _LAST_PORT):
-        raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (one that is free) to {_LAST_PORT}")
+        raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (any free port) to {_LAST_PORT}")
     return int(text)
 
 

@@ -48,7 +48,7 @@ def _add_check(commands: Commands) -> None:
     parser = add_command(
         commands,
         "check",
-        "compare a rig with its file; moves nothing",
+        "compare a rig with its file, without motion",
         _check,
         "flexneedle rig check rig.toml",
         "flexneedle rig check rig.toml --scenario phantom --json",
@@ -100,12 +100,12 @@ def _add_home(commands: Commands) -> None:
     parser = add_command(
         commands,
         "home",
-        "find the zero of axes",
+        "home axes",
         _home,
         "flexneedle rig home rig.toml",
         "flexneedle rig home rig.toml insertion --yes",
-        about="Find the zero of axes by the key home of the rig file, one after the other, insertion "
-        "first. Only without a needle in tissue. Asks for confirmation; Ctrl-C stops.",
+        about="Home axes by the key home of the rig file, one after another, insertion first. Use it "
+        "only without a needle in tissue. Asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(

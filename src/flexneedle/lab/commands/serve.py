@@ -62,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         type=_port,
         default=_PORT,
         metavar="N",
-        help=f"port to listen on, 0 for any free one (default: {_PORT})",
+        help=f"port to listen on, 0 for any free port (default: {_PORT})",
     )
     parser.add_argument(
         "--open",
