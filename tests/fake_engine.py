@@ -16,7 +16,7 @@ from synthetic import make_periods, make_plan
 
 def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, *, miss=0.0):
     """Plan as `flexneedle.plan` does; `miss` displaces the end of the plan."""
-    made = make_plan(strategy, target or scenario.target.position, seed)
+    made = make_plan(strategy, target or scenario.target.position, seed, step=3.0)
     for iteration in range(1, 6):
         progress({"iteration": iteration, "iterations": 5, "best": 9.0, "cost_mean": 9.0})
     limit = "setup.max_guide_travel_mm = 15" if miss > 1.0 else ""

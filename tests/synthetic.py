@@ -37,16 +37,16 @@ def _poses(x, curve):
     return rows
 
 
-def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
-    """Return a plan that meets its target to 0.01 mm."""
-    depth = np.append(np.arange(START, target[0], STEP), target[0])
+def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0, step=STEP):
+    """Return a plan that meets its target to 0.01 mm, in steps of `step` mm."""
+    depth = np.append(np.arange(START, target[0], step), target[0])
     entry = -2.0 if strategy == "manipulation" else 0.3
     tips = tip_path(depth, (target[0], target[1] + 0.01), entry)
     guide = (-3.0 if strategy == "manipulation" else 0.0) * np.sin(np.linspace(0.0, 2.4, len(depth)))
     inside = np.clip(depth, 0.0, None) / target[0]
     energy = (0.8 if strategy == "manipulation" else 2.1) * inside**2
     controls = controls_of(len(depth) - 1, db_x=np.diff(depth), dg_y=np.diff(guide))
-    controls[TURN_AT, ROLL] = np.pi
+    controls[round(TURN_AT / step), ROLL] = np.pi
     shapes = np.stack(
         [
             needle_shape(tips[: k + 1], d - LENGTH, g)
@@ -65,11 +65,12 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
 def make_periods(plan, miss=0.06, seed=0):
     """Yield a period for each step of the plan; the true tip ends `miss` mm beyond the target, laterally."""
     rng = np.random.default_rng(seed)
-    roll = plan.roll
+    roll, step = plan.roll, plan.tips[1, X] - plan.tips[0, X]
+    flips = [round((TURN_AT + off) / step) for off in (-4, 8, 20)]
     for k, (before, tip) in enumerate(pairwise(plan.tips)):
         inside = max(0.0, tip[0]) / plan.target[0]
         off = 0.5 * np.cos(3 * inside) * (1 - inside) + miss * inside
-        flip = k in (TURN_AT - 4, TURN_AT + 8, TURN_AT + 20)
+        flip = k in flips
         roll = np.pi - roll if flip else roll
         x, y, _, theta, _ = tip.tolist()
         true = Pose(x, y + off, 0.0, theta + 0.002, 0.0)

@@ -26,7 +26,7 @@ def test_export_writes_one_line_per_period_with_units(engine, capsys, in_tmp):
     assert text == (in_tmp / "other.csv").read_text()
     rows = list(csv.DictReader(text.splitlines()))
     assert tuple(rows[0]) == COLUMNS
-    assert len(rows) == 69
+    assert len(rows) == 23
     assert float(rows[-1]["true_x_mm"]) == 40.0
     assert rows[-1]["guide_y_mm"].count(".") == 1
 
@@ -58,8 +58,8 @@ def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
         *("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm"),
         *(f"{name}.{part}" for name in ("tip", "ref1", "ref2", "ref3") for part in sensor),
     ]
-    assert [int(row["frame_number"]) for row in rows] == list(range(8 * 69))
-    assert [int(row["period"]) for row in rows] == [k // 8 for k in range(8 * 69)]
+    assert [int(row["frame_number"]) for row in rows] == list(range(8 * 23))
+    assert [int(row["period"]) for row in rows] == [k // 8 for k in range(8 * 23)]
     last = rows[-1]
     period = read_trace(in_tmp / "here/trace.mcap").periods[-1]
     assert float(last["time_s"]) == period.readings[-1].measurement.time

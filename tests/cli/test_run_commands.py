@@ -64,10 +64,10 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert (status, result["target_mm"], result["reached"]) == (0, [40.0, -4.5, 0.0], True)
     assert (result["controller"], result["phantom"]) == (DEFAULT, "exact")
     assert result["true_error_mm"] == pytest.approx(0.07)
-    assert (result["flips"], result["planned_flips"], result["steps"], result["seed"]) == (3, 1, 69, 3)
+    assert (result["flips"], result["planned_flips"], result["steps"], result["seed"]) == (3, 1, 23, 3)
     assert result["strain_energy_mj"] == pytest.approx(1.25 * result["planned_strain_energy_mj"])
     assert set(result["timing"]) == {"plan_seconds", "period_ms"}
-    assert result["timing"]["period_ms"]["max"] == pytest.approx(5.1 + 0.01 * 68)
+    assert result["timing"]["period_ms"]["max"] == pytest.approx(5.1 + 0.01 * 22)
     stored = read(result["run_dir"])
     assert (stored["result"], stored["status"]) == (without_place(result), "done")
     assert stored["scenario"]["target"] == {"depth_mm": 40.0, "lateral_mm": -4.5, "lateral_z_mm": 0.0}
@@ -133,7 +133,7 @@ def test_a_target_in_space_has_two_lateral_offsets_and_two_entry_angles(engine, 
     ("options", "line", "status"),
     [
         ({"miss": 1.4}, "MISSED: the tip ended 1.410 mm from the target, more than 1 mm", "done"),
-        ({"outcome": "held"}, "Held after 69 periods: no sample for 1.00 s", "held"),
+        ({"outcome": "held"}, "Held after 23 periods: no sample for 1.00 s", "held"),
     ],
 )
 def test_an_insertion_that_does_not_reach_its_target_fails(engine, capsys, options, line, status):
@@ -141,7 +141,7 @@ def test_an_insertion_that_does_not_reach_its_target_fails(engine, capsys, optio
     code, out, _ = run(capsys, "insert", "--out", "here")
     assert (code, out.splitlines()[0], read("here")["status"]) == (1, line, status)
     code, result, _ = insert_json(capsys)
-    assert (code, result["outcome"], result["steps"], result["reached"]) == (1, status, 69, False)
+    assert (code, result["outcome"], result["steps"], result["reached"]) == (1, status, 23, False)
 
 
 def test_a_plan_that_misses_names_its_limit(engine, capsys):
@@ -152,7 +152,7 @@ def test_a_plan_that_misses_names_its_limit(engine, capsys):
     assert "flexneedle: warning: the plan MISSES the target: best distance 2.510 mm" in err
     assert "limited by setup.max_guide_travel_mm = 15" in err
     status, forced, _ = insert_json(capsys, "--force", "--controller", "open-loop")
-    assert (status, forced["steps"], forced["planned_error_mm"]) == (1, 69, pytest.approx(2.51))
+    assert (status, forced["steps"], forced["planned_error_mm"]) == (1, 23, pytest.approx(2.51))
     status, refused, err = insert_json(capsys, "--out", "here", "--controller", "open-loop")
     assert (status, err.splitlines()[-1]) == (1, f"flexneedle: {refused['reason']}")
     assert "limited by setup.max_guide_travel_mm" in refused["reason"]

@@ -147,11 +147,16 @@ def test_a_plan_without_steps_is_restored():
 
 
 def test_text_is_json_with_one_row_per_line():
-    values = {"a": np.arange(4.0).reshape(2, 2), "b": [], "c": {}, "d": {"e": float("nan"), "f": (1, "µ")}}
+    values = {
+        "a": np.array([[0.0, 1.0], [2.0, np.nan]]),
+        "b": [],
+        "c": {},
+        "d": {"e": float("nan"), "f": (1, "µ")},
+    }
     text = to_text(values)
     assert json.loads(text) == plain(values)
     assert text == (
-        '{\n "a": [\n  [0.0, 1.0],\n  [2.0, 3.0]\n ],\n "b": [],\n "c": {},\n'
+        '{\n "a": [\n  [0.0, 1.0],\n  [2.0, null]\n ],\n "b": [],\n "c": {},\n'
         ' "d": {\n  "e": null,\n  "f": [1, "µ"]\n }\n}\n'
     )
 

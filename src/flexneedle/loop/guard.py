@@ -76,7 +76,7 @@ class Guard:
         yield Excess(past - self.past, f"tip {past:.2f} mm past the target > {self.past:g} mm")
 
     def _compression_excess(self, state: State) -> Excess:
-        """Return the excess of the contact that is most beyond the limit of its law."""
+        """Return the excess of the contact that is farthest beyond the limit of its law."""
         contacts = state.contacts
         if not contacts.active.any():
             return Excess(-math.inf, "")

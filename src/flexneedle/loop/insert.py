@@ -38,10 +38,10 @@ def insert(
 ) -> Insertion:
     """Execute a plan in closed loop and return the complete record.
 
-    The record is the same for the same seed, except for wall-clock durations. A DriverError of driver or tracker is no
-    exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
-    stopped at the rig, with the outcome "interrupted", and one with a command that the rig refuses, with the outcome
-    "held". The driver is stopped at the end, after an error and after an interrupt.
+    The record is the same for the same seed, except for wall-clock durations. An insertion that ends early has its
+    reason and all periods until then: the outcome is "failed" after a DriverError of driver or tracker, "interrupted"
+    after a stop at the rig, and "held" after a command that the rig refuses. The driver is stopped at the end, after an
+    error and after an interrupt.
 
     Args:
         scenario: Scenario, or its name or path as for `load_scenario`. It may differ from the plan's own only in

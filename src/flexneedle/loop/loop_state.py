@@ -30,7 +30,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class DecisionRefusal:
-    """Reason to carry out no decision, "" for none, and the time (s) held for it.
+    """Reason to refuse decisions, "" for none, and the time (s) held for it.
 
     No path reaches the target, the command would exceed a limit, or the rig, whose checks may differ from the loop's,
     ends motions before their goal. The time does not run while the needle is held for the tracker; a decision that is

@@ -1,8 +1,8 @@
 """`trace.mcap`: a run as standard ROS 2 messages, complete up to the last period even if the process is killed.
 
-Each period is one chunk (uncompressed), given to the operating system at once when the period ends, so that the file
-ends with a complete record. The disk itself gets it when the system writes its cache, and at the end: no period waits
-for a disk. A power failure may cost the periods of the last half minute.
+Each period is one uncompressed chunk. It is passed to the operating system when the period ends, so that the file ends
+with a complete record. No period waits for the disk: the system writes its cache later, and a power failure may cost
+the periods of the last half minute.
 """
 
 import json
@@ -40,7 +40,7 @@ class TraceWriter:
     """Writes a run to a new file. Use it as a context manager, or call `close`.
 
     about: metadata `flexneedle` of the file, such as seed and versions; scenario: nested values, attached as
-    `scenario.json`. Raises FileExistsError if the file exists. It and all functions raise RecordError if the file
+    `scenario.json`. Raises FileExistsError if the file exists. All functions raise RecordError if the file
     cannot be written; earlier periods are kept, and the writer is closed.
     """
 

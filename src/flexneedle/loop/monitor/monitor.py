@@ -87,9 +87,9 @@ class _Repeats:
 class _Jump:
     """A jump that no later reading has revoked: the largest distance (mm) from the last good reading at its time (s).
 
-    The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew over time, a
-    sensor that has slipped would soon be accepted. Only the travel that is still predicted adds to it. A reading as
-    close to its prediction, which no reading has corrected since, shows that the last good one was wrong.
+    The needle is held after a jump. The limit therefore does not grow with time, or a sensor that has slipped would
+    soon be accepted; it grows only with the travel that is still predicted. A later reading that is as close to the
+    prediction, which no reading has corrected since, shows that the last good reading was wrong.
     """
 
     time: float
