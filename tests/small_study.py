@@ -13,6 +13,7 @@ name = "mine"
 title = "Mine"
 repeats = 2
 [values]
+controller = "open-loop"
 plan = { samples = 16, iterations = 2 }
 setup.tip_to_skin_mm = 4.0
 phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }

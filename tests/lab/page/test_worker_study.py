@@ -64,7 +64,7 @@ def test_rows_are_listed_with_their_settings_the_worst_first(made):
     assert next(row for row in message.rows if row.index == 6) == StudyRow(
         index=6,
         settings="base, phantom.tracker_bias_mm 0.3",
-        controller="adaptive-mpc",
+        controller="open-loop",
         target=(7.0, 0.0, 0.0),
         error_mm=errors[6],
         outcome="done",

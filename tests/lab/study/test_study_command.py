@@ -15,14 +15,13 @@ from flexneedle.lab.study.runner import StudyProgress
 from small_study import STUDY
 
 SIZE = 8
-QUICK = STUDY.replace("[values]", '[values]\ncontroller = "open-loop"')
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch, in_threads):  # noqa: ARG001
     """An empty folder with the file of a study, the current one."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "my.toml").write_text(QUICK)
+    (tmp_path / "my.toml").write_text(STUDY)
     return tmp_path
 
 

@@ -20,6 +20,7 @@ STUDY = """\
 name = "mine"
 repeats = 2
 [values]
+controller = "open-loop"
 plan = { samples = 16, iterations = 2 }
 setup.tip_to_skin_mm = 4.0
 target = [8, 0.5]
