@@ -17,29 +17,11 @@ from starlette.websockets import WebSocketDisconnect
 import flexneedle.lab.page
 from flexneedle.lab.page.protocol import DoneMessage, RefusedMessage, ServerMessage
 from flexneedle.lab.page.requests import REQUESTS
+from flexneedle.lab.page.server.access import _with_headers
 from recorded_page import TARGET, opening, people, scene, scene_frames, session
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-    "font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
 _KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
-
-
-class Guarded:
-    """An application with the page's content security policy on every answer."""
-
-    def __init__(self, app):
-        self.app = app
-
-    async def __call__(self, scope, receive, send):
-        async def guarded(message):
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], (b"content-security-policy", POLICY.encode())]
-            await send(message)
-
-        await self.app(scope, receive, guarded)
 
 
 class FakePage:
@@ -64,8 +46,13 @@ class FakePage:
             WebSocketRoute("/live", self._live),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
+        app = Starlette(routes=routes)
+
+        async def guarded(scope, receive, send):
+            await app(scope, receive, _with_headers(send))
+
         config = uvicorn.Config(
-            Guarded(Starlette(routes=routes)),
+            guarded,
             port=0,
             log_level="critical",
             ws="websockets-sansio",

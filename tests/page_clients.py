@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 from websockets.sync.client import connect
 
+from flexneedle.lab.page.protocol import ServerMessage
 from flexneedle.lab.page.server import worker_process
 from flexneedle.lab.page.server.clients import PageLimits
 from flexneedle.lab.page.server.page_server import PageServer
@@ -24,9 +25,9 @@ from page_worker import WorkerThread
 
 STUB = ("page_worker",)
 PATIENCE_S = 20.0
-"""Time after which a test gives up; what it waits for takes milliseconds."""
+"""Deadline of a wait, which takes milliseconds on an idle machine."""
 QUICK = PageLimits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
-"""Waits that tests can wait for; a changed scenario is not planned by itself."""
+"""Limits with short waits; a changed scenario is planned only on request."""
 
 
 def start_worker(module, *arguments):
@@ -59,7 +60,7 @@ def port_of(server) -> int:
 
 
 class Client:
-    """A client: `newest` has the last message of each key, `rows` those that it got, in order."""
+    """A client. newest: last message of each key; rows: received rows of each insertion, in order."""
 
     def __init__(self, server, **options) -> None:
         port = port_of(server)
@@ -107,7 +108,7 @@ class Client:
         return self
 
     def listed(self) -> list[str]:
-        """Names of the runs, the newest first; none before they have come."""
+        """Return the names of the runs, the newest first; none before the first message."""
         return [run["name"] for run in self.newest.get("runs", {"runs": []})["runs"]]
 
     def answer_to(self, number: int) -> dict | None:
@@ -115,7 +116,7 @@ class Client:
         return next((answer for answer in answers if answer and answer["request"] == number), None)
 
     def wait(self, wanted: Callable[[], object]):
-        """Read until something is wanted, and return it."""
+        """Read messages until a function returns a true value, and return that."""
         end = monotonic() + PATIENCE_S
         while not (found := wanted()):
             self.read(timeout=max(end - monotonic(), 0.0))
@@ -154,17 +155,17 @@ class Client:
         self.wait(lambda: [row["index"] for row in self.rows.get(of, ())] == list(range(count)))
 
 
-_PARTS = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}
+BY = {each.model_fields["type"].default: each.by for each in ServerMessage.__subclasses__()}
 
 
 def _key(values) -> str:
-    """The key of a message, as `ServerMessage.key`."""
-    kind = values["type"]
-    return f"{kind} {values[_PARTS[kind]]}" if kind in _PARTS else kind
+    """Return the key of a message, as `ServerMessage.key`."""
+    by = BY[values["type"]]
+    return f"{values['type']} {values[by]}" if by else values["type"]
 
 
 def get(server, path: str, **headers) -> tuple[int, str, dict[str, str]]:
-    """Status, text and headers (lower case) of a page; headers: of the request, `_` for `-`."""
+    """Return status, text and headers (lower case) of a page. headers: of the request, `_` for `-`."""
     connection = HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
     connection.putrequest("GET", path, skip_host="Host" in headers)
     for name, value in headers.items():

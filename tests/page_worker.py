@@ -1,13 +1,12 @@
 """A worker of the page without physics: it answers each order at once with invented messages, and reports each change.
 
-It runs in a thread of the test, behind the interface of a child process.
+It runs in a thread of the test, with the interface of a child process.
 
-Seeds of a plan choose a failure: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled. Row 15
-of a study does the last, too; with 14 an insertion neither cancels nor stops.
-A save waits for a pipe called GATE in the folder of runs, if there is one.
-An insertion that is cancelled still sends a row, and a run called SLOW is read only when it is cancelled.
-An insertion on a rig waits for "go", also after a hold; seeds: 16 it has a fault then, 17 it does not stop, 18 it takes
-some beats of the server for its record.
+The seed of a plan chooses a failure: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled, as
+row 15 of a study. An insertion with seed 14 neither cancels nor stops; a cancelled one sends one more row.
+A save waits for a pipe called GATE in the folder of runs, if there is one. A run called SLOW is read until it is
+cancelled. An insertion on a rig waits for "go", also after a hold. Its seeds: 16 a fault follows "go", 17 it does not
+stop, 18 its record takes some beats of the server.
 """
 
 import json

@@ -12,8 +12,11 @@ from pathlib import Path
 import pytest
 
 import flexneedle.lab.page
+from flexneedle.lab.page import replay
 from flexneedle.lab.page.replay import bundle_modules, encode_record, make_document
 from flexneedle.lab.page.shape_frames import FrameSource, ShapeFrame, pack_frame, unpack_frame
+from flexneedle.lab.page.worker.recordings import row_of
+from flexneedle.types import Pose
 from replays import File, insertion, record
 from synthetic import blind
 
@@ -64,6 +67,14 @@ def test_unknown_values_are_null_and_have_no_shapes():
     *_, rows = File.of(make_document("mine", record(made))).record
     unknown = ("measured", "true", "true_energy_mj", "miss_sd_mm")
     assert {tuple(row[key] for key in unknown) for row in rows["rows"]} == {(None,) * 4}
+
+
+def test_the_error_is_the_lateral_distance_from_the_planned_path_at_the_depth_of_the_tip():
+    made = insertion()
+    (x, y, z), period = made.plan.tips[20, :3], made.periods[30]
+    tip = Pose(x, y + 3.0, z - 4.0, 0.0, 0.0)
+    for changed in (replace(period, true_tip=tip), replace(period, true_tip=None, estimate=tip)):
+        assert row_of(changed, made.plan)["error_mm"] == pytest.approx(5.0, abs=1e-9)
 
 
 def test_a_text_of_the_record_ends_no_element():
@@ -119,15 +130,16 @@ def test_every_module_that_the_replay_imports_is_in_it_once(file):
         assert path.read_text() in file.script
 
 
-def test_all_modules_can_be_bundled():
+def test_all_modules_can_be_converted():
     """Except main.js, which imports by a computed name."""
     for path in STATIC.rglob("*.js"):
         name = path.relative_to(STATIC).as_posix()
         if name == "main.js":
             with pytest.raises(ValueError, match=r"main\.js"):
-                bundle_modules(STATIC, name)
+                replay._convert_module(STATIC, name)
         else:
-            assert not re.search(r"^(?:import|export)\b", bundle_modules(STATIC, name), re.MULTILINE)
+            text = replay._convert_module(STATIC, name).text
+            assert not re.search(r"^(?:import|export)\b", text, re.MULTILINE)
 
 
 def bundle_of(folder, **modules):
@@ -181,11 +193,12 @@ def test_other_forms_and_modules_that_import_each_other_are_refused(tmp_path):
 
 @pytest.mark.parametrize("piece", ["</script>", "<SCRIPT>", "<!--", "</style>"])
 def test_a_script_that_would_end_its_element_is_refused(monkeypatch, piece):
-    monkeypatch.setattr("flexneedle.lab.page.replay.bundle_modules", lambda *_: f'"{piece}"')
+    monkeypatch.setattr(replay, "bundle_modules", lambda *_: f'"{piece}"')
     with pytest.raises(ValueError, match="it ends the element"):
         make_document("mine", [])
 
 
+@pytest.mark.long
 def test_it_needs_no_package_of_the_server():
     script = "import sys, flexneedle.lab.page.replay; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""`flexneedle serve --rig` with an emulated rig in processes of its own: an insertion from the page, and its ends."""
+"""`flexneedle serve --rig` with an emulated rig in separate processes: an insertion from the page, and its ends."""
 
 import json
 import os
@@ -31,16 +31,16 @@ from page_tasks import short
 pytestmark = pytest.mark.long
 
 PERIOD_S = 1.0
-"""A control period, with its decision, on a computer that does other work, too."""
+"""A control period with its decision, on a busy computer."""
 RESTS_S = 0.5
 """From a stop of the supervisor until all motors rest: the queue, and a tick."""
 LONGER = {"target.depth_mm": 20.0, "setup.insertion_speed_mm_s": 2.0}
-"""So that there is time to interrupt it."""
+"""Settings of an insertion with time to interrupt it."""
 
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    """Workers take their time to start where many run."""
+    """Workers start slowly beside other processes."""
     monkeypatch.setattr(page_clients, "PATIENCE_S", 100.0)
 
 
@@ -60,7 +60,7 @@ class Bench:
         return truth.time, truth.positions["insertion"]
 
     def moved_after(self, time):
-        """How far the base has moved (mm) since a time."""
+        """Return the distance (mm) by which the base has moved since a time."""
         times, places = self.base
         return float(np.ptp(places[times >= time])) if (times >= time).any() else 0.0
 
@@ -69,7 +69,7 @@ class Bench:
         until(lambda: np.ptp(self.base[1]) > distance, page_clients.PATIENCE_S)
 
     def visitor(self):
-        """A client, which takes what comes also while it is not read, as a browser does."""
+        """Return a client that receives messages while it is not read, as a browser does."""
         return Client(self.page, max_queue=None)
 
     def worker(self):
@@ -91,7 +91,7 @@ class Bench:
 
 @contextmanager
 def bench(folder, **changes):
-    """Serve an emulated rig, and the page with that."""
+    """Serve an emulated rig, and the page with it."""
     path, scenario, truth = rig_file(folder), folder / "case.toml", folder / "truth.csv"
     scenario.write_text(dump_scenario(short(**changes)))
     with emulated_rig(path, scenario, "--seed", 3, "--truth", truth) as rig:
@@ -195,12 +195,12 @@ def test_anybody_stops_it(tmp_path):
 
 @pytest.mark.slow
 def test_a_steering_client_that_is_silent_is_lost(tmp_path):
-    """Its computer has crashed or its line is cut: the connection stays open, and brings nothing."""
+    """Its computer has crashed or its line is cut: the connection stays open and silent."""
     with bench(tmp_path, **LONGER) as one, one.visitor() as watcher:
         client = Client(one.page, max_queue=1)
         client.wait(lambda: "rig" in client.newest)
         inserting(client.steer())
-        silent = monotonic()  # from here on it reads nothing, and so answers no ping
+        silent = monotonic()  # from now on it reads nothing and answers no ping
         rig_is(watcher, "holding")
         limit = RIG_LIMITS.ping_s + RIG_LIMITS.pong_s + PERIOD_S
         Event().wait(max(0.0, silent + limit + 0.5 - monotonic()))

@@ -5,7 +5,7 @@ are sent as null.
 """
 
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict
 
@@ -40,12 +40,15 @@ class ServerMessage(ProtocolMessage):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True, ser_json_inf_nan="null")
 
+    by: ClassVar[str] = ""
+    """Field that distinguishes states of one type, as in `static/store.js`."""
+
     type: str
 
     @property
     def key(self) -> str:
         """Name of the state that the message reports."""
-        return self.type
+        return f"{self.type} {getattr(self, self.by)}" if self.by else self.type
 
 
 class WelcomeMessage(ServerMessage):
@@ -115,17 +118,14 @@ class SceneMessage(ServerMessage):
 class JobMessage(ServerMessage):
     """State of a job. share: of the work done, None if unknown; text: one line for the user."""
 
+    by = "kind"
+
     type: Literal["job"] = "job"
     job: int
     kind: JobKind
     state: Literal["waiting", "running", "done", "failed", "cancelled"]
     share: float | None = None
     text: str = ""
-
-    @property
-    def key(self) -> str:
-        """Job by kind."""
-        return f"job {self.kind}"
 
 
 class EstimateMessage(ServerMessage):
@@ -144,6 +144,8 @@ class IterationMessage(ServerMessage):
     best: least cost until each iteration; elite, median: of the cost of the samples of each iteration.
     """
 
+    by = "strategy"
+
     type: Literal["iteration"] = "iteration"
     revision: int
     strategy: str
@@ -153,17 +155,14 @@ class IterationMessage(ServerMessage):
     elite: list[float]
     median: list[float]
 
-    @property
-    def key(self) -> str:
-        """Iteration by strategy."""
-        return f"iteration {self.strategy}"
-
 
 class PlanMessage(ServerMessage):
     """A complete plan. Its needles are a frame SWEEP, the tip's path a frame PATH.
 
     roll_deg: of the bevel's direction at the start, about x from y to z; terms: weighted terms of the cost by name.
     """
+
+    by = "strategy"
 
     type: Literal["plan"] = "plan"
     revision: int
@@ -177,11 +176,6 @@ class PlanMessage(ServerMessage):
     cost: float
     terms: dict[str, float]
     seconds: float
-
-    @property
-    def key(self) -> str:
-        """Plan by strategy."""
-        return f"plan {self.strategy}"
 
 
 class ReachMessage(ServerMessage):
@@ -204,15 +198,12 @@ class RowsMessage(ServerMessage):
     A row has the keys of `record.fields.page_values`, and those that `worker.recordings.row_of` adds.
     """
 
+    by = "of"
+
     type: Literal["rows"] = "rows"
     of: Literal["live", "first", "second"]
     first: int
     rows: list[dict[str, Any]]
-
-    @property
-    def key(self) -> str:
-        """Rows by insertion."""
-        return f"rows {self.of}"
 
 
 class InsertionMessage(ServerMessage):
@@ -227,6 +218,8 @@ class InsertionMessage(ServerMessage):
         folder: Name of the run that records it, "" without one.
         row: Row of a study that was computed again and can be saved as a run.
     """
+
+    by = "of"
 
     type: Literal["insertion"] = "insertion"
     of: Literal["live", "first", "second"]
@@ -243,11 +236,6 @@ class InsertionMessage(ServerMessage):
     folder: str = ""
     row: int | None = None
     scene: SceneMessage | None = None
-
-    @property
-    def key(self) -> str:
-        """Insertion by place."""
-        return f"insertion {self.of}"
 
 
 class ClosedMessage(ServerMessage):

@@ -1,11 +1,13 @@
 """Presets, scenario files, links, recorded runs, rows of studies."""
 
 from base64 import b64decode, b64encode
+from io import BytesIO
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from browser_blends import painted
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRow, StudyRowsMessage
@@ -69,9 +71,7 @@ def test_it_asks_before_changes_are_lost(files, server):
     page = files()
     server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
     until(page, "flexneedle.store.get('session').changed.length")
-    page.evaluate(
-        "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-    )  # presets chosen
+    painted(page)  # presets chosen
 
     def begin(way):
         if way == "preset":
@@ -233,10 +233,6 @@ def test_rows_of_a_study_are_listed_computed_opened_and_compared(files, server):
     page.wait_for_selector("text=No row is finished yet")
 
 
-PAINTED = """async () => {
-  for (let frame = 0; frame < 4; frame++) await new Promise(requestAnimationFrame);
-}"""
-
 # Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.
 CODED = """
 const coded = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
@@ -282,54 +278,53 @@ def test_a_gif_has_the_pixels_of_its_frames(files, size):
     assert np.max(np.abs(shown.reshape(frames.shape).astype(int) - frames)) <= 26
 
 
-def test_pictures_of_the_scene_and_of_an_insertion_are_saved(files, server, tmp_path):
+@pytest.fixture
+def saved(tmp_path):
+    """A function that returns the bytes of the file that a button saves."""
+
+    def download(page, button):
+        with page.expect_download() as download:
+            page.click(f"text={button}")
+        path = tmp_path / download.value.suggested_filename
+        download.value.save_as(path)
+        return path.read_bytes()
+
+    return download
+
+
+def open_four_periods(page, server):
+    frames = [frame for period in range(4) for frame in period_frames(period, FrameSource.FIRST)]
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames)
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
+
+
+def test_pictures_of_the_scene_and_of_an_insertion_are_saved(files, server, saved):
     page = files(draws=True)
     page.wait_for_selector("[data-panel=space] .legend li")
-    with page.expect_download() as download:
-        page.click("text=Picture")
-    assert download.value.suggested_filename == "flexneedle.png"
-    download.value.save_as(tmp_path / "made.png")
-    picture = imread(tmp_path / "made.png")
+    picture = imread(BytesIO(saved(page, "Picture")))
     size = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
     assert list(picture.shape[:2]) == size
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
     page.click("text=GIF")
     page.wait_for_selector("text=A GIF needs an insertion")
-    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
-    until(page, "flexneedle.store.get('rows first')?.length === 4")
-    with page.expect_download() as download:
-        page.click("text=GIF")
-    download.value.save_as(tmp_path / "made.gif")
-    frames = page.evaluate(DECODED, b64encode((tmp_path / "made.gif").read_bytes()).decode())
+    open_four_periods(page, server)
+    frames = page.evaluate(DECODED, b64encode(saved(page, "GIF")).decode())
     assert len(frames) == 4
     assert frames[0] != frames[-1]
     assert page.evaluate("flexneedle.store.get('view period')") is None
 
 
-def test_pictures_without_webgl_are_of_the_section_though_it_is_off_the_screen(files, server, tmp_path):
+def test_pictures_without_webgl_are_of_the_section_even_off_the_screen(files, server, saved):
     page = files(width=390, before=NO_WEBGL)
-
-    def saved(button):
-        with page.expect_download() as download:
-            page.click(f"text={button}")
-        download.value.save_as(tmp_path / "made")
-        return (tmp_path / "made").read_bytes()
-
     page.locator("text=Picture").scroll_into_view_if_needed()
-    page.evaluate(PAINTED)
+    painted(page)
     box = page.locator(SECTION).bounding_box()
     assert box["y"] + box["height"] < -100.0
-    before = saved("Picture")
-    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames_of(4))
-    until(page, "flexneedle.store.get('rows first')?.length === 4")
-    frames = page.evaluate(DECODED, b64encode(saved("GIF")).decode())
-    assert len(set(frames)) == 4
-    picture = saved("Picture")
+    before = saved(page, "Picture")
+    open_four_periods(page, server)
+    assert len(set(page.evaluate(DECODED, b64encode(saved(page, "GIF")).decode()))) == 4
+    picture = saved(page, "Picture")
     assert picture != before
-    page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn by itself
-    page.evaluate(PAINTED)
-    assert saved("Picture") == picture
-
-
-def frames_of(count):
-    return [frame for period in range(count) for frame in period_frames(period, FrameSource.FIRST)]
+    page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn anyway
+    painted(page)
+    assert saved(page, "Picture") == picture

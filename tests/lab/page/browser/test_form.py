@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from browser_blends import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RefusedMessage, SessionMessage
 from flexneedle.lab.page.server.catalog import build_catalog
@@ -16,7 +17,6 @@ pytestmark = pytest.mark.page
 FORM = "[data-panel=form]"
 DEPTH = "#field-target-depth_mm"
 OPEN_ALL = "document.querySelectorAll('details').forEach((each) => { each.open = true; })"
-PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 def session(revision=1, changed=(), doubts=(), seed=0, preset="phantom3d", **values):
@@ -44,6 +44,18 @@ def form(visit, server):
 
 def search(page, text):
     page.fill(f"{FORM} input[type=search]", text)
+
+
+def enter(page, selector, text):
+    page.fill(selector, text)
+    page.press(selector, "Enter")
+
+
+def refuse(server, **problems):
+    """Refuse edits with problems by key, none: accept them."""
+    server.answers.pop("edit", None)
+    if problems:
+        server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems=problems)
 
 
 def edit_of(page, server):
@@ -115,16 +127,13 @@ def test_a_value_is_edited_by_keys_and_slider_and_a_refusal_is_beside_it(form, s
     offset = field(page, "needle.bevel.offset_mm").locator("input[type=range]")
     assert float(offset.get_attribute("min")) == 0.0
     assert float(offset.get_attribute("max")) == pytest.approx(10.0)
-    page.fill(DEPTH, "deep")
-    page.press(DEPTH, "Enter")
+    enter(page, DEPTH, "deep")
     page.wait_for_selector("text=must be a number")
     page.press(DEPTH, "Escape")
     assert (page.input_value(DEPTH), server.asked("edit")) == ("40", [])
     rule = "must be at least 0.0 mm"
-    problems = {"target.depth_mm": rule, "target.lateral_mm": "must be less"}
-    server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems=problems)
-    page.fill(DEPTH, "-3")
-    page.press(DEPTH, "Enter")
+    refuse(server, **{"target.depth_mm": rule, "target.lateral_mm": "must be less"})
+    enter(page, DEPTH, "-3")
     problem = depth.locator(".problem")
     problem.wait_for()
     assert (problem.inner_text(), page.input_value(DEPTH)) == (rule, "-3")
@@ -135,9 +144,8 @@ def test_a_value_is_edited_by_keys_and_slider_and_a_refusal_is_beside_it(form, s
     server.send(session(2))
     field(page, "target.lateral_mm").locator(".problem").wait_for(state="hidden")
     assert page.locator(f"{FORM} .problem:visible").count() == 0
-    del server.answers["edit"]
-    page.fill(DEPTH, "35.5")
-    page.press(DEPTH, "Enter")
+    refuse(server)
+    enter(page, DEPTH, "35.5")
     assert edit_of(page, server) == {"target.depth_mm": 35.5}
     slider = field(page, "target.lateral_mm").locator("input[type=range]")
     slider.focus()
@@ -174,12 +182,11 @@ def test_a_table_is_set_changed_and_removed(form, server):
     thickness = "#field-phantom-structure-hidden_layer-thickness_mm"
     assert page.input_value(thickness) == "5"
     key = "phantom.structure.hidden_layer.thickness_mm"
-    server.answers["edit"] = RefusedMessage(what="edit", reason="no", problems={key: "must be above 0 mm"})
-    page.fill(thickness, "-1")
-    page.press(thickness, "Enter")
+    refuse(server, **{key: "must be above 0 mm"})
+    enter(page, thickness, "-1")
     field(page, key).locator(".problem").filter(has_text="must be above 0 mm").wait_for()
     assert not field(page, "phantom.structure.hidden_layer").locator(".problem").is_visible()
-    del server.answers["edit"]
+    refuse(server)
     page.press(thickness, "Escape")
     choice.select_option("not set")
     assert edit_of(page, server) == {"phantom.structure.hidden_layer": None}
@@ -271,9 +278,7 @@ def test_a_refused_choice_stays_with_the_problem_of_its_part_and_others_follow_t
         ("phantom.structure.hidden_layer", "own values", "phantom.structure.hidden_layer.top_mm"),
         ("tissue.1.law", "ogden", "tissue.1.alpha"),
     ):
-        server.answers["edit"] = RefusedMessage(
-            what="edit", reason="no", problems={part: "must be at most 5"}
-        )
+        refuse(server, **{part: "must be at most 5"})
         search(page, key)
         choice = field(page, key).locator("select")
         choice.focus()
@@ -282,7 +287,7 @@ def test_a_refused_choice_stays_with_the_problem_of_its_part_and_others_follow_t
         problem.wait_for()
         assert problem.inner_text() == f"{part.split('.')[-1]}: must be at most 5"
         assert choice.input_value() == chosen
-    del server.answers["edit"]
+    refuse(server)
     search(page, "setup.rotation")
     choice = page.locator("#field-setup-rotation")
     before = choice.input_value()
@@ -290,7 +295,7 @@ def test_a_refused_choice_stays_with_the_problem_of_its_part_and_others_follow_t
     choice.focus()
     server.send(session(2, **{"setup.rotation": other}))
     until(page, "flexneedle.store.get('session').revision === 2")
-    page.evaluate(PAINTED)
+    painted(page)
     assert (choice.input_value(), page.evaluate("document.activeElement.id")) == (
         other,
         "field-setup-rotation",
@@ -303,13 +308,11 @@ def test_options_are_chosen_doubts_shown_and_all_is_disabled_while_another_is_in
     page.wait_for_selector(".changed[data-key='target.depth_mm']")
     problem = page.locator("#option-seed-problem")
     for text in ("-1", "1.5", "99999999999999999999", ""):
-        page.fill("#option-seed", text)
-        page.press("#option-seed", "Enter")
+        enter(page, "#option-seed", text)
         problem.filter(has_text="must be a whole number").wait_for()
     assert page.get_attribute("#option-seed", "aria-invalid") == "true"
     assert not server.asked("options")
-    page.fill("#option-seed", "7")
-    page.press("#option-seed", "Enter")
+    enter(page, "#option-seed", "7")
     problem.wait_for(state="hidden")
     page.select_option("#option-strategy", "steering")
     page.select_option("#option-controller", "ce-mpc")

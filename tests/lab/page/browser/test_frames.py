@@ -1,4 +1,4 @@
-"""static/frames.js and page/shape_frames.py read the same bytes in the same way."""
+"""Frames and keys: Python and JavaScript agree."""
 
 import re
 from pathlib import Path
@@ -8,8 +8,9 @@ import pytest
 
 import flexneedle.lab.page
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
+from page_clients import BY
 
-TEXT = (Path(flexneedle.lab.page.__file__).parent / "static/frames.js").read_text()
+STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
 READ = """async (frames) => {
   const { unpacked } = await import("/static/frames.js");
   return frames.map((bytes) => {
@@ -23,10 +24,18 @@ READ = """async (frames) => {
 }"""
 
 
-@pytest.mark.parametrize(("name", "numbers"), [("Kind", FrameKind), ("Source", FrameSource)])
-def test_names_and_numbers_are_the_same(name, numbers):
-    body = re.search(rf"const {name} = Object.freeze\({{(.*?)}}\)", TEXT, re.DOTALL).group(1)
-    assert {key: int(value) for key, value in re.findall(r"(\w+): (\d+)", body)} == numbers.__members__
+def table_of(module, name):
+    """Return a table of a module in JavaScript."""
+    found = re.search(rf"const {name} = [^{{]*{{(.*?)}}", (STATIC / module).read_text(), re.DOTALL)
+    return dict(re.findall(r'(\w+): "?(\w+)', found[1]))
+
+
+def test_both_languages_have_the_same_kinds_sources_and_keys():
+    for name, numbers in (("Kind", FrameKind), ("Source", FrameSource)):
+        assert table_of("frames.js", name) == {
+            key: str(int(value)) for key, value in numbers.__members__.items()
+        }
+    assert table_of("store.js", "BY") == {type_: by for type_, by in BY.items() if by}
 
 
 @pytest.mark.page

@@ -22,7 +22,7 @@ LIMITS = replace(
     PageLimits(), rest_s=60.0, runs_s=0.2
 )  # a changed scenario keeps its estimate until it is planned
 PATIENCE_MS = 100_000
-"""Workers take their time to start where many run."""
+"""Workers start slowly beside other processes."""
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def address(tmp_path, monkeypatch):
 
 
 def see(page, selector):
-    """Wait for what a worker has computed."""
+    """Wait for a result of a worker."""
     page.wait_for_selector(selector, timeout=PATIENCE_MS)
 
 

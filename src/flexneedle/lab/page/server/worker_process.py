@@ -1,4 +1,4 @@
-"""A worker's process: started, written to, read, and started again when it has ended."""
+"""The process of a worker on the event loop: started, read, and started again when it has ended."""
 
 import asyncio
 import sys
@@ -12,7 +12,7 @@ _SHORT_S, _LONGEST_PAUSE_S, _END_S = 2.0, 30.0, 3.0
 
 
 class WorkerProcess:
-    """The process of a module, on the event loop."""
+    """A worker. ready: whether it can take work."""
 
     def __init__(
         self,
@@ -21,18 +21,10 @@ class WorkerProcess:
         on_report: Callable[[Report], None],
         on_end: Callable[[int], None],
     ) -> None:
-        """Keep what `start` needs.
-
-        Args:
-            name: For messages.
-            command: Module and its arguments.
-            on_report: Called with each object that the worker sends.
-            on_end: Called with the exit status of a process that has ended.
-        """
+        """command: module and arguments; on_end: called with the exit status of a process that has ended."""
         self._name, self._command = name, command
         self._on_report, self._on_end = on_report, on_end
         self.ready = False
-        """True once the process can take work."""
         self._child: ChildProcess | None = None
         self._keeping: asyncio.Task[None] | None = None
 
@@ -55,23 +47,21 @@ class WorkerProcess:
         if self._keeping is not None:
             self._keeping.cancel()
             await asyncio.gather(self._keeping, return_exceptions=True)
-        child, self._child = self._child, None
-        if child is not None:
-            await asyncio.to_thread(child.end, seconds)
-            child.close()
+        await self._end_child(seconds)
 
     async def _keep(self) -> None:
-        pause = 0.0
+        loop, pause = asyncio.get_running_loop(), 0.0
         while True:
-            began = asyncio.get_running_loop().time()
-            status = await self._run()
-            lived = asyncio.get_running_loop().time() - began
-            pause = 0.0 if lived > _SHORT_S else min(_LONGEST_PAUSE_S, 2.0 * pause + 0.1)
+            began = loop.time()
+            await self._run()
+            self.ready = False
+            status = await self._end_child(_END_S)
+            pause = 0.0 if loop.time() - began > _SHORT_S else min(_LONGEST_PAUSE_S, 2.0 * pause + 0.1)
             self._on_end(status)
             await asyncio.sleep(pause)
 
-    async def _run(self) -> int:
-        """Run one process until it ends; return its exit status."""
+    async def _run(self) -> None:
+        """Run one process until its channel ends."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
         child = self._child = ChildProcess(*self._command)
         loop.add_reader(child.channel.fileno(), self._receive, child, ended)
@@ -79,9 +69,13 @@ class WorkerProcess:
             await ended.wait()
         finally:
             loop.remove_reader(child.channel.fileno())
-        self._child, self.ready = None, False
+
+    async def _end_child(self, seconds: float) -> int:
+        child, self._child = self._child, None
+        if child is None:
+            return 0
         try:
-            return await asyncio.to_thread(child.end, _END_S)
+            return await asyncio.to_thread(child.end, seconds)
         finally:
             child.close()
 

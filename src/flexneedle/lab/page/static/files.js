@@ -1,8 +1,6 @@
 // Scenarios and runs: presets, files, recorded runs with downloads, pictures.
 
 import { button, make } from "./dom.js";
-import { unlessChanged } from "./files/changes.js";
-import { safe } from "./files/names.js";
 import { saveGif, savePng } from "./files/pictures.js";
 import { showRuns } from "./files/runs.js";
 import { maySteer } from "./shown.js";
@@ -63,7 +61,7 @@ async function send(file, store, link, status) {
     status.textContent = `${file.name}: has ${text.length} characters, must have at most ${LARGEST}`;
     return;
   }
-  const name = safe(file.name);
+  const name = acceptable(file.name);
   await unlessChanged(store, status, `To load ${name}`, "Load", () => link.ask({ type: "load", name, text }));
 }
 
@@ -87,4 +85,21 @@ async function makeGif(gif, store, status) {
   } finally {
     gif.disabled = false;
   }
+}
+
+// A name that requests accept (requests.py: FileName).
+const acceptable = (name) => name.replace(/[^A-Za-z0-9 ._-]/g, "_").replace(/^[^A-Za-z0-9]+/, "").slice(0, 80) || "scenario";
+
+// Call `open`, which begins another scenario; if this one was changed, ask in `status` first. words: the action, as the
+// beginning of a sentence; name: of the button.
+function unlessChanged(store, status, words, name, open) {
+  status.textContent = "";
+  if (!store.get("session")?.changed.length) return open();
+  const choice = (text, then) => button(text, () => {
+    status.textContent = "";
+    then();
+  });
+  const question = `${words} drops the changes that were made here.`;
+  status.replaceChildren(question, " ", choice(name, open), " ", choice("Keep this scenario", () => {}));
+  return undefined;
 }

@@ -1,7 +1,8 @@
-// Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place in index.html.
+// Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place (panels.js).
 // The scene comes first, and in it space.js, the largest, last; the rest when the scene is drawn.
 
 import { Link } from "./link.js";
+import { addPanels } from "./panels.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
@@ -11,6 +12,8 @@ const PATIENCE = 2000; // ms
 const FRAMES = 3; // until the mounted panels are on the screen
 
 const store = new Store();
+addPanels(document.getElementById("main"), ["space", "player", "section", "axial", "plans", "insertion", "plots"]);
+addPanels(document.getElementById("settings"), ["files", "form"]);
 const link = new Link(store);
 window.flexneedle = { store, link }; // for the console, and for tests
 link.connect();

@@ -1,7 +1,5 @@
 // Light or dark: as the system prefers, or as chosen by the switch, which this browser stores.
 
-import { remember, remembered } from "./memory.js";
-
 const CHOICE = "flexneedle theme";
 const colors = new Map(); // by name, in the present theme
 const system = matchMedia("(prefers-color-scheme: dark)");
@@ -39,4 +37,21 @@ function computed(name) {
   const found = getComputedStyle(probe).outlineColor;
   probe.style.outlineColor = "";
   return found;
+}
+
+// The storage of this browser may refuse, above all for a page from a file; then nothing is stored.
+function remembered(key) {
+  try {
+    return localStorage.getItem(key);
+  } catch {
+    return null;
+  }
+}
+
+function remember(key, text) {
+  try {
+    localStorage.setItem(key, text);
+  } catch {
+    // as above
+  }
 }
