@@ -132,12 +132,14 @@ class FakePage:
     async def _live(self, socket):
         await socket.accept()
         self._sockets.append(socket)
-        await self._send_to(socket, self.news)
-        with suppress(WebSocketDisconnect):
-            while True:
-                request = self._taken(await socket.receive_text())
-                await self._answer(socket, request)
-        self._sockets.remove(socket)
+        try:
+            with suppress(WebSocketDisconnect, RuntimeError):  # the latter: closed while it is sent to
+                await self._send_to(socket, self.news)
+                while True:
+                    request = self._taken(await socket.receive_text())
+                    await self._answer(socket, request)
+        finally:
+            self._sockets.remove(socket)
 
     def _taken(self, text):
         """Keep a request, and the problem that the page's server would find."""

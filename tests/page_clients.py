@@ -13,14 +13,14 @@ from unittest.mock import patch
 from websockets.sync.client import connect
 
 from flexneedle.lab.page.protocol import ServerMessage
-from flexneedle.lab.page.server import worker_process
+from flexneedle.lab.page.server import job_queue
 from flexneedle.lab.page.server.clients import PageLimits
 from flexneedle.lab.page.server.page_server import PageServer
 from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.lab.page.server.request_handler import PageSetup
-from flexneedle.lab.page.shape_frames import unpack_frame
 from flexneedle.lab.process import ChildProcess
 from flexneedle.scenario.files import load_scenario
+from page_frames import unpack_frame
 from page_worker import WorkerThread
 
 STUB = ("page_worker",)
@@ -44,7 +44,7 @@ def served(runs: Path, *, limits=QUICK, rig=None, host="127.0.0.1", workers=(STU
     server.on_start = listens.set
     thread = Thread(target=server.serve_until_interrupted)
     path = os.pathsep.join((str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")))
-    with patch.dict(os.environ, PYTHONPATH=path), patch.object(worker_process, "ChildProcess", start_worker):
+    with patch.dict(os.environ, PYTHONPATH=path), patch.object(job_queue, "ChildProcess", start_worker):
         thread.start()
         try:
             assert listens.wait(PATIENCE_S)

@@ -9,7 +9,8 @@ import pytest
 from flexneedle.errors import RunError
 from flexneedle.lab.page.protocol import ClientsMessage, JobMessage, RefusedMessage, ServerMessage
 from flexneedle.lab.page.server.hub import Hub
-from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
+from page_frames import unpack_frame
 
 
 def joined(hub):

@@ -14,9 +14,10 @@ import pytest
 import flexneedle.lab.page
 from flexneedle.lab.page import replay
 from flexneedle.lab.page.replay import bundle_modules, encode_record, make_document
-from flexneedle.lab.page.shape_frames import FrameSource, ShapeFrame, pack_frame, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameSource, ShapeFrame, pack_frame
 from flexneedle.lab.page.worker.recordings import row_of
 from flexneedle.types import Pose
+from page_frames import unpack_frame
 from replays import File, insertion, record
 from synthetic import blind
 

@@ -182,9 +182,14 @@ def test_an_insertion_is_listed_once_it_is_completely_saved_and_is_read_again(
         read_run(task("read", "recording", folder=str(tmp_path)))
 
 
-def disturbed(*disturbs, scenario=None, worker=None):
-    """Return the reports of an insertion that is disturbed from its start."""
-    one = task("insert", "insertion", scenario, seed=3, pace=NO_WAIT)
+def disturbed(*disturbs, scenario=None, worker=None, rows=1000):
+    """Return the reports of an insertion that is disturbed from its start, and stopped after some rows."""
+
+    def then(message):
+        if message.type == "rows" and message.first == rows - 1:
+            one.control.take(JobChange(job=1, stop="enough"))
+
+    one = task("insert", "insertion", scenario, seed=3, pace=NO_WAIT, reported=Reported(then))
     for disturb in disturbs:
         one.control.take(JobChange(job=1, disturb=DisturbRequest(type="disturb", **disturb)))
     (worker or InsertionJobs()).insert(one)
@@ -195,7 +200,7 @@ def test_a_push_moves_the_true_tip_in_its_direction_and_is_recorded(expected, in
     """The seed of its record alone does not reproduce it."""
     worker, free = InsertionJobs(), expected.periods[1].true_tip.y
     pushed = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}, worker=worker)
-    back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0})
+    back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0}, rows=2)
     assert pushed.rows[1]["true"][1] > free + 0.02
     assert back.rows[1]["true"][1] < free - 0.02
     summary = pushed.of("insertion")[-1].summary
@@ -272,12 +277,14 @@ def test_a_lost_tip_holds_the_needle_and_returns():
 def test_a_plate_distorts_the_readings_until_it_is_removed(environment, in_field):
     scenario = short(**{"tracker.environment": environment, "monitor.enabled": False})
     free = in_field if environment == "ideal" else by_command(scenario)
-    near = disturbed({"what": "plate", "size": 60.0}, scenario=scenario).rows
-    assert near[3]["indicator"] > 1.2 * row_of(free.periods[3], free.plan)["indicator"]
-    assert abs(near[3]["measured"][1] - free.periods[3].measurement.y) > 0.1
-    away = disturbed({"what": "plate", "size": 60.0}, {"what": "plate", "size": 0.0}, scenario=scenario)
+    free_rows = rows_of(free)[:6]
+    near = plain(disturbed({"what": "plate", "size": 60.0}, scenario=scenario, rows=6).rows)
+    assert near[3]["indicator"] > 1.2 * free_rows[3]["indicator"]
+    assert abs(near[3]["measured"][1] - free_rows[3]["measured"][1]) > 0.1
+    brought, removed = ({"what": "plate", "size": size} for size in (60.0, 0.0))
+    away = disturbed(brought, removed, scenario=scenario, rows=6)
     without = [
         row["measured"] for row in plain(away.rows)
     ]  # in "noisy" also without the plate of the scenario
-    assert (without == [row["measured"] for row in rows_of(free)]) == (environment == "ideal")
+    assert (without == [row["measured"] for row in free_rows]) == (environment == "ideal")
     assert away.of("disturbances")[-1].active == []

@@ -9,13 +9,14 @@ import pytest
 import flexneedle
 from flexneedle.lab.page.job_orders import JobChange
 from flexneedle.lab.page.protocol import describe_scene
-from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, pack_frame, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, pack_frame
 from flexneedle.lab.page.worker import plan_jobs
 from flexneedle.lab.page.worker.__main__ import carry_out
 from flexneedle.lab.page.worker.plan_jobs import estimate, needle, plan, samples_of
 from flexneedle.lab.page.worker.reach_job import _DEEPEST, reach
 from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.planning.horizon import Samples
+from page_frames import unpack_frame
 from page_tasks import Reported, done, short, task
 
 

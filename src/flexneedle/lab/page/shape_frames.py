@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _HEADER = struct.Struct("<BBBBIII")
-_MOST_VALUES = 4_000_000
 
 
 class FrameKind(IntEnum):
@@ -102,18 +101,6 @@ def pack_frame(frame: ShapeFrame) -> bytes:
     paths, points, columns = frame.values.shape
     header = _HEADER.pack(frame.kind, columns, frame.source, 0, frame.number, paths, points)
     return header + np.ascontiguousarray(frame.values, dtype="<f4").tobytes()
-
-
-def unpack_frame(data: bytes) -> ShapeFrame:
-    """Return the frame of bytes. Raises ValueError for invalid bytes."""
-    if len(data) < _HEADER.size:
-        raise ValueError(f"a frame of {len(data)} bytes: must have at least {_HEADER.size}")
-    kind, columns, source, zero, number, paths, points = _HEADER.unpack_from(data)
-    values = paths * points * columns
-    if zero or values > _MOST_VALUES or len(data) != _HEADER.size + 4 * values:
-        raise ValueError(f"a frame of {len(data)} bytes does not have {paths} x {points} x {columns} values")
-    shaped: Any = np.frombuffer(data, dtype="<f4", offset=_HEADER.size).reshape(paths, points, columns)
-    return ShapeFrame(FrameKind(kind), FrameSource(source), number, shaped)
 
 
 def make_frame(kind: FrameKind, source: FrameSource, number: int, *paths: Any) -> ShapeFrame:

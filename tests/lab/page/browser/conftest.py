@@ -112,19 +112,26 @@ def tab(browser, kept_tabs):
 
 @pytest.fixture
 def visit(server, tab):
-    """A function that opens the page and returns it; before: a script that runs first."""
+    """A function that opens the page and returns it.
+
+    news: messages and frames for it (default: an opening); before: a script that runs first; ready: awaited selectors.
+    """
 
     def opened(
+        news=None,
+        *,
         width=1280,
         height=800,
         scheme="light",
         before=None,
-        ready="[data-panel=status] .connection",
+        ready=("[data-panel=status] .connection",),
         **how,
     ):
+        server.news = news or server.news
         page = tab(width, height, scheme, before, **how)
         page.goto(server.url)
-        page.wait_for_selector(ready)
+        for selector in [ready] if isinstance(ready, str) else ready:
+            page.wait_for_selector(selector)
         return page
 
     opened.errors = tab.errors

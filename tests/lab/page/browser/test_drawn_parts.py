@@ -35,10 +35,9 @@ LEAST = (20, 15)
 
 
 @pytest.fixture
-def views(visit, server):
+def views(visit):
     def opened(news, **how):
-        server.news = news
-        page = visit(ready=f"{SECTION} .legend li", **how)
+        page = visit(news, ready=f"{SECTION} .legend li", **how)
         page.evaluate("document.querySelector('.panel.section').scrollIntoView()")
         page.wait_for_selector(f"{AXIAL} .legend li")
         arrived(page)

@@ -316,6 +316,7 @@ def test_pictures_of_the_scene_and_of_an_insertion_are_saved(files, server, save
 
 def test_pictures_without_webgl_are_of_the_section_even_off_the_screen(files, server, saved):
     page = files(width=390, before=NO_WEBGL)
+    assert "no WebGL" in page.inner_text("[data-panel=space] [role=note]")
     page.locator("text=Picture").scroll_into_view_if_needed()
     painted(page)
     box = page.locator(SECTION).bounding_box()

@@ -32,12 +32,12 @@ def field(page, key):
 
 
 @pytest.fixture
-def form(visit, server):
+def form(visit):
     """A function that opens the page with a session and returns it once its form is made."""
 
     def opened(given=None, **how):
-        server.news = [WELCOME, people(), given or session(), scene(), *scene_frames()]
-        return visit(ready=f"{FORM} details", **how)
+        news = [WELCOME, people(), given or session(), scene(), *scene_frames()]
+        return visit(news, ready=f"{FORM} details", **how)
 
     return opened
 

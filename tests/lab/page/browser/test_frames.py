@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle.lab.page
-from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
 from page_clients import BY
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
@@ -39,14 +39,11 @@ def test_both_languages_have_the_same_kinds_sources_and_keys():
 
 
 @pytest.mark.page
-def test_a_browser_reads_what_python_packs_and_refuses_what_python_refuses(visit):
+def test_a_browser_reads_what_python_packs_and_refuses_other_bytes(visit):
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4) / 7
     good = pack_frame(make_frame(FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values))
     other_kind, other_source = b"\x63" + good[1:], good[:2] + b"\x63" + good[3:]
     bad = [good[:15], good[:-1], good + b"\0", good[:3] + b"\1" + good[4:], other_kind, other_source]
-    for frame in bad:
-        with pytest.raises(ValueError):
-            unpack_frame(frame)
     read, *refused = visit().evaluate(READ, [list(frame) for frame in (good, *bad)])
     named = (FrameKind.SAMPLES, FrameSource.STEERING, 3_000_000_000, *values.shape)
     assert tuple(read[key] for key in ("kind", "source", "number", "paths", "points", "columns")) == named

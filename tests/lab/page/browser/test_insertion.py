@@ -1,5 +1,7 @@
 """An insertion is started, paced, stopped and disturbed; a rig is armed; decisions in words."""
 
+from functools import partial
+
 import pytest
 
 from browser_blends import painted
@@ -19,14 +21,8 @@ PANEL = "[data-panel=insertion]"
 
 
 @pytest.fixture
-def panel(visit, server):
-    def opened(news=None, **how):
-        server.news = news or server.news
-        page = visit(ready=f"{PANEL} button:visible", **how)
-        page.wait_for_selector("text=person")
-        return page
-
-    return opened
+def panel(visit):
+    return partial(visit, ready=(f"{PANEL} button:visible", "text=person"))
 
 
 def click(page, text):

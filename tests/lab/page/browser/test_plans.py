@@ -1,5 +1,7 @@
 """Plans: started, watched and cancelled; both strategies side by side with the terms of their cost."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -29,14 +31,8 @@ PLANS = "[data-panel=plans]"
 
 
 @pytest.fixture
-def plans(visit, server):
-    def opened(news=None, **how):
-        server.news = news or server.news
-        page = visit(ready=f"{PLANS} button:visible", **how)
-        page.wait_for_selector("text=in control")
-        return page
-
-    return opened
+def plans(visit):
+    return partial(visit, ready=(f"{PLANS} button:visible", "text=in control"))
 
 
 def table(page):

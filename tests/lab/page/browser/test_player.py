@@ -34,10 +34,9 @@ def shows(page, of):
 
 
 @pytest.fixture
-def player(visit, server):
+def player(visit):
     def opened(news=None, **how):
-        server.news = news or [*opening(), *recorded()]
-        return visit(ready=f"{SCRUB}:visible", **how)
+        return visit(news or [*opening(), *recorded()], ready=f"{SCRUB}:visible", **how)
 
     return opened
 

@@ -7,7 +7,8 @@ from browser_layout import too_wide
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.replay import make_document
-from flexneedle.lab.page.shape_frames import FrameSource, unpack_frame
+from flexneedle.lab.page.shape_frames import FrameSource
+from page_frames import unpack_frame
 from recorded_page import PERIODS, insertion, period_frames, row, rows
 
 pytestmark = pytest.mark.page

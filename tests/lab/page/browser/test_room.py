@@ -1,5 +1,7 @@
 """Fixed parts in space: layers with their names, skin, guide, grid with its labels."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -41,12 +43,8 @@ SPRITES = (
 
 
 @pytest.fixture
-def space(visit, server):
-    def opened(news):
-        server.news = news
-        return visit(ready=f"{SPACE} .legend li")
-
-    return opened
+def space(visit):
+    return partial(visit, ready=f"{SPACE} .legend li")
 
 
 def labels(page):

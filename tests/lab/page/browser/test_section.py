@@ -31,10 +31,9 @@ SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
 
 
 @pytest.fixture
-def views(visit, server):
+def views(visit):
     def opened(news=None, **how):
-        server.news = news or server.news
-        page = visit(ready=f"{SECTION} .legend li", **how)
+        page = visit(news, ready=f"{SECTION} .legend li", **how)
         page.locator(SECTION).scroll_into_view_if_needed()
         page.wait_for_selector(f"{AXIAL} .legend li")
         return page

@@ -2,13 +2,13 @@
 
 import os
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 
 from browser_blends import BLENDS, arrived, painted
 from browser_layout import too_wide
-from chromium import NO_WEBGL
 from fake_page import until
 from recorded_page import (
     NODES,
@@ -49,14 +49,9 @@ def legend(page):
 
 
 @pytest.fixture
-def space(visit, server):
-    """A function that opens the page with some news and returns it once the scene is drawn."""
-
-    def opened(news=None, **how):
-        server.news = news or server.news
-        return visit(ready=f"{SPACE} .legend li", **how)
-
-    return opened
+def space(visit):
+    """A function that opens the page and returns it once the scene is drawn."""
+    return partial(visit, ready=f"{SPACE} .legend li")
 
 
 # With SCREENSHOTS all; drawing a picture takes long in software.
@@ -342,10 +337,3 @@ def test_in_the_plane_the_target_keeps_its_plane_and_rests_while_another_is_in_c
         page.wait_for_timeout(100)
         assert len(server.asked("edit")) == edits
         assert on_view(page, "return view.target.ball.position.toArray()") == place
-
-
-def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):
-    page = visit(before=NO_WEBGL, ready=f"{SPACE} [role=note]")
-    assert "no WebGL" in page.inner_text(f"{SPACE} [role=note]")
-    assert not page.locator(CANVAS).count()
-    page.wait_for_selector("text=nobody is in control")

@@ -1,15 +1,17 @@
-"""Jobs of one worker: those that wait, the one that runs, and the rules of replacement."""
+"""A worker's process and its jobs: the running one, the waiting ones, and the rules of replacement."""
 
 import asyncio
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from flexneedle.errors import describe_error
 from flexneedle.lab.page.job_orders import JobChange, Report, RigReport, WorkerReady, WorkOrder
 from flexneedle.lab.page.protocol import JobKind, JobMessage
 from flexneedle.lab.page.server.clients import PageLimits
 from flexneedle.lab.page.server.hub import Hub
-from flexneedle.lab.page.server.worker_process import WorkerProcess
+from flexneedle.lab.process import ChildProcess
 
 _URGENCY: dict[JobKind, int] = {
     "needle": 0,
@@ -33,6 +35,9 @@ _SLOTS: dict[JobKind, JobKind] = {"compare": "plan", "row": "recording"}
 _ENDS = ("done", "failed", "cancelled")
 _STARTS = "the computation starts; the first time after installation this takes about a minute"
 """Text of a worker's first job until the worker is ready."""
+
+_SHORT_S, _LONGEST_PAUSE_S, _END_S = 2.0, 30.0, 3.0
+"""A process that lived less than the first is started again after a pause, which grows up to the second."""
 
 OnEnd = Callable[[WorkOrder, str, str], None]
 """Called with a job, its last state, and a line about it."""
@@ -67,7 +72,6 @@ class JobQueue:
 
     def __init__(
         self,
-        name: str,
         command: Sequence[str],
         hub: Hub,
         limits: PageLimits,
@@ -78,8 +82,7 @@ class JobQueue:
         """Create an empty queue.
 
         Args:
-            name: Name of the worker.
-            command: Its module and arguments.
+            command: Module and arguments of the worker.
             hub: Receives its messages.
             limits: Times for which the worker may take to cancel.
             numbers: Numbers of jobs, shared with other workers.
@@ -91,7 +94,7 @@ class JobQueue:
         self._waiting: list[QueuedJob] = []
         self._running: QueuedJob | None = None
         self._deadline: asyncio.TimerHandle | None = None
-        self.worker = WorkerProcess(name, command, self._take, self._fail)
+        self.worker = WorkerProcess(command, self._take, self._fail)
 
     @property
     def orders(self) -> list[WorkOrder]:
@@ -222,3 +225,83 @@ class JobQueue:
     def _publish(self, job: QueuedJob, state: str, text: str = "") -> None:
         values = {"job": job.order.job, "kind": job.order.kind, "state": state, "text": text}
         self._hub.publish(JobMessage.model_validate(values))
+
+
+class WorkerProcess:
+    """A worker. ready: whether it can take work."""
+
+    def __init__(
+        self, command: Sequence[str], on_report: Callable[[Report], None], on_end: Callable[[int], None]
+    ) -> None:
+        """command: module and arguments; on_end: called with the exit status of a process that has ended."""
+        self._command = command
+        self._on_report, self._on_end = on_report, on_end
+        self.ready = False
+        self._child: ChildProcess | None = None
+        self._keeping: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start the process, and keep it running."""
+        self._keeping = asyncio.create_task(self._keep())
+
+    def send(self, order: WorkOrder | JobChange) -> None:
+        """Send an order, if the process runs; never waits."""
+        if self._child is not None:
+            self._child.channel.send(order)
+
+    def kill(self) -> None:
+        """Kill the process; it is started again."""
+        if self._child is not None:
+            self._child.end(0.0)
+
+    async def end(self, seconds: float = _END_S) -> None:
+        """End the process for good: its channel ends, at which it stops its job; kill it after a time."""
+        if self._keeping is not None:
+            self._keeping.cancel()
+            await asyncio.gather(self._keeping, return_exceptions=True)
+        await self._end_child(seconds)
+
+    async def _keep(self) -> None:
+        loop, pause = asyncio.get_running_loop(), 0.0
+        while True:
+            began = loop.time()
+            await self._run()
+            self.ready = False
+            status = await self._end_child(_END_S)
+            pause = 0.0 if loop.time() - began > _SHORT_S else min(_LONGEST_PAUSE_S, 2.0 * pause + 0.1)
+            self._on_end(status)
+            await asyncio.sleep(pause)
+
+    async def _run(self) -> None:
+        """Run one process until its channel ends."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        child = self._child = ChildProcess(*self._command)
+        loop.add_reader(child.channel.fileno(), self._receive, child, ended)
+        try:
+            await ended.wait()
+        finally:
+            loop.remove_reader(child.channel.fileno())
+
+    async def _end_child(self, seconds: float) -> int:
+        child, self._child = self._child, None
+        if child is None:
+            return 0
+        try:
+            return await asyncio.to_thread(child.end, seconds)
+        finally:
+            child.close()
+
+    def _receive(self, child: ChildProcess, ended: asyncio.Event) -> None:
+        try:
+            for report in child.channel.receive():
+                self.ready = self.ready or isinstance(report, WorkerReady)
+                self._on_report(report)
+        except Exception as error:  # noqa: BLE001  the server survives an invalid message of a worker
+            print(
+                f"flexneedle: the worker {self._command[-1]} is ended: {describe_error(error)}",
+                file=sys.stderr,
+            )
+            child.end(0.0)
+            ended.set()
+        if child.channel.ended:
+            ended.set()

@@ -55,14 +55,12 @@ class RequestHandler:
         self.limits, self.hub, self.clients = setup.limits, Hub(), Clients()
         self.session, self.runs = setup.session, RunsFolder(setup.runs)
         numbers, (plans, insertions) = count(1), setup.workers
-        self._plans = JobQueue(
-            "plans", plans, self.hub, setup.limits, numbers, self._end_job, lambda _report: None
-        )
+        self._plans = JobQueue(plans, self.hub, setup.limits, numbers, self._end_job, lambda _report: None)
         self.rig = ConnectedRig(self.hub, lambda: self._insertions, setup.limits, setup.rig)
         self.live = LiveInsertion(self.hub, lambda: self._insertions, setup.limits, self.rig)
         self._rig_name = None if setup.rig is None else setup.rig.name
         self._insertions = JobQueue(
-            "insertions", insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
+            insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
         )
         self._timers = dict[str, asyncio.TimerHandle]()
         self._watching: asyncio.Task[None] | None = None
