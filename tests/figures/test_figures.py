@@ -56,11 +56,9 @@ def drawn(case="reached"):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """The folder with the saved figures of an insertion and its plan, and the figure of the insertion."""
-    folder, figure = tmp_path_factory.mktemp("saved"), insertion_figure(PHANTOM, INSERTION)
-    save(figure, folder, "insertion")
-    save(plan_figure(PHANTOM, [INSERTION.plan]), folder, "plan")
-    return folder, figure
+    """The paths of a saved figure of an insertion, and the figure."""
+    figure = insertion_figure(PHANTOM, INSERTION)
+    return save(figure, tmp_path_factory.mktemp("saved"), "insertion"), figure
 
 
 # ---- the scene
@@ -329,11 +327,10 @@ def test_a_layer_has_as_much_of_its_name_as_fits():
     assert named == ["wide, μ 1.25 kPa", "narrow\nμ 1.625 kPa", "μ 2 kPa", "last\nμ 2.75 kPa"]
 
 
-def test_names_are_no_mathematics_and_never_too_long(tmp_path):
+def test_names_are_no_mathematics_and_never_too_long():
     values = PHANTOM.values() | {"name": "$5_phantom$ 針 " + "long " * 30}
     values["tissue"][0] |= {"name": "$x_1", "thickness_mm": 1.5}
     figure = insertion_figure(Scenario.from_values(values), INSERTION)
-    save(figure, tmp_path, "insertion")
     assert any(text.startswith("$5_phantom$ 針 long") and "…" in text for text in texts(figure))
 
 
@@ -370,12 +367,10 @@ def test_a_long_reason_of_a_miss_stays_within_the_figure():
 
 def test_the_same_data_give_the_same_bytes_whatever_the_users_settings(tmp_path, saved):
     with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black", "svg.hashsalt": None}):
-        save(insertion_figure(PHANTOM, INSERTION), tmp_path, "insertion")
-        save(plan_figure(PHANTOM, [INSERTION.plan]), tmp_path, "plan")
+        paths = save(insertion_figure(PHANTOM, INSERTION), tmp_path, "insertion")
         assert matplotlib.rcParams["font.size"] == 20.0
-    paths = sorted(tmp_path.iterdir())
-    assert [path.name for path in paths] == ["insertion.png", "insertion.svg", "plan.png", "plan.svg"]
-    assert all((saved[0] / path.name).read_bytes() == path.read_bytes() for path in paths)
+    assert [path.name for path in paths] == ["insertion.png", "insertion.svg"]
+    assert [path.read_bytes() for path in paths] == [path.read_bytes() for path in saved[0]]
 
 
 def test_a_saved_figure_has_rounded_positions(saved):

@@ -125,6 +125,7 @@ def test_texts_neither_overlap_nor_leave_the_figure(make):
     assert [(a, b) for k, (a, one) in enumerate(boxes) for b, two in boxes[:k] if one.overlaps(two)] == []
 
 
+@pytest.mark.long
 def test_the_same_data_give_the_same_bytes(tmp_path):
     one, two = (
         [path.read_bytes() for path in save(perspective_figure(SPACE, INSERTION), tmp_path, name)]
