@@ -23,7 +23,7 @@ _SWITCH = "the {} switch is at the {} end of range_{}, or beyond"
 
 
 def _whole(value: object) -> object:
-    if isinstance(value, bool):  # equal to 1, but not what was meant by a direction
+    if isinstance(value, bool):  # equal to 1, but no direction
         raise ValueError("must be one of -1, 1")
     return value
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from flexneedle.errors import DriverError
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -63,6 +64,19 @@ def test_late_readings_and_a_distorted_field_hold_the_needle(bad, why):
     done = bench.until(1)
     assert done.why.startswith(why)
     assert done.ended <= bench.clock.now() < 60 * TICK_S + 0.25 + 0.9
+
+
+def test_a_tracker_that_fails_is_a_fault(bench):
+    def fail():
+        raise DriverError("no connection")
+
+    bench.step(duration=2.0)
+    bench.tick(8)
+    bench.camera.read = fail
+    done = bench.until(1)
+    assert (done.state, done.why) == (SupervisorState.FAULT, "no connection")
+    assert 0.0 < done.travelled["insertion"] < 1.0
+    bench.assert_rests()
 
 
 def test_a_short_dropout_does_not_hold_the_needle(bench):
