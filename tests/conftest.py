@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures and settings of all tests."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ import hypothesis
 import pytest
 
 # Before numpy is loaded: OpenBLAS rounds differently on each kind of processor, and a closed loop carries the last
-# digit on, so that the figures that the pages print would be those of another insertion.
+# digit on, so that the figures that the pages print would belong to another insertion.
 os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 from fake_engine import draw_nothing, install

@@ -24,7 +24,7 @@ def rows_of(true, samples, sensor="tip", environment="ideal", indicator=None, na
 
 
 def random_rows(seed=0, samples=20, bias=0.5, jitter=0.07, offset=0.0, **more):
-    """A grid with a bias of its own at each point."""
+    """A grid with a separate bias at each point."""
     rng = np.random.default_rng(seed)
     middle = GRID + offset + rng.normal(0.0, bias, GRID.shape)
     drawn = [p + rng.normal(0.0, jitter, (samples, 3)) for p in middle]

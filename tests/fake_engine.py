@@ -24,7 +24,7 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
 
 
 def carry_out(_scenario, plan, choices, stream, *, miss=0.06, stop=None, outcome="done"):
-    """Insert as `flexneedle.loop.insert.carry_out` does; stop: after so many periods, call that."""
+    """Insert as `flexneedle.loop.insert.carry_out` does; stop: number of periods, and a function to call then."""
     if not (plan.reached or choices.force or choices.controller.predicts):
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, limited by {plan.limit}")
     periods = []
@@ -47,7 +47,7 @@ def install(setattr_, **options):
 
 
 def draw_nothing(setattr_):
-    """Put empty figures in the place of those of plans and insertions: drawing takes most of a command's time."""
+    """Replace the figures of plans and insertions by empty ones: drawing takes most of a command's time."""
     from flexneedle.figures.style import new_figure
     from flexneedle.record import figures
 

@@ -1,4 +1,4 @@
-"""Insertions in real time, in a process of their own, which ROS nodes follow and stop; most on a rig in memory."""
+"""Insertions in real time, in a separate process, which ROS nodes follow and stop; most on a rig in memory."""
 
 import json
 import os
@@ -96,7 +96,7 @@ def quick_scenario(folder):
 
 
 class Started:
-    """An insertion in a process of its own. Peers are made by `peer`."""
+    """An insertion in a separate process. `peer` makes its peers."""
 
     def __init__(self, folder, profile, *options, ros):
         self.folder, self.profile, self.notes = folder, profile, folder / "notes"
@@ -183,7 +183,7 @@ class Started:
 
 @contextmanager
 def started(folder, profile, *options, ros=None):
-    """Start an insertion: on the rig in memory with a section `ros`; None: a virtual one, or that of the options."""
+    """Start an insertion: on the rig in memory with a section `ros`; None: a virtual rig, or the rig of the options."""
     made = Started(folder, profile, *options, ros=ros)
     try:
         yield made

@@ -1,4 +1,4 @@
-"""A rig of topics in a process of its own: joints, and a tip where a needle has it that no tissue bends.
+"""A rig of topics in a separate process: joints, and the tip of a needle that no tissue bends.
 
     python -m ros_topics_rig START_MM
 

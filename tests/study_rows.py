@@ -28,7 +28,7 @@ def make_rows(controllers=(OURS,), cases=None, axes=None, targets=TARGETS, repea
     """Return rows (dicts): cases vary slowest, then controllers, axes, targets, repeats, as in a study.
 
     cases: {name: {dotted key: value}}; axes: {dotted key, or several joined by "+": values};
-    grow(settings): factor of the errors. Every target and repeat has a seed of its own, the same elsewhere.
+    grow(settings): factor of the errors. Every target and repeat has a separate seed, the same elsewhere.
     """
     cases, axes = cases or {"": {}}, axes or {}
     grid = product(cases, controllers, product(*axes.values()))
@@ -112,7 +112,7 @@ def asked(rows, **more):
 
 
 def write_study(folder, rows, about=None, **more):
-    """Write the folder of a study, and return it. about: `study.json`; without it that of `asked(rows, **more)`."""
+    """Write the folder of a study, and return it. about: `study.json`; without it the one of `asked(rows, **more)`."""
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns_of(rows)), folder / "runs.parquet")
     (folder / "study.json").write_text(json.dumps(about or {"study": asked(rows, **more)}))

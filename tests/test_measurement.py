@@ -50,7 +50,7 @@ def test_values_that_are_not_finite_are_left_to_the_monitor():
 
 
 def test_a_covariance_may_be_asymmetric_by_rounding_only():
-    """By that of single precision, of its largest entry."""
+    """By the rounding of single precision, of its largest entry."""
     third = float(np.float32(1 / 3))
     matrix = ((1.0, third, 0.0), (1 / 3, 1.0, 1e-8), (0.0, 0.0, 1.0))
     assert Measurement(0.1, 1.0, 2.0, covariance=matrix).covariance == matrix

@@ -1,4 +1,4 @@
-"""What a recorded trace has: topics with messages, their types, and the names of the values in them."""
+"""Contents of a recorded trace: topics with messages, their types, and the names of the values in them."""
 
 from mcap.reader import make_reader
 

@@ -220,7 +220,7 @@ class Period:
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
     converged: bool = True  # solves of the model in this period, and of the virtual phantom up to it
-    true_stretch: float | None = None  # minimum stretch λ of the true tissue so far
+    true_stretch: float | None = None  # minimum stretch λ of the true tissue until now
     miss: Lateral = UNKNOWN  # predicted lateral miss y, z at the target (mm); NaN: not predicted
     miss_sd: float = math.nan  # its standard deviation on an axis (mm)
     warning: str = ""  # warning of a likely miss, or ""

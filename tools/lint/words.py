@@ -68,7 +68,7 @@ def python(source: str) -> Iterator[Text]:
     """Yield docstrings of modules, classes, functions and attributes, strings with a space, and comments."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            yield token.start[0], "message", re.sub(r"`[^`\n]+`", "·", token.string)
+            yield token.start[0], "comment", re.sub(r"`[^`\n]+`", "·", token.string)
     waiting: list[tuple[ast.AST, str]] = [(ast.parse(source), "module")]
     while waiting:
         node, kind = waiting.pop()
@@ -107,18 +107,27 @@ READERS = {".md": markdown, ".py": python, ".js": javascript}
 
 
 def texts(paths: list[Path]) -> Iterator[tuple[Path, Text]]:
-    """Yield the texts of files and of all files in folders, except vendored ones."""
+    """Yield the texts of files and of all files in folders, except vendored ones, this check and its tests.
+
+    Strings of tests are data, not messages.
+    """
     for path in paths:
         for file in [path] if path.is_file() else sorted(path.rglob("*")):
-            if file.suffix in READERS and "vendor" not in file.parts:
-                for text in READERS[file.suffix](file.read_text(encoding="utf-8")):
+            if (
+                file.suffix not in READERS
+                or "vendor" in file.parts
+                or file.name in ("words.py", "test_words.py")
+            ):
+                continue
+            for text in READERS[file.suffix](file.read_text(encoding="utf-8")):
+                if text[1] != "message" or not file.is_relative_to(ROOT / "tests"):
                     yield file, text
 
 
 def findings(text: Text) -> Iterator[tuple[int, str, str, str]]:
     """Yield the line, the construction, the words found and the remedy."""
     line, kind, words = text
-    for name, pattern, remedy in [] if kind in ("prose", "message") else _OPENINGS:
+    for name, pattern, remedy in [] if kind in ("prose", "message", "comment") else _OPENINGS:
         # "Whether the plan ends within 1 mm of the target." is a good docstring of a property.
         if (found := pattern.match(words)) and not (kind == "attribute" and name.startswith("Whether")):
             yield line, name, found[0].strip(), remedy
