@@ -13,24 +13,16 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.lab.tracker_evaluation.evaluation import published
-from flexneedle.lab.tracker_evaluation.evaluation.accuracy import P95
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, read_table
-from flexneedle.lab.tracker_evaluation.evaluation.indicator import average_indicator
+from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
+    IndicatorSummary,
+    average_indicator,
+    summarize_indicator,
+)
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import Interval, bootstrap
-from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples, MeasuredGrid
+from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PowerLevel:
-    """The indicator with power off or on: over means at grid points, and of single samples."""
-
-    n_points: int
-    mean: float
-    p95: float
-    max: float
-    samples: IndicatorSamples
 
 
 @dataclass(frozen=True)
@@ -43,8 +35,8 @@ class PowerComparison:
 
     sensor: str
     threshold: float
-    off: PowerLevel
-    on: PowerLevel
+    off: IndicatorSummary
+    on: IndicatorSummary
     difference: float
     difference_interval: Interval
     paired: bool
@@ -97,22 +89,26 @@ def check_power(data: Path, off: str, on: str, threshold: float, options: Evalua
         for name in (before | after)
         if name not in both
     ]
-    return PowerCheck([compare_power(before[name], after[name], threshold) for name in both], notes)
+    compared = (compare_power(before[name], after[name], threshold) for name in both)
+    return PowerCheck([found for found in compared if found is not None], notes)
 
 
-def compare_power(off: MeasuredGrid, on: MeasuredGrid, threshold: float) -> PowerComparison:
-    """Return the comparison of two grids of one sensor, both with an indicator."""
+def compare_power(off: MeasuredGrid, on: MeasuredGrid, threshold: float) -> PowerComparison | None:
+    """Return the comparison of two grids of one sensor, None unless both have an indicator."""
+    before, after = summarize_indicator(off), summarize_indicator(on)
+    if before is None or after is None:
+        return None
     low, high = average_indicator(off)[0], average_indicator(on)[0]
     paired = _names(off) == _names(on)
     return PowerComparison(
         sensor=on.sensor,
         threshold=threshold,
-        off=_level(off),
-        on=_level(on),
-        difference=float(high.mean() - low.mean()),
+        off=before,
+        on=after,
+        difference=after.mean - before.mean,
         difference_interval=bootstrap(_difference, low, high, paired=paired),
         paired=paired,
-        above=bool(high.mean() > threshold),
+        above=after.mean > threshold,
         points_above=int((high > threshold).sum()),
     )
 
@@ -135,16 +131,3 @@ def _names(grid: MeasuredGrid) -> list[str]:
 def _difference(low: Floats, high: Floats, axis: int) -> Floats:
     difference: Floats = high.mean(axis=axis) - low.mean(axis=axis)
     return difference
-
-
-def _level(grid: MeasuredGrid) -> PowerLevel:
-    values = average_indicator(grid)[0]
-    if grid.samples is None:
-        raise ValueError(f"{grid.title}: no indicator")
-    return PowerLevel(
-        n_points=len(values),
-        mean=float(values.mean()),
-        p95=float(np.quantile(values, P95)),
-        max=float(values.max()),
-        samples=grid.samples,
-    )
