@@ -6,11 +6,13 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
 from flexneedle.cli.main import build_parser
 from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
+from scenario_reference import schema, tables
 
 # Pages that take more than about 5 s, and the longest pages.
 LONG = {"emulate.md", "index.md"}
@@ -23,6 +25,7 @@ SLOW = {
     "targets.md",
     "tutorial.md",
 }
+KEYS = {key.name for table in tables(schema()) for key in table.keys}
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
 BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
 EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]
@@ -111,6 +114,15 @@ def test_make_has_every_target_of_the_pages():
     }
     assert len(named) > 8
     assert named <= targets
+
+
+def test_the_code_that_the_theory_cites_exists():
+    """Names with a dot are keys of scenarios, or modules and functions below `flexneedle`."""
+    cited = re.findall(r"`([a-z_]+(?:\.\w+)+)`", TEXTS["docs/theory.md"])
+    code = set(cited) - KEYS - {"module.function"}
+    assert len(code) > 20
+    for name in code:
+        resolve_name(f"flexneedle.{name}")
 
 
 def test_few_blocks_are_not_run_and_each_has_a_reason():
