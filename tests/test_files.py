@@ -37,5 +37,6 @@ def test_a_file_is_the_old_one_until_the_new_one_is_complete(tmp_path, monkeypat
         with pytest.raises(RecordError, match="cannot be written: No space left"):
             write(tmp_path)
     assert {path.read_bytes() for path in written} == {b"old"}
+    assert set(tmp_path.iterdir()) == set(written)  # no draft remains
     write(tmp_path)
     assert {path: path.stat().st_size for path in tmp_path.iterdir()} == written

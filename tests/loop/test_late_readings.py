@@ -14,7 +14,6 @@ from insertions import (
     STILL,
     Stage,
     blind,
-    first_periods,
     moving,
     run,
 )
@@ -54,21 +53,6 @@ def test_delayed_readings_are_used_at_their_time_of_measurement(late, real):
         assert recorded.tape[30][-1].time == pytest.approx(
             done.periods[30].time - (0.2 if recorded is late[1] else 0.0)
         )
-
-
-def test_readings_in_transit_during_a_move_are_not_stale(plan, late):
-    """The oldest are 0.375 s old when read, with a limit of 0.3 s: they arrived during the move and are valid."""
-    done, recorded = late
-
-    def estimates(tape, scenario=PHANTOM):
-        periods = first_periods(12, plan, Stage(tape, recorded.applied).rig(), scenario, controller=DEFAULT)
-        return [period.estimate for period in periods]
-
-    real = [period.estimate for period in done.periods[:12]]
-    patient = PHANTOM.with_values({"control.stale_after_s": 10.0})
-    assert estimates(recorded.tape) == real
-    assert estimates(recorded.tape, patient) == real
-    assert estimates([batch[-1:] for batch in recorded.tape]) != real
 
 
 def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):

@@ -1,6 +1,5 @@
 """Insertions with a simulated electromagnetic tracker: room, monitor, sensor behind the tip."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -81,58 +80,6 @@ def test_a_passing_plate_holds_the_needle_while_it_is_near(inserted):
     assert {period.innovation for period in held} == {(0.0, 0.0, 0.0)}  # no correction in a distorted field
     assert done.outcome == "done"
     assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
-
-
-class Interrupted:
-    """A tracker that returns no frames, or no tip, within a span (s)."""
-
-    status = "unplugged"
-
-    def __init__(self, tracker, clock, span, calls):
-        self.tracker, self.clock, self.span, self.calls, self.late = tracker, clock, span, calls, ()
-
-    def read(self):
-        if self.calls and self.span[0] <= self.clock.now() < self.span[1]:
-            self.late += self.tracker.read()
-            return ()
-        samples, self.late = self.late + self.tracker.read(), ()
-        lost = [
-            replace(sample, x=None, y=None) if self.span[0] <= sample.time < self.span[1] else sample
-            for sample in samples
-        ]
-        return samples if self.calls else tuple(lost)
-
-
-def interrupted(plan, span, calls, **values):
-    scenario = PHANTOM.with_values({"tracker.environment": "ideal", **WITH_PLATE, **values})
-    rig = virtual_rig(scenario, plan.roll, Seeds.of(3), "model", plate_distance_at=passing)
-    rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
-    return flexneedle.insert(scenario, plan, 3, controller="resolved-rate", rig=rig)
-
-
-def test_a_call_between_two_frames_does_not_change_a_hold(plan):
-    done = interrupted(plan, (6.0, 6.06), calls=True)
-    silent = [period for period in done.periods if not period.readings]
-    assert silent
-    assert all(str(period.verdict).startswith("field distorted") for period in silent)
-    assert done.outcome == "done"
-
-
-def test_holds_for_readings_and_for_the_field_have_separate_clocks(plan):
-    """The tip is missing for 0.7 s after the field is good again: less than the hold limit of 1 s."""
-    done = interrupted(plan, (7.0, 8.3), calls=False)
-    verdicts = [
-        str(period.verdict).split(":")[0] for period in done.periods if period.decision.startswith("held")
-    ]
-    assert {"field distorted", "missing"} <= set(verdicts)
-    assert done.outcome == "done"
-
-
-def test_without_frames_the_needle_is_held_once_the_last_reading_is_stale(plan):
-    done = interrupted(plan, (2.0, 2.6), calls=True, **{"phantom.delay_periods": 0.0})
-    silent = [period for period in done.periods if not period.readings]
-    assert {str(period.verdict) for period in silent} == {"ok", "missing: no reading (unplugged)"}
-    assert done.outcome == "done"
 
 
 def test_nothing_moves_before_the_field_was_checked(inserted):

@@ -201,15 +201,6 @@ def test_a_run_without_a_plan_is_rejected(tmp_path):
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
-    trace = flexneedle.save(INSERTION, tmp_path / "a") / "trace.mcap"
-    trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
-    with pytest.warns(RuntimeWarning, match="incomplete: .* complete periods read"):
-        torn = flexneedle.load(tmp_path / "a")
-    assert 0 < len(torn.periods) < len(INSERTION.periods)
-
-
-@pytest.mark.usefixtures("empty_figures")
 def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
     folder = flexneedle.save(INSERTION, tmp_path / "run")
     (folder / TRACE_FILE).unlink()

@@ -11,7 +11,6 @@ import pytest
 import flexneedle
 from commands import run
 from flexneedle.errors import RecordError
-from flexneedle.files import replace_file
 from flexneedle.phantom import kernels
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.record import saving
@@ -183,15 +182,6 @@ def test_a_trace_without_its_beginning_is_removed_and_a_failed_writer_is_closed(
     writer.close()
     with pytest.raises(ValueError, match="closed"):
         writer.add(PERIODS[0])
-
-
-def test_a_replaced_file_stays_and_its_draft_goes(tmp_path):
-    path = tmp_path / "file"
-    replace_file(path, b"old")
-    with files_up_to(1000), pytest.raises(RecordError, match=f"file cannot be written: {TOO_LARGE}"):
-        replace_file(path, b"new" * 1000)
-    assert path.read_bytes() == b"old"
-    assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 
 def test_save_raises_what_cannot_be_written(tmp_path, monkeypatch):

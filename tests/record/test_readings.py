@@ -74,13 +74,6 @@ def test_values_that_are_not_finite_are_restored():
     assert repr(restored(bad)) == repr(bad)
 
 
-def test_a_status_without_the_keys_is_a_reading_without_them():
-    """As in the file of a tracker that measures only the tip."""
-    values = to_values(CheckedMeasurement(FULL, Verdict()))
-    few = {key: text for key, text in values.items() if key not in KEYS}
-    assert from_values(few, Verdict()).measurement == BARE
-
-
 def test_a_trace_has_all_that_was_measured(tmp_path):
     plan = make_plan()
     readings = tuple(

@@ -128,6 +128,8 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
 
 
 def _insert(args: argparse.Namespace) -> int:
+    from flexneedle.control.controllers import DEFAULT
+    from flexneedle.loop.choices import Choices
     from flexneedle.loop.insert import check_choices
     from flexneedle.record.folder import Folder
 
@@ -135,7 +137,7 @@ def _insert(args: argparse.Namespace) -> int:
         return _list()
     with ExitStack() as stack:
         connection: Connection = args.connection(args)
-        choices = _choices(args, connection)
+        choices = Choices.of(args.seed, args.controller or DEFAULT, connection.source, force=args.force)
         with _print_refusal(args, choices):
             scenario = connection.with_registration(choose_scenario(args, choices.controller))
         with _print_refusal(args, choices, scenario):
@@ -155,13 +157,6 @@ def _insert(args: argparse.Namespace) -> int:
             if insertion.periods:
                 connection.end()
     return status or int(bool(folder.problems))
-
-
-def _choices(args: argparse.Namespace, connection: Connection) -> Choices:
-    from flexneedle.control.controllers import DEFAULT
-    from flexneedle.loop.choices import Choices
-
-    return Choices.of(args.seed, args.controller or DEFAULT, connection.source, force=args.force)
 
 
 def _execute(

@@ -111,7 +111,8 @@ def _report_errors(command: Callable[[], int]) -> int:
         _print_error("interrupted")
         return 130
     except BrokenPipeError:
-        _drop_stdout()
+        # prevents a second error about the closed pipe at interpreter exit (Python docs, signal)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
         _print_error(str(error))
@@ -121,8 +122,3 @@ def _report_errors(command: Callable[[], int]) -> int:
 def _print_error(message: str) -> None:
     for line in message.splitlines():
         print(f"flexneedle: {line}", file=sys.stderr)
-
-
-def _drop_stdout() -> None:
-    """Prevent a second error about the closed pipe at interpreter exit (Python docs, signal)."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -47,10 +47,7 @@ def run(steering: Steering, rig: Rig) -> Insertion:
 
 
 def _run_to_end(steering: Steering, rig: Rig) -> tuple[list[Period], _Ending]:
-    """Return all periods, and (outcome, reason), once the driver is stopped.
-
-    Raises DriverError if the driver cannot be stopped after another error or an interrupt.
-    """
+    """Return all periods, and (outcome, reason), once the driver is stopped. Raises as `run`."""
     periods: list[Period] = []
     ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
     try:
@@ -108,7 +105,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
             rig.expect(state.observation.estimate, step.decision.command)
         motion = _carry_out(task.scenario, rig, step, begun)
         clocks.append(time.perf_counter())
-        observation = _observe_after(state.observation, task.scenario, rig, motion, begun)
+        predicted, monitor = state.observation.estimate.move(motion), state.observation.monitor
+        observation = observe(task.scenario, predicted, monitor, begun, rig.clock.now(), rig.tracker)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
         if motion.held:
@@ -129,21 +127,10 @@ def _measure_before_start(scenario: Scenario, memory: Any, estimate: Estimate, r
 
 
 def _first_step(state: LoopState) -> Step | None:
-    """Return the step of the measurement before the first motion.
-
-    None for a good reading of a tip alone, which is not recorded.
-    """
+    """Return the step of the measurement before the first motion; a good reading of a tip alone is not recorded."""
     if state.hold is None and state.observation.measurement.frame is None:
         return None
     return Step(Action.MEASURE, Decision(STILL, "measurement before the first motion"))
-
-
-def _observe_after(
-    before: Observation, scenario: Scenario, rig: Rig, motion: Motion, begun: float
-) -> Observation:
-    """Return the observation after the motion of a period that began at `begun` (s)."""
-    predicted = before.estimate.move(motion)
-    return observe(scenario, predicted, before.monitor, begun, rig.clock.now(), rig.tracker)
 
 
 def _advance(

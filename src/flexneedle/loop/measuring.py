@@ -100,11 +100,7 @@ def observe(
 def _keep_last_reading(
     predicted: Estimate, monitor: Monitor, now: float, stale_after: float, status: str
 ) -> Observation:
-    """Observe a period without a new frame.
-
-    The last verdict on the field and the last good reading hold until they are stale. status: of the tracker, the
-    reason if no frames arrive.
-    """
+    """Observe a period without a new frame: the last verdicts hold until they are stale; status: of the tracker."""
     if not monitor.field.ok and monitor.has_reading(now, stale_after):
         return Observation(predicted.without_reading(), monitor, verdict=monitor.field, field=True)
     if (last_good := monitor.last_good(now, stale_after)) is not None:

@@ -77,11 +77,7 @@ class Steering:
         return Step(Action.HOLD, held, reading), replace(state, late=None, asked=asked)
 
     def _decide(self, state: LoopState, rig: Rig, begun: float) -> tuple[Step, LoopState]:
-        """Return the step of a late decision that still holds, or of a new decision.
-
-        While the controller decides, the needle rests. A decision later than the deadline ends the period, so that the
-        tracker is read again before the needle moves.
-        """
+        """Return the step of a late decision that still holds, or of a new one; a rest if that comes late."""
         estimate, late = state.observation.estimate, state.late
         if late is not None and late.holds_for(estimate):
             return self._act_on(replace(state, late=None), late.decision, late.memory)
@@ -124,17 +120,13 @@ class Steering:
 def _ask_controller(
     chosen: Controller, task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Any]:
-    """Return the controller's decision and its memory. Raises InputError if `decide` returns anything else."""
+    """Return the controller's decision, with the planned shape if it predicts none, and its memory.
+
+    Raises InputError if `decide` returns anything else.
+    """
     match chosen.decide(task, memory, estimate, rng):
         case (Decision() as decision, after):
-            return _with_predicted_shape(decision, task, estimate), after
+            if decision.predicted is None:
+                decision = replace(decision, predicted=predict_planned_shape(task, estimate))
+            return decision, after
     raise InputError(f"controller {chosen.name}: decide must return a Decision and the memory after it")
-
-
-def _with_predicted_shape(decision: Decision, task: Task, estimate: Estimate) -> Decision:
-    """Return the decision with a predicted shape: its own, or the shape at the end of the plan."""
-    return (
-        decision
-        if decision.predicted is not None
-        else replace(decision, predicted=predict_planned_shape(task, estimate))
-    )

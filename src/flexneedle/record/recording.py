@@ -128,10 +128,7 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
 
 @contextmanager
 def _close_at_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWriter]:
-    """Close a trace at the end.
-
-    Without its index, which may fail to be written, it is readable; then `folder.problems` has a line.
-    """
+    """Close a trace at the end; `folder.problems` has a line if its index cannot be written."""
     try:
         yield trace
     finally:

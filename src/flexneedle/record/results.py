@@ -88,10 +88,7 @@ def _predicted_sd(insertion: Insertion, fraction: float) -> float | None:
 
 
 def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
-    """Return the deviation of the final true tip from the predicted one, in its standard deviations.
-
-    The prediction is the predicted miss, or the end of the predicted shape if there is none.
-    """
+    """Return the deviation of the true tip from the predicted miss, or predicted shape, in standard deviations."""
     found, last = _prediction(insertion, fraction), _at_target(insertion)
     if found is None or last is None or last.true_tip is None:
         return None

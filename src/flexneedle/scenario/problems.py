@@ -32,7 +32,9 @@ def refuse(problems: Iterable[Problem]) -> None:
 
 def to_line(problem: Problem, *, above: Sequence[str | int] = ()) -> str:
     """Return a problem as `key = value: rule`; `above` is the path of the section that found it."""
-    return _line([*above, *_path(problem.key)], problem.value, problem.rule)
+    path = key_path([*above, *_path(problem.key)]) or "scenario"
+    shown = "" if problem.value is None else f" = {_shown(problem.value)}"
+    return make_printable(f"{path}{shown}: {problem.rule}")
 
 
 def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
@@ -78,11 +80,6 @@ def _problems(detail: ErrorDetails, model: type[BaseModel]) -> list[Problem]:
 
 def _path(key: str | tuple[str | int, ...]) -> Sequence[str | int]:
     return split_key(key) if isinstance(key, str) else key
-
-
-def _line(loc: Sequence[str | int], value: object, rule: str) -> str:
-    shown = "" if value is None else f" = {_shown(value)}"
-    return make_printable(f"{key_path(loc) or 'scenario'}{shown}: {rule}")
 
 
 def _shown(value: object) -> str:
