@@ -32,24 +32,7 @@ def test_the_example_of_structural_mismatch_loads():
 
 def test_every_shipped_study_is_documented():
     table = DOCS.split("## The studies that come")[1].split("##")[0]
-    assert re.findall(r"^\|`([a-z-]+)`", table, re.MULTILINE) == [
-        *(
-            "phantom",
-            "phantom-published",
-            "odd-targets",
-            "controllers",
-            "mismatch",
-            "mismatch-doubled",
-            "imperfections",
-            "guide-distance",
-            "gauges",
-            "tracker",
-            "worlds",
-            "space",
-            "worlds-space",
-        )
-    ]
-    assert len(STUDIES.names()) == 13
+    assert sorted(re.findall(r"^\| ?`([a-z-]+)`", table, re.MULTILINE)) == sorted(STUDIES.names())
 
 
 def test_every_column_is_documented(quick, uninterrupted):
