@@ -20,7 +20,6 @@ from flexneedle.scenario.worlds import world
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DG_Y, ROLL, STILL, THETA, Control, Measurement, Motion, X, Y
-from reference.cases import numbers
 from tasks import stretched, task_of
 
 ACCURATE = PHANTOM.with_values(
@@ -314,33 +313,6 @@ def test_on_the_exact_model_it_ends_at_the_target_and_stays_as_certain(short_pla
     sds = np.array([decision.miss_sd for decision in decisions])
     assert (sds > 0.0).all()
     assert sds[-10:].mean() < 1.1 * sds[:10].mean()
-
-
-# ---- decisions as values
-
-
-def test_the_same_random_numbers_lead_to_the_same_decision(quick_plan, along):
-    estimate = estimate_of(along(quick_plan, 45, base=(0.5,)))
-    one, again, other = (decide(quick_plan, estimate, seed) for seed in (5, 5, 6))
-    assert one == again
-    for here, there in zip(one.predicted, again.predicted, strict=True):
-        np.testing.assert_array_equal(here, there)
-    assert other.command.dg_y != one.command.dg_y
-    many = replace(estimate, simulator=Simulator(PHANTOM, threads=3))
-    assert decide(quick_plan, many, 5) == one
-
-
-def test_deciding_changes_neither_estimate_nor_plan_nor_memory(quick_plan, along):
-    estimate = estimate_of(along(quick_plan, 45), residual=0.1)
-    _, memory = decided(quick_plan, estimate)
-    arrays = (
-        estimate.parameters, estimate.tips, numbers(estimate.state), estimate.curves, quick_plan.tips, quick_plan.guide,
-        memory.path.depth, memory.path.guide, memory.outlook.curves,
-    )  # fmt: skip
-    before = [array.copy() for array in arrays]
-    ADAPTIVE.decide(task_of(estimate.nominal, quick_plan), memory, estimate, np.random.default_rng(0))
-    for kept, there in zip(before, arrays, strict=True):
-        np.testing.assert_array_equal(kept, there)
 
 
 @pytest.mark.long

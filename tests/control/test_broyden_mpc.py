@@ -228,19 +228,3 @@ def test_inputs_are_those_of_when_the_tip_was_there():
     for k in range(20):
         memory = bm.record_inputs(memory, 3.0 + k, np.zeros(2))
     assert len(memory.history) == 8
-
-
-def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, estimated):
-    task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
-    state = along(quick_plan, 30)
-    last_update = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide[0]]))
-    memory = bm.JacobianEstimate(np.array([[1.0, 0.0], [0.1, 0.9]]), (), last_update)
-    before = memory.jacobian.copy(), memory.last_update[0].copy(), memory.last_update[1].copy()
-    estimate = estimated(state, measured=tuple(state.tip[:3].tolist()))
-    one, after = BROYDEN.decide(task, memory, estimate, RNG)
-    again, _ = BROYDEN.decide(task, memory, estimate, RNG)
-    assert one == again
-    for kept, now in zip(before, (memory.jacobian, *memory.last_update), strict=True):
-        np.testing.assert_array_equal(kept, now)
-    assert memory.history == ()
-    assert not np.array_equal(after.jacobian, memory.jacobian)

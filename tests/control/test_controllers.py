@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 import flexneedle
 from controllers import assert_predicted_shapes
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.interface import travel_left
 from flexneedle.errors import InputError
 from flexneedle.phantom.plants import PLANTS
 from flexneedle.simulator.simulator import Simulator
@@ -119,13 +118,6 @@ def test_mirrored_plan_and_readings_give_mirrored_commands(short_plan, mirrored,
     np.testing.assert_allclose(there, stretched(here, -1.0, DB_Y, DB_THETA, DG_Y), atol=1e-9)
     np.testing.assert_allclose(other_end.tip, end.tip * MIRROR, atol=1e-9)
     assert np.abs(here[:, DG_Y]).max() > 0.0 or name == "bevel-only"
-
-
-@pytest.mark.parametrize("name", ["bevel-only", "resolved-rate", "broyden-mpc"])
-def test_the_end_is_at_the_target_depth(short_plan, estimated, name):
-    scenario = short_plan.scenario
-    _, state = drive(name, short_plan, scenario, estimated, noise(), steps=40)
-    assert 0.0 <= travel_left(scenario, short_plan, state) <= scenario.control.depth_tolerance_mm
 
 
 def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, estimated):

@@ -108,13 +108,6 @@ def test_spread_is_that_of_the_first_guide_step(plan, along):
     assert (choice.spread, choice.command.dg_y) == (0.0, 0.0)
 
 
-def test_same_seed_same_command_other_seed_another(plan, along):
-    state = along(plan, 30, base=(0.5,))
-    one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)
-    assert (one.command, one.cost, one.spread) == (again.command, again.cost, again.spread)
-    assert one.command.dg_y != other.command.dg_y
-
-
 def test_cost_is_that_of_the_chosen_steps(plan, along):
     """With a horizon of one step it can be computed again: pose against the planned one, guide, energy."""
     weights = {
@@ -131,20 +124,6 @@ def test_cost_is_that_of_the_chosen_steps(plan, along):
     guide = choice.command.dg_y - plan.controls[int(at + 1e-9), DG_Y]
     expected = (off**2).sum() + 3.0 * guide**2 + 2.0 * after.strain_energy
     assert choice.cost == pytest.approx(expected, rel=1e-9)
-
-
-def test_each_step_is_compared_with_the_planned_guide_step(plan, along):
-    """With only the guide's cost it repeats the plan, before the end of a primitive and after it."""
-    alone = {
-        "control.ce_mpc.horizon": 1,
-        "control.ce_mpc.guide_weight": 1e6,
-        "control.ce_mpc.energy_weight_per_mj": 0.0,
-    }
-    scenario = PHANTOM.with_values(alone)
-    changes = np.flatnonzero(np.diff(plan.controls[:, DG_Y]))
-    for k in (changes[0], changes[0] + 1):
-        choice = choose(plan, along(plan, k, scenario), scenario)
-        assert choice.command.dg_y == pytest.approx(plan.controls[k, DG_Y], abs=1e-4)
 
 
 def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):

@@ -90,22 +90,6 @@ def test_depths_ascend_where_a_plan_stands_still(quick_plan):
 # ---- the first sample
 
 
-@pytest.mark.parametrize("steps", [0, 20, 45, 66])
-def test_the_sample_that_corrects_nothing_is_the_current_path(quick_plan, along, steps):
-    """Guide positions at the ends of the steps and rolls are the same."""
-    state = along(quick_plan, steps)
-    x = float(state.tip[0])
-    path = replace(path_of_plan(quick_plan), rolls=rolls_at(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
-    ahead = ahead_of(quick_plan, state, path)
-    controls, depth = ahead.controls(ahead.current[None])
-    guide = state.guide[0] + np.cumsum(controls[0, :, DG_Y])
-    np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide[:, 0]), atol=2e-3)
-    kept = ahead.correct(ahead.current)
-    assert depths(kept) == pytest.approx(depths(path))
-    again = ahead_of(quick_plan, state, kept)
-    np.testing.assert_allclose(again.controls(again.current[None])[0], controls, atol=1e-12)
-
-
 def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
     """They begin with 0 at the tip and are small enough to stay within the limits."""
     state = started(-10.0)
@@ -136,35 +120,6 @@ def test_the_path_found_is_the_current_path_of_the_next_period(quick_plan, along
 
 
 # ---- samples
-
-
-@given(
-    seed=st.integers(0, 10**6),
-    x=st.floats(-25.0, 39.9),
-    guide=st.floats(-1.0, 1.0),
-    offset=st.floats(-9.0, 9.0),
-)
-@hypothesis_settings(max_examples=60)
-def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, guide, offset):
-    """The current path may have the guide out of reach."""
-    state = started(x, guide * REACH)
-    path = level(x + 3.0, 35.0, guide=offset)
-    ahead = ahead_of(quick_plan, state, path)
-    lower, upper = ahead.bounds
-    z = np.random.default_rng(seed).uniform(lower, upper, (40, lower.size))
-    z[::3, : KNOTS.size] = 0.0
-    z[::4, -1] = z[::4, -2]  # two rolls at one depth
-    controls, depth = ahead.controls(z)
-    advance = controls[:, :, DB_X]
-    assert (advance >= 0.0).all()
-    np.testing.assert_allclose(advance.sum(axis=1), 40.0 - state.tip[0], atol=1e-9)
-    np.testing.assert_allclose(np.diff(depth, axis=1), advance, atol=1e-12)
-    place = state.guide[0] + np.cumsum(controls[:, :, DG_Y], axis=1)
-    assert np.abs(place).max() <= REACH + 1e-9
-    assert (np.abs(controls[:, :, DG_Y]) <= STEP * advance / PHANTOM.setup.max_advance_mm + 1e-9).all()
-    assert set(np.unique(controls[:, :, ROLL])) <= {0.0, np.pi}
-    inside = z[:, KNOTS.size :] < 0.5 * (ahead.depth[-1] + ahead.depth[-2])  # others are too late for a step
-    np.testing.assert_array_equal((controls[:, :, ROLL] > 0.0).sum(axis=1) % 2, inside.sum(axis=1) % 2)
 
 
 @pytest.mark.parametrize("guide", [0.0, 1.5])

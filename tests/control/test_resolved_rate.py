@@ -120,14 +120,6 @@ def test_the_innovation_of_the_newest_reading_is_assumed_to_stay(quick_plan, alo
     assert plain - shifted == pytest.approx(0.5 * damped_inverse(jacobian[0, 0], 0.1) * 0.01, rel=1e-6)
 
 
-def test_without_gain_the_guide_follows_the_plan(quick_plan, along, estimated):
-    state = along(quick_plan, 30)
-    off = Simulator(PHANTOM, threads=1).step(state.with_estimate(base=(1.0,)), Control())
-    depth = off.tip[0] + np.array([0.0, 1.0])
-    planned = np.diff(np.interp(depth, quick_plan.tips[:, X], quick_plan.guide[:, 0]))[0]
-    assert decide(quick_plan, estimated(off), gain=0.0).command.dg_y == pytest.approx(planned)
-
-
 @given(
     steps=st.integers(0, 70), way=st.floats(0.01, 40), limit=st.floats(0.02, 0.5), reach=st.floats(0.02, 15),
     roll=st.sampled_from([0.0, np.pi]), advance=st.floats(0.2, 2.0),

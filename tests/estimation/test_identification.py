@@ -14,7 +14,6 @@ from identified import (
     OWN,
     PHANTOM,
     QUIET,
-    TIGHT,
     WAVES,
     Needle,
     ahead,
@@ -136,14 +135,6 @@ def test_in_air_the_wall_that_the_needle_bears_on_is_found():
     assert max(off) < 5e-3, off
 
 
-def test_a_base_offset_alone_is_found_by_its_lever():
-    """In air y = b (1 − lever): only the joint effect of base y and base θ is identified."""
-    needle = Needle(base_y=0.5)
-    estimate, states = followed(needle, 20)
-    np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-3)
-    assert abs(estimate.parameters[AT.base]) + 100.0 * abs(estimate.parameters[AT.slope]) > 0.2
-
-
 @pytest.mark.parametrize("layers", [1, 3])
 def test_tissue_of_other_layers_is_identified_too(layers):
     """One layer, and three whose upper boundary is displaced to below the place of the lower one."""
@@ -173,20 +164,6 @@ def test_a_tracker_without_jitter_is_trusted_up_to_the_model_error():
     assert estimate.tip[Y] == pytest.approx(
         NEEDLES["all"].measured(states[-1])[1], abs=unexplained(scenario, OWN)
     )
-
-
-def test_a_noisier_reading_moves_the_estimate_less():
-    """One reading 0.1 mm off. The guide is exact, so the problem is linear."""
-    moved = []
-    for jitter in (1e-3, 0.05, 0.5):
-        scenario = TIGHT.with_values({"tracker.jitter_mm": jitter})
-        estimate = (
-            Identification()
-            .begin(begun_with(Simulator(scenario, 1)))
-            .move(Motion(Control(db_x=1.0), 0.0, 1.0))
-        )
-        moved.append(estimate.observe([Measurement(1.0, -27.5, 0.1)]).tip[Y])
-    assert 0.1 > moved[0] > moved[1] > moved[2] > 0.0
 
 
 def test_known_parameters_are_not_fitted():

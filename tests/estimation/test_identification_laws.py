@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.identification import Identification
-from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Measurement, Motion, X, Y
 from identified import (
@@ -66,24 +65,6 @@ def test_mirrored_readings_give_the_mirrored_estimate():
     np.testing.assert_allclose(there.tip, here.tip * MIRROR, atol=1e-6)
     mirrored = np.where(np.isin(np.arange(here.parameters.size), (AT.base, AT.slope)), -1.0, 1.0)
     np.testing.assert_allclose(there.parameters, mirrored * here.parameters, atol=1e-4)
-
-
-def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
-    """In air, an estimated bend of the free needle and a run-out are on the other side afterwards."""
-    scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-    simulator = Simulator(scenario, 1)
-    estimate = Identification().begin(begun_with(simulator))
-    parameters = estimate.parameters.copy()
-    parameters[[AT.bend, AT.run_out]] = 0.6, 0.1
-    adapted = simulator.with_adaptation(Adaptation(np.zeros(1), np.ones(2), bend=0.6))
-    state = adapted.step(simulator.start(), Control())
-    bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
-    assert bent.tip[Y] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
-    mirrored = bent.move(Motion(Control(db_x=0.1, flip=True), 0.0, 1.0))
-    np.testing.assert_allclose(mirrored.tip[1:], -bent.tip[1:], atol=1e-9)
-    assert bent.off_axis(-1) == pytest.approx(-bent.off_axis(1))
-    left = replace(bent, residual=0.03)
-    assert (left.off_axis(1), left.off_axis(-1)) == pytest.approx((0.13, -0.07))
 
 
 def test_a_bevel_rolls_before_its_move_and_so_does_the_run_out():

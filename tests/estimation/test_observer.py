@@ -1,7 +1,6 @@
 """The observer: its estimates in air and in tissue, from late readings or in time; its prediction has no offset."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -41,19 +40,6 @@ def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, bas
     np.testing.assert_allclose(estimate.tip[:2], truth.tip[:2], atol=2e-3)
     np.testing.assert_allclose(estimate.tip[THETA], truth.tip[THETA], atol=1e-4)
     assert estimate.state.tip_load == (0.0, 0.0)
-
-
-def test_an_estimate_from_air_predicts_the_first_depths():
-    """The estimate from air is still good 10 mm deep, without a further reading."""
-    simulator = Simulator(QUIET)
-    truth, estimate, _ = follow(start_with(QUIET, base=(0.6,)), begun(simulator), simulator, 28)
-    assert truth.tip[X] < 0.0
-    state, naive = estimate.state, Simulator(QUIET).start()
-    for _ in range(28):
-        naive = simulator.step(naive, Control(db_x=1.0))
-    for _ in range(10):
-        truth, state, naive = (simulator.step(s, Control(db_x=1.0)) for s in (truth, state, naive))
-    assert abs(state.tip[Y] - truth.tip[Y]) < 0.1 * abs(naive.tip[Y] - truth.tip[Y])
 
 
 def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
@@ -104,19 +90,6 @@ def test_without_estimating_the_load_the_offset_stays(gain, estimates):
     _, estimate, innovations = follow(state, begin, simulator, 30, force=0.003)
     assert estimate.state.tip_load == (0.0, 0.0)
     assert np.abs(innovations[-5:, Y]).min() > 0.3 * abs(innovations[0, Y])
-
-
-def test_stiffer_tissue_than_estimated_leaves_little_offset():
-    """The disturbance grows slowly with depth; the load estimate leaves a fraction of the offset."""
-    left = []
-    for gain in (PHANTOM.control.load_gain, 0.0):
-        soft, stiff = (
-            QUIET.with_values({f"tissue.{k}.shear_modulus_kpa": mu for k in (0, 1)}) for mu in (2.0, 6.0)
-        )
-        simulator, plant = Simulator(soft.with_values({"control.load_gain": gain})), Simulator(stiff)
-        *_, innovations = follow(plant.start(), begun(simulator), plant, 65, guide=0.02)
-        left.append(np.abs(innovations[-10:, Y]).max())
-    assert left[0] < 0.2 * left[1]
 
 
 def test_the_load_grows_by_the_gain_times_the_reaction_and_the_tip_is_held_where_measured():
@@ -231,15 +204,6 @@ def test_a_move_without_duration_is_done_at_once():
     assert Move(5.0, 5.0, AHEAD).part(5.0) == 1.0
 
 
-def test_more_readings_are_trusted_more():
-    """In air a period's correction grows with the number of its readings, as their mean is less noisy."""
-    simulator = Simulator(PHANTOM.with_values({"tracker.jitter_mm": 1.0}))
-    predicted = begun(simulator).move(Motion(AHEAD, 0.0, 1.0))
-    x, y = predicted.tip[:2] + np.array([0.0, 0.5])
-    tips = [predicted.observe([Measurement(1.0, x, y)] * n).tip[Y] for n in (1, 4, 16)]
-    assert all(0.0 < less < more < 0.5 for less, more in pairwise(tips))
-
-
 def test_an_empty_reading_is_refused():
     moved = begun(Simulator(PHANTOM)).move(Motion(AHEAD, 0.0, 1.0))
     with pytest.raises(ValueError, match="not removed"):
@@ -270,15 +234,6 @@ def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(n
         x, y = np.add(moved.tip[:2], [0.0, 0.3])
         updated = moved.observe([Measurement(1.0, float(x), float(y))]).state
         assert bool(updated.base[Y] != 0.0 or updated.tip_load != (0.0, 0.0)) is estimates
-
-
-def test_without_a_reading_the_estimate_stays_and_the_innovation_is_zero():
-    simulator = Simulator(PHANTOM)
-    moved = begun(simulator, in_tissue(simulator)).move(Motion(AHEAD, 0.0, 1.0))
-    updated = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
-    assert updated.innovation != (0.0, 0.0, 0.0)
-    assert updated.without_reading().innovation == (0.0, 0.0, 0.0)
-    assert updated.without_reading().state is updated.state
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from flexneedle.errors import ScenarioError
-from flexneedle.estimation import prior as prior_of
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import Prior
 from flexneedle.mechanics.model import Adaptation
@@ -45,14 +44,6 @@ def test_the_prior_is_that_of_the_scenario():
     np.testing.assert_allclose(prior.bounds, expected, atol=0.01)
     off = np.random.default_rng(1).normal(size=sd.size) * sd
     assert prior.cost(prior.mean + off) == pytest.approx(0.5 * off @ np.linalg.solve(covariance, off))
-
-
-@pytest.mark.parametrize(("size", "distance"), [(2, 0.3), (3, 2.0), (7, 0.25), (40, 0.01)])
-def test_precision_of_a_chain_is_the_inverse_of_its_correlation(size, distance):
-    correlation = np.exp(-distance * np.abs(np.subtract.outer(np.arange(size), np.arange(size))))
-    np.testing.assert_allclose(
-        prior_of.inverse_correlation(size, distance), np.linalg.inv(correlation), rtol=1e-9, atol=1e-9
-    )
 
 
 def test_cells_are_not_so_short_that_a_fit_would_never_end():

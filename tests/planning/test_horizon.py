@@ -99,12 +99,6 @@ def test_it_is_never_worse_than_the_incumbent(seed, z):
     assert found.cost <= before
 
 
-def test_an_incumbent_that_no_sample_beats_is_returned():
-    best = np.array([[0.375, 0.375, 0.375, 0.375]])  # the last one has no sigma: no sample comes there
-    found = search(first=np.concatenate([best, best + np.linspace(0.1, 0.6, 16)[:, None]]))
-    np.testing.assert_array_equal(found.z, best[0])
-
-
 def test_given_samples_are_those_of_the_first_iteration_and_are_kept_in_bounds():
     tape, first = Taped(), np.tile([[0.1], [0.2], [9.0], [0.3], [0.4]], (1, 4))
     search(tape, first=first)

@@ -1,6 +1,5 @@
 """Plans on the phantom: they reach the target's depth, or name the limit that keeps them from the target."""
 
-import math
 from functools import cache
 
 import numpy as np
@@ -132,25 +131,6 @@ def test_a_sketch_of_the_bevel_alone_reaches_with_one_roll_the_targets_of_severa
     assert planner.sketch(scenario, "steering").reached
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", range(160_000, 160_040))
-def test_in_random_worlds_a_sketch_of_the_bevel_alone_reaches_what_a_plan_does(number):
-    """Near targets, and the worlds' own, which are mostly out of reach; with as few samples as on the page."""
-    base = world(number)
-    for share in (0.15, 1.0):
-        scenario = base.with_values({"target.lateral_mm": share * base.target.lateral_mm})
-        few = {"plan.samples": 24, "plan.iterations": 4, "plan.max_iterations": 4, "plan.elite_fraction": 0.1}
-        sketch = planner.sketch(scenario.with_values(few), "steering")
-        assert sketch.reached == flexneedle.plan(scenario, strategy="steering").reached
-
-
-def test_a_sketch_of_a_target_out_of_reach_is_not_reached():
-    scenario = PHANTOM.with_values({**COARSE, "target.lateral_mm": 9.0})
-    sketch = planner.sketch(scenario, "steering")
-    assert sketch.error_mm == pytest.approx(math.dist(sketch.tips[-1, :3], scenario.target.position))
-    assert not sketch.reached
-
-
 def test_manipulation_enters_at_an_angle_towards_the_target():
     """The slope at the skin is to the target's side; towards a target straight ahead it is 0."""
     assert planned(LATERAL).entry_angle > 0.01
@@ -177,19 +157,6 @@ def test_the_bevels_reach_lies_between_the_two_insertions_without_a_roll():
     constant = planned((40.0, greatest + 0.1), "steering")
     assert constant.flips == 0
     assert constant.tip_mm[1] == pytest.approx(greatest, abs=0.005)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("number", "share"), [(3, -0.9), (17, 0.05), (31, 0.6), (37, -0.9)])
-def test_every_target_within_reach_is_steered_to_on_any_needle(number, share):
-    """With and without a guide; `make steering` has a hundred."""
-    scenario = world(number)
-    depth = scenario.target.depth_mm
-    least, greatest = bevel_reach(scenario, depth)
-    target = (depth, 0.5 * (least + greatest) + share * 0.5 * (greatest - least))
-    plan = flexneedle.plan(scenario, target, "steering", seed=number)
-    assert plan.error_mm <= 0.1
-    assert not plan.guide.any()
 
 
 def test_without_guide_and_base_both_strategies_are_the_same_search():

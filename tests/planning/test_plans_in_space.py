@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.errors import InputError
 from flexneedle.planning.entry import entry_bounds, mount_needle
-from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.planning.problem import PlanProblem
 from flexneedle.scenario.sections.settings import PlanSettings
@@ -102,23 +100,6 @@ def test_with_the_bevel_alone_a_free_entry_leaves_it_room_to_correct():
     )
     off = abs(complex(*plan.target[1:]) - plan.scenario.entry.lateral(25.0))
     assert off <= 0.5 * 0.5 * (greatest - least) + 0.02
-
-
-def test_an_insertion_begins_where_the_plan_enters():
-    """With the scenario of a free entry, and with the plan's scenario; another entry is refused."""
-    free = PHANTOM.with_values({"entry.free_radius_mm": 4.0, "target.lateral_z_mm": 4.0})
-    plan = flexneedle.plan(free, threads=1)
-    assert with_planned_entry(free, plan) == plan.scenario
-    options = {"controller": "resolved-rate", "rig": flexneedle.VirtualRig("model"), "threads": 1}
-    one, other = (flexneedle.insert(each, plan, 3, **options) for each in (free, plan.scenario))
-    assert one.true_error_mm == other.true_error_mm
-    assert one.scenario.entry == plan.scenario.entry
-    entry = plan.scenario.entry
-    begun = one.periods[0]
-    assert begun.base.y == pytest.approx(entry.lateral(begun.base.x).real, abs=2.0)
-    assert one.true_error_mm < 2.0
-    with pytest.raises(InputError, match="entry"):
-        flexneedle.insert(PHANTOM.with_values({"target.lateral_z_mm": 4.0, "entry.lateral_mm": 9.0}), plan)
 
 
 @pytest.mark.parametrize("axes", [1, 2])

@@ -178,19 +178,6 @@ def padded(tips, energy, converged, deflection):
     return tips[:, :9], energy[:, :9], converged[:, :9], deflection[:, :9]
 
 
-def test_padding_of_a_shorter_sample_is_not_charged():
-    """Two samples, 12 and 24 steps: the first one's last twelve steps lie in tissue and count nothing."""
-    z = np.concatenate([primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), primitives(*[(0.5, 0, 0, 0.1, 1, 0)] * 3)])
-
-    controls, _ = make_controls(PROBLEM, z)
-    n, m = controls.shape[:2]
-    trajectories = Trajectories(
-        controls, np.ones((n, m, 5)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
-    )
-    found = evaluate_terms(PROBLEM.terms, trajectories)
-    np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
-
-
 def rigid(controls, bevel=1.0):
     """A needle that goes where guide (mm) and bevel (0.1 mm a mm in tissue) push it, without tissue energy."""
     x = np.cumsum(controls[:, :, DB_X], axis=1) - 4.0
