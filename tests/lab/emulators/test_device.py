@@ -33,25 +33,6 @@ def test_before_init_only_queries_are_valid():
     assert send(power_on(), "INIT:")[1] == "OKAY"
 
 
-def test_sensors_are_found_initialised_and_enabled_in_this_order():
-    device, _ = send(power_on(2), "INIT:")
-    assert send(device, "PENA:0AD")[1] == "ERROR0E"
-    for command, query, listed in (
-        ("PHSR:00", "PHSR:02", "020A0010B001"),
-        ("PINIT:0A", "PHSR:02", "010B001"),
-        ("PHSR:00", "PHSR:03", "010A011"),
-        ("PENA:0AD", "PHSR:04", "010A031"),
-        ("PDIS:0A", "PHSR:03", "010A011"),
-    ):
-        device, _ = send(device, command)
-        assert send(device, query)[1] == listed
-
-
-def test_phinf_returns_the_port_of_a_sensor():
-    assert send(set_up(), "PHINF:0C0020")[1] == "00000000100300"
-    assert len(send(set_up(), "PHINF:0C0001")[1]) == 33
-
-
 def test_handles_can_be_requested_and_freed():
     device, handle = send(set_up(1), "PHRQ:*********1****")
     assert handle == "0B"
@@ -87,19 +68,6 @@ def test_an_invalid_command_returns_its_error_code(command, error):
 
 def test_a_command_with_a_wrong_checksum_is_rejected():
     assert aurora.reply(power_on(), b"INIT:0000", FRAME)[1] == codec.encode_text("ERROR04")
-
-
-def test_set_up_commands_are_invalid_while_tracking_until_init():
-    device, _ = send(set_up(), "TSTART:")
-    assert send(device, "PINIT:0A")[1] == "ERROR0C"
-    assert send(device, "TSTOP:", "PHSR:04")[1].startswith("04")
-    assert send(device, "INIT:", "PHSR:02")[1].startswith("04")
-
-
-def test_old_firmware_does_not_support_bx():
-    device, _ = send(set_up(has_bx=False), "TSTART:")
-    assert send(device, "BX:0801")[1] == "ERROR01"
-    assert send(device, "TX:0801")[1].startswith("04")
 
 
 def test_a_reading_in_text_has_pose_status_and_frame_number():

@@ -200,18 +200,6 @@ def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_ru
     assert recorded == expected | {READINGS: recorded[READINGS]}  # another tracker
 
 
-@pytest.mark.long
-def test_a_target_out_of_reach_is_refused_as_on_the_command_line(tmp_path):
-    with started(tmp_path, NEUTRAL, "--dry-run", ros={"target": True}) as insertion:
-        peer = insertion.peer(("diagnostics",), ("target",))
-        insertion.await_that(lambda: "waits for target" in str(peer.received("diagnostics")))
-        peer.send("target", target(time.time(), (0.5, 0.0, 0.0)))
-        status, _, errors = insertion.end()
-    assert status == 2
-    assert errors[-1].startswith("flexneedle: target.depth_mm = 500.0: beyond the stroke")
-    assert not insertion.out.exists()
-
-
 # Refusals before anything is opened
 
 

@@ -16,7 +16,7 @@ from flexneedle.lab.ros.tracker import RosTracker, make_tracker
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import VISIBLE
 from rooms import ManualClock
-from ros_peers import Peer, shape, tip
+from ros_peers import Peer, tip
 
 
 class Node:
@@ -127,17 +127,3 @@ def test_tips_of_smartneedle_reach_the_stage_of_the_insertion():
     assert (found[:, 0] > 5.0).all()
     np.testing.assert_allclose([m.direction for m in measured], 0.0, atol=1e-9)
     assert (np.diff([m.time for m in measured]) > 0).all()
-
-
-def test_a_shape_of_the_fibre_optic_needle():
-    with make_tracker({"profile": "smartneedle-fbg", "source": "shape"}, WallClock()) as tracker:
-        peer, frames = Peer(load_profile("smartneedle-fbg"), subscribe=("shape",)), []
-        points = [(0.0, 0.0, z) for z in (0.0, 5.0, 10.0)]
-
-        def arrived():
-            peer.send("shape", shape(time.time(), points, frame="needle"))
-            frames.extend(tracker.read())
-            return frames
-
-        until(arrived)
-    assert frames[0].readings["tip"].position == pytest.approx((10.0, 0.0, 0.0))

@@ -68,13 +68,6 @@ def test_with_backlash_the_axis_lags_by_the_lost_motion_on_reversal(path, scale,
     assert (places <= motor + backlash + 1e-9).all()
 
 
-def test_a_reversal_first_takes_up_the_lost_motion():
-    carriage = Carriage(1000.0, 0.0, FAR, FAR, backlash=0.2)
-    there_and_back = [5000.0, 4900.0, 4800.0, 4700.0, 4800.0, 4900.0, 5000.0]
-    places = followed(carriage, there_and_back)
-    np.testing.assert_allclose(places, [0.0, 5.0, 5.0, 5.0, 4.9, 4.9, 4.9, 5.0])
-
-
 def test_a_carriage_ends_at_its_stops():
     places = followed(Carriage(1000.0, 0.0, (-2.0, 10.0), FAR), [20_000.0, 9_500.0, -9_000.0])
     np.testing.assert_allclose(places, [0.0, 10.0, 9.5, -2.0])

@@ -107,15 +107,6 @@ def test_a_relative_and_an_absolute_move_end_at_their_targets():
     assert value(after(moving, ms=200), "TPA") == value(after(moving, ms=200), "PA ?") == 100
 
 
-def test_motion_is_reported_while_it_lasts():
-    device = switched_on("SPA=1000", "PRA=1000", "BGA", ms=500)
-    assert (value(device, "MG _BGA"), value(device, "TVA"), value(device, "SCA")) == (1, 1000, 0)
-    assert int(value(device, "TSA")) & 128
-    device = after(device, ms=600)
-    assert value(device, "MG _BGA") == 0
-    assert not int(value(device, "TSA")) & 128
-
-
 def test_a_stop_slows_down_and_an_abort_does_not():
     device = switched_on("SP 1000,1000", "DC 10240,10240", "JG 1000,1000", "OEB=1", "BGAB", ms=300)
     at = value(device, "TPA")

@@ -407,15 +407,6 @@ def test_after_an_invalid_reply_nothing_is_sent_until_the_connection_is_renewed(
         assert settled(motors)["A"].position == 5
 
 
-def test_data_in_the_reply_to_a_command_ends_the_connection():
-    with driven(timeout_ms=100) as (motors, device):
-        device.damage = lambda _line, true: b" 5\r\n" + true
-        with pytest.raises(DriverError, match="data in the reply to DCA"):
-            motors.set_speed("A", 100, 1024)
-        with pytest.raises(DriverError, match="not connected"):
-            motors.read()
-
-
 def test_a_failed_reconnection_is_tried_again_by_the_next():
     with driven(timeout_ms=100) as (motors, device):
         motors.stop()

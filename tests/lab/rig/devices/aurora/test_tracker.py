@@ -174,19 +174,6 @@ def test_bad_replies_are_dropped_counted_and_reported(path, order, fault, kind, 
     assert counts.errors[kind] >= 1
 
 
-@pytest.mark.slow
-def test_delayed_replies_give_correct_frames(path, order):
-    with Aurora(path, WallClock()) as aurora:
-        frames, _ = read_until(aurora, at_least(20))
-        order("fault delay=0.2:0.6")
-        more, statuses = read_until(aurora, lambda f: f and f[-1].number - frames[-1].number > 40)
-        missed = aurora.counts.missed
-    assert_true_and_new(frames + more)
-    assert missed >= 10
-    assert any(status.startswith("no frame for") for status in statuses)
-    assert_times_of_measurement(frames + more)
-
-
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
@@ -237,23 +224,15 @@ BAD_LINK = """
 import signal, socket, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 channel = socket.socket(fileno=int(sys.argv[1]))
-for data in (b'["ready", {"10": ["01", "00"]}]', SENT):
+for data in (b'["ready", {"10": ["01", "00"]}]', b'no JSON'):
     channel.sendall(len(data).to_bytes(4, "little") + data)
 while True: time.sleep(60)
 """
 
 
-@pytest.mark.parametrize(
-    ("sent", "text"),
-    [
-        (b"no JSON", "not a message: b'no JSON'"),
-        (b'["frame", 1, 0.0, {"99": [0, 49, 1, [1, 0, 0, 0, 1, 2, 3, 0]]}]', "requested"),
-        (b"x" * 70000, "must have at most"),
-    ],
-)
-def test_a_link_that_sends_no_message_is_ended_counted_and_replaced(path, sent, text, monkeypatch, tmp_path):
+def test_a_link_that_sends_no_message_is_ended_counted_and_replaced(path, monkeypatch, tmp_path):
     """Also if it would neither end nor obey; frames of the next link arrive."""
-    (tmp_path / "bad_link.py").write_text(BAD_LINK.replace("SENT", repr(sent)))
+    (tmp_path / "bad_link.py").write_text(BAD_LINK)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     modules = ["bad_link"]
 
@@ -267,7 +246,7 @@ def test_a_link_that_sends_no_message_is_ended_counted_and_replaced(path, sent, 
         counts = aurora.counts
     assert_true_and_new(frames)
     assert counts.errors == {"crash": 1}
-    assert any(status.startswith("the link failed: ") and text in status for status in statuses)
+    assert "the link failed: not a message: b'no JSON'" in statuses
 
 
 def test_without_a_read_the_oldest_frames_are_dropped_and_counted(path, monkeypatch):
