@@ -2,15 +2,11 @@
 
 import os
 
-import numpy as np
 import pytest
 
-from emulated import emulator, read_until
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import orders
 from flexneedle.lab.emulators.orders import Orders, parse_position
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
-from flexneedle.lab.rig.devices.clock import WallClock
 
 
 def test_a_position_is_three_numbers_in_mm():
@@ -60,18 +56,3 @@ def test_a_terminal_is_not_read_in_the_background(monkeypatch):
     assert commands.sources == [host]
     os.close(device)
     os.close(host)
-
-
-def test_the_tip_rests_from_the_start_or_at_a_given_position():
-    def last(frames, name):
-        return np.mean([frame.readings[name].position for frame in frames[-20:]], axis=0)
-
-    with emulator("--still", "--sensors", "2") as (path, send), Aurora(path, WallClock()) as aurora:
-        before, _ = read_until(aurora, lambda frames: len(frames) >= 20)
-        assert send("30 -40 -250") == "the tip rests at 30 -40 -250 mm"
-        assert send("30 -40").startswith("'30 -40': must be three numbers")
-        aurora.read()
-        moved, _ = read_until(aurora, lambda frames: len(frames) >= 30)
-    np.testing.assert_allclose(last(before, "tip"), (0, 0, -200), atol=0.1)
-    np.testing.assert_allclose(last(moved, "tip"), (30, -40, -250), atol=0.1)
-    np.testing.assert_allclose(last(moved, "ref1"), last(before, "ref1"), atol=0.1)

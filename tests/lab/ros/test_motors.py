@@ -2,9 +2,6 @@
 
 import math
 import time
-import tomllib
-from importlib.metadata import EntryPoint
-from pathlib import Path
 from threading import Event, current_thread
 from unittest.mock import MagicMock
 
@@ -25,7 +22,6 @@ from flexneedle.lab.ros.motors import (
     make_motors,
 )
 from flexneedle.lab.ros.profile import load_part, load_profile
-from flexneedle.lab.ros.tracker import make_tracker
 from ros_peers import Joints
 
 PROFILE = load_part("neutral", publish=("joint_targets",), subscribe=("joint_states",))
@@ -319,9 +315,3 @@ def test_a_set_point_never_exceeds_its_speed_nor_its_goal(begin, goal, speed, st
         point = after
     if abs(goal - begin) < speed * now * (1 - 1e-6):
         assert point.position == goal
-
-
-def test_driver_and_tracker_are_found_by_name():
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
-    for group, make in (("flexneedle.drivers", make_motors), ("flexneedle.trackers", make_tracker)):
-        assert EntryPoint("ros", project["entry-points"][group]["ros"], group).load() is make

@@ -1,9 +1,5 @@
 """Settings of the driver in a rig file."""
 
-import tomllib
-from importlib import import_module
-from pathlib import Path
-
 import pytest
 
 from flexneedle.errors import RigError
@@ -63,9 +59,3 @@ def test_channels_are_axes_of_the_controller(channels, line):
     with pytest.raises(RigError) as error:
         factory(GOOD, channels)
     assert line in error.value.problems
-
-
-def test_the_package_offers_the_driver():
-    pyproject = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())
-    module, name = pyproject["project"]["entry-points"]["flexneedle.drivers"]["galil"].split(":")
-    assert getattr(import_module(module), name) is factory

@@ -5,7 +5,6 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
 from typing import Any, NoReturn, Self
 
 from flexneedle.errors import InputError, RunError
@@ -78,9 +77,7 @@ class EmulatedRig:
         self._say({"ready": ready, "pids": pids, "time_s": monotonic()})
         return self
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self._end()
 
     def serve(self, orders: Orders) -> NoReturn:
