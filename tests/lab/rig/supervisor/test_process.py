@@ -217,19 +217,28 @@ def test_motors_are_stopped_after_the_computer_was_suspended(supervisor):
     flag.unlink()
 
 
-def test_motors_are_moved_by_one_program_at_a_time_and_by_none_in_a_dry_run(shared, make_task, capfd):
+def test_motors_are_moved_by_one_program_at_a_time(shared, make_task, capfd):
     """The second program is refused before it sends a command. What a driver prints is not on standard output."""
     before = notes_of(shared)
     with pytest.raises(DriverError, match=rf"^shared: in use by pid {os.getpid()} \(.*: end it first$"):
         SupervisorClient(make_task("shared"))
+    assert notes_of(shared) == before
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "the stage is opened\n")
+
+
+def test_a_dry_run_moves_no_motors_and_a_supervisor_that_is_killed_is_an_error(shared, make_task):
+    before = notes_of(shared)
     with SupervisorClient(replace(make_task("shared"), dry=True)) as dry:
         dry.arm()
         done = dry.step(0.0, {"insertion": 1.0}, 0.2)
         assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
         dry.stop()
+        dry.reset()
+        os.kill(dry.pid, signal.SIGKILL)
+        with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
+            dry.wait(60.0)
     assert notes_of(shared) == before
-    printed = capfd.readouterr()
-    assert (printed.out, printed.err) == ("", "the stage is opened\n" * 2)
 
 
 @pytest.mark.parametrize("how", ["close", "end of the client", "error in the supervisor"])
@@ -251,11 +260,3 @@ def test_motors_are_stopped_at_the_end_whatever_it_is(make_task, how):
     assert [name for name, *_ in notes_of(made)][-1 - stops :] == ["follow"] + ["stop"] * stops
     made.request_stop("too late")
     assert signal.set_wakeup_fd(wakeup) == -1
-
-
-def test_a_supervisor_that_is_killed_is_an_error(make_task):
-    with SupervisorClient(make_task("killed")) as made:
-        made.arm()
-        os.kill(made.pid, signal.SIGKILL)
-        with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
-            made.wait(60.0)
