@@ -13,6 +13,7 @@ from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.supervisor import connection, protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Frame, Measurement
 from stages import rig_file
@@ -22,7 +23,7 @@ class ScriptedProcess:
     """The supervisor's process in a thread, with a rig that was stopped before the start.
 
     Another stop is reported, and then that motors rest, only after heartbeats of a waiting client. Arming ends in a
-    fault.
+    fault, and a motor cannot be switched off.
     """
 
     pid = 0
@@ -72,6 +73,9 @@ class ScriptedProcess:
                     Measurement(0.0, x, 0.0, 0.0, Frame(0.0, n, {})) for n, x in enumerate((None, math.nan))
                 ]
                 self._report(self._requests, SupervisorState.IDLE, "", measurements=tuple(lost))
+            case protocol.OffCommand():
+                on = {"insertion": protocol.AxisState(0.0, MotorState(0.0, 0.0, on=True))}
+                self._report(self._requests, why="A is in motion", axes=on)
             case protocol.ArmCommand():
                 self._report(self._requests, SupervisorState.FAULT, "the motor does not follow")
 
@@ -151,6 +155,8 @@ def test_a_refused_request_has_its_reason(supervisor):
         supervisor.reset()
 
 
-def test_arming_that_ends_in_a_fault_has_its_reason(supervisor):
+def test_arming_that_ends_in_a_fault_and_a_motor_that_stays_on_are_errors_with_their_reason(supervisor):
+    with pytest.raises(DriverError, match="A is in motion"):
+        supervisor.off()
     with pytest.raises(DriverError, match="the motor does not follow"):
         supervisor.arm()
