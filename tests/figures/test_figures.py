@@ -6,14 +6,13 @@ from functools import cache
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
 from drawn import axes, lines, names, overlapping, texts
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
-from flexneedle.figures.style import NEEDLE, save
+from flexneedle.figures.style import save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import ROLL, THETA
@@ -176,13 +175,6 @@ def test_the_legend_names_all_that_is_drawn_and_nothing_else(case, missing):
     known += ["bevel flip, planned", "bevel flip, applied", "guide travel"]
     (legend,) = drawn(case).legends
     assert sorted(names(legend)) == sorted(set(known) - missing)
-
-
-def test_the_grey_needle_is_named_estimated_in_an_insertion_and_planned_in_a_plan():
-    for figure, name in ((drawn(), "estimated needle"), (plan_figure(PHANTOM, PLANS[:1]), "planned needle")):
-        (legend,) = figure.legends
-        (patch,) = (handle for handle in legend.legend_handles if handle.get_label() == name)
-        assert to_hex(patch.get_facecolor()) == NEEDLE
 
 
 # ---- panels

@@ -211,20 +211,6 @@ def test_a_second_axis_or_a_key_set_to_zero_changes_no_other_draw():
             assert changes(drawn(seed), drawn(seed, without)) == CHANGED[key][1]
 
 
-@pytest.mark.parametrize(
-    ("key", "name"),
-    [
-        ("start_offset_sd_mm", "base_y"),
-        ("initial_bend_mm", "bend"),
-        ("run_out_mm", "run_out"),
-        ("tracker_bias_mm", "bias"),
-    ],
-)
-def test_a_doubled_key_doubles_its_draw(key, name):
-    one, two = (drawn(3, PHANTOM.with_values({f"phantom.{key}": value})) for value in (0.3, 0.6))
-    np.testing.assert_allclose(getattr(two, name), 2.0 * np.array(getattr(one, name)))
-
-
 def test_without_imperfections_the_true_scenario_is_the_scenario():
     """Except for the spacing of its contacts."""
     expected = IDEAL.with_values({"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm})
@@ -251,15 +237,6 @@ def test_no_layer_vanishes(shift):
     scenario = layered(5.0, 0.5, 12.0).with_values({"phantom.layer_shift_sd_mm": shift})
     tops = np.array([drawn(seed, scenario).scenario.layer_tops for seed in range(60)])
     assert np.diff(tops, axis=1).min() == pytest.approx(0.1)
-
-
-def test_boundaries_are_displaced_independently():
-    """Around the scenario's boundaries, if the layers are thick enough."""
-    roomy = layered(15.0, 15.0, 15.0)
-    shift = np.array([drawn(seed, roomy).scenario.layer_tops[1:] for seed in range(500)]) - [15.0, 30.0, 45.0]
-    np.testing.assert_allclose(shift.mean(axis=0), 0.0, atol=0.2)
-    np.testing.assert_allclose(shift.std(axis=0), 1.5, rtol=0.12)
-    assert_independent(shift, 0.15)
 
 
 def test_a_strong_bevel_is_drawn_within_its_limit():

@@ -31,33 +31,6 @@ def test_the_tip_moves_by_the_run_out_when_the_bevel_rolls(kind, seed):
     np.testing.assert_allclose(tip(driven(phantom, TURN)), here, atol=1e-9)
 
 
-def test_layer_boundaries_are_at_their_drawn_depths():
-    """Displaced by 1.5 mm (sd) around 20 mm: the stiffness of the cells changes there, within one cell."""
-    steps = []
-    for seed in range(60):
-        phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
-        rod = phantom._plant.rod
-        k = rod.foundation
-        (jump,) = np.flatnonzero(np.diff(k))
-        assert k[jump + 1] / k[jump] == pytest.approx(3.63 / 1.82)
-        drawn = phantom._truth.scenario.layer_tops[1]
-        assert (jump + 1) * rod.cell == pytest.approx(drawn, abs=0.5 * rod.cell + 1e-9)
-        steps.append(drawn)
-    assert np.mean(steps) == pytest.approx(20.0, abs=4.0 * 1.5 / math.sqrt(60))
-    assert np.std(steps) == pytest.approx(1.5, rel=0.3)
-
-
-def test_stiffness_varies_along_the_depth_as_drawn():
-    """Factors on the modulus of each cell; test_draw.py tests their size and correlation."""
-    phantom = alone(3, shear_modulus_variation=0.2, element_mm=30.0)
-    rod = phantom._plant.rod
-    plain = np.where((np.arange(rod.law.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
-    factor = rod.foundation / plain
-    drawn = np.array(phantom._truth.variation)[: rod.law.size]
-    np.testing.assert_allclose(factor / factor[0], drawn / drawn[0])
-    assert factor.std() > 0.05 * factor.mean()
-
-
 @both_plants
 def test_factors_of_tissue_bevel_and_needle_equal_a_changed_scenario(kind):
     """1.5 times the modulus of both layers, half the bevel, and a drawn modulus of the needle."""

@@ -92,14 +92,6 @@ def test_the_tip_does_not_move_during_a_wait():
     np.testing.assert_allclose(phantom.tip_at(0.7), before.tip[:3], atol=1e-12)
 
 
-@both_plants
-def test_a_clamp_offset_beyond_the_travel_of_the_base_is_valid(kind):
-    tight = IDEAL.with_values({"setup.max_base_travel_mm": 0.1})
-    moved = driven(tank(tight, kind, base_y=0.4, base_turn=0.001), AHEAD)
-    free = driven(tank(IDEAL, kind, base_y=0.4, base_turn=0.001), AHEAD)
-    np.testing.assert_array_equal(tip(moved), tip(free))
-
-
 @pytest.mark.parametrize(
     "command",
     [

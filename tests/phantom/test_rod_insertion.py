@@ -110,17 +110,6 @@ def test_an_insertion_hardly_depends_on_step_and_spacing(name, sizes, limits, ce
 # ---- entry and exit
 
 
-def test_a_step_across_the_skin_may_be_long_or_short():
-    before = [move(plant(), 0.5, times=56) for _ in range(3)]
-    ends = [
-        move(needle, step, times=round(2.0 / step)).tip
-        for needle, step in zip(before, (2.0, 0.5, 0.0625), strict=True)
-    ]
-    assert ends[-1][1] > 0.01
-    np.testing.assert_allclose([tip[1] for tip in ends], ends[-1][1], atol=3e-3)
-    np.testing.assert_allclose(ends[1][1], ends[-1][1], atol=1e-3)
-
-
 def test_an_inclined_needle_cuts_along_its_axis_from_the_skin_on():
     """In one step through the skin: points every 0.5 mm along the needle, the first 0.25 mm behind its entry."""
     turn = 0.2
@@ -149,25 +138,6 @@ def test_out_of_the_skin_the_channel_is_closed():
 
 
 # ---- the channel
-
-
-def test_the_channel_is_on_the_path_of_the_tip():
-    """A point for every 0.5 mm of cut, with the layer at its depth."""
-    needle, way, cut = plant(), [], []
-    for row in commands(1.5, 44.5, AHEAD):
-        needle.step(row)
-        way.append(needle.tip[:2])
-        cut.append(needle.state["cut"])
-    points = needle.channel["place"][: needle.count, :2].T
-    at = 0.5 * (np.arange(needle.count) + 0.5)
-    assert at[-1] <= cut[-1] < at[-1] + 0.5
-    expected = np.array([np.interp(at, cut, along) for along in np.transpose(way)])
-    np.testing.assert_allclose(points[:, 1:], expected[:, 1:], atol=1e-9)
-    np.testing.assert_allclose(points[:, 0], expected[:, 0], atol=0.02)  # from air into the skin
-    assert cut[-1] == pytest.approx(way[-1][0], rel=0.01)
-    force, deep = needle.channel["stiffness"][: needle.count], points[0] > 20.0
-    assert np.unique(force[~deep]).size == np.unique(force[deep]).size == 1
-    assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
 
 
 def test_a_flip_without_insertion_changes_only_the_bevel():

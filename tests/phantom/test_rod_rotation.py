@@ -13,7 +13,6 @@ from reference import kirchhoff
 from reference.rods import IDEAL, plant
 from reference.space_insertions import Inserted, angle_between, turned, wander
 from reference.space_validation import inserted_straight, largest_lag
-from reference.validation import scaled
 
 ROUGH = IDEAL.with_values(
     {
@@ -139,22 +138,6 @@ def test_the_number_of_parts_of_a_roll_does_not_matter():
     assert one.roll == pytest.approx(many.roll, abs=1e-9)
 
 
-def test_the_lag_turns_the_path_of_the_bevel():
-    """A roll by a quarter turn against friction: the path follows the bevel of the tip, not the roll of the base."""
-    rolled, free = (
-        Inserted(IDEAL.with_values({"phantom.rotation_friction_mn": friction}))
-        .move(db_x=0.25, times=194)
-        .move(roll=0.5 * math.pi)
-        .move(db_x=0.25, times=60)
-        for friction in (300.0, 0.0)
-    )
-    assert 0.1 < lag(rolled) < 0.6
-    y, z = rolled.bevel[1:]
-    assert math.atan2(z, y) == pytest.approx(0.5 * math.pi - lag(rolled), abs=0.02)
-    assert rolled.tip[1] > free.tip[1] + 0.02
-    assert rolled.tip[2] < free.tip[2]
-
-
 def test_a_bevel_turns_by_the_spin_that_reaches_it():
     """If the shaft takes up all of the base's spin, the rest point lags only behind the drift of the tip."""
     scenario = IDEAL.with_values({"phantom.rotation_friction_mn": 1000.0})
@@ -218,25 +201,6 @@ def test_the_work_of_base_and_guide_is_the_stored_energy(name):
         gaps.append(done / stored - 1.0)
     assert abs(gaps[1]) < 5e-4
     assert abs(gaps[1]) < abs(gaps[0]) / 2.5 or abs(gaps[0]) < 2e-6
-
-
-@pytest.mark.long
-def test_an_insertion_in_space_converges_with_the_segment():
-    """Guide in both axes and two rolls, compared with four times the finest: second order but for single points of
-    the channel, which change their segment or are cut one step later.
-    """
-
-    def tip(segments):
-        needle = Inserted(scaled(1.0, 1, 150.0 / segments, 0.5), cell=0.25)
-        for k in range(240):
-            roll = {150: 1.0, 200: -2.0}.get(k, 0.0)
-            needle.move(db_x=0.25, dg_y=0.02 * math.cos(k / 30), dg_z=0.015 * math.sin(k / 40), roll=roll)
-        return needle.tip
-
-    counts = np.array([50, 100, 200, 600])
-    errors = np.linalg.norm(np.array([tip(n) for n in counts]) - tip(2400), axis=1)
-    assert errors[2] < errors[0] / 12.0
-    assert errors[-1] < 2e-5
 
 
 def test_the_plants_pose_is_the_pose_of_its_last_segment():

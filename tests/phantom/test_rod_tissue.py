@@ -7,19 +7,9 @@ import pytest
 
 from flexneedle import Control
 from reference.rods import IDEAL, move, plant
-from reference.validation import bent, friction_balance, insertion_balance
+from reference.validation import friction_balance, insertion_balance
 
 AHEAD, BACK = 0.25, -0.25
-
-
-def test_energy_is_a_function_of_the_positions_of_base_and_guide():
-    """After a closed loop of motions without cutting the needle is the same."""
-    needle = bent(3.75)
-    before, energy = needle.nodes, needle.state["energy"]
-    for sign in (1.0, -1.0):
-        move(needle, db_y=-0.1 * sign, dg_y=0.1 * sign, times=20)
-    np.testing.assert_allclose(needle.nodes, before, atol=2e-5)
-    assert needle.state["energy"] == pytest.approx(energy, rel=1e-5)
 
 
 def test_a_push_with_friction_stores_and_dissipates_the_work_of_the_base():
@@ -56,22 +46,6 @@ def test_friction_is_5_mn_per_mm_opposite_to_the_last_sliding_direction():
     assert needle.state["base_force"][0] == pytest.approx(-5e-3 * 39.75)
     move(needle, BACK, times=159)
     assert needle.state["base_force"][0] == pytest.approx(0.0, abs=1e-12)  # the tip is at the skin
-
-
-def test_friction_follows_the_bent_needle():
-    """Its direction is opposite to each segment, on the part inside the tissue."""
-    needle = bent(8.0, friction=5.0)
-    move(needle, 0.01)
-    friction = needle.segments["friction"][:-1]
-    inside = np.linalg.norm(friction, axis=1) / 5e-3
-    x = needle.nodes[:, 0]
-    assert not inside[x[1:] <= 0.0].any()
-    np.testing.assert_allclose(inside[x[:-1] >= 0.0], needle.rod.segment)
-    crossing = int(np.flatnonzero(x > 0.0)[0]) - 1
-    part = x[crossing + 1] / (x[crossing + 1] - x[crossing])
-    assert inside[crossing] == pytest.approx(needle.rod.segment * part, rel=5e-3)
-    along = (friction * needle.segments["tangent"][:-1]).sum(axis=1)
-    np.testing.assert_allclose(along, -5e-3 * inside, rtol=1e-6)
 
 
 def test_mirrored_commands_give_the_mirrored_needle():

@@ -1,17 +1,13 @@
 """A guide with clearance: an inequality, so that the needle bears on one wall, which pushes, or on none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicHermiteSpline
 
 from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.mechanics.solve import COUPLED_ITERATIONS
-from flexneedle.types import THETA
 from reference.cases import repeat, tight
 
 PHANTOM = load_scenario("phantom")
@@ -123,41 +119,6 @@ def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_t
         assert lower * (clearance + off) == pytest.approx(0.0, abs=TOLERANCE)
         assert upper * (clearance - off) == pytest.approx(0.0, abs=TOLERANCE)
         assert state.converged
-
-
-def test_without_clearance_nothing_of_it_is_left():
-    """Bit for bit, for a needle that was at any wall before."""
-    bears = loaded(0.1, 10, 1.0)[-1]
-    assert wall(bears) == -1.0
-    solution = bears.needle.solution
-    last = solution.last._replace(guide=EXACT.start().needle.solution.last.guide)  # none
-    never = bears.needle._replace(solution=solution._replace(last=last))
-    assert wall(replace(bears, needle=never)) == 0.0
-    command = Control(db_x=1.0, dg_y=-0.2)
-    here, there = (EXACT.step(state, command) for state in (bears, replace(bears, needle=never)))
-    for name in ("rest", "compression", "mesh"):
-        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
-    for name in ("boundary", "cut", "channel"):
-        assert getattr(here.needle, name) == getattr(there.needle, name)
-    for name in ("tip", "loads", "iterations", "residual"):
-        assert getattr(here.needle.solution, name) == getattr(there.needle.solution, name)
-    assert off_centre(here) == 0.0
-
-
-@pytest.mark.parametrize("base_y", [0.0, 0.4])
-def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
-    """Its lateral position in the guide is on the cubic between the neighbouring nodes of a needle without a guide."""
-    bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
-    free = loaded(5.0, 25, 0.0, base_y)[-1]
-    other = bare.step(bare.start().with_estimate(base=(base_y, 0.0)), Control())
-    other = repeat(bare, other, Control(db_x=1.0), int(25 - PHANTOM.setup.start_tip_x))[-1]
-    np.testing.assert_allclose(free.tip, other.tip, atol=1e-9)
-    x, y, slope = (other.mesh[name] for name in ("x", "y", "slope"))
-    shape = CubicHermiteSpline(
-        np.append(other.base[0], x), np.append(other.base[1], y), np.append(other.base[THETA], slope)
-    )
-    assert abs(off_centre(free)) > 0.01
-    assert off_centre(free) == pytest.approx(float(shape(GUIDE_X)), abs=1e-9)
 
 
 def test_rollouts_converge_and_equal_steps():
