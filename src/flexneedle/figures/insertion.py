@@ -93,8 +93,8 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> No
     _paths(ax, insertion, view)
     _rolls(ax, scenario, insertion, view, 4.0)
     scene.draw_target(ax, plan.target, view)
-    if scenario.setup.axes == 2:
-        _prediction(ax, insertion, view)
+    if scenario.setup.axes == 2 and (period := curves.prediction(insertion)) is not None:
+        space.draw_prediction(ax, period, view)
     if scenario.setup.guide_x is not None:
         travel = _guide_travel(insertion)[:, view[1]]
         scene.draw_guide(ax, scenario.setup.guide_x, travel, travel[-1])
@@ -108,12 +108,6 @@ def _rolls(ax: Axes, scenario: Scenario, insertion: Insertion, view: View, lengt
         scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel flip, applied")
     else:
         space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=space.APPLIED)
-
-
-def _prediction(ax: Axes, insertion: Insertion, view: View) -> None:
-    period = curves.prediction(insertion)
-    if period is not None and period.predicted is not None:
-        space.draw_prediction(ax, period.predicted, view, space.prediction_label(period))
 
 
 def _guide_travel(insertion: Insertion) -> Floats:

@@ -39,7 +39,7 @@ from flexneedle.figures.style import (
 )
 from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Shape, X, Y, Z
+from flexneedle.types import Floats, X, Y, Z
 
 _HEIGHT = 3.9  # inches
 _LINE = 100  # characters of a line of the verdict
@@ -210,15 +210,10 @@ def _draw_guide(ax: Any, scenario: Scenario, insertion: Insertion) -> None:
 
 def _draw_prediction(ax: Any, insertion: Insertion, low: Floats) -> None:
     """Draw the predicted shape as a translucent tube, as wide as its uncertainty."""
-    predicted = _predicted(insertion)
-    if predicted is not None:
+    period = curves.prediction(insertion)
+    if period is not None and (predicted := period.predicted) is not None:
         rows = _inside(np.column_stack([predicted.nodes[:, :3], predicted.sd]), low)
         _surface(ax, _tube(rows[:, :3], SDS * rows[:, 3:]), ESTIMATE, 0.18, zorder=4, gid="prediction")
-
-
-def _predicted(insertion: Insertion) -> Shape | None:
-    period = curves.prediction(insertion)
-    return None if period is None else period.predicted
 
 
 def _draw_needle(ax: Any, scenario: Scenario, insertion: Insertion, low: Floats) -> None:

@@ -16,7 +16,7 @@ from flexneedle.figures.scene import View
 from flexneedle.figures.style import BAD, INK, STRATEGIES, TARGET, signed, styled, tone
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, X, Y
+from flexneedle.types import X, Y
 
 _LINES = {1: 100, 2: 66}  # characters of a line above a plan, by the number of lateral axes
 _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the skin
@@ -24,7 +24,8 @@ _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the sk
 
 def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
-    panels = _panels(scenario, plans)
+    roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
+    panels = {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}  # from above
     with styled():
         figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
@@ -34,9 +35,8 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
             for ax, view in zip(drawn, scene.sections(scenario).values(), strict=True):
                 scene.draw_tissue(ax, scenario, known, view)
                 _draw_plan(ax, scenario, plan, color, view)
-            scene.name_scenes(
-                drawn, fill(_result(scenario, plan), _LINES[scenario.setup.axes]), *_title_style(plan)
-            )
+            title = fill(_result(scenario, plan), _LINES[scenario.setup.axes])
+            scene.name_scenes(drawn, title, TARGET if plan.reached else BAD, 9.5)
             scenes += drawn
             if scenario.setup.axes == 2:
                 _draw_along(axes[f"{plan.strategy} along"], scenario, plan)
@@ -49,14 +49,9 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     return figure
 
 
-def _panels(scenario: Scenario, plans: Sequence[Plan]) -> dict[str, DepthPanel]:
-    """Return panels over depth by name, from above."""
-    roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
-    return {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}
-
-
 def _sheet(scenario: Scenario, plans: Sequence[Plan], panels: list[str]) -> tuple[Figure, dict[str, Axes]]:
-    names, title = [plan.strategy for plan in plans], _title(scenario, plans[0])
+    names, first = [plan.strategy for plan in plans], plans[0]
+    title = f"{short(scenario.name, 60)}: plan to {scene.place(scenario, first.target)} (seed {first.seed})"
     if scenario.setup.axes == 1:
         rows = [*((name, name) for name in names), *((panel, "cost") for panel in panels)]
         return mosaic(title, 3.4 + 2.4 * len(plans), rows, [2.4] * len(plans) + [1.0, 1.0])
@@ -65,10 +60,6 @@ def _sheet(scenario: Scenario, plans: Sequence[Plan], panels: list[str]) -> tupl
     below = [(panel, "cost", "cost") for panel in panels]
     heights = [1.6] * len(ends) + [1.0] * len(panels)
     return mosaic(title, 4.6 + 3.2 * len(plans), sections + below, heights, space.COLUMNS)
-
-
-def _title(scenario: Scenario, plan: Plan) -> str:
-    return f"{short(scenario.name, 60)}: plan to {scene.place(scenario, plan.target)} (seed {plan.seed})"
 
 
 def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View) -> None:
@@ -103,10 +94,6 @@ def _result(scenario: Scenario, plan: Plan) -> str:
     ]
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
     return f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f}){entry}"
-
-
-def _title_style(plan: Plan) -> tuple[str, float]:
-    return TARGET if plan.reached else BAD, 9.5
 
 
 def _draw_entry(ax: Axes, plan: Plan, view: View) -> None:
@@ -145,15 +132,11 @@ def _roll(plans: Sequence[Plan]) -> DepthPanel:
 
 
 def _energy(plans: Sequence[Plan]) -> DepthPanel:
-    lines = _lines(plans, [plan.strain_energy for plan in plans])
-    return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
-
-
-def _lines(plans: Sequence[Plan], values: Sequence[Floats]) -> list[Line]:
-    return [
-        Line(plan.strategy, plan.tips[:, X], value, color)
-        for plan, value, color in zip(plans, values, STRATEGIES, strict=False)
+    lines = [
+        Line(plan.strategy, plan.tips[:, X], plan.strain_energy, color)
+        for plan, color in zip(plans, STRATEGIES, strict=False)
     ]
+    return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
 
 
 def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:

@@ -16,7 +16,7 @@ from flexneedle.figures.scene import ALONG, View
 from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, signed
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Point, Shape, X, Y, Z
+from flexneedle.types import Floats, Point, X, Y, Z
 
 COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
 """Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""
@@ -69,11 +69,12 @@ def prediction_label(period: Period) -> str:
     return f"final shape ± {SDS:g} sd, predicted at {signed(period.estimate.x, '.0f')} mm"
 
 
-def draw_prediction(ax: Axes, predicted: Shape, view: View, label: str) -> None:
-    """Draw the band about a predicted shape, in the view from the side."""
-    x, y = predicted.nodes[:, view].T
-    half = SDS * predicted.sd[:, view[1] - Y]
-    ax.fill_between(x, y - half, y + half, color=ESTIMATE, alpha=0.2, linewidth=0.0, zorder=2.2, label=label)
+def draw_prediction(ax: Axes, period: Period, view: View) -> None:
+    """Draw the band about the predicted shape of a period, in the view from the side."""
+    if period.predicted is not None:
+        (x, y), half = period.predicted.nodes[:, view].T, SDS * period.predicted.sd[:, view[1] - Y]
+        how: dict[str, Any] = {"color": ESTIMATE, "alpha": 0.2, "linewidth": 0.0, "zorder": 2.2}
+        ax.fill_between(x, y - half, y + half, label=prediction_label(period), **how)
 
 
 def set_up_along(ax: Axes, scenario: Scenario, paths: Sequence[Floats]) -> None:

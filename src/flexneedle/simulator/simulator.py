@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -298,12 +298,8 @@ class Simulator:
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="rollout")
 
-    def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int, model.Model]]:
-        return _restore, (self.scenario, self.threads, self._model)
-
-
-def _restore(scenario: Scenario, threads: int, constants: model.Model) -> Simulator:
-    return Simulator(scenario, threads, constants=constants)
+    def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int]]:
+        return partial(Simulator, constants=self._model), (self.scenario, self.threads)
 
 
 def _point(values: Sequence[float], axes: int) -> list[float]:
