@@ -10,12 +10,10 @@ import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from websockets.exceptions import ConnectionClosed
 
 import page_clients
 from page_clients import Client, port_of
@@ -155,17 +153,13 @@ def paths(server):
 
 
 def invalid(server):
-    """Requests without control, parts of a request, other protocols, and texts that are too long."""
+    """Parts of a request on a web socket, other protocols, and headers, addresses and bodies that are too long."""
     whole = json.dumps({"type": "edit", "values": {"target.depth_mm": 25.0}})
-    texts = [*(whole[:end] for end in range(len(whole))), whole, "\0", "[" * 1000, b"\x01\x02", "x" * 390_000]
     with Member(server) as client:
-        for text in texts:
+        for text in (*(whole[:end] for end in range(len(whole) + 1)), b"\x01\x02", "x" * 390_000):
             client.newest.pop("refused", None)
             client.socket.send(text)
             assert client.has("refused")["reason"]
-        client.socket.send("x" * 1_000_001)
-        with pytest.raises(ConnectionClosed):
-            client.wait(lambda: False)
     hello = b"\x16\x03\x01\x02\x00\x01\x00\r\n\r\n"  # of TLS
     for nonsense in (hello, b"GET\r\n\r\n", b"\0" * 100_000, os.urandom(2_000) + b"\r\n\r\n"):
         assert exchange(server, nonsense)[0] in (0, 400)
@@ -175,21 +169,4 @@ def invalid(server):
     assert ask(server, method="POST", more=b"x" * 5_000_000, Content_Length=5_000_000)[0] in (0, 405)
 
 
-def many(server):
-    """Pages and silent connections above the limit."""
-    with ExitStack() as stack:
-        for _ in range(200):
-            stack.enter_context(socket.create_connection(("127.0.0.1", port_of(server))))
-        refused = []
-        for _ in range(60):
-            client = Member(server)
-            stack.callback(client.socket.close)
-            try:
-                client.read()
-            except ConnectionClosed as end:
-                refused.append(end.rcvd.code)
-        assert len(refused) > 20
-        assert set(refused) == {1013}
-
-
-ATTACKS = (strangers, paths, invalid, many)
+ATTACKS = (strangers, paths, invalid)

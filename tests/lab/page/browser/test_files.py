@@ -67,31 +67,23 @@ def test_a_scenario_is_begun_from_preset_world_and_file_and_saved(files, server,
 
 
 def test_it_asks_before_changes_are_lost(files, server):
-    """For each way to begin another scenario; once the scenario is kept, and once it is not."""
+    """Once the scenario is kept, and once it is not."""
     page = files()
     server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
     until(page, "flexneedle.store.get('session').changed.length")
     painted(page)  # presets chosen
 
-    def begin(way):
-        if way == "preset":
+    def begin(kind):
+        if kind == "preset":
             page.select_option("#files-preset", "phantom")
             page.click("[aria-label='Begin with the preset']")
-        elif way == "world":
-            page.fill("[aria-label='Number of a random world']", "7")
-            page.click("text=Random world")
         else:
             page.set_input_files(f"{FILES} input[type=file]", payload("my.toml", TEXT.encode()))
 
-    for way, words in (
-        ("preset", "To begin with phantom"),
-        ("world", "To begin with world:7"),
-        ("file", "To load my.toml"),
-    ):
-        kind, name = ("load", "Load") if way == "file" else ("preset", "Begin")
+    for kind, words in (("preset", "To begin with phantom"), ("load", "To load my.toml")):
         asked = len(server.asked(kind))
-        for button in ("Keep this scenario", name):
-            begin(way)
+        for button in ("Keep this scenario", "Load" if kind == "load" else "Begin"):
+            begin(kind)
             page.wait_for_selector(f"{FILES} >> text={words} drops the changes")
             assert len(server.asked(kind)) == asked
             status = page.locator(f"{FILES} [role=status]", has_text="drops the changes")

@@ -3,10 +3,9 @@
 import pytest
 
 from browser_layout import too_wide
-from fake_page import until
 from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage, StudyRow, StudyRowsMessage
 from flexneedle.scenario.files import load_scenario
-from recorded_page import REACH, WELCOME, inserting, insertion, opening, people, planned, rows, session
+from recorded_page import REACH, WELCOME, inserting, insertion, people, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -86,23 +85,3 @@ def test_on_a_telephone_the_section_stays_above_the_controls_of_the_insertion(vi
     top, bottom = page.evaluate(box, "fieldset.disturb")
     push = page.get_by_role("button", name="Push", exact=True).bounding_box()
     assert 0 <= top < bottom < push["y"] < 844 - push["height"]
-
-
-@pytest.mark.parametrize("width", [1280, 390])
-def test_no_word_of_a_label_is_broken(visit, server, width):
-    server.news = [*opening(), whole_session()]
-    page = visit(width=width, height=900, ready="[data-panel=form] details")
-    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    until(page, "document.querySelectorAll('.field > label').length > 50")
-    broken = page.evaluate(
-        """() => [...document.querySelectorAll('.field > label')].filter((label) => {
-          const range = document.createRange();
-          return label.firstChild.data.split(' ').some((word) => {
-            const begin = label.firstChild.data.indexOf(word);
-            range.setStart(label.firstChild, begin);
-            range.setEnd(label.firstChild, begin + word.length);
-            return range.getClientRects().length > 1;
-          });
-        }).map((label) => label.textContent)"""
-    )
-    assert broken == []

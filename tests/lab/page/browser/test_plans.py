@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS, arrived, painted
+from browser_blends import added, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
-from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
+from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import (
     insertion,
     iteration,
@@ -20,9 +20,7 @@ from recorded_page import (
     planned,
     rows,
     samples,
-    scene,
     session,
-    shape,
 )
 
 pytestmark = pytest.mark.page
@@ -112,50 +110,14 @@ def test_strategies_are_side_by_side_with_their_terms_and_their_age(plans, serve
     page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")
     assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    for source in ("manipulation", "steering"):
+        canvas = f"{PLANS} .sweeps canvas[aria-label*={source}]"
+        frames = plan_frames(FrameSource[source.upper()], sway=3.0)
+        assert added(page, server, f"--{source}", *frames, canvases=[canvas])[0] > 50
     server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
     page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
-
-
-BANDS = f"""async ([selector, tone, x]) => {{
-  {BLENDS}
-  const {{ boxOf }} = await import("/static/box.js");
-  const {{ mappingOf }} = await import("/static/flat/plane.js");
-  const canvas = document.querySelector(selector);
-  const [{{ width, height }}, scene] = [canvas, flexneedle.store.get("scene")];
-  const across = Math.round(mappingOf(boxOf(scene, scene.target), width, height, 3).toX(x));
-  const picture = composed(canvas);
-  const at = (y) => 4 * (y * width + across);
-  const ground = [0, 1, 2].map((part) => picture[at(1) + part]);
-  const bands = [];
-  let before = 0;
-  for (let y = 0; y < height; y++) {{
-    const pixel = picture.slice(at(y), at(y) + 4);
-    const share = shareOf(ground, pixel, 0, toneOf(tone));
-    if (share && !before) bands.push(0);
-    if (share) bands[bands.length - 1] = Math.max(bands.at(-1), share);
-    before = share;
-  }}
-  return bands;
-}}"""
-"""Share of a tone in each of the lines that cross a column of a canvas at x (mm), from above."""
-
-
-def test_nine_needles_of_a_plan_are_drawn_from_light_to_strong(plans):
-    """At the first step, the last, and evenly between them."""
-    x = np.linspace(-60.0, 45.0, 12)
-    needles = [np.column_stack([x, np.full(12, 8.0 - 0.5 * step), np.zeros(12)]) for step in range(33)]
-    flat = [session(target=(40.0, 5.0, 0.0)), scene(target=(40.0, 5.0, 0.0))]
-    sweep = shape(FrameKind.SWEEP, FrameSource.STEERING, 0, *needles)
-    page = plans([*opening(), *flat, plan("steering"), sweep])
-    canvas = f"{PLANS} .sweeps figure:not([hidden]) canvas"
-    page.locator(canvas).scroll_into_view_if_needed()
-    arrived(page)
-    shares = page.evaluate(BANDS, [canvas, "--steering", -11.0])
-    assert len(shares) == 9
-    assert np.all(np.diff(shares) > 0.04)
-    assert shares[-1] > 0.8
 
 
 def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server):

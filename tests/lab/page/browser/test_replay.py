@@ -61,16 +61,6 @@ def at(page, period):
     painted(page)
 
 
-def pictures_at(page, period):
-    at(page, period)
-    found = []
-    for canvas in (SPACE, SECTION, AXIAL):
-        page.locator(canvas).scroll_into_view_if_needed()
-        at(page, period)
-        found.append(page.locator(canvas).screenshot())
-    return found
-
-
 def test_a_run_is_read_played_and_scrubbed(replay):
     page = replay()
     assert page.title() == "mine – flexneedle"
@@ -105,18 +95,6 @@ def test_a_run_is_read_played_and_scrubbed(replay):
     page.mouse.move(box["x"] + box["width"] / 2 - 3, box["y"] + 20)
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
     until(page, f"Math.abs(flexneedle.store.get('view period') - {PERIODS // 2}) <= 3")
-
-
-def test_scrubbing_by_keys_shows_another_period_in_all_views(replay):
-    page = replay(draws=True)
-    last = pictures_at(page, PERIODS - 1)
-    page.focus(SCRUB)
-    page.keyboard.press("Home")
-    until(page, "flexneedle.store.get('view period') === 0")
-    for before, after in zip(last, pictures_at(page, 0), strict=True):
-        assert before != after
-    for before, after in zip(last, pictures_at(page, PERIODS - 1), strict=True):
-        assert before == after
 
 
 def test_names_are_text_in_a_browser_without_storage_and_webgl(replay):
