@@ -34,17 +34,6 @@ def test_nodes_are_on_the_curve_at_equal_arc_lengths(n, knots):
     np.testing.assert_allclose([arc(end) for end in at], np.linspace(0, arc(80.0), n), atol=1e-9)
 
 
-def test_a_curve_in_a_turned_plane_has_the_same_nodes_turned():
-    """y + iz of a plane at an angle about the axis, and its energy."""
-    x, turn = np.array([0.0, 3.0, 50.0, 80.0]), np.exp(0.7j)
-    plane, space = (sampled(x, *(by * each for each in cubic(x)), 61) for by in (1.0, turn))
-    np.testing.assert_allclose(space[0], plane[0], atol=1e-12)
-    np.testing.assert_allclose(space[1:], turn * np.array(plane[1:]), atol=1e-12)
-    shear, moment = np.array([0.3, -0.2, 0.1]), np.array([1.5, 0.9, -0.4])
-    flat = beam_energy(x, shear, moment, 400.0)
-    assert beam_energy(x, turn * shear, turn * moment, 400.0) == pytest.approx(flat, rel=1e-12)
-
-
 def test_a_helix_has_the_arc_length_and_energy_of_both_components():
     """y and z add up in squares: ½∫(y'² + z'²) dx, ½∫(M_y² + M_z²)/EI dx."""
     x = np.linspace(0.0, 80.0, 321)

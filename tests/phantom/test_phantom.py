@@ -10,27 +10,11 @@ from flexneedle.errors import CommandError, InputError
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom, evenly_spaced
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, make_plant
-from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA
 from reference.rods import IDEAL
 from tanks import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, tank, tip
 
 # ---- commands and time
-
-
-@both_plants
-def test_the_needle_starts_at_the_true_pose_of_the_clamp(kind):
-    """As the controller's model with this base, except for the mesh."""
-    phantom = tank(kind=kind, roll=math.pi, base_y=0.4, base_turn=-0.002)
-    simulator = Simulator(IDEAL)
-    expected = simulator.step(
-        simulator.start(math.pi).with_estimate(base=(0.4, 0.0), slope=(-0.002, 0.0)), Control()
-    )
-    np.testing.assert_allclose(tip(phantom), expected.tip, atol=1e-3)
-    assert abs(tip(phantom)[1]) > 0.01
-    assert phantom._plant.roll == math.pi
-    assert phantom.now() == 0.0
-    assert phantom.condition()[1:4] == (0.0, 1.0, True)
 
 
 @both_plants

@@ -64,17 +64,6 @@ def test_beyond_the_clearance_one_wall_pushes(side):
     np.testing.assert_allclose(state.tip, exact.tip, atol=1e-9)
 
 
-def test_from_wall_to_wall_the_needle_follows_late():
-    """The guide goes up, down and up again: the needle moves only once the clearance is taken up."""
-    simulator, state, path = loose(0.05), EXACT.start(), []
-    for dg_y in [0.02] * 10 + [-0.02] * 20 + [0.02] * 20:
-        state = simulator.step(state, Control(dg_y=dg_y))
-        path.append((state.guide[0], off_centre(state)))
-    guide, off = np.array(path).T
-    at_wall = np.where(np.abs(guide) > 0.05, -0.05 * np.sign(guide), -guide)  # straight unless it is pushed
-    np.testing.assert_allclose(off, at_wall, atol=1e-9)
-
-
 def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     simulator = loose(0.05, bend=1.0)
     state = simulator.step(simulator.start(), Control())
