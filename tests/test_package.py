@@ -52,7 +52,7 @@ def test_an_unknown_name_is_an_attribute_error():
         flexneedle.nonsense  # noqa: B018  access is what raises
 
 
-def test_the_version_is_that_of_the_distribution():
+def test_the_version_equals_the_distribution():
     assert flexneedle.__version__ == version("flexneedle")
 
 

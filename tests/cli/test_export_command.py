@@ -71,7 +71,7 @@ def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
     assert [rows[0][f"ref2.{part}"] for part in sensor] == [""] * 8 + ["missing"]
 
 
-def test_what_a_tracker_measures_besides_the_tip_has_columns_of_its_own(engine, monkeypatch, capsys):
+def test_other_measurements_than_the_tip_have_separate_columns(engine, monkeypatch, capsys):
     measured = {
         "direction": (0.125, -0.25),
         "covariance": ((1.0, 0.5, 0.0), (0.5, 1.0, 0.0), (0.0, 0.0, 1.0)),

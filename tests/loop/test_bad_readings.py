@@ -116,7 +116,7 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
 
 
 @pytest.mark.parametrize("limit", [0.1, 12.0])  # in 12 s there are more readings than periods in a run
-def test_the_hold_limit_is_that_of_the_scenario(plan, limit):
+def test_the_scenario_sets_the_hold_limit(plan, limit):
     scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
     failed = bad(run(plan, RecordedPhantom(plan.roll, spoil=between(1.0, math.inf, lost)).rig(), scenario))
     assert failed[-1].time - failed[0].time == pytest.approx(limit, abs=READING)
@@ -138,7 +138,7 @@ def test_all_holds_together_have_a_limit(plan):
 
 
 @pytest.mark.long
-def test_the_limits_of_age_and_innovation_are_those_of_the_scenario(plan):
+def test_the_scenario_limits_age_and_innovation(plan):
     def offset(measurement):
         return replace(measurement, time=measurement.time - 0.05, y=measurement.y + 1.2)
 

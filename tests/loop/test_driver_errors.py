@@ -79,7 +79,7 @@ def test_at_the_target_a_driver_that_cannot_be_stopped_is_a_failure(plan):
 
 
 @pytest.mark.parametrize(("error", "text"), [(KeyboardInterrupt(), "interrupted"), (OSError("torn"), "torn")])
-def test_a_driver_that_cannot_be_stopped_after_an_interrupt_is_an_error_of_its_own(plan, error, text):
+def test_a_driver_that_cannot_be_stopped_after_an_interrupt_raises_its_own_error(plan, error, text):
     with pytest.raises(DriverError, match=f"{text}; the driver was not stopped: galil.*no reply"):
         run(plan, Failing(plan.roll, apply=error, stop=LOST).rig())
 

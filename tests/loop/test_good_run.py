@@ -119,7 +119,7 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
     assert plants == [PLANTS["exact"], PLANTS["exact"], PLANTS["model"]]
 
 
-def test_on_period_gets_each_period_as_it_ends(plan):
+def test_each_period_is_sent_when_it_ends(plan):
     periods = []
     recorded = RecordedPhantom(plan.roll)
     part = replace(plan, target=(-20.0, 0.0, 0.0))

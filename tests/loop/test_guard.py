@@ -50,7 +50,7 @@ def test_by_default_tissue_may_be_compressed_to_a_share_of_what_its_law_allows(p
     assert guard_of(plan, least_stretch=0.6).compression == pytest.approx([0.4])
 
 
-def test_the_strain_of_a_cantilever_is_that_of_the_beam():
+def test_the_strain_of_a_cantilever_equals_beam_theory():
     """In air the guide bends the needle over its distance a from the clamp: M = F a, strain M d/2EI."""
     simulator, needle = Simulator(PHANTOM, 1), PHANTOM.needle
     bent = driven(simulator, simulator.start(), ASIDE, 10)
@@ -62,7 +62,7 @@ def test_the_strain_of_a_cantilever_is_that_of_the_beam():
     assert bending_strain(simulator.start()) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_in_tissue_it_is_that_of_the_curvature_of_its_shape():
+def test_the_strain_in_tissue_follows_from_the_curvature():
     simulator = Simulator(PHANTOM, 1)
     bent = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
     curvature = np.abs(np.gradient(bent.nodes[:, 3], bent.nodes[:, 0]))
@@ -70,7 +70,7 @@ def test_in_tissue_it_is_that_of_the_curvature_of_its_shape():
     assert bending_strain(bent) == pytest.approx(expected, rel=0.1)
 
 
-def test_limits_are_those_of_the_scenario(plan):
+def test_the_scenario_sets_the_limits(plan):
     guard = guard_of(plan, guide_force_n=0.2, past_target_mm=0.5, needle_strain_percent=0.1)
     assert (guard.force, guard.past, guard.depth, guard.strain) == (0.2, 0.5, plan.target[0], 0.001)
     assert (guard_of(plan).force, guard_of(plan).strain) == (math.inf, 0.01)

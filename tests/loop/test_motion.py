@@ -92,7 +92,7 @@ def test_motors_are_stopped_at_the_end(plan):
     assert stops == [done.periods[-1].time]
 
 
-def test_beyond_a_limit_the_needle_may_rest_and_return_but_not_go_on():
+def test_beyond_a_limit_the_needle_may_rest_and_return_but_not_advance():
     limits, setup = Limits.of(PHANTOM), PHANTOM.setup
     beyond = np.zeros(7)
     beyond[5] = setup.max_guide_travel_mm + 4e-4

@@ -40,7 +40,7 @@ def test_a_plant_starts_straight_on_the_line_of_the_entry(kind):
 
 
 @pytest.mark.parametrize("kind", PLANTS)
-def test_the_limits_of_the_guide_are_those_of_its_travel_from_the_entry(kind):
+def test_the_travel_of_the_guide_is_limited_from_the_entry(kind):
     phantom = Phantom(Truth(ENTERED.with_values({"setup.max_guide_travel_mm": 1.0})), 0.0, kind)
     for _ in range(2):
         phantom.apply(Control(dg_y=0.5), 0.2)
@@ -166,7 +166,7 @@ def test_with_half_turns_the_shaft_is_never_wound_up(kind):
     assert free.step(free.step(free.start(), applied[0]), applied[0]).roll == 2.0 * math.pi
 
 
-def test_the_tissue_holds_a_needle_in_space_by_its_axial_friction_unless_told_otherwise():
+def test_rotation_friction_in_space_is_the_axial_friction_unless_set():
     """Friction times outer radius on each mm; in the plane a flip leaves no couple."""
 
     def couple(scenario):

@@ -61,7 +61,7 @@ def test_the_rigs_tracker_has_the_bias_of_the_scenario(environment):
     assert np.abs(errors[0][-1] - errors[1][-1]).max() > 0.01
 
 
-def test_the_share_of_missing_readings_is_that_of_the_scenario():
+def test_the_scenario_sets_the_share_of_missing_readings():
     """1 % by default, within four standard deviations."""
     rig = rig_of(phantom="model")
     rig.clock.wait(250.0)

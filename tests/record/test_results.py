@@ -118,7 +118,7 @@ def test_the_tip_is_compared_with_the_predicted_miss_and_the_middle_with_the_sha
     assert (row["tip_y_mm"], row["tip_z_mm"]) == (true.y, true.z)
 
 
-def test_the_middle_is_that_of_the_inserted_part(in_any_direction):
+def test_the_middle_is_taken_from_the_inserted_part(in_any_direction):
     """A shape that is predicted too low in the second half of the depth does not change it."""
     insertion = predicting(in_any_direction)
     nodes, sd = insertion.periods[-1].predicted
@@ -128,7 +128,7 @@ def test_the_middle_is_that_of_the_inserted_part(in_any_direction):
     assert sds(changed)[2:] == pytest.approx(sds(insertion)[2:], rel=1e-12)
 
 
-def test_without_a_predicted_miss_the_tip_is_that_of_the_shape(in_any_direction):
+def test_without_a_predicted_miss_the_shape_predicts_the_tip(in_any_direction):
     insertion = predicting(in_any_direction, miss=UNKNOWN)
     last = insertion.periods[-1]
     off = [last.true_tip[k] - last.predicted.nodes[-1, k] for k in (1, 2)]

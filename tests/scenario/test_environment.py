@@ -54,7 +54,7 @@ def test_a_value_of_a_named_environment_can_be_changed_afterwards_or_at_once():
     assert later.first_difference(phantom(environment="noisy")) == PLATE
 
 
-def test_a_table_of_ones_own_needs_no_more_than_a_name():
+def test_a_custom_table_needs_only_a_name():
     scenario = phantom(environment={"name": "mine", "plate": {"reference_mm": 3}})
     assert scenario.tracker.environment.plate.reference_mm == 3.0
 

@@ -63,7 +63,7 @@ def test_jitter_of_one_axis_gives_the_jitter_of_the_3d_vector():
     assert math.sqrt(3 * PHANTOM.tracker.jitter_per_axis**2) == pytest.approx(PHANTOM.tracker.jitter_mm)
 
 
-def test_bending_stiffness_is_that_of_a_round_rod():
+def test_bending_stiffness_of_a_round_rod():
     radius = 0.819 / 2
     assert PHANTOM.needle.second_moment == pytest.approx(math.pi * radius**4 / 4)
     assert PHANTOM.needle.bending_stiffness == pytest.approx(4416.9, rel=1e-4)

@@ -41,7 +41,7 @@ def changed(key, value):
     return values
 
 
-def test_a_target_out_of_reach_from_the_entry_is_told():
+def test_a_target_out_of_reach_from_the_entry_is_refused():
     """The message has the range around the needle's axis at this depth, including the free part."""
     entry = {"lateral_mm": 20.0, "slope_mrad": 25.0, "free_radius_mm": 0.5}
     (line,) = problems({**PHANTOM.values(), "entry": entry})
@@ -49,10 +49,10 @@ def test_a_target_out_of_reach_from_the_entry_is_told():
 
 
 @pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
-def test_a_broken_rule_is_told_in_one_line(key, value, rule):
+def test_a_broken_rule_is_one_line(key, value, rule):
     (line,) = problems(changed(key, value))
-    told_key, message = line.split(": ", maxsplit=1)
-    assert told_key.split(" = ")[0] == key
+    named, message = line.split(": ", maxsplit=1)
+    assert named.split(" = ")[0] == key
     assert message.startswith(rule)
 
 
@@ -125,7 +125,7 @@ def test_a_gauge_replaces_the_diameters():
     assert line.startswith('needle.gauge = "16G": must be one of 17G, 18G, 19G')
 
 
-def test_all_problems_are_told_at_once():
+def test_all_problems_are_reported_together():
     values = changed("tissue[0].alpha", 0)
     values["needle"]["nodes"] = 1
     values["plan"]["sample"] = 5
@@ -190,7 +190,7 @@ def test_a_syntax_error_names_its_line(scenario_file):
         load_scenario(scenario_file('name = "a"\nlength = 1 mm\n'))
 
 
-def test_a_value_in_a_file_is_told_with_the_file(scenario_file):
+def test_a_wrong_value_in_a_file_names_the_file(scenario_file):
     text = (files("flexneedle.scenario") / "presets" / "phantom.toml").read_text(encoding="utf-8")
     path = scenario_file(text.replace("offset_mm = 4.0", "offset_mm = inf"))
     with pytest.raises(ScenarioError) as caught:

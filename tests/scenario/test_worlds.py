@@ -76,7 +76,7 @@ def test_every_world_is_within_its_ranges_and_else_the_preset(number):
 
 
 @pytest.mark.long
-def test_worlds_are_as_varied_as_they_say():
+def test_worlds_have_the_documented_shares():
     """Shares of a thousand: steel 70 %, stylet in half of it, guide 80 %, layers evenly."""
     worlds = [world(number) for number in range(1000)]
     steel = [found.needle for found in worlds if found.needle.gauge is not None]

@@ -30,9 +30,9 @@ def refuse(problems: Iterable[Problem]) -> None:
         raise PydanticCustomError(_BROKEN, "rules are broken", {"problems": found})
 
 
-def to_line(problem: Problem, *, above: Sequence[str | int] = ()) -> str:
-    """Return a problem as `key = value: rule`; `above` is the path of the section that found it."""
-    path = key_path([*above, *_path(problem.key)]) or "scenario"
+def to_line(problem: Problem) -> str:
+    """Return a problem as `key = value: rule`."""
+    path = key_path(_path(problem.key)) or "scenario"
     shown = "" if problem.value is None else f" = {_shown(problem.value)}"
     return make_printable(f"{path}{shown}: {problem.rule}")
 
