@@ -27,15 +27,6 @@ def test_in_noisy_no_indicator_is_below_the_threshold(found):
     assert found["noisy"]["𝓘 min"].min() > 0.0547
 
 
-def test_both_shipped_environments_are_one_room_with_and_without_a_plate():
-    one, other = map(environments.load_environment, ("ideal", "noisy"))
-    same = {"plate": None, "name": "", "tip": one.tip, "reference": one.reference}
-    assert one.model_copy(update=same) == other.model_copy(update=same)
-    assert one.tip.bias_mm == other.tip.bias_mm
-    jitter = {"jitter_mm": 0.0}
-    assert one.reference.model_copy(update=jitter) == other.reference.model_copy(update=jitter)
-
-
 def by_hand(sensor, indicator):
     """Two points: error (3, 4, 0) mm with ±0.1 mm; error (0, 0, 2) mm without jitter and with a missing sample."""
     nan = np.nan

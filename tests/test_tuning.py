@@ -58,16 +58,6 @@ def test_records_agree_with_the_script(controller):
     assert sum(trial["cases"] for trial in record["trials"]) == record["budget_insertions"]
 
 
-def test_the_first_candidate_is_the_middle_of_the_space():
-    space = {
-        "even": tune.Range(1.0, 3.0, log=False),
-        "log": tune.Range(0.01, 1.0),
-        "whole": tune.Range(2, 18, whole=True),
-    }
-    first = tune.candidates(space, 5, np.random.default_rng(0))[0]
-    assert first == {"even": 2.0, "log": 0.1, "whole": 6}
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_the_other_candidates_cover_each_range_evenly(seed):
     space = {"even": tune.Range(0.0, 8.0, log=False), "log": tune.Range(1.0, 1e4)}

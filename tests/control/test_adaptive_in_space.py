@@ -108,17 +108,6 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     assert weight["reach"] == task.settings.unguided_reach_weight
 
 
-def test_the_disc_is_charged_with_a_margin_of_its_uncertainty(state):
-    """With three times the uncertainty the expected distance is larger."""
-    middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
-    task, estimate, memory, ahead = prepared(state, middle + 2.0)
-    estimate = replace(estimate, precision=1e-8 * estimate.precision)
-    one, three = (
-        adaptive_mpc.expected_out_of_reach(task, estimate, ahead, memory, margin)[0] for margin in (1.0, 3.0)
-    )
-    assert (three > one).all()
-
-
 @pytest.fixture
 def outlook(state):
     """Derivatives of the path and of the shape ahead, drawn at random, and an estimate with some covariance."""
@@ -148,16 +137,3 @@ def test_the_deviations_of_the_shape_are_those_of_needles_drawn_from_the_estimat
     np.testing.assert_allclose(
         found, np.stack([nodes.real.std(axis=0), nodes.imag.std(axis=0)], axis=1), rtol=0.03
     )
-
-
-def test_the_deviation_of_the_miss_is_that_on_one_axis(outlook):
-    """The reference is the mean over both axes of needles drawn from the estimate."""
-    estimate, derivatives, _ = outlook
-    rng = np.random.default_rng(5)
-    drawn = rng.multivariate_normal(
-        np.zeros(len(estimate.precision)), np.linalg.inv(estimate.precision), 40_000
-    )
-    end = np.array([np.interp(END, derivatives.grid, curve) for curve in derivatives.curves])
-    misses = drawn @ end
-    on_axis = math.sqrt(0.5 * (np.abs(misses) ** 2).mean())
-    assert derivatives.sd_now(estimate, END) == pytest.approx(on_axis, rel=0.03)

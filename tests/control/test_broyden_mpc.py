@@ -148,17 +148,16 @@ def test_steps_and_places_of_the_guide_keep_their_limits(quick_plan):
 # ---- the whole controller, on needles that are linear
 
 
-def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effect=1.0):
+def linear_run(plan, slope, effect, *, delay=1, steps=30):
     """Drive a tip y = slope x + effect guide; readings come `delay` steps late. Tips, guides, the last memory."""
     scenario = PHANTOM.with_values(
-        {"control.broyden_mpc.guide_weight": 0.0, "control.broyden_mpc.guide_effect": guide_effect}
+        {"control.broyden_mpc.guide_weight": 0.0, "control.broyden_mpc.guide_effect": 1.0}
     )
     task = task_of(Simulator(scenario, threads=1), plan, "broyden-mpc")
     memory, inputs, tips = BROYDEN.begin(task), [np.zeros(2)], [np.array([-28.5, 0.0])]
-    rng = np.random.default_rng(1)
     for k in range(steps):
         insertion, guide = inputs[-1]
-        measured = tips[k - delay] + rng.normal(0.0, noise, 2) if k >= delay else None
+        measured = tips[k - delay] if k >= delay else None
         state = SimpleNamespace(
             travel=np.array([insertion, 0.0, 0.0, 0.0, 0.0, guide, 0.0]), guide=(guide, 0.0),
             tip=np.array([*tips[-1], 0.0, 0.0, 0.0]),
@@ -184,25 +183,10 @@ def test_a_linear_needle_is_identified_and_kept_on_its_path(quick_plan, slope, e
     np.testing.assert_allclose(direction, [1.0, 0.0], atol=2e-3)  # what it needs to know of the Jacobian
 
 
-@pytest.mark.parametrize("delay", [1, 2])
-@pytest.mark.parametrize("effect", [0.6, 1.5])
-def test_with_another_effect_of_the_guide_than_first_estimated_it_swings_and_settles(
-    quick_plan, effect, delay
-):
-    """Small guide steps show little of the guide's effect, so the first Jacobian is forgotten slowly."""
-    tips, _, _ = linear_run(straight(quick_plan, 0.0), -0.03, effect, delay=delay, steps=60)
-    assert np.abs(tips[50:, 1]).max() < 0.04
-
-
 def test_a_lateral_path_is_reached_by_guide_steps_within_their_limit(quick_plan):
     tips, inputs, _ = linear_run(straight(quick_plan, 2.0), 0.0, 0.7)
     assert np.abs(np.diff(inputs[:, 1])).max() == pytest.approx(0.5)
     assert tips[-1, 1] == pytest.approx(2.0, abs=1e-3)
-
-
-def test_noise_of_the_tracker_does_not_upset_it(quick_plan):
-    tips, _, _ = linear_run(straight(quick_plan, 0.0), 0.03, 0.7, noise=0.02, steps=60)
-    assert np.abs(tips[20:, 1]).max() < 0.15
 
 
 def test_before_the_first_reading_it_goes_straight_on(quick_plan):

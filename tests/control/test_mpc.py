@@ -37,15 +37,6 @@ def decide(plan, estimate, seed=0):
     return CONTROLLERS["ce-mpc"].decide(task, None, estimate, np.random.default_rng(seed))[0]
 
 
-@pytest.mark.parametrize("periods", [0, 20, 45, 70])
-def test_command_is_within_the_limits(plan, periods, along):
-    choice = choose(plan, along(plan, periods))
-    assert 0.5 <= choice.command.db_x <= 1.0
-    assert abs(choice.command.dg_y) <= 0.5
-    assert np.isfinite(choice.cost)
-    assert choice.spread > 0.0
-
-
 def test_on_the_plan_it_continues_with_the_plan(plan, along):
     for periods in (10, 40, 60):
         choice = choose(plan, along(plan, periods))
@@ -68,18 +59,6 @@ def test_the_deviation_shrinks_over_the_next_periods(plan, along, offset):
         state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
     assert first > 0.1
     assert deviation() < 0.2 * first
-
-
-def test_guide_stays_within_its_reach(plan):
-    """A plan with a large lateral offset, and a guide that may hardly move: it goes to its end and no further."""
-    scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.3, "target.lateral_mm": 0.3})
-    away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0, 0.0, 0.0]))
-    simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
-    for _ in range(4):
-        choice = mpc.choose_step(simulator, away, state, mpc.CeMpc(), roll=0.0, rng=rng)
-        state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
-        assert abs(state.guide[0]) <= 0.3 + 1e-9
-    assert state.guide == (pytest.approx(0.3), 0.0)
 
 
 @pytest.mark.parametrize("left", [0.7, 0.3, 1e-6])

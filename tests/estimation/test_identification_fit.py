@@ -19,7 +19,6 @@ from identified import (
     QUIET,
     Needle,
     commands,
-    fitted,
     off_the_prior,
     predicted,
     readings,
@@ -60,29 +59,6 @@ def test_derivatives_agree_with_central_differences():
         assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
     deepest = estimate.tips[:, X].max()
     np.testing.assert_array_equal(jacobian[:, AT.cells + int(deepest // 2.5) + 1 :], 0.0)
-
-
-def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
-    """It covers the depth passed and a few steps ahead."""
-    estimate, _ = fitted("all", 50)
-    assert len(estimate.perturbed) > 3
-    forward = [Control(db_x=1.0)] * 4
-    rows = [*commands(50), *forward]
-
-    def lateral(parameters):
-        return np.array([state.tip for state in stepped(parameters, rows, estimate.axial)])
-
-    base = lateral(estimate.parameters)
-    depth = np.maximum.accumulate(base[:, X])
-    passed = (estimate.grid > depth[0]) & (estimate.grid < depth[-1])
-    for one in estimate.perturbed:
-        k, step = one.parameter, estimate.prior.steps[one.parameter]
-        parameters = estimate.parameters.copy()
-        parameters[k] += step
-        difference = (lateral(parameters)[:, Y] - base[:, Y]) / step
-        expected = np.interp(estimate.grid[passed], depth, difference)
-        np.testing.assert_allclose(estimate.curves[0, k][passed], expected, rtol=1e-5, atol=2e-5)
-        assert one.step == step
 
 
 def test_no_derivative_is_older_than_a_round():

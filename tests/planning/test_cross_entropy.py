@@ -28,8 +28,8 @@ def two_wells(z):
     return np.minimum(well[0] - 1.0, well[1])
 
 
-def search(cost, settings=FREE, mean=(0.0, 0.0), sigma=(2.0, 2.0), seed=0, progress=None):
-    return ce.minimize(cost, ce.start(mean, sigma), settings, np.random.default_rng(seed), progress)
+def search(cost, settings=FREE, mean=(0.0, 0.0), sigma=(2.0, 2.0), seed=0):
+    return ce.minimize(cost, ce.start(mean, sigma), settings, np.random.default_rng(seed))
 
 
 def after(costs, samples, *, elite=2, smoothing=0.25, search_state=None):
@@ -269,14 +269,6 @@ def test_history_has_mean_quantiles_and_spread_of_each_iteration():
     later = after([3.0, 4.0, 5.0], [(0, 0), (1, 1), (2, 2)], search_state=search_state)
     assert [e["best"] for e in later.history] == [1.0, 1.0]
     np.testing.assert_array_equal(later.best, [0.0, 0.0])
-
-
-def test_callback_gets_each_iteration_in_order():
-    calls = []
-    found = search(quadratic, replace(FREE, iterations=4), progress=calls.append)
-    assert [call["iteration"] for call in calls] == [1, 2, 3, 4]
-    assert {call["iterations"] for call in calls} == {4}
-    assert [call["best"] for call in calls] == [entry["best"] for entry in found.history]
 
 
 def test_an_update_changes_neither_samples_nor_costs():

@@ -8,7 +8,6 @@ import pytest
 import flexneedle
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.planning import planner
-from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
@@ -151,14 +150,6 @@ def test_steering_reaches_the_target_with_the_guide_still():
     assert abs(plan.entry_angle) < abs(planned(LATERAL).entry_angle)
 
 
-def test_the_bevels_reach_lies_between_the_two_insertions_without_a_roll():
-    least, greatest = bevel_reach(PHANTOM, 40.0)
-    assert least == pytest.approx(-greatest)
-    constant = planned((40.0, greatest + 0.1), "steering")
-    assert constant.flips == 0
-    assert constant.tip_mm[1] == pytest.approx(greatest, abs=0.005)
-
-
 def test_without_guide_and_base_both_strategies_are_the_same_search():
     bare = PHANTOM.with_values({"setup.guide_to_skin_mm": None, **COARSE})
     plans = [flexneedle.plan(bare, (30.0, 0.5), strategy) for strategy in ("manipulation", "steering")]
@@ -258,14 +249,6 @@ def test_without_a_guide_the_bevel_steers_and_the_limit_names_it():
     far = coarse({**free, "plan.guide_sigma_mm": 5.0}, (40.0, 14.0))
     assert not far.controls[:, DG_Y].any()
     assert far.limit.startswith("needle.bevel.offset_mm = 4 (the bevel alone reaches")
-
-
-def test_progress_comes_after_each_iteration():
-    calls = []
-    plan = coarse(progress=calls.append)
-    assert [call["iteration"] for call in calls] == list(range(1, plan.iterations + 1))
-    assert [call["best"] for call in calls] == [entry["best"] for entry in plan.history]
-    assert calls[0]["iterations"] == 4
 
 
 NEAR_THE_SKIN = {
