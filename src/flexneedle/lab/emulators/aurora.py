@@ -120,8 +120,8 @@ def reply(aurora: AuroraState, line: bytes, frame: EmulatedFrame) -> tuple[Auror
 def _execute(aurora: AuroraState, command: AuroraCommand, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     if command.name in _ANYWHERE:
         return _ANYWHERE[command.name](aurora, command.arguments)
-    supported = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
-    if not supported:
+    readings = ("TX", "BX") if aurora.has_bx else ("TX",)
+    if command.name not in (*_SET_UP, *readings, "TSTOP"):
         raise _Refusal("01")
     if aurora.mode == _OFF:
         raise _Refusal("10")
@@ -134,10 +134,6 @@ def _execute(aurora: AuroraState, command: AuroraCommand, frame: EmulatedFrame) 
     return aurora, (_text_readings if command.name == "TX" else _binary_readings)(
         aurora, _parse_options(command.arguments), frame
     )
-
-
-def _is_bx(aurora: AuroraState, name: str) -> bool:
-    return name == "BX" and aurora.has_bx
 
 
 def _parse_options(arguments: str) -> int:

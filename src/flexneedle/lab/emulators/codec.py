@@ -4,6 +4,7 @@ A command is ASCII, `NAME:argumentsCRC\r`, or `NAME arguments\r` without a check
 `\r`, or binary with a header (`BX`). The layouts are from ndicapi's sources.
 """
 
+import re
 import struct
 from dataclasses import dataclass
 from math import copysign, inf, isfinite, isnan
@@ -44,17 +45,13 @@ def crc16(data: bytes) -> int:
 
 def parse_command(line: bytes) -> AuroraCommand:
     r"""Return the command in a line without its `\r`; bytes outside ASCII are replaced."""
-    name = line[: _name_length(line)].decode("ascii", "replace")
+    name = re.split(rb"[: ]", line, maxsplit=1)[0].decode("ascii", "replace")
     rest = line[len(name) :]
     if not rest.startswith(b":"):
         return AuroraCommand(name, rest[1:].decode("ascii", "replace"))
     body, checksum = line[:-_CRC_DIGITS], line[-_CRC_DIGITS:]
     intact = len(rest) > _CRC_DIGITS and checksum.upper() == b"%04X" % crc16(body)
     return AuroraCommand(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
-
-
-def _name_length(line: bytes) -> int:
-    return next((at for at, byte in enumerate(line) if byte in b": "), len(line))
 
 
 def encode_text(reply: str) -> bytes:

@@ -137,7 +137,11 @@ class FaultSchedule:
 
     def at(self, now: float, since: float | None) -> tuple[Fault, ...]:
         """Return the active faults, with the device's times."""
-        begun = () if since is None else tuple(_shift(fault, since) for fault in self.scheduled)
+        begun = (
+            []
+            if since is None
+            else [replace(one, start=since + one.start, end=since + one.end) for one in self.scheduled]
+        )
         return active_faults((*begun, *self.ordered), now)
 
     def obey(self, line: str, now: float) -> str:
@@ -146,14 +150,7 @@ class FaultSchedule:
         if fault is None:
             self.scheduled = self.ordered = ()
             return "no fault"
-        kept = [one for one in self.ordered if one.end > now and not _is_same(one, fault)]
+        same = fault.kind, fault.detail
+        kept = [one for one in self.ordered if one.end > now and (one.kind, one.detail) != same]
         self.ordered = (*kept, fault)
         return f"{fault.kind}{fault.detail and '='}{fault.detail}"
-
-
-def _is_same(one: Fault, other: Fault) -> bool:
-    return (one.kind, one.detail) == (other.kind, other.detail)
-
-
-def _shift(fault: Fault, since: float) -> Fault:
-    return replace(fault, start=since + fault.start, end=since + fault.end)

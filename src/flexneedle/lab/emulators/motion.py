@@ -132,10 +132,7 @@ def is_missing(number: int, seed: int, noise: SensorNoise) -> bool:
 
 @lru_cache(maxsize=64)  # a frame is requested several times
 def _draw_noise(sensor: str, number: int, seed: int) -> Floats:
-    """Return standard normal numbers (7,) of a sensor in a frame.
-
-    Three are for its position, one for its indicator, two for its axis, and one decides whether it is missing.
-    """
+    """Return normal numbers (7,) of a sensor in a frame: 3 for position, indicator, 2 for its axis, missing."""
     drawn = np.random.default_rng((seed, SENSORS.index(sensor), number)).standard_normal(7)
     drawn.setflags(write=False)
     return drawn

@@ -128,10 +128,6 @@ def _is_left_over(link: Path) -> bool:
     return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
 
 
-def _remedy_for(error: OSError) -> str:
-    return ": remove it, unless another emulator uses it" if isinstance(error, FileExistsError) else ""
-
-
 class SerialPort:
     """Pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
 
@@ -169,9 +165,9 @@ class SerialPort:
                 self.link.unlink()
             self.link.symlink_to(os.ttyname(host))
         except OSError as error:
-            raise InputError(
-                f"{self.link}: the link cannot be created: {error.strerror}{_remedy_for(error)}"
-            ) from None
+            exists = isinstance(error, FileExistsError)
+            remedy = ": remove it, unless another emulator uses it" if exists else ""
+            raise InputError(f"{self.link}: the link cannot be created: {error.strerror}{remedy}") from None
 
     def unplug(self) -> None:
         """Close the terminal and remove the link."""

@@ -126,10 +126,7 @@ def resample(nodes: Floats, spacing: float) -> Floats:
 
 
 def _interpolate_cubic(at: Floats, values: Floats, slopes: Floats, wanted: Floats) -> Floats:
-    """Return the Hermite cubics through values (n, 3) with slopes (n, 3) at `wanted` (m,).
-
-    SciPy's spline has the same coefficients, but its import takes half of the node's start.
-    """
+    """Return Hermite cubics at `wanted`, as SciPy's spline, whose import takes half of the node's start."""
     piece = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, len(at) - 2)
     width = np.diff(at)[:, None]
     mean = np.diff(values, axis=0) / width

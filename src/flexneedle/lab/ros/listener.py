@@ -1,7 +1,6 @@
 """A participant that reads the topics of a rig and publishes nothing."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from flexneedle.errors import make_printable
@@ -87,7 +86,7 @@ class _Topic:
 
     def take(self, now: float) -> None:
         publishers = self.readers[0].writers
-        for data, source in self._take_all():
+        for data, source in (sample for reader in self.readers for sample in reader.take()):
             if source not in self.sources:  # a stop has several readers
                 self.sources.add(source)
                 match self.subscription.read(data, now, publishers):
@@ -95,10 +94,6 @@ class _Topic:
                         self.problem = f"{reason or 'true'}: an insertion would be stopped"
                     case RosRefusal(reason=reason):
                         self.problem = f"a message is refused: {reason}"
-
-    def _take_all(self) -> Iterator[tuple[bytes, tuple[int, int]]]:
-        for reader in self.readers:
-            yield from reader.take()
 
     def summarize(self, now: float, publishers: list[tuple[str, str]]) -> TopicActivity:
         """Return the activity; now: Unix time, s; publishers: of the domain."""

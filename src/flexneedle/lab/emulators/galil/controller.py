@@ -82,7 +82,8 @@ def _execute(device: ControllerState, command: str) -> tuple[ControllerState, st
     if name in _WHOLE:
         return _WHOLE[name](device, rest)
     if name in ACTIONS:
-        return _act(device, name, rest), ""
+        changed = {k: ACTIONS[name](device.axes[k]) for k in _parse_axes(rest)}
+        return _with_axes(device, changed), ""
     if name in REPORTED:
         which = _parse_axes(rest)
         return device, _format_line(", ".join(_format_number(REPORTED[name](device.axes[k])) for k in which))
@@ -142,13 +143,6 @@ def _apply_setting(device: ControllerState, name: str, rest: str) -> tuple[Contr
     return _with_axes(
         device, {k: change(device.axes[k], _parse_value(text)) for k, text in fields.items()}
     ), ""
-
-
-# Actions: NAMEABC, or NAME for all axes
-
-
-def _act(device: ControllerState, name: str, rest: str) -> ControllerState:
-    return _with_axes(device, {k: ACTIONS[name](device.axes[k]) for k in _parse_axes(rest)})
 
 
 # Queries

@@ -1,6 +1,6 @@
 """The trackers that come with the package, as rig files name them, and as `flexneedle em` opens them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,7 +57,9 @@ def replay(settings: Mapping[str, Any], clock: Clock) -> Replay:
     chosen = check_settings(ReplaySettings, settings)
     path = Path(chosen.file)
     frames = read_run_frames(path) if path.is_dir() else read_frames(path)
-    return Replay(_scale_times(frames, chosen.speed), clock)
+    if chosen.speed != 1.0:
+        frames = tuple(replace(one, time=one.time / chosen.speed) for one in frames)
+    return Replay(frames, clock)
 
 
 def read_run_frames(folder: Path) -> tuple[Frame, ...]:
@@ -74,10 +76,6 @@ def read_run_frames(folder: Path) -> tuple[Frame, ...]:
     if not frames:
         raise InputError(f"{folder}: the run has no tracker readings")
     return tuple(frames.values())
-
-
-def _scale_times(frames: Sequence[Frame], speed: float) -> tuple[Frame, ...]:
-    return tuple(frames) if speed == 1.0 else tuple(replace(one, time=one.time / speed) for one in frames)
 
 
 def _make_frame(number: int, measurement: Measurement) -> Frame:

@@ -182,7 +182,9 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
             _report(channel, "error", kind, reason)
             if code in LOST or (code == TIMEOUT and not device.synchronise(_SYNCHRONISE_S)):
                 break
-        elif fault := _SYSTEM.get(_lowest_bit(device.system_status(read) & sum(_SYSTEM))):
+        elif fault := _SYSTEM.get(
+            (bits := device.system_status(read) & sum(_SYSTEM)) & -bits
+        ):  # the lowest bit
             reason = f"the tracker reports: {fault}"
             _report(channel, "error", "system", reason)
         else:
@@ -202,10 +204,6 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
         sleep(_POLL_S)
     channel.send(("end", reason))
     return code not in (TIMEOUT, *LOST)
-
-
-def _lowest_bit(bits: int) -> int:
-    return bits & -bits
 
 
 def _describe_error(device: AuroraDevice, code: int) -> tuple[str, str]:

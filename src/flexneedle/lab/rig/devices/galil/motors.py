@@ -185,10 +185,7 @@ class GalilMotors:
                 raise DriverError("; ".join((str(error), *self._describe_stops(deadline)))) from None
 
     def _describe_stops(self, deadline: float) -> list[str]:
-        """Return a line for each channel that the controller itself has stopped, or that is at a limit switch.
-
-        The controller refuses targets of channels that it has stopped until they rest.
-        """
+        """Return a line for each channel at a limit switch or stopped by the controller, which then refuses targets."""
         if not self._link.is_open:
             return []
         try:
@@ -238,6 +235,7 @@ class GalilMotors:
         AB 1, which stops all axes of the controller without deceleration, and switches off motors with OE.
         """
         deadline = self._deadline()
+        slowing = max(self._slowing.get(letter, _SLOWING_S) for letter in self._letters)
         first = self._stopping is None
         began = self._stopping = monotonic() if self._stopping is None else self._stopping
         self._drop_targets(STOPPED)
@@ -249,7 +247,7 @@ class GalilMotors:
             raise
         if (
             not first
-            and monotonic() >= began + self._slowing_s
+            and monotonic() >= began + slowing + _MARGIN_S
             and self._find_moving(self._letters, deadline)
         ):
             self._abort(deadline)
@@ -260,10 +258,6 @@ class GalilMotors:
 
     def _drop_targets(self, *codes: int) -> None:
         self._channels = {k: channel.without_target(*codes) for k, channel in self._channels.items()}
-
-    @property
-    def _slowing_s(self) -> float:
-        return max(self._slowing.get(letter, _SLOWING_S) for letter in self._letters) + _MARGIN_S
 
     def set_speed(self, channel: str, speed: float, acceleration: float) -> None:
         """Limit speed (counts/s) and acceleration (counts/s²) of present and later motions.
@@ -297,11 +291,7 @@ class GalilMotors:
         self._execute([f"{'SH' if on else 'MO'}{channel}"], deadline)
 
     def _end_tracking(self, letter: str, deadline: float) -> None:
-        """End the position tracking of a channel at rest, in which the controller refuses other commands.
-
-        One that counts as in motion, and was not sent anywhere by this connection, was left in position tracking by one
-        that broke, or another program moves it: it is stopped.
-        """
+        """End position tracking, in which the controller refuses other commands; stop motion of unknown origin."""
         self._read_states(deadline)
         moving = self._read_states(deadline)[letter].moving  # the second one: see `seen`
         channel = self._channels[letter]

@@ -105,7 +105,7 @@ def take_report(channel: ChannelState, found: MotorReport) -> tuple[ChannelState
     good = found.code in (RUNNING, ARRIVED)
     old = channel.old if found.code in channel.old and not good else frozenset[int]()
     stopped = (
-        _describe_code(found.code)
+        _REASONS.get(found.code, f"stop code {found.code}")
         if channel.target is not None and not good and found.code not in old
         else ""
     )
@@ -130,7 +130,3 @@ def _is_blocked(channel: ChannelState, found: MotorReport) -> bool:
     """Return whether the target is beyond a limit switch that is active: the controller would not move there."""
     way = 0.0 if channel.target is None else channel.target - found.commanded
     return (found.reverse_limit and way < 0.0) or (found.forward_limit and way > 0.0)
-
-
-def _describe_code(code: int) -> str:
-    return _REASONS.get(code, f"stop code {code}")
