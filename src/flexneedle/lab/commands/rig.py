@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import ARMS, add_strategy, confirm_motions, print_json
@@ -184,10 +184,15 @@ def _check(args: argparse.Namespace) -> int:
     findings = [*check_rig(rig, clock, args.seconds, _wanted(args)), *check_ros(rig, clock, args.seconds)]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
-        print_json(_values(rig, findings))
+        lines = [
+            {"part": one.part, "item": one.item, "found": one.found, "problem": one.problem or None}
+            for one in findings
+        ]
+        print_json({"rig": rig.name, "ok": not problems, "findings": lines})
     else:
         _print_findings(findings)
-        print(f"\n{args.rig}: {_counted(problems)}")
+        counted = f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
+        print(f"\n{args.rig}: {counted}")
     return 1 if problems else 0
 
 
@@ -198,24 +203,12 @@ def _wanted(args: argparse.Namespace) -> IntendedInsertion | None:
     return None if args.scenario is None else IntendedInsertion(load_scenario(args.scenario), args.strategy)
 
 
-def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
-    lines = [
-        {"part": one.part, "item": one.item, "found": one.found, "problem": one.problem or None}
-        for one in findings
-    ]
-    return {"rig": rig.name, "ok": not any(one.problem for one in findings), "findings": lines}
-
-
 def _print_findings(findings: Sequence[Finding]) -> None:
     parts = max(len(one.part) for one in findings)
     items = max(len(one.item) for one in findings)
     for one in findings:
         verdict, found = "PROBLEM" if one.problem else "ok", "; ".join(filter(None, (one.found, one.problem)))
         print(f"{verdict:7}  {one.part:{parts}}  {one.item:{items}}  {found}")
-
-
-def _counted(problems: int) -> str:
-    return f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
 
 
 # Motions

@@ -54,7 +54,9 @@ def check_rig(
 
     A device that cannot be reached is a finding, too.
     """
-    found = [*_file_findings(rig), *(_scenario_findings(rig, wanted) if wanted is not None else ())]
+    found = [Finding(name, "queued motion", distance) for name, distance in describe_queues(rig)]
+    found += [Finding(name, "speed", speed) for name, speed in describe_speeds(rig)]
+    found += _scenario_findings(rig, wanted) if wanted is not None else ()
     found += check_device(
         "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: check_motors(rig, m, clock, wanted)
     )
@@ -81,13 +83,6 @@ def check_device(
         return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
 
 
-def _file_findings(rig: RigFile) -> Iterator[Finding]:
-    for name, distance in describe_queues(rig):
-        yield Finding(name, "queued motion", distance)
-    for name, speed in describe_speeds(rig):
-        yield Finding(name, "speed", speed)
-
-
 def _scenario_findings(rig: RigFile, wanted: IntendedInsertion) -> list[Finding]:
     problems = fit_problems(rig, wanted.scenario, wanted.strategy)
     name = wanted.scenario.name
@@ -110,7 +105,9 @@ def check_motors(
 ) -> list[Finding]:
     """Return the findings of a few readings of the motors. Raises DriverError if they cannot be read."""
     states, seconds = _read_motors(device, clock)
-    found = [_reply_finding(rig, seconds)]
+    tick = 1.0 / rig.loop.rate_hz
+    late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
+    found = [Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)]
     # Not every driver reports the setup of its controller.
     setups: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
     positions: dict[str, float] = {}
@@ -139,19 +136,15 @@ def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState]
     return states, median(times)
 
 
-def _reply_finding(rig: RigFile, seconds: float) -> Finding:
-    tick = 1.0 / rig.loop.rate_hz
-    late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
-    return Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)
-
-
 def _axis_findings(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
     moving = "moves, though this command does not move it" if state.moving else ""
     problem = "; ".join(filter(None, (moving, state.stopped)))
     yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", problem)
     position = state.position / axis.scale
     problem = limits_problem(axis, position) if isfinite(position) else "is not a number"
-    yield Finding(name, "position", _format_position(axis, state.position), problem)
+    slack = f", {describe_uncertainty(axis)}" if axis.backlash else ""
+    shown = f"{axis.shown(position)} {axis.unit} ({state.position:.10g} counts){slack}"
+    yield Finding(name, "position", shown, problem)
     active = " and ".join(sorted(active_switches(state), reverse=True)) or "none active"
     problem = resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
     yield Finding(name, "limit switches", active, problem)
@@ -189,11 +182,6 @@ def _error_limit_finding(name: str, axis: Axis, setup: MotorSetup) -> Finding:
         f"below max_error_{axis.unit} ({most}): it comes before the fault" if error < axis.max_error else ""
     )
     return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
-
-
-def _format_position(axis: Axis, counts: float) -> str:
-    slack = f", {describe_uncertainty(axis)}" if axis.backlash else ""
-    return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts){slack}"
 
 
 def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:

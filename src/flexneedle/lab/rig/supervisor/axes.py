@@ -145,20 +145,16 @@ class RigAxes:
         changed = []
         with self._mark_lost_on_error():
             for drive in self.drives.values():
-                if self._is_misplaced(drive):
+                state, before = self.state(drive), self.before.states[drive.axis.channel]
+                if state.on and is_at_rest(drive, state, before) and is_misplaced(drive, state):
                     self._motors.power(drive.axis.channel, False)
-                    off = drive.shown(abs(drive.error_of(self.state(drive))))
+                    off = drive.shown(abs(drive.error_of(state)))
                     changed.append(
                         f"{drive.name}: was {off} from its commanded position, now held where it is"
                     )
                 self._motors.power(drive.axis.channel, True)
         self.read()
         return "; ".join(changed)
-
-    def _is_misplaced(self, drive: Drive) -> bool:
-        """Return whether a motor is on, and rests too far from its commanded position."""
-        state, before = self.state(drive), self.before.states[drive.axis.channel]
-        return state.on and is_at_rest(drive, state, before) and is_misplaced(drive, state)
 
     def power_off(self) -> None:
         """Switch all motors off, also if one of them fails; raise DriverError with all problems."""

@@ -25,7 +25,7 @@ def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
     """Report a motor that is off, was stopped by the motor controller since the reading before, or does not follow."""
     error = drive.error_of(state)
     if not state.on:
-        return f"{drive.name}: the motor is off{_format_reason(state.stopped)}"
+        return f"{drive.name}: the motor is off" + (f" ({state.stopped})" if state.stopped else "")
     if state.stopped and state.stopped != before.stopped:
         return f"{drive.name}: stopped by the motor controller: {state.stopped}"
     if abs(error) > drive.axis.max_error:
@@ -165,10 +165,6 @@ def new_switch_problem(drive: Drive, state: MotorState, known: frozenset[str]) -
 def is_misplaced(drive: Drive, state: MotorState) -> bool:
     """Return whether a motor at rest is further from its commanded position than the checks at rest allow."""
     return abs(drive.error_of(state)) > min(drive.axis.max_error, STILL * drive.axis.tolerance)
-
-
-def _format_reason(reason: str) -> str:
-    return f" ({reason})" if reason else ""
 
 
 @dataclass(frozen=True)

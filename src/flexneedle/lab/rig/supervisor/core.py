@@ -193,7 +193,9 @@ class Supervisor:
         """Read motors and tracker, check, and send targets or stop."""
         before, now = self._ticked_at, self._clock.now()
         self._ticked_at = now
-        self._check_ticks(now - before)
+        if self._motion is not None and self._motion.leg is not None and now - before > _STALL_S:
+            # The motors have stopped at the end of their queue.
+            self.stop(f"no tick for {now - before:.2f} s, limit {_STALL_S:g} s")
         self._read_tracker(now)
         self._check_motors()
         self._check_client(now)
@@ -212,11 +214,6 @@ class Supervisor:
         return protocol.TickReport(
             self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests
         )
-
-    def _check_ticks(self, seconds: float) -> None:
-        """Stop after a long time without ticks: the motors have stopped at the end of their queue."""
-        if self._motion is not None and self._motion.leg is not None and seconds > _STALL_S:
-            self.stop(f"no tick for {seconds:.2f} s, limit {_STALL_S:g} s")
 
     def _read_tracker(self, now: float) -> None:
         try:
