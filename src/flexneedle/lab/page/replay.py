@@ -49,7 +49,7 @@ def make_replay(
 
 def make_document(title: str, record: Iterable[ServerMessage | ShapeFrame]) -> str:
     """Return the HTML file that replays the messages and frames of recorded insertions."""
-    style = _check("\n".join(_read_text(name) for name in _STYLES))
+    style = _check("\n".join((_STATIC / name).read_text(encoding="utf-8") for name in _STYLES))
     script = _check(bundle_modules(_STATIC, _ENTRY))
     icon = f"data:image/svg+xml;base64,{b64encode((_STATIC / _ICON).read_bytes()).decode()}"
     return Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
@@ -156,10 +156,6 @@ def _describe(
 
 def _name(folder: Path) -> str:
     return folder.resolve().name
-
-
-def _read_text(name: str) -> str:
-    return (_STATIC / name).read_text(encoding="utf-8")
 
 
 def _check(text: str) -> str:

@@ -87,7 +87,10 @@ class AccessRules:
             return 403, f"Origin = {shorten(origin)}: must be http://{host}, only the page itself may connect"
         if not page and headers.get("sec-fetch-site") == "cross-site":
             return 403, "Sec-Fetch-Site = cross-site: only the page itself may ask for this"
-        if self.token and not any(self._matches(given) for given in self._tokens(headers, query)):
+        if self.token and not any(
+            secrets.compare_digest(given.encode(), self.token.encode())
+            for given in self._tokens(headers, query)
+        ):
             return 401, "the token is missing or wrong: open the address that flexneedle serve has printed"
         return None
 
@@ -108,9 +111,6 @@ class AccessRules:
             return
         if self.cookie in cookies:
             yield cookies[self.cookie].value
-
-    def _matches(self, given: str) -> bool:
-        return secrets.compare_digest(given.encode(), self.token.encode())
 
 
 class AccessGuard:

@@ -305,14 +305,11 @@ class RequestHandler:
             self.live.require_ended()
             jobs, order = self._insertions, WorkOrder("save", "save", name=request.name)
         else:
-            self._require_row(request.of)
+            newest = self.hub.newest(f"insertion {request.of}")
+            if not isinstance(newest, InsertionMessage) or newest.row is None:
+                raise Refusal("no row of a study is shown there: open one first")
             jobs, order = self._plans, WorkOrder("save_row", "save", name=request.name, of=request.of)
         jobs.add(replace(order, folder=str(self.runs.new(request.name))))
-
-    def _require_row(self, of: Recording) -> None:
-        newest = self.hub.newest(f"insertion {of}")
-        if not isinstance(newest, InsertionMessage) or newest.row is None:
-            raise Refusal("no row of a study is shown there: open one first")
 
     # Timers and ends of jobs
 

@@ -20,7 +20,7 @@ from flexneedle.ports import TipTracker
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Measurement, SensorReading
 
 _MISSING = "missing"
 _METAL = "noisy"
@@ -109,12 +109,10 @@ class DisturbedTracker:
 
 
 def _without_tip(one: Measurement) -> Measurement:
-    frame = None if one.frame is None else _frame_without_tip(one.frame)
+    frame = one.frame
+    if frame is not None:
+        frame = replace(frame, readings={**frame.readings, TIP: SensorReading(None, status=_MISSING)})
     return Measurement(one.time, None, None, None, frame)
-
-
-def _frame_without_tip(frame: Frame) -> Frame:
-    return replace(frame, readings={**frame.readings, TIP: SensorReading(None, status=_MISSING)})
 
 
 class Disturber:

@@ -1,8 +1,6 @@
 """Reports of an insertion: its state, its plan and its periods."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from flexneedle.cli.common import STILL_IN
 from flexneedle.control.interface import Decision
@@ -71,7 +69,8 @@ class InsertionReporter:
         match event:
             case Iterated(info=info):
                 self.task.control.check_stop()
-                self._report_iteration(info)
+                done, usual = info["iteration"], info["iterations"]
+                self.task.report_job("running", done / usual, f"plan: iteration {done} of {usual}")
             case Planned(plan):
                 self.report_plan(plan)
             case Decided(decision, estimate):
@@ -84,10 +83,6 @@ class InsertionReporter:
         self.plan = plan
         self.task.report(shapes_of(plan, FrameSource.LIVE)[0])
         self.task.report_job("running", 0.0, "inserting")
-
-    def _report_iteration(self, info: Mapping[str, Any]) -> None:
-        done, usual = info["iteration"], info["iterations"]
-        self.task.report_job("running", done / usual, f"plan: iteration {done} of {usual}")
 
     def _report_period(self, period: Period) -> None:
         if self.plan is None:

@@ -96,18 +96,13 @@ def row_of(period: Period, plan: Plan) -> dict[str, Any]:
     error_mm: lateral distance of the true tip (on a rig: of the estimated tip) from the planned path at its depth;
     indicator: as `_largest_indicator`; decide_ms: time of the decision.
     """
-    tip = period.true_tip or period.estimate
+    x, y, z = (period.true_tip or period.estimate).point
+    planned_y, planned_z = (float(np.interp(x, plan.tips[:, X], plan.tips[:, column])) for column in (1, 2))
     return page_values(period) | {
-        "error_mm": _distance_from_path(plan, tip.point),
+        "error_mm": math.hypot(y - planned_y, z - planned_z),
         "indicator": _largest_indicator(period),
         "decide_ms": 1e3 * period.durations.get("decide", 0.0),
     }
-
-
-def _distance_from_path(plan: Plan, point: Sequence[float]) -> float:
-    """Return the lateral distance (mm) of a point from the planned path of the tip, at its depth."""
-    y, z = (float(np.interp(point[0], plan.tips[:, X], plan.tips[:, column])) for column in (1, 2))
-    return math.hypot(point[1] - y, point[2] - z)
 
 
 def _largest_indicator(period: Period) -> float | None:
