@@ -75,14 +75,6 @@ def test_a_damaged_recording_is_rejected_in_one_line(table, change, message):
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_duplicate_rows_are_rejected(table, suffix):
-    """An identical row, and another one of the same sensor in the same frame."""
-    for again in (ROWS[0], {**ROWS[0], "x_mm": 9.0}):
-        with pytest.raises(InputError, match=r"(line 4|row 3): duplicate sensor tip in frame 4"):
-            read_frames(table([*ROWS[:2], again, *ROWS[2:]], suffix))
-
-
 def test_a_file_that_is_not_a_recording_is_rejected(table, tmp_path):
     with pytest.raises(InputError, match="no column frame_number"):
         read_frames(table(ROWS, columns=("time_s", "sensor", "x_mm", "y_mm", "z_mm")))

@@ -62,13 +62,6 @@ def test_a_motor_that_creeps_after_its_motion_still_moves():
     assert seen[-1][2]
 
 
-def test_two_motors_may_have_the_same_fault():
-    session, seen = observed("stall=A@0", "stall=B@0")
-    session.reply("PR 100,100,100;BGABC", 0.0)
-    session.advance(1.0)
-    assert seen[-1][1] == (0.0, 0.0, 100.0, 0.0)
-
-
 def test_a_fault_that_is_ordered_begins_at_once_and_can_be_cleared():
     session, seen = observed("stall=B@0")
     session.reply("PR 1000,1000;BGAB", 0.0)
