@@ -317,3 +317,15 @@ def test_a_folder_with_other_files_is_rejected(quick, tmp_path, resume):
 def test_workers_are_at_least_one_and_local(quick, tmp_path, options):
     with pytest.raises(InputError, match=f"^workers = {options['workers']}: "):
         run_study(quick, tmp_path / "a", **options)
+
+
+@pytest.mark.slow
+def test_a_script_without_the_guard_ends_with_the_remedy(quick, tmp_path):
+    """Its workers, which import it, create no folder."""
+    script = tmp_path / "script.py"
+    script.write_text(f"from flexneedle import run_study\nrun_study({str(quick)!r}, workers=1)\n")
+    command = [sys.executable, str(script)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert "a script needs the guard `if __name__ == '__main__':`" in done.stderr.splitlines()[-1]
+    assert len(list((tmp_path / "runs").iterdir())) == 1
