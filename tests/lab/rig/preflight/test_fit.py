@@ -22,6 +22,7 @@ from flexneedle.scenario.files import load_scenario
 PLANE, SPACE = load_scenario("phantom"), load_scenario("phantom3d")
 TILTED = PLANE.with_values({"entry.lateral_mm": 3.0, "entry.slope_mrad": 50.0})
 GUIDE_Z = {**VALUES["axes"]["guide_y"], "channel": "D"}
+BASE = {**VALUES["axes"]["guide_y"], "channel": "E", "range_mm": [-15, 15], "speed_mm_s": 5}
 FREE = {"axes__guide_z": GUIDE_Z, "axes__rotation__range_deg": [-200, 200]}
 """Axes for needles in space that roll to any angle."""
 
@@ -64,6 +65,12 @@ def keys_of(lines):
             ["axes.guide_z", "setup.max_rotation_deg"],
         ),
         ({}, scenario(plan__base_sigma_mm=0.1), ["axes.base_y"]),
+        ({"axes__base_y": BASE}, scenario(plan__base_sigma_mm=0.1), []),
+        (
+            {"axes__base_y": BASE | {"range_mm": [-5, 5], "speed_mm_s": 1}},
+            scenario(plan__base_sigma_mm=0.1),
+            ["axes.base_y.range_mm = [-5.0, 5.0]", "setup.max_base_step_mm = 0.5"],
+        ),
         ({}, scenario(plan__base_turn_sigma_mrad=1.0), ["plan.base_turn_sigma_mrad = 1.0"]),
         (FREE, scenario(SPACE, setup__max_rotation_deg=200.0), []),
         (FREE, scenario(SPACE, setup__rotation="half-turns"), []),
@@ -79,14 +86,6 @@ def keys_of(lines):
 )
 def test_each_requirement_that_the_rig_does_not_meet_is_a_line(changes, given, lines):
     assert keys_of(fit_problems(rig(**changes), given)) == lines
-
-
-def test_base_axes_are_checked_like_guide_axes():
-    base = {**VALUES["axes"]["guide_y"], "channel": "E", "range_mm": [-5, 5], "speed_mm_s": 1}
-    moving = scenario(plan__base_sigma_mm=0.1)
-    lines = fit_problems(rig(axes__base_y=base), moving)
-    assert keys_of(lines) == ["axes.base_y.range_mm = [-5.0, 5.0]", "setup.max_base_step_mm = 0.5"]
-    assert fit_problems(rig(axes__base_y={**base, "range_mm": [-15, 15], "speed_mm_s": 5}), moving) == []
 
 
 def test_a_plan_that_steers_by_the_bevel_needs_neither_guide_nor_base():

@@ -60,7 +60,7 @@ def test_an_axis_finds_its_switch_and_moves_into_its_range(home, direction):
     assert bench.until(3).why == ""
 
 
-@pytest.mark.parametrize("phase", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize("phase", [0.0, 0.7])
 @pytest.mark.parametrize("seconds", [0.005, 0.03, 0.1])
 def test_the_home_of_an_axis_that_slows_down_at_its_switch_is_where_it_rests(seconds, phase):
     """The motor controller reports the stop some ticks before the axis rests, and refuses targets meanwhile."""
@@ -179,7 +179,7 @@ def test_from_its_switch_an_axis_moves_away_before_it_searches_it(creeps):
     assert len(bench.calls("define")) == 1
 
 
-@pytest.mark.parametrize(("home", "start"), [(3.0, -1.9), (7.0, 7.0), (7.0, 2.0)])
+@pytest.mark.parametrize(("home", "start"), [(3.0, -1.9), (7.0, 7.0)])
 def test_a_switch_far_beyond_a_short_range_is_found_from_anywhere(home, start):
     keys = {"home": "reverse-limit", "home_mm": home, "range_mm": [-2.0, 2.0]}
     bench = Bench(rig_file(guide_y=keys), tracked=False)
