@@ -11,9 +11,7 @@ import tomli_w
 import flexneedle
 from commands import run
 from emulated import DEADLINE_S, until
-from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import RigError, StoppedError
-from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
 from flexneedle.lab.rig.supervised import SupervisedRig
 from flexneedle.lab.ros import bridge as module
@@ -25,7 +23,7 @@ from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import READINGS
 from flexneedle.results import Period
 from ros_peers import Bool, target
-from ros_rig import quick_scenario, started
+from ros_rig import started
 from stages import RIG
 from synthetic import make_periods, make_plan
 from traces import contents
@@ -64,33 +62,6 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     ((_, _, rest),) = insertion.calls("close")
     assert 1000.0 < where["A"] <= rest["A"] < where["A"] + 500.0  # 0.5 mm
     assert events(insertion) == ["stop: ROS topic /flexneedle/stop"]
-
-
-@pytest.mark.slow
-def test_the_needle_of_the_emulated_rig_rests_after_a_stop(tmp_path):
-    path, record = rig_file(tmp_path), tmp_path / "truth.csv"
-    with emulated_rig(path, quick_scenario(tmp_path), "--seed", 3, "--truth", record) as rig:
-        served = path.read_text().replace("127.0.0.1:0", rig.ready["ready"]["galil"])
-        path.write_text(f"{served}\n[ros]\n")
-        with started(tmp_path, NEUTRAL, "--yes", "--rig", str(path)) as insertion:
-            peer = insertion.peer(("tip",))
-            insertion.await_that(lambda: len(peer.received("tip")) > 8)
-            sent = time.monotonic()
-            peer.send("stop", Bool(True))
-            status, _, errors = insertion.end()
-        ended = time.monotonic()
-        until(lambda: read_truth(record).time[-1] > ended + 1.0)
-    assert (status, insertion.stored["reason"]) == (130, "stopped: ROS topic /flexneedle/stop"), errors
-    stopped = insertion.stored["timing"]["ticks"]["states"][-1]
-    assert stopped["state"] == "stopped"
-    seconds = stopped["time_s"] - sent
-    assert seconds > 0.0
-    truth = read_truth(record)
-    base = truth.positions["insertion"]
-    reached = np.interp([sent, stopped["time_s"]], truth.time, base)
-    assert reached[0] > 2.0
-    assert np.all(base[-1] - reached < (5.0 * seconds + 0.5, 0.5))  # at 5 mm/s
-    assert all(np.ptp(turns[truth.time > ended]) == 0.0 for turns in truth.counts.values())
 
 
 @pytest.mark.long

@@ -36,24 +36,6 @@ def switched_on(*lines, ms=0, **motor):
     return after(device, *lines, ms=ms)
 
 
-@pytest.mark.parametrize(
-    ("line", "answer"),
-    [
-        ("", ":"),
-        ("TPA", " 0\r\n:"),
-        ("TP", " 0, 0, 0, 0\r\n:"),
-        ("SPA=5000;EO 0", "::"),
-        ("SP ?,?", " 25000, 25000\r\n:"),
-        ("MG _TPA,_MOB", " 0.0000 1.0000\r\n:"),
-        ("SHA;XX;TPA", ":? 0\r\n:"),
-        ("sha", "?"),
-        ("TC", " 0\r\n:"),
-    ],
-)
-def test_a_line_is_answered_command_by_command(line, answer):
-    assert reply(ControllerState(), line)[1] == answer
-
-
 MOVING = ("SH", "PRA=9999", "BGA")
 
 
@@ -88,6 +70,7 @@ def test_an_invalid_command_is_refused_with_its_code(lines, refused, code):
         ("OE ,1", "MG _OEA,_OEB", " 0.0000 1.0000\r\n:"),
         ("", "MG _TM,_CN0,_PF", " 1000.0000 -1.0000 10.0000\r\n:"),
         ("SP 100,1e12", "SPA=?", " 25000\r\n:"),  # none is set if one is refused
+        ("", "SHA;XX;sha;;TPA", ":??: 0\r\n:"),
     ],
 )
 def test_settings_are_reported_in_the_steps_of_the_controller(line, query, answer):
