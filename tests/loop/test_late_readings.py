@@ -40,10 +40,6 @@ def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late
     assert np.abs(off).max() < 4.0 * PHANTOM.tracker.jitter_per_axis
 
 
-def test_without_a_delay_there_is_no_rest(real):
-    assert RESTING not in {period.decision for period in real[0].periods}
-
-
 def test_delayed_readings_are_used_at_their_time_of_measurement(late, real):
     """Innovations are as small as without a delay, although the needle moves by 1 mm per period."""
     for done, recorded in (late, real):
@@ -91,11 +87,3 @@ def test_a_delay_beyond_the_age_limit_holds_from_the_start(inserted):
     assert "stale: 0.350 s old, limit 0.3 s" in done.reason
     assert done.periods[-1].time == pytest.approx(1.0)
     assert {period.command for period in done.periods} == {STILL}
-
-
-def test_the_rest_does_not_depend_on_the_controller(inserted):
-    done = inserted(2003, controller="open-loop")
-    assert (done.outcome, done.controller) == ("done", "open-loop")
-    assert done.periods[-1].decision in (RESTING, HELD)
-    last = moving(done)[-1]
-    assert done.periods[-1].measurement.time > last.time - 1e-6

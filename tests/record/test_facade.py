@@ -87,6 +87,7 @@ def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, ca
     assert frame["converged"].dtype == bool
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_each_record_of_a_dry_run_is_marked_as_one(tmp_path, capsys):
     dry, folder = replace(INSERTION, phantom="", rig="Bench", dry_run=True), tmp_path / "run"
     assert dry.summary == f"dry run: {INSERTION.summary}"

@@ -93,11 +93,19 @@ class TraceWriter:
             raise RecordError.of(self._path, error) from error
 
     def _begin(self, about: Mapping[str, str], scenario: Mapping[str, Any]) -> None:
+        """Write metadata and scenario; register types and topics."""
         self._writer.start(profile="ros2", library="flexneedle")
         self._writer.add_metadata("flexneedle", dict(about))
         text = json.dumps(scenario, indent=1, ensure_ascii=False, allow_nan=False)
         self._writer.add_attachment(0, 0, "scenario.json", "application/json", text.encode())
-        self._channels = self._register()
+        schemas = {}
+        for kind in dict.fromkeys(TOPICS.values()):
+            definition, _ = STORE.generate_msgdef(kind, ros_version=2)
+            schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", definition.encode()))
+        self._channels: dict[str, int] = {}
+        for topic, kind in TOPICS.items():
+            qos = {"offered_qos_profiles": _LATCHED_QOS} if topic in LATCHED else {}
+            self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schemas[kind], qos))
 
     def _write(self, messages: Iterable[TopicMessage]) -> None:
         """Write messages as one chunk and flush it."""
@@ -106,19 +114,6 @@ class TraceWriter:
             self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
         self._writer.flush()
         self._count += 1
-
-    def _register(self) -> dict[str, int]:
-        """Register types and topics; return the channel of each topic."""
-        schemas = {kind: self._schema(kind) for kind in dict.fromkeys(TOPICS.values())}
-        return {topic: self._channel(topic, schemas[kind]) for topic, kind in TOPICS.items()}
-
-    def _schema(self, kind: str) -> int:
-        definition, _ = STORE.generate_msgdef(kind, ros_version=2)
-        return int(self._writer.register_schema(kind, "ros2msg", definition.encode()))
-
-    def _channel(self, topic: str, schema: int) -> int:
-        qos = {"offered_qos_profiles": _LATCHED_QOS} if topic in LATCHED else {}
-        return int(self._writer.register_channel(topic, "cdr", schema, qos))
 
 
 def _opened(path: Path) -> BinaryIO:
