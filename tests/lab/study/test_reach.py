@@ -30,7 +30,7 @@ def end(scenario, roll=0.0, phantom="model"):
     return insert_straight(truth, roll, phantom, scenario.target.depth_mm)
 
 
-@pytest.mark.parametrize("phantom", ["model", "exact"])
+@pytest.mark.parametrize("phantom", ["model", pytest.param("exact", marks=pytest.mark.long)])
 def test_without_a_guide_the_ends_are_mirror_images(phantom):
     right, left = (end(FREE, roll, phantom) for roll in (0.0, math.pi))
     np.testing.assert_allclose(right, (left[0], -left[1], 0.0), atol=1e-9)
@@ -226,7 +226,7 @@ def test_a_limited_range_reaches_the_hull_of_its_arc():
         assert compute_reach(aimed(limited, target), 0, "model") == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("rig", ["one-axis", "one-axis-half-turns"])
+@pytest.mark.parametrize("rig", ["one-axis", pytest.param("one-axis-half-turns", marks=pytest.mark.long)])
 def test_a_guide_on_one_axis_leaves_the_other_to_the_bevel(rig):
     """A target beyond what the bevel reaches along z; half turns reach nothing there."""
     scenario = world(3, "perfect", rig).with_values(COARSE)
