@@ -8,7 +8,7 @@ import pytest
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.loop.events import Gate
 from insertions import PHANTOM, READING, RecordedPhantom, run
-from tanks import STRAIGHT
+from phantoms import STRAIGHT
 
 WHY = "nobody is in control"
 

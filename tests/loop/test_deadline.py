@@ -13,7 +13,7 @@ from flexneedle.record.fields import from_row, to_row
 from flexneedle.results import Action, Outcome
 from flexneedle.types import STILL
 from insertions import READING, RecordedPhantom, blind, run
-from tanks import STRAIGHT
+from phantoms import STRAIGHT
 
 DEADLINE_S, TAKEN_S = 0.2, 0.35
 LATE = 3  # the number of the decision

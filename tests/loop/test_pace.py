@@ -13,7 +13,7 @@ from flexneedle.simulator.control import Limits
 from flexneedle.simulator.pace import roll_time, travel_time
 from flexneedle.types import COLUMNS, Control
 from insertions import PHANTOM, READING, RecordedPhantom, first_periods
-from tanks import STRAIGHT, TURN, tank, tip
+from phantoms import STRAIGHT, TURN, make_phantom, tip
 
 SPACE = PHANTOM.with_values({"setup.axes": 2})
 SLOW = PHANTOM.with_values(
@@ -93,7 +93,7 @@ def test_a_period_lasts_as_long_as_its_motion(plan):
 
 
 def test_the_needle_does_not_advance_while_it_rolls():
-    phantom = tank()
+    phantom = make_phantom()
     motion = phantom.apply(Control(db_x=1.0, flip=True), 0.2)
     assert (motion.begun, motion.turned, motion.ended) == pytest.approx((0.0, 0.5, 0.7))
     x = [phantom.tip_at(time)[0] for time in (0.0, 0.25, 0.5, 0.6, 0.7)]
@@ -101,19 +101,19 @@ def test_the_needle_does_not_advance_while_it_rolls():
 
 
 def test_without_a_roll_the_travel_begins_at_once():
-    motion = tank().apply(STRAIGHT, 0.2)
+    motion = make_phantom().apply(STRAIGHT, 0.2)
     assert motion.turned is None
     assert motion.travel_begun == motion.begun == 0.0
 
 
 def test_two_half_turns_of_a_driver_of_half_turns_take_no_time():
-    motion = tank().apply(Control(db_x=1.0, roll=2.0 * math.pi), 0.2)
+    motion = make_phantom().apply(Control(db_x=1.0, roll=2.0 * math.pi), 0.2)
     assert (motion.turned, motion.ended) == (None, 0.2)
 
 
 def test_in_a_roll_the_tip_goes_round_its_axis():
     """In the plane its lateral position follows the cosine of the angle, from one side to the other."""
-    phantom = tank(run_out=0.1)
+    phantom = make_phantom(run_out=0.1)
     phantom.apply(TURN, 0.025)
     y = [phantom.tip_at(0.5 * part)[1] for part in (0.0, 0.25, 0.5, 1.0)]
     assert y == pytest.approx([0.1, 0.1 * math.cos(math.pi / 4), 0.0, -0.1], abs=1e-4)
@@ -121,7 +121,7 @@ def test_in_a_roll_the_tip_goes_round_its_axis():
 
 
 def test_in_space_the_tip_leaves_the_plane_and_returns():
-    phantom = tank(SPACE.with_values({"phantom.rotation_friction_mn": 0.0}), run_out=0.1)
+    phantom = make_phantom(SPACE.with_values({"phantom.rotation_friction_mn": 0.0}), run_out=0.1)
     phantom.apply(Control(roll=math.pi), 0.025)
     sides = [complex(*phantom.tip_at(0.5 * part)[1:]) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]
     expected = [0.1 * np.exp(1j * math.pi * part) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]

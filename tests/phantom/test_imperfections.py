@@ -10,8 +10,8 @@ from flexneedle.errors import CommandError
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.types import PSI, THETA, Y, Z
+from phantoms import AHEAD, COARSE, PHANTOM, STRAIGHT, TURN, alone, both_plants, driven, make_phantom, tip
 from reference.rods import IDEAL, planar
-from tanks import AHEAD, COARSE, PHANTOM, STRAIGHT, TURN, alone, both_plants, driven, tank, tip
 
 
 def free(scenario=IDEAL):
@@ -44,7 +44,7 @@ def test_factors_of_tissue_bevel_and_needle_equal_a_changed_scenario(kind):
     assert abs(modulus - 200.0) > 1.0
     values = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
     values |= {"contact.spacing_mm": 0.5, "needle.bevel.offset_mm": 2.0, "needle.youngs_modulus_gpa": modulus}
-    other = tank(IDEAL.with_values(values), kind)
+    other = make_phantom(IDEAL.with_values(values), kind)
     ends = [tip(driven(needle, AHEAD, times=35)) for needle in (phantom, other)]
     np.testing.assert_allclose(*ends, atol=1e-9)
 
@@ -65,7 +65,7 @@ def test_start_offset_and_slope_move_the_clamp(kind):
 @pytest.mark.parametrize("angle", [0.0, -1.2])
 def test_a_bend_is_the_deflection_of_the_free_tip_and_rolls_with_the_needle(angle):
     """The free tip is 0.5 mm off in the direction of the bevel turned by the angle."""
-    tips = [tip(tank(free(), roll=roll, bend=0.5, bend_angle=angle)) for roll in (0.0, math.pi)]
+    tips = [tip(make_phantom(free(), roll=roll, bend=0.5, bend_angle=angle)) for roll in (0.0, math.pi)]
     for at, sign in zip(tips, (1.0, -1.0), strict=True):
         expected = sign * 0.5 * np.array([math.cos(angle), math.sin(angle)])
         np.testing.assert_allclose(at[[Y, Z]], expected, rtol=1e-4)
@@ -76,18 +76,18 @@ def test_a_bend_is_the_deflection_of_the_free_tip_and_rolls_with_the_needle(angl
 def test_a_run_out_is_across_the_tilted_tip(kind):
     """Along the bevel's direction of the tip, turned by its angle; in the plane exactly without z."""
     pose = {"base_turn": 0.02, "base_psi": -0.03}
-    plain, off = (tank(free(), kind, run_out=size, run_out_angle=0.7, **pose) for size in (0.0, 0.1))
+    plain, off = (make_phantom(free(), kind, run_out=size, run_out_angle=0.7, **pose) for size in (0.0, 0.1))
     theta, psi = tip(off)[[THETA, PSI]]
     frame = Rotation.from_rotvec([0.0, -psi, theta]) * Rotation.from_rotvec([0.7, 0.0, 0.0])
     np.testing.assert_allclose((tip(off) - tip(plain))[:3], frame.apply([0.0, 0.1, 0.0]), atol=1e-12)
     for roll in (0.0, math.pi):
-        assert tip(tank(IDEAL, kind, roll=roll, run_out=0.1))[Z] == 0.0
+        assert tip(make_phantom(IDEAL, kind, roll=roll, run_out=0.1))[Z] == 0.0
 
 
 @both_plants
 def test_a_clamp_out_of_the_plane_moves_the_free_tip_there(kind):
     """By base z, and 150 mm times its slope ψ; also where the controller steers in the plane."""
-    here = tip(tank(free(), kind, base_z=0.4, base_psi=-0.002))
+    here = tip(make_phantom(free(), kind, base_z=0.4, base_psi=-0.002))
     np.testing.assert_allclose(here[[Y, Z]], [0.0, 0.4 - 0.3], atol=1e-5)
     np.testing.assert_allclose(here[[THETA, PSI]], [0.0, -0.002], atol=1e-9)
 
@@ -97,14 +97,14 @@ def test_the_shaft_has_the_torsional_stiffness_of_steel():
     needle = IDEAL.needle
     modulus = 1e3 * needle.youngs_modulus_gpa / 2.6
     expected = modulus * math.pi * needle.outer_diameter**4 / 32.0
-    assert tank()._plant.rod.torsion == pytest.approx(expected, rel=1e-12)
+    assert make_phantom()._plant.rod.torsion == pytest.approx(expected, rel=1e-12)
 
 
 @both_plants
 def test_a_true_load_deflects_the_free_tip(kind):
     """Pl³/3EI in both axes."""
     load = np.array([2e-4, -3e-4])
-    here = tip(tank(free(), kind, load=tuple(load)))
+    here = tip(make_phantom(free(), kind, load=tuple(load)))
     expected = load * 150.0**3 / (3.0 * IDEAL.needle.bending_stiffness)
     np.testing.assert_allclose(here[[Y, Z]], expected, rtol=1e-3)
 

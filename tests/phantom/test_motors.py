@@ -10,15 +10,15 @@ from flexneedle import Control
 from flexneedle.simulator.control import MOVES
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, STILL
+from phantoms import COARSE, make_phantom
 from reference.rods import IDEAL
-from tanks import COARSE, tank
 
 LENGTHS = [DB_X, DB_Y, DB_Z, DG_Y, DG_Z]
 
 
 def rough(grid, scenario=IDEAL):
     """Return a phantom with motors of this resolution and a coarse mesh."""
-    return tank(scenario.with_values({**COARSE, "phantom.motor_resolution_mm": grid}))
+    return make_phantom(scenario.with_values({**COARSE, "phantom.motor_resolution_mm": grid}))
 
 
 @given(

@@ -11,8 +11,8 @@ from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom, evenly_spaced
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, make_plant
 from flexneedle.types import THETA
+from phantoms import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, make_phantom, tip
 from reference.rods import IDEAL
-from tanks import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, tank, tip
 
 # ---- commands and time
 
@@ -20,7 +20,7 @@ from tanks import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, tank, tip
 @both_plants
 def test_a_command_is_executed_in_finer_steps(kind):
     """One roll of the bevel, to and fro, then 1 mm in four equal parts; all columns of travel."""
-    phantom = tank(kind=kind)
+    phantom = make_phantom(kind=kind)
     by_hand = make_plant(kind, Truth(IDEAL), 0.0)
     flipped = Control(1.0, db_y=0.01, db_theta=2e-4, dg_y=0.1, flip=True)
     for number in range(32):
@@ -37,7 +37,7 @@ def test_a_command_is_executed_in_finer_steps(kind):
     ("advance", "parts"), [(0.0, 1), (0.25, 1), (0.26, 2), (0.75, 3), (1.0, 4), (-1.0, 4)]
 )
 def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
-    phantom = driven(tank(), STRAIGHT)
+    phantom = driven(make_phantom(), STRAIGHT)
     advances, step = [], phantom._plant.step
     phantom._plant.step = lambda row: advances.append(row[0]) or step(row)
     driven(phantom, Control(db_x=advance))
@@ -46,7 +46,7 @@ def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
 
 def test_the_tip_is_known_at_any_past_time():
     """Within the last command, within earlier ones, and at rest before the start."""
-    phantom = tank()
+    phantom = make_phantom()
     tips = [tip(phantom)[:3]]
     for _ in range(3):
         driven(phantom, Control(db_x=0.5, dg_y=0.25))
@@ -63,7 +63,7 @@ def test_the_tip_is_known_at_any_past_time():
 
 
 def test_the_tip_does_not_move_during_a_wait():
-    phantom = driven(tank(), AHEAD)
+    phantom = driven(make_phantom(), AHEAD)
     before = phantom.condition()
     phantom.wait(0.5)
     assert phantom.now() == pytest.approx(0.7)
@@ -98,7 +98,7 @@ def test_there_are_two_plants_and_the_exact_one_is_the_default():
     assert set(PLANTS) == {"exact", "model"}
     assert DEFAULT_PLANT == "exact"
     with pytest.raises(InputError, match=r"gel.*exact, model"):
-        tank(kind="gel")
+        make_phantom(kind="gel")
 
 
 # ---- both plants
@@ -110,7 +110,7 @@ def swung():
     commands = [
         Control(db_x=1.0, dg_y=round(-0.25 * math.cos(math.pi * k / 40), 3), flip=k == 44) for k in range(73)
     ]
-    phantoms = {kind: tank(kind=kind) for kind in PLANTS}
+    phantoms = {kind: make_phantom(kind=kind) for kind in PLANTS}
     return {
         kind: [driven(phantom, command).condition() for command in commands]
         for kind, phantom in phantoms.items()
@@ -137,7 +137,7 @@ def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
     stretches = [condition.least_stretch for condition in swung[kind]]
     assert all(np.diff(stretches) <= 0.0)
     assert stretches[0] == 1.0
-    phantom = driven(tank(kind=kind), AHEAD, times=45)
+    phantom = driven(make_phantom(kind=kind), AHEAD, times=45)
     compressed = phantom.condition().least_stretch
     driven(phantom, Control(db_x=-1.0, dg_y=-0.1), times=44)
     assert phantom._plant.least_stretch > compressed
@@ -148,7 +148,7 @@ def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
 
 
 def test_one_failed_step_within_a_command_is_reported_permanently():
-    phantom = driven(tank(), AHEAD, times=3)
+    phantom = driven(make_phantom(), AHEAD, times=3)
     assert phantom.condition().converged
     phantom._plant.state["load"][0] = -100.0  # many times the buckling load
     driven(phantom, Control(db_x=0.25))
@@ -159,11 +159,11 @@ def test_one_failed_step_within_a_command_is_reported_permanently():
 
 def test_a_failed_start_is_reported():
     """Clamped at an angle that is not a number."""
-    assert not tank(base_turn=math.nan).condition().converged
+    assert not make_phantom(base_turn=math.nan).condition().converged
 
 
 def test_the_model_plant_reports_a_failed_step(monkeypatch):
-    phantom = driven(tank(kind="model"), AHEAD)
+    phantom = driven(make_phantom(kind="model"), AHEAD)
     state = type(phantom._plant._state)
     with monkeypatch.context() as patched:
         patched.setattr(state, "converged", property(lambda _: False))
@@ -175,7 +175,7 @@ def test_the_model_plant_reports_a_failed_step(monkeypatch):
 @both_plants
 def test_the_true_shape_is_the_needle_in_points_at_equal_distances(kind):
     """Their number is the model's; they are from the base to the end of the axis, on the chain of the plant's nodes."""
-    phantom = driven(tank(kind=kind, base_y=0.4, base_z=-0.3), AHEAD, times=SKIN + 10)
+    phantom = driven(make_phantom(kind=kind, base_y=0.4, base_z=-0.3), AHEAD, times=SKIN + 10)
     shape, nodes = phantom.condition().shape, phantom._plant.nodes
     assert shape.shape == (IDEAL.needle.nodes, 3)
     spacing = np.linalg.norm(np.diff(shape, axis=0), axis=1)
@@ -203,4 +203,4 @@ def test_a_plant_without_nodes_has_no_shape():
                 raise AttributeError(name)
             return getattr(self._plant, name)
 
-    assert tank(kind=Without).condition().shape is None
+    assert make_phantom(kind=Without).condition().shape is None

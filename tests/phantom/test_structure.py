@@ -10,8 +10,8 @@ from flexneedle import load_scenario
 from flexneedle.errors import ScenarioError
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
+from phantoms import AHEAD, COARSE, both_plants, driven
 from reference.rods import IDEAL
-from tanks import AHEAD, COARSE, both_plants, driven
 
 PHANTOM = load_scenario("phantom")
 NO_GUIDE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})

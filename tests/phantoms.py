@@ -21,7 +21,7 @@ COARSE = {
 both_plants = pytest.mark.parametrize("kind", PLANTS)
 
 
-def tank(scenario=IDEAL, kind="exact", roll=0.0, **truth):
+def make_phantom(scenario=IDEAL, kind="exact", roll=0.0, **truth):
     """A phantom with only these imperfections."""
     return Phantom(Truth(scenario, cell_mm=0.5 * scenario.phantom.contact_spacing_mm, **truth), roll, kind)
 
