@@ -28,9 +28,9 @@ def probability_beyond(limit: float, miss: float | complex, sd: float) -> float:
     return 0.5 * (math.erfc((limit - miss) / scale) + math.erfc((limit + miss) / scale))
 
 
-def format_miss(miss: float | complex) -> str:
+def format_miss(miss: float | complex, digits: int = 3) -> str:
     """Return a miss (mm) as text: with its sign in the plane, its size in space."""
-    return f"{abs(miss):.3f}" if isinstance(miss, complex) else f"{miss:+.3f}"
+    return f"{abs(miss):.{digits}f}" if isinstance(miss, complex) else f"{miss:+.{digits}f}"
 
 
 def reason_to_hold(decision: Decision, control: ControlSettings) -> str:
@@ -65,9 +65,7 @@ def warn_of_miss(decision: Decision, in_a_row: int) -> str:
 
 
 def _format_prediction(decision: Decision) -> str:
-    miss = decision.miss
-    size = f"{abs(miss):.2f}" if isinstance(miss, complex) else f"{miss:+.2f}"
-    return f"{size} ± {decision.miss_sd:.2f} mm"
+    return f"{format_miss(decision.miss, 2)} ± {decision.miss_sd:.2f} mm"
 
 
 def describe_miss(true: float, estimated: float) -> str:
