@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from flexneedle import controls as controls_of
-from flexneedle.results import Action, Insertion, Outcome, Period, Plan, Verdict, VerdictKind
-from flexneedle.types import DG_Y, ROLL, THETA, Control, Measurement, Pose, X, Y
+from flexneedle.results import Action, Insertion, Outcome, Period, Plan
+from flexneedle.types import DG_Y, ROLL, THETA, Control, Measurement, Pose, Verdict, VerdictKind, X, Y
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from flexneedle.record.fields import parse_verdict
-from flexneedle.results import Action, CheckedMeasurement
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.results import Action
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 from synthetic import make_insertion
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

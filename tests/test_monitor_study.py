@@ -7,8 +7,7 @@ import pytest
 
 import monitor as study
 from flexneedle import load_scenario
-from flexneedle.results import CheckedMeasurement
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 from synthetic import make_periods, make_plan
 
 

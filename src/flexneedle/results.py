@@ -19,6 +19,7 @@ from flexneedle.types import (
     ROLL,
     THETA,
     UNKNOWN,
+    CheckedMeasurement,
     Control,
     Floats,
     Lateral,
@@ -26,6 +27,7 @@ from flexneedle.types import (
     Point,
     Pose,
     Shape,
+    Verdict,
     X,
 )
 
@@ -131,41 +133,6 @@ class Plan:
         return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
 
 
-class VerdictKind(StrEnum):
-    """Result of a check of a measurement, or of the field in which it was taken."""
-
-    OK = "ok"
-    MISSING = "missing"
-    NOT_A_NUMBER = "not a number"
-    STALE = "stale"
-    INNOVATION = "innovation"
-    OUT_OF_PLANE = "out of plane"
-    JUMP = "jump"
-    FROZEN = "frozen"
-    FIELD_UNKNOWN = "field not known"
-    FIELD_DISTORTED = "field distorted"
-    FIELD_IN_DOUBT = "field in doubt"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Result of a check, and its reason: the value and its limit; no reason for kind OK."""
-
-    kind: VerdictKind = VerdictKind.OK
-    reason: str = ""
-
-    @property
-    def ok(self) -> bool:
-        """Whether the check passed."""
-        return self.kind is VerdictKind.OK
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.reason}" if self.reason else str(self.kind)
-
-
-OK = Verdict()
-
-
 class Action(StrEnum):
     """Action of the needle in a control period."""
 
@@ -183,14 +150,6 @@ class Outcome(StrEnum):
     HELD = "held"  # bad readings, or no path to the target
     FAILED = "failed"
     INTERRUPTED = "interrupted"
-
-
-@dataclass(frozen=True)
-class CheckedMeasurement:
-    """A tracker reading and its verdict: "ok", or the reason for the rejection."""
-
-    measurement: Measurement
-    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ rows of columns, in arrays, too.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -277,3 +278,46 @@ class Measurement:
         for name, size in (("covariance", 3), ("direction_covariance", 2)):
             if (matrix := getattr(self, name)) is not None:
                 object.__setattr__(self, name, check_covariance(name, matrix, size))
+
+
+class VerdictKind(StrEnum):
+    """Result of a check of a measurement, or of the field in which it was taken."""
+
+    OK = "ok"
+    MISSING = "missing"
+    NOT_A_NUMBER = "not a number"
+    STALE = "stale"
+    INNOVATION = "innovation"
+    OUT_OF_PLANE = "out of plane"
+    JUMP = "jump"
+    FROZEN = "frozen"
+    FIELD_UNKNOWN = "field not known"
+    FIELD_DISTORTED = "field distorted"
+    FIELD_IN_DOUBT = "field in doubt"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a check, and its reason: the value and its limit; no reason for kind OK."""
+
+    kind: VerdictKind = VerdictKind.OK
+    reason: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the check passed."""
+        return self.kind is VerdictKind.OK
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.reason}" if self.reason else str(self.kind)
+
+
+OK = Verdict()
+
+
+@dataclass(frozen=True)
+class CheckedMeasurement:
+    """A tracker reading and its verdict: "ok", or the reason for the rejection."""
+
+    measurement: Measurement
+    verdict: Verdict

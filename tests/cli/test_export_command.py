@@ -10,7 +10,7 @@ from commands import run
 from flexneedle.cli import main as cli
 from flexneedle.record.fields import COLUMNS
 from flexneedle.record.reader import read_trace
-from flexneedle.results import CheckedMeasurement
+from flexneedle.types import CheckedMeasurement
 from synthetic import make_periods
 from synthetic_readings import with_readings
 

@@ -14,8 +14,7 @@ from flexneedle.figures.curves import (
     worst_indicator,
 )
 from flexneedle.record.fields import parse_verdict
-from flexneedle.results import CheckedMeasurement
-from flexneedle.types import ROLL, SPIN, Measurement, X
+from flexneedle.types import ROLL, SPIN, CheckedMeasurement, Measurement, X
 from synthetic import make_insertion, make_plan
 from synthetic_readings import frame_of, held
 

@@ -13,9 +13,8 @@ from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
-from flexneedle.results import VerdictKind
 from flexneedle.simulator.control import limit_half_turn
-from flexneedle.types import Measurement
+from flexneedle.types import Measurement, VerdictKind
 from rooms import STILL
 
 SPACE = load_scenario("phantom").with_values({"setup.axes": 2, "phantom.motor_resolution_mm": 0.0})

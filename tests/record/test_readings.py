@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from flexneedle.record.reader import read_trace
 from flexneedle.record.readings import from_values, to_values
 from flexneedle.record.writer import TraceWriter
-from flexneedle.results import CheckedMeasurement, Verdict
-from flexneedle.types import Measurement
+from flexneedle.types import CheckedMeasurement, Measurement, Verdict
 from synthetic import make_periods, make_plan
 
 NUMBERS = st.floats(-1e6, 1e6)

@@ -21,8 +21,17 @@ from flexneedle.record.messages import joints
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import TOPICS
 from flexneedle.record.writer import TraceWriter
-from flexneedle.results import CheckedMeasurement, Verdict, VerdictKind
-from flexneedle.types import Control, Frame, Measurement, Pose, SensorReading, Shape
+from flexneedle.types import (
+    CheckedMeasurement,
+    Control,
+    Frame,
+    Measurement,
+    Pose,
+    SensorReading,
+    Shape,
+    Verdict,
+    VerdictKind,
+)
 from synthetic import blind, make_periods, make_plan
 
 PLAN = make_plan()

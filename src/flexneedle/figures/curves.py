@@ -12,8 +12,8 @@ from statistics import median
 
 import numpy as np
 
-from flexneedle.results import Action, Insertion, Period, Plan, VerdictKind
-from flexneedle.types import ROLL, SPIN, Floats, Frame, Pose, X, Y
+from flexneedle.results import Action, Insertion, Period, Plan
+from flexneedle.types import ROLL, SPIN, Floats, Frame, Pose, VerdictKind, X, Y
 
 _TIP = "tip"  # the sensor in the needle; all others of a frame are references
 # Verdicts of readings that the monitor excludes from its window.

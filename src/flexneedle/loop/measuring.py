@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.ports import TipTracker
-from flexneedle.results import OK, CheckedMeasurement, Verdict, VerdictKind
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import VISIBLE, Measurement
+from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, Verdict, VerdictKind
 
 _PREDICTION_SDS = 3.0  # standard deviations of the prediction, added to the limit of the innovation
 _NO_MEASUREMENT = Measurement(0.0, None, None)

@@ -14,9 +14,18 @@ from math import degrees, hypot, isfinite
 from typing import Any
 
 from flexneedle.record.messages import Message, joints, number, path, points, pose, table, vector
-from flexneedle.results import Action, CheckedMeasurement, Period, Verdict, VerdictKind
+from flexneedle.results import Action, Period
 from flexneedle.types import COLUMNS as CONTROL
-from flexneedle.types import ROLL, Control, Floats, Measurement, Pose
+from flexneedle.types import (
+    ROLL,
+    CheckedMeasurement,
+    Control,
+    Floats,
+    Measurement,
+    Pose,
+    Verdict,
+    VerdictKind,
+)
 
 _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "sensor_msgs/msg/JointState"
 _NUMBER, _VECTOR = "std_msgs/msg/Float64", "geometry_msgs/msg/Vector3Stamped"

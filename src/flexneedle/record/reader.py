@@ -25,8 +25,8 @@ from flexneedle.record.messages import (
 from flexneedle.record.messages import Path as PathMessage
 from flexneedle.record.readings import from_values
 from flexneedle.record.topics import READINGS, STATUS, TIMING, TOPICS
-from flexneedle.results import CheckedMeasurement, Period
-from flexneedle.types import Floats, Shape, Z
+from flexneedle.results import Period
+from flexneedle.types import CheckedMeasurement, Floats, Shape, Z
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,7 @@ Points and matrices are one text: numbers separated by spaces, rows by semicolon
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from flexneedle.results import CheckedMeasurement, Verdict
-from flexneedle.types import Frame, Matrix, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Frame, Matrix, Measurement, SensorReading, Verdict
 
 _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 _DIRECTION = ("direction_theta_rad", "direction_psi_rad")

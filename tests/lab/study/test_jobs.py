@@ -15,8 +15,7 @@ from flexneedle.lab.study.jobs import InsertionJob, make_plan, run_job
 from flexneedle.lab.study.journal import StudyJournal
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
 from flexneedle.record.results import RESULT_COLUMNS
-from flexneedle.results import Verdict, VerdictKind
-from flexneedle.types import DG_Y, ROLL
+from flexneedle.types import DG_Y, ROLL, Verdict, VerdictKind
 
 
 @pytest.fixture(scope="module")

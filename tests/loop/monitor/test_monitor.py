@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.results import Verdict, VerdictKind
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
 
 RATE = 40.0
 SETTINGS = MonitorSettings()

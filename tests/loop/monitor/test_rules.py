@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.loop.monitor import rules
-from flexneedle.results import Verdict, VerdictKind
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
 
 OK = "ok"
 ORIGIN = (0.0, 0.0, 0.0)

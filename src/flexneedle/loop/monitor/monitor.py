@@ -8,9 +8,8 @@ from statistics import median
 
 from flexneedle.loop.monitor import rules
 from flexneedle.phantom.tracking.table import TIP
-from flexneedle.results import OK, Verdict, VerdictKind
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement, Point
+from flexneedle.types import OK, Frame, Measurement, Point, Verdict, VerdictKind
 
 TipAt = Callable[[float], Point]
 """Predicted position of the tip (mm) at a time (s)."""

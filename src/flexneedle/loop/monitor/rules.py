@@ -9,8 +9,16 @@ from itertools import chain
 from statistics import median
 
 from flexneedle.phantom.tracking.table import TIP
-from flexneedle.results import OK, Verdict, VerdictKind
-from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, is_reference
+from flexneedle.types import (
+    OK,
+    VISIBLE,
+    Frame,
+    Measurement,
+    SensorReading,
+    Verdict,
+    VerdictKind,
+    is_reference,
+)
 
 Position = tuple[float, ...]
 

@@ -8,8 +8,7 @@ import pytest
 from bench_rig import Clock
 from flexneedle.errors import InputError, RigError
 from flexneedle.lab.rig.devices.trackers import aurora, read_run_frames, replay
-from flexneedle.results import CheckedMeasurement
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n5.0,1,tip,1,2,3\n6.0,2,tip,1,2,3\n"
 

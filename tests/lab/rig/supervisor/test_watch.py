@@ -8,9 +8,8 @@ import pytest
 from flexneedle.lab.rig.supervisor.protocol import Expectation
 from flexneedle.lab.rig.supervisor.watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.results import VerdictKind
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
+from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, VerdictKind
 
 NOW = 10.0
 AT_TIP = Expectation((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 3.0)

@@ -9,8 +9,7 @@ from flexneedle.loop.monitor import rules
 from flexneedle.loop.monitor.monitor import Monitor, TipAt
 from flexneedle.phantom.tracking.stage import tip_on_stage
 from flexneedle.ports import Tracker
-from flexneedle.results import OK, Verdict, VerdictKind
-from flexneedle.types import VISIBLE, Measurement, Point
+from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKind
 
 _NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # never good, whatever is expected
 
