@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
@@ -68,7 +68,8 @@ def test_a_long_hold_keeps_no_more_readings_than_a_short_one(estimate):
 
 def test_after_a_hold_the_estimate_is_where_the_readings_are(estimate):
     x, y = estimate.tip[:2]
-    found = held(estimate, 150, lambda now, _: [Measurement(now - DELAY_S, x, y + 0.05)])
+    count = 60 if isinstance(estimate, Identified) else 150
+    found = held(estimate, count, lambda now, _: [Measurement(now - DELAY_S, x, y + 0.05)])
     assert found.tip[1] == pytest.approx(y + 0.05, abs=5e-3)
 
 
