@@ -114,6 +114,7 @@ def test_a_miss_that_was_not_predicted_is_reported_in_the_reason_without_a_warni
     assert done.warning == ""
 
 
+@pytest.mark.long
 def test_an_unreachable_target_is_held(plan):
     """The plan needs a larger guide motion than this rig permits, and the bevel is too weak to compensate."""
     narrow = PHANTOM.with_values(
