@@ -1,7 +1,10 @@
-"""The laws by name, and the layers of a scenario, each by its law."""
+"""The laws by name, and the layers of a scenario, each by its law. A new law is a file here with a `Layer` subclass."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import numpy as np
 from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
@@ -10,8 +13,6 @@ from flexneedle.errors import InputError, make_printable
 from flexneedle.plugins import load_part
 from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.tissue.layer import Layer
-from flexneedle.scenario.tissue.linear import Linear
-from flexneedle.scenario.tissue.ogden import Ogden
 
 DEFAULT = "ogden"
 _FUNCTIONS = ("energy", "force", "stiffness")
@@ -23,7 +24,19 @@ def _is_law(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, Layer) and value is not Layer
 
 
-LAWS: dict[str, type[Layer]] = {"linear": Linear, "ogden": Ogden}
+def _find_laws() -> dict[str, type[Layer]]:
+    """Return the subclasses of Layer in the files of this folder, by the names of their files."""
+    package = __name__.rpartition(".")[0]
+    for file in iter_modules([str(Path(__file__).parent)]):
+        if file.name != "laws":
+            import_module(f"{package}.{file.name}")
+    laws = {law.__module__: law for law in Layer.__subclasses__()}
+    return {
+        module.rpartition(".")[2]: law for module, law in laws.items() if module.startswith(f"{package}.")
+    }
+
+
+LAWS = _find_laws()
 
 
 def _layer(value: Any, _validate: ValidatorFunctionWrapHandler) -> Layer:
@@ -92,5 +105,8 @@ def _broken_rule(layer: Layer) -> str:
     return ""
 
 
-AnyLayer = Annotated[SerializeAsAny[Ogden | Linear], WrapValidator(_layer)]
+if TYPE_CHECKING:
+    AnyLayer = Layer
+else:
+    AnyLayer = Annotated[SerializeAsAny[Union[tuple(LAWS.values())]], WrapValidator(_layer)]  # noqa: UP007
 """A layer of any law; the schema has those that come with the package."""
