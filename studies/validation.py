@@ -72,8 +72,8 @@ def wrapped(text: str) -> str:
 INTRODUCTION = (
     "`python studies/validation.py` (`make validation`) compares the needle of the virtual phantom (`--phantom exact`,"
     " [theory](theory.md), section 11) with closed forms, a second solver and the controller's model. It writes this"
-    " page; the tests assert its values (`pytest tests/phantom`). The page verifies that the equations are solved; only"
-    " an experiment can validate the tissue law and the rules of contact that plant and model share."
+    " page; the tests assert its values (`pytest tests/phantom`). The page verifies that the equations are solved"
+    " correctly; only an experiment can validate the tissue law and contact rules that plant and model share."
 )
 
 
@@ -143,7 +143,7 @@ def needle(found: results.Found) -> list[str]:
     ]
     return [
         "## The needle alone",
-        "A cantilever with a transverse dead load P at its end is compared with the elastica by elliptic integrals"
+        "A cantilever with a transverse dead load P at its end is compared with the elastica from elliptic integrals"
         f" (Bisshopp and Drucker 1945). Errors with {results.SEGMENTS[-1]} segments:",
         table(("PL²/EI", "elastica, y/L", "error x/L", "error y/L", "error θ (rad)"), rows),
         "![Bent cantilevers; error over the number of segments](images/validation-needle.png)",
@@ -161,8 +161,8 @@ def model(found: results.Found) -> list[str]:
     slope = power([gap.angle for gap in last], [gap.lateral for gap in last])
     return [
         "## The controller's model at small angles",
-        "Both formulations carry out the same insertion to 44.5 mm with guide motion and a flip. Bevel offset and guide"
-        " motion are scaled together; segments are 0.125 mm, and the guide is as rigid as in the model. The table has"
+        "Both formulations simulate the same insertion to 44.5 mm with guide motion and a flip. Bevel offset and guide"
+        " motion are scaled together; segments are 0.125 mm, and the guide is as rigid as in the model. The table gives"
         " the largest slope of the tip and the largest distance between the tips:",
         table(
             ("slope (rad), one layer", "distance (mm)", "slope (rad), two layers", "distance (mm)"),
@@ -171,7 +171,7 @@ def model(found: results.Found) -> list[str]:
         "![Distance over the slope, with the third power](images/validation-model.png)",
         "Mirrored commands give the mirror image, so the effect of finite rotations begins with the third power of the"
         f" slope. The fitted power from {last[-1].angle:.3f} to {last[0].angle:.3f} rad is {slope}. At smaller slopes"
-        " the discretisation error dominates, at larger ones higher powers contribute.",
+        " the discretisation error dominates; at larger slopes higher powers contribute.",
     ]
 
 
@@ -209,11 +209,11 @@ def energy(found: results.Found) -> list[str]:
     return [
         "## Energy",
         "Without cutting, energy is conserved: when base and guide move a bent needle at a depth of 28 mm without"
-        " insertion, the relative difference of their work (trapezoidal rule, 40 steps) from the change of the stored"
-        f" energy is at most {small(moved)}.",
+        " insertion, the relative difference between their work (trapezoidal rule, 40 steps) and the change of the"
+        f" stored energy is at most {small(moved)}.",
         "In an insertion to 40 mm with guide motion and a flip, the work of base, guide and the tissue on the bevel is"
         " compared with the stored energy and the energy dissipated by friction. The relative error decreases with the"
-        f" step, without friction with the power {power(results.STEPS, gaps)}:",
+        f" step, without friction at order {power(results.STEPS, gaps)}:",
         table(("step (mm)", *(f"friction {friction:g} mN/mm" for friction in found.balances)), rows),
     ]
 
@@ -227,14 +227,14 @@ def solver(found: results.Found) -> list[str]:
     orders = [power(results.ELEMENTS, column) for column in found.second.T]
     return [
         "## A second solver",
-        "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, with"
-        " equilibrium of forces instead of minimal energy. The test has 48 steps of all inputs with a retraction, two"
+        "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, from"
+        " force equilibrium instead of minimum energy. The test has 48 steps in all inputs with a retraction, two"
         " flips, two layers, varying stiffness, start errors, bend and guide clearance. Largest differences of the"
         " tips:",
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
-        "θ converges with first order: the slope of the last segment is the slope half a segment before the tip. With"
-        f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm; with half the step they"
-        f" differ by {small(found.rubbed[1])} mm, since friction acts along the shape of the needle before the step.",
+        "θ converges at first order: the last segment has the rod's slope half a segment before the tip. With"
+        f" ten times the default friction the tips differ by {small(found.rubbed[0])} mm; with half the step"
+        f" by {small(found.rubbed[1])} mm, since friction acts along the shape of the needle before the step.",
     ]
 
 
@@ -249,8 +249,8 @@ def refinement(found: results.Found) -> list[str]:
     finest = ", ".join(f"{results.SIZES[name][-1]:g}" for name in results.SIZES)
     return [
         "## Refinement of an insertion",
-        "An insertion to 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance of"
-        f" the tip from the result with {finest} mm for element, step and spacing.",
+        "An insertion to 44.5 mm with guide motion and a flip in the paper's phantom without imperfections. The"
+        f" distance is measured from the tip with {finest} mm for element, step and spacing.",
         table(("key of `[phantom]`", "default (mm)", "distance (mm)", "order"), rows),
         "![Error over element, step and spacing; difference from the second solver](images/validation-insertion.png)",
     ]
@@ -267,22 +267,22 @@ def space(found: results.Space) -> list[str]:
             power(1.0 / np.array(in_space.HELIX_SEGMENTS), found.helix),
         ),
     ]
-    buckling = " and ".join(
+    buckling = " and at ".join(
         f"{factor:.3f} times this moment with {share:g} times Euler's load"
         for share, factor in found.twist.items()
     )
     counts = [f"{n}, {m} segments" for n, m in zip(in_space.SEGMENTS, in_space.HELIX_SEGMENTS, strict=True)]
     return [
         "## In space",
-        "Rods of 100 mm with a natural bend, tilted and rolled at their base, have a force in any direction on their"
-        " tip; the table has the largest distance (mm) to the tip by Kirchhoff's equations"
-        " (`tests/reference/kirchhoff.py`). For a twisted helix under its wrench it has the largest unbalanced moment"
+        "Rods of 100 mm with a natural bend, tilted and rolled at their base, carry a tip force in any direction;"
+        " the table gives the largest distance (mm) to the tip from Kirchhoff's equations"
+        " (`tests/reference/kirchhoff.py`). For a twisted helix under its wrench it gives the largest unbalanced moment"
         " per mm over EIκ².",
         table(("problem", *counts, "order"), rows),
         "A straight rod between two clamps, twisted by its base under an axial load, buckles at Greenhill's moment. The"
         f" plant buckles at {buckling}; its second clamp is stiff tissue, which moves by about half a millimetre.",
-        "The roll of the tip lags behind the roll of the base by c l²/2GJ over the inserted length l, for a couple c"
-        f" per mm of friction, and by c l/GJ per mm of the free length: relative error {small(abs(found.lag))}.",
+        "The roll of the tip lags behind the roll of the base by c l²/2GJ over the inserted length l, for a friction"
+        f" couple c per mm, and by c l/GJ per mm of the free length: relative error {small(abs(found.lag))}.",
     ]
 
 
