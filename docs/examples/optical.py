@@ -4,7 +4,7 @@ from flexneedle.devices import VISIBLE, Frame, Section, SensorReading, check_set
 
 
 class Settings(Section):
-    """The keys of [tracker] beside `kind`."""
+    """The keys of [tracker] besides `kind`."""
 
     rate_hz: float = 40.0
     """Frames per second."""
@@ -26,7 +26,7 @@ class Optical:
         return tuple(self.frame(number) for number in numbers)
 
     def frame(self, number):
-        """Return a frame with the time of its measurement and its number, lost frames included."""
+        """Return a frame with its time of measurement and its number, which counts lost frames."""
         tip = SensorReading(position=(-28.5, 0.0, 0.0))
         return Frame(self.start + number / self.rate_hz, number, {"tip": tip})
 
@@ -35,5 +35,5 @@ class Optical:
 
 
 def open_tracker(settings, clock):
-    """Return the started tracker; frames have the times of the clock."""
+    """Start the tracker; frames have the clock's times."""
     return Optical(clock, check_settings(Settings, settings).rate_hz)

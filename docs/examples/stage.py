@@ -10,7 +10,7 @@ CHANNELS = ("X", "Y", "R")
 
 
 class Settings(Section):
-    """The keys of [driver] beside `kind`."""
+    """The keys of [driver] besides `kind`."""
 
     port: str
     """Serial port."""
@@ -45,7 +45,7 @@ class Stage:
         self.time = now
 
     def read(self):
-        """Return the present state of each channel; on hardware, never an old answer."""
+        """Return the present state of each channel; on hardware, never a stale answer."""
         self.advance()
         return {
             channel: MotorState(m.position, m.position, moving=abs(m.goal - m.position) > 0.5, on=m.on)
@@ -83,14 +83,14 @@ class Stage:
         motor.on, motor.goal = on, motor.position
 
     def reconnect(self):
-        """Open a new connection without a motion."""
+        """Open a new connection without moving."""
 
     def close(self):
         """Close the connection; leave the motors unchanged."""
 
 
 def open_stage(settings, channels):
-    """Return the motors of these channels, connected. settings: the table [driver] without `kind`."""
+    """Connect to the motors of these channels. settings: the table [driver] without `kind`."""
     chosen = check_settings(Settings, settings)  # on hardware: open chosen.port
     if unknown := [channel for channel in channels if channel not in CHANNELS]:
         raise RigError(f"channel {', '.join(unknown)}: {chosen.port} has {', '.join(CHANNELS)}")

@@ -115,9 +115,9 @@ def test_changes_by_dotted_key_leave_the_original_unchanged():
     ("change", "message"),
     [
         ({"needle.bevel.offset_mm": -1.0}, "needle.bevel.offset_mm = -1.0: must be at least 0"),
-        ({"tissue.2.alpha": 1.0}, "tissue.2.alpha: no such key, the list has items 0 to 1"),
-        ({"tissue.alpha": 1.0}, "tissue.alpha: no such key, the list has items 0 to 1"),
-        ({"name.first": "a"}, "name.first: no such key, the value above it is not a table"),
+        ({"tissue.2.alpha": 1.0}, "tissue.2.alpha: no such key: the list has items 0 to 1"),
+        ({"tissue.alpha": 1.0}, "tissue.alpha: no such key: the list has items 0 to 1"),
+        ({"name.first": "a"}, "name.first: no such key: the value above it is not a table"),
         ({"needle.colour": "red"}, 'needle.colour = "red": unknown key'),
     ],
 )

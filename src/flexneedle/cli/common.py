@@ -25,7 +25,7 @@ SWITCHED_ON = (
 """Notice before any motion of a rig."""
 ARMS = f"{SWITCHED_ON} Ctrl-C stops."
 """Printed before any motion of a rig."""
-STILL_IN = "the needle stays where it is: withdraw it by flexneedle rig retract {rig}"
+STILL_IN = "the needle stays in place: withdraw it with flexneedle rig retract {rig}"
 """Notice of a needle that is left in; rig: as the user gave it."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""
@@ -186,7 +186,7 @@ def print_problems(folder: Folder) -> Iterator[None]:
 def require_terminal() -> None:
     """Raise InputError if there is no terminal on which motions could be confirmed."""
     if not sys.stdin.isatty():
-        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
+        raise InputError("no terminal to confirm the motion: use --yes to move without asking")
 
 
 def confirm_motions(lines: Iterable[str], question: str) -> None:

@@ -19,7 +19,7 @@ def add_parser(commands: Commands) -> None:
         "flexneedle view runs/mine --html",
         "flexneedle view runs/accuracy --row 17",
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run, or with --row of a study")
+    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run, or of a study with --row")
 
 
 def draw(args: argparse.Namespace) -> int:

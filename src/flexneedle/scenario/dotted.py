@@ -45,7 +45,7 @@ def set_value(values: dict[str, Any], key: str, value: Any) -> None:
 
 def _item(table: Any, part: str | int, key: str) -> Any:
     if not isinstance(table, list):
-        raise ScenarioError(f"{key}: no such key, the value above it is not a table")
+        raise ScenarioError(f"{key}: no such key: the value above it is not a table")
     if not isinstance(part, int) or part >= len(table):
-        raise ScenarioError(f"{key}: no such key, the list has items 0 to {len(table) - 1}")
+        raise ScenarioError(f"{key}: no such key: the list has items 0 to {len(table) - 1}")
     return table[part]

@@ -98,7 +98,7 @@ def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Prob
             rule = f"no free entry brings it and target.lateral_z_mm both within {most:g} mm, in reach of the {mover}"
             yield Problem("target.lateral_mm", lateral, rule)
     if setup.axes == 1 and target.lateral_z_mm != 0.0:
-        rule = "must be 0 with setup.axes = 1, a needle in the plane; setup.axes = 2 is one in space, as in phantom3d"
+        rule = "must be 0 with setup.axes = 1 (in the plane); for a needle in space set setup.axes = 2"
         yield Problem("target.lateral_z_mm", target.lateral_z_mm, rule)
 
 

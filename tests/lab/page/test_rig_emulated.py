@@ -136,7 +136,7 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
             client.do("prepare")
             moves = rig_is(client, "ready")["moves"]
             assert moves[0].startswith(
-                "Emulated rig: the needle will be inserted from where it is, to a target 20 mm"
+                "Emulated rig: the needle will be inserted from its present position to a target 20 mm"
             )
             assert moves[1] == "insertion: at 0 mm, moves at most at 10 mm/s"
             assert client.refused("go") == "Emulated rig is not armed: arm it first"

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
 POSITIONS = {"insertion": 30.0, "rotation": 0.0, "guide_y": -1.5}
 INSERT = ("insert", "phantom", "--rig", "rig.toml", "--out", "run")
-STAYS = "flexneedle: the needle stays where it is: withdraw it by flexneedle rig retract rig.toml"
+STAYS = "flexneedle: the needle stays in place: withdraw it with flexneedle rig retract rig.toml"
 REGISTRATION = {
     "rotation": [0.5, 0.5, 0.5, 0.5],
     "translation_mm": [220.0, 0.0, 0.0],

@@ -89,7 +89,7 @@ def test_half_turns_alternate_and_do_not_drift():
 
 def test_a_half_turn_that_was_interrupted_ends_the_insertion_unless_it_did_not_begin():
     driver = SupervisedDriver(Axes(-1.0), PHANTOM, 0.0)
-    with pytest.raises(DriverError, match=r"interrupted at 122\.7° of 180°: the bevel is not known"):
+    with pytest.raises(DriverError, match=r"interrupted at 122\.7° of 180°: the bevel angle is unknown"):
         driver.apply(Control(flip=True), 0.2)
     none = SupervisedDriver(Axes(-math.pi), PHANTOM, 0.0).apply(Control(flip=True), 0.2)
     assert none.control.roll == 0.0

@@ -51,7 +51,7 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     why = "stopped: ROS topic /flexneedle/stop"
     assert errors[-2] == f"flexneedle: interrupted: {why}; record: {insertion.out}"
     assert errors[-1].startswith(
-        "flexneedle: the needle stays where it is: withdraw it by flexneedle rig retract "
+        "flexneedle: the needle stays in place: withdraw it with flexneedle rig retract "
     )
     assert (insertion.stored["status"], insertion.stored["reason"]) == ("interrupted", why)
     stopped = insertion.stored["timing"]["ticks"]["states"][-1]  # by the supervisor, not at the next period

@@ -59,7 +59,7 @@ def _add_aurora(commands: Commands) -> None:
         "--firmware", metavar="TEXT", help="firmware tag in the reply to VER (default: AURORA Rev 008)"
     )
     aurora.add_argument(
-        "--no-bx", action="store_true", help="do not support binary readings (BX), as old firmware"
+        "--no-bx", action="store_true", help="do not support binary readings (BX), like old firmware"
     )
     add_seed(aurora, "seed of jitter and corrupted bytes")
 
@@ -82,7 +82,7 @@ def _add_galil(commands: Commands) -> None:
         "--port", type=_port, default=0, metavar="N", help="port to listen on (default: any free port)"
     )
     _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
-    add_seed(galil, "seed of the changed bytes")
+    add_seed(galil, "seed of corrupted bytes")
 
 
 def _add_rig(commands: Commands) -> None:

@@ -18,7 +18,7 @@ def add_parser(commands: Commands) -> None:
         _report,
         "flexneedle report runs/accuracy",
         "flexneedle report runs/mine --out mine --json",
-        about="Write the report of a study: an HTML page and its figures. The study may be interrupted; "
+        about="Write the report of a study: an HTML page and its figures. The study may be unfinished;  "
         "after kill -9, run `flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")

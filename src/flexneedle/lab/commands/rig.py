@@ -104,7 +104,7 @@ def _add_home(commands: Commands) -> None:
         _home,
         "flexneedle rig home rig.toml",
         "flexneedle rig home rig.toml insertion --yes",
-        about="Home axes by the key home of the rig file, one after another, insertion first. Use it "
+        about="Home axes as set by home in the rig file, one after another, insertion first. Use "
         "only without a needle in tissue. Asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)

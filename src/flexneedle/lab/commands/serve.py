@@ -54,7 +54,7 @@ def add_parser(commands: Commands) -> None:
         "--host",
         default=_HOST,
         metavar="HOST",
-        help="address to listen on; other addresses than loopback require the token in the printed address "
+        help="address to listen on; addresses other than loopback require the token in the printed address "
         "(default: 127.0.0.1)",
     )
     parser.add_argument(

@@ -103,7 +103,7 @@ class Axis(Section):
 
     @property
     def max_error(self) -> float:
-        """Largest difference of commanded and measured position, mm or rad."""
+        """Largest difference between commanded and measured position, mm or rad."""
         usual = min(self.size * self.usual_error, _LAG_S * self.speed)
         return self.size * self._setting("max_error_{}") or max(usual, _TOLERANCES * self._usual_tolerance)
 
@@ -149,8 +149,8 @@ class LinearAxis(Axis):
     backlash_mm: NonNegative = 0.0
     """Lost motion when the motor reverses."""
     max_error_mm: Positive | None = None
-    """Largest difference of commanded and measured position; a larger one is a fault. Not set: the distance of 40 ms at
-    `speed_mm_s`, at most 0.2 mm, at least four default tolerances."""
+    """Largest difference between commanded and measured position; a larger one is a fault. Not set: the distance of 40
+    ms at `speed_mm_s`, at most 0.2 mm, at least four default tolerances."""
     tolerance_mm: Positive | None = None
     """Distance from the goal within which a motion has arrived. Not set: 3 counts, 0.02 to 0.1 mm."""
 
@@ -176,7 +176,7 @@ class RotaryAxis(Axis):
     backlash_deg: NonNegative = 0.0
     """Lost motion when the motor reverses."""
     max_error_deg: Positive | None = None
-    """Largest difference of commanded and measured angle; a larger one is a fault. Not set: the angle of 40 ms at
+    """Largest difference between commanded and measured angle; a larger one is a fault. Not set: the angle of 40 ms at
     `speed_deg_s`, at most 5°, at least four default tolerances."""
     tolerance_deg: Positive | None = None
     """Angle from the goal within which a roll has arrived. Not set: 3 counts, 1° to 2°."""

@@ -44,7 +44,7 @@ class DeviceSection(Section):
 
 
 class LoopSettings(Section):
-    """Section `loop`: times of the supervisor and the decisions."""
+    """Section `loop`: timing of the supervisor and the decisions."""
 
     rate_hz: Annotated[float, Field(ge=_SLOWEST_HZ, le=_FASTEST_HZ)] = 40.0
     """Rate at which tracker and motors are read and checked and targets are sent."""
@@ -52,9 +52,9 @@ class LoopSettings(Section):
     """Time of the motion queued in the motors, which they complete if the computer fails. Not set: three ticks, 75 to
     100."""
     queue_mm: Positive = 0.5
-    """Largest distance of that motion, for linear axes: a faster axis is slowed down. At least twice each tolerance."""
+    """Largest queued distance, for linear axes: a faster axis is slowed down. At least twice each tolerance."""
     decision_ms: Positive = 200.0
-    """Time for a decision. After it the needle rests until the decision arrives, and the period counts as late."""
+    """Time for a decision. Then the needle rests until the decision arrives, and the period counts as late."""
     decision_limit_s: Positive = 2.0
     """Time without a command after which the insertion is stopped."""
 
@@ -93,7 +93,7 @@ class RosSettings(Section):
     profile: Annotated[str, Field(max_length=1000), AfterValidator(one_line)] = "neutral"
     """Name or file of the profile."""
     arm: bool = False
-    """Arm the rig only after an arm on its topic, and stop if the ROS node is lost."""
+    """Arm the rig only after a message on the arm topic, and stop if the ROS node is lost."""
     target: bool = False
     """Take the target from its topic, before planning."""
 
@@ -124,7 +124,7 @@ def _queue_problems(rig: RigFile) -> Iterator[Problem]:
     name, axis = max(linear, key=lambda one: one[1].tolerance)
     least = _LEAST_QUEUE * axis.tolerance
     if rig.loop.queue_mm < least * (1.0 - _ROUNDING):
-        rule = f"must be at least {axis.shown(least)}, twice tolerance_mm of axes.{name}: a motor may rest within one"
+        rule = f"must be at least {axis.shown(least)}, twice tolerance_mm of axes.{name}: a motor may rest one away"
         yield Problem("loop.queue_mm", rig.loop.queue_mm, rule)
 
 

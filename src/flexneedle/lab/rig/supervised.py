@@ -187,7 +187,7 @@ class SupervisedDriver:
             return 0.0, 0.0
         if min(abs(turned), abs(turned - roll)) > self._tolerance:
             at = f"{math.degrees(turned):.1f}° of {math.degrees(roll):.0f}°"
-            raise DriverError(f"the roll was interrupted at {at}: the bevel is not known")
+            raise DriverError(f"the roll was interrupted at {at}: the bevel angle is unknown")
         return (roll if abs(turned) > self._tolerance else 0.0), 0.0
 
     @property
@@ -262,9 +262,7 @@ class SupervisedRig(RigSource):
         if rig.ros is not None and not any(
             getattr(one, "hears_ros_stops", False) for one in stream.listeners
         ):
-            raise RigError(
-                "ros: nothing listens to the stop of this section: add a Bridge(rig.ros) to the listeners"
-            )
+            raise RigError("ros: nothing listens to the stop topic: add a Bridge(rig.ros) to the listeners")
         scenario = with_registration(rig, scenario)
         task = SupervisorTask(
             rig,

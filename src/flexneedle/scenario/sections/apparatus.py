@@ -163,7 +163,7 @@ class Entry(Section):
     slope_z_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dz/dx of the axis."""
     free_radius_mm: NonNegative = 0.0
-    """Largest distance that the planner may move the entry point. 0: fixed."""
+    """Largest displacement of the entry point by the planner. 0: fixed."""
     free_slope_mrad: float = Field(default=0.0, ge=0.0, le=STEEPEST_MRAD)
     """Largest change of the slope by the planner. 0: fixed."""
 

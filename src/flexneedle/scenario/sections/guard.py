@@ -8,11 +8,11 @@ from flexneedle.scenario.sections.fields import Positive, Section
 
 
 class GuardSettings(Section):
-    """Section `guard`: limits of the predicted state. A command that would exceed them is not carried out."""
+    """Section `guard`: limits on the predicted state. A command that would exceed them is not carried out."""
 
     least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Least stretch λ of the tissue along the needle. Not set: at 19/20 of the compression limit of each
-    layer's law (0.335 for `ogden`)."""
+    """Least stretch λ of the tissue along the needle. Not set: the stretch at 19/20 of the compression limit of
+    each layer's law (0.335 for `ogden`)."""
     needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 1.0
     """Largest bending strain of the needle's surface."""
     guide_force_n: Positive | None = None

@@ -8,7 +8,7 @@ from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, 
 
 
 class MonitorSettings(Section):
-    """Section `monitor`: limits beyond which the needle is held. The first is from paper section IV-B."""
+    """Section `monitor`: limits beyond which the needle is held. `indicator_limit` is from the paper, section IV-B."""
 
     enabled: bool = True
     """Whether the checks of this section run. Missing, stale and improbable readings are always rejected."""
@@ -16,9 +16,9 @@ class MonitorSettings(Section):
     """Limit of a reference's indicator, the relative error of its coils' distance. Above it the field is
     distorted."""
     indicator_window_s: Positive = 1.0
-    """Time of the median that is compared with the limit."""
+    """Window of the median that is compared with the limit."""
     doubt_window_s: Positive = 0.2
-    """Shorter time of the same median; while it is above the limit no reading corrects the model."""
+    """Window of a shorter median; while this is above the limit, no reading corrects the model."""
     resume_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Share of the limit below which all indicators must fall before a held needle continues."""
     abort_after_s: Positive = 10.0

@@ -83,7 +83,7 @@ class ControlSettings(Section):
     start_angle_sd_mrad: NonNegative = 3.0
     """Prior standard deviation of the base's slope at the start."""
     innovation_limit_mm: Positive = 2.0
-    """Innovation limit, plus three standard deviations of the prediction; readings beyond it are rejected."""
+    """Readings whose innovation exceeds this value plus three standard deviations of the prediction are rejected."""
     start_axial_sd_mm: NonNegative = 1.0
     """Prior standard deviation of the tip's axial position at the start."""
     miss_limit_mm: Positive = 2.0
@@ -93,7 +93,7 @@ class ControlSettings(Section):
     hold_limit_s: Positive = 1.0
     """Time without a valid reading, or without a path to the target, after which the insertion ends."""
     hold_total_s: Positive = 300.0
-    """Total time of all holds after which the insertion ends."""
+    """Total hold time after which the insertion ends."""
     stale_after_s: Positive = 0.3
     """Age above which a reading is rejected."""
 

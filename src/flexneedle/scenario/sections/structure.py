@@ -15,7 +15,7 @@ _SECTION = "phantom.structure."
 
 
 class HiddenLayer(Section):
-    """Section `phantom.structure.hidden_layer`: a layer of another modulus that the scenario does not have."""
+    """Section `phantom.structure.hidden_layer`: a layer of different modulus that the scenario lacks."""
 
     top_mm: Annotated[NonNegative, Field(examples=[10.0])]
     """Depth of the upper boundary."""

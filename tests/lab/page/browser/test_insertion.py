@@ -156,7 +156,7 @@ def test_decisions_are_listed_where_their_words_change(panel, server):
 
 
 MOVES = [
-    "Bench: the needle will be inserted from where it is, to a target 40 mm deep.",
+    "Bench: the needle will be inserted from its present position to a target 40 mm deep.",
     "insertion: at 30 mm",
 ]
 

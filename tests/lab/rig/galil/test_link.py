@@ -129,7 +129,7 @@ def test_an_old_reply_is_never_that_to_a_new_command():
 
 
 @pytest.mark.parametrize(
-    ("sent", "problem"), [(b" 17.0000\r\n", "not asked for.*before TPA"), (b"", "closed the connection")]
+    ("sent", "problem"), [(b" 17.0000\r\n", "unsolicited.*before TPA"), (b"", "closed the connection")]
 )
 def test_a_message_or_an_end_between_two_commands_is_noticed_before_the_second_is_sent(sent, problem):
     with socket.create_server(("127.0.0.1", 0)) as listening:

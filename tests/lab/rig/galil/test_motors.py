@@ -73,7 +73,7 @@ def test_a_controller_without_an_echo_to_switch_off_is_accepted():
         ("\x12\x16", b" RIO47162 Rev 1.1l\r\n:", "RIO47162"),
         (SETUP_QUERY, b" 7.0000 1000.0000\r\n: 1.0000\r\n:", "PF 7"),
         (SETUP_QUERY, b" 10.0000 500.0000\r\n: 1.0000\r\n:", "TM 500"),
-        (SETUP_QUERY, b" 10.0000 1000.0000\r\n: -2.5000\r\n:", "A is no servo motor"),
+        (SETUP_QUERY, b" 10.0000 1000.0000\r\n: -2.5000\r\n:", "A is not a servo motor"),
         (SETUP_QUERY, b"??", "refused: 0"),
         ("", b"", "refused: 1 Unrecognized command"),  # it has no axis E
     ],

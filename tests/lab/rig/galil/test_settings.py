@@ -51,8 +51,8 @@ def test_an_invalid_setting_is_refused_in_one_line(settings, line):
     [
         (["A", "Q"], 'channel = "Q": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
         (["AB"], 'channel = "AB": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
-        (["A", "A"], 'channel = "A": each axis once'),
-        ([], "channel: at least one"),
+        (["A", "A"], 'channel = "A": must be listed only once'),
+        ([], "channel: needs at least one"),
     ],
 )
 def test_channels_are_axes_of_the_controller(channels, line):

@@ -118,7 +118,7 @@ def test_no_retraction_ends_where_the_base_may_be_at_the_switch(home, most, to):
 @pytest.mark.parametrize(
     ("to", "line"),
     [
-        (30.0, "to 30 mm: must be below 30 mm, where the insertion axis is: it only retracts"),
+        (30.0, "to 30 mm: must be below 30 mm, the present position: the axis only retracts"),
         (31.0, "to 31 mm: must be below 30 mm"),
         (-1.0, "insertion to -1 mm: beyond the soft limits"),
         (0.19, "to 0.19 mm: must be at least 0.2 mm: the reverse limit switch is at 0 mm"),
@@ -144,11 +144,11 @@ def test_a_motion_is_described_in_one_line_with_its_uncertainty():
     turned = rig(axes__insertion__direction=-1, axes__insertion__home_mm=121.5)
     assert str(plan_homings(turned, ["insertion"])[0]) == (
         "insertion: in its positive direction to the reverse limit switch, by at most 133.5 mm at 1 mm/s; "
-        "the position there is called 121.5 mm; then in its negative direction by 3.9 mm at 1 mm/s, off the switch to "
+        "the position there is set to 121.5 mm; then in its negative direction by 3.9 mm at 1 mm/s, off the switch to "
         "117.6 mm. If the switch is active now, first in its negative direction by 3.9 mm at 1 mm/s"
     )
     assert str(plan_homings(RIG, ["rotation"])[0]) == (
-        "rotation: stays where it is, and its position is called 0 deg"
+        "rotation: does not move; its position is set to 0 deg"
     )
     loose = rig(axes__insertion__backlash_mm=0.1, axes__rotation__backlash_deg=0.9)
     assert str(plan_jog(loose, "insertion", "5", 10.0)) == (

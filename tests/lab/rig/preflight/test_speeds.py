@@ -37,7 +37,7 @@ def test_a_step_takes_the_time_that_its_acceleration_needs(acceleration):
 
 def test_a_speed_that_an_axis_does_not_keep_is_printed_with_its_reason():
     assert dict(describe_speeds(slow(10.0, 50.0))) == {
-        "insertion": "5.93 of 10 mm/s: acceleration_mm_s2 = 50 brakes from no more within the queue",
+        "insertion": "5.93 of 10 mm/s: acceleration_mm_s2 = 50 cannot brake a faster axis within the queue",
         "rotation": "360 deg/s",
         "guide_y": "10 mm/s",
     }

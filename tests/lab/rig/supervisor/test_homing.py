@@ -154,7 +154,7 @@ def test_an_axis_that_never_rests_has_no_home_at_its_position():
         motor.position = 4.0 * ((tick + 1) % 2)
         bench.tick()
     done = bench.until(1)
-    assert (done.state, done.why) == (SupervisorState.FAULT, "guide_y: does not rest")
+    assert (done.state, done.why) == (SupervisorState.FAULT, "guide_y: has not come to rest")
     assert bench.calls("define") == []
 
 
@@ -292,7 +292,7 @@ def test_a_home_that_cannot_be_defined_is_a_fault():
     ("keys", "high", "why"),
     [
         ({"home": "reverse-limit", "home_mm": 15.0}, 0.0, "guide_y: both limit switches are active"),
-        ({"home": "absolute"}, math.inf, "guide_y: has an absolute encoder, and no home to search"),
+        ({"home": "absolute"}, math.inf, "guide_y: its absolute encoder needs no homing"),
     ],
 )
 def test_a_search_with_both_switches_active_or_an_absolute_encoder_is_refused(keys, high, why):

@@ -29,7 +29,7 @@ def replace_motor(channel, **changes):
         (lambda stage: stage.define("C", 2000.0), "guide_y: the position jumped by 4.000 mm in 0.025 s"),
         (lambda stage: setattr(stage, "refuses", True), "PAA=5: ? 22 Begin not possible"),
         (lambda stage: setattr(stage, "lost", True), "no reply within 100 ms"),
-        (lambda stage: stage.motors.pop("C"), "the driver reports no state of channel C"),
+        (lambda stage: stage.motors.pop("C"), "the driver reports no state for channel C"),
     ],
 )
 def test_a_fault_of_a_motor_during_a_step_stops_all_of_them(bench, change, why):
@@ -316,7 +316,7 @@ def test_a_motion_without_a_heartbeat_is_stopped(bench):
     bench.move("insertion", 20.0, 2.0)
     bench.tick(30, beat=False)
     assert bench.state is SupervisorState.STOPPED
-    assert bench.why.startswith("no heartbeat of the controller for 0.5")
+    assert bench.why.startswith("no heartbeat from the controller for 0.5")
     assert bench.position("insertion") < 1.3
     bench.assert_rests()
 
@@ -328,7 +328,7 @@ def test_an_insertion_without_a_command_is_stopped(bench):
     assert bench.state is SupervisorState.INSERTING
     bench.tick(5, beat=False)
     assert bench.state is SupervisorState.STOPPED
-    assert bench.why.startswith("no command of the controller for 2.0")
+    assert bench.why.startswith("no command from the controller for 2.0")
 
 
 @pytest.mark.parametrize("stall", [0.1, 0.3, 0.45])

@@ -56,7 +56,7 @@ FAULTS = {
     "silence": FaultKind("commands are carried out, but not answered"),
     "garbled": FaultKind("a byte of each reply is changed"),
     "cut": FaultKind("half of each reply is sent"),
-    "chatter": FaultKind("a message that was not asked for precedes each reply"),
+    "chatter": FaultKind("an unsolicited message precedes each reply"),
     "half-open": FaultKind("nothing is received and nothing answered; the connection stays"),
     "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
     "unplug": FaultKind("connections are closed, and refused for the duration"),

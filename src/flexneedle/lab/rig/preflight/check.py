@@ -179,7 +179,9 @@ def _error_limit_finding(name: str, axis: Axis, setup: MotorSetup) -> Finding:
         return Finding(name, "motor off on error", "no")
     most = axis.shown(axis.max_error)
     rule = (
-        f"below max_error_{axis.unit} ({most}): it comes before the fault" if error < axis.max_error else ""
+        f"below max_error_{axis.unit} ({most}): it would act before the fault"
+        if error < axis.max_error
+        else ""
     )
     return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
 
@@ -188,7 +190,7 @@ def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
     error = abs((state.commanded - state.position) / axis.scale)
     most = axis.max_error
     limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
-    rule = "" if error <= most else f"{limit}: free the axis; the next motion begins where it then is"
+    rule = "" if error <= most else f"{limit}: free the axis; the next motion begins at its position then"
     return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
 
 
@@ -258,5 +260,5 @@ def _needed_sensor_findings(frames: Sequence[Frame], wanted: IntendedInsertion |
         return
     references, needed = sum(map(is_reference, names)), wanted.scenario.monitor.references
     if references < needed:
-        rule = f"monitor.references of the scenario is {needed}: a sensor whose name begins with ref is one"
+        rule = f"monitor.references of the scenario is {needed}: references have names that begin with ref"
         yield Finding("tracker", "reference sensors", str(references), rule)

@@ -265,7 +265,7 @@ def check_start(scenario: Scenario, tip: Point | None) -> Point:
     at = scenario.entry.lateral(x)
     expected = (x, at.real, at.imag)
     if tip is None:
-        raise RigError(f"tip: not measured for {control.hold_limit_s:g} s: it must be before anything moves")
+        raise RigError(f"tip: not measured for {control.hold_limit_s:g} s: measure it before anything moves")
     turned = 1e-3 * control.start_angle_sd_mrad * scenario.needle.length_mm
     sd = math.hypot(control.start_axial_sd_mm, control.start_offset_sd_mm, turned)
     off, limit = math.dist(tip, expected), innovation_limit(scenario, sd)

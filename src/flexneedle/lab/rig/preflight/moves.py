@@ -46,9 +46,7 @@ def require_start(move: AxisMove, position: float) -> None:
     axis, turns = move.axis, (move.goal - position) * move.distance <= 0.0
     if turns or not abs(position - move.start) <= STILL * axis.tolerance:
         now, then = (_with_unit(axis, at) for at in (position, move.start))
-        raise RefusedError(
-            f"{move.name}: is at {now} now, not at {then} any more: nothing was moved; try again"
-        )
+        raise RefusedError(f"{move.name}: is at {now}, no longer at {then}: nothing was moved; try again")
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,11 @@ class AxisHoming:
         axis = self.axis
         home = _with_unit(axis, axis.at_home)
         if axis.to_home == 0:
-            return f"{self.name}: stays where it is, and its position is called {home}"
+            return f"{self.name}: does not move; its position is set to {home}"
         reach, back = homing_reach(axis), position_after_homing(axis) - axis.at_home
         speed = f"at {_with_unit(axis, homing_speed(axis))}/s"
         search = f"in its {_name_direction(reach)} direction to the {_name_switch(axis)}"
-        there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
+        there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is set to {home}"
         off = f"in its {_name_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
         to = f"off the switch to {_with_unit(axis, position_after_homing(axis))}"
         return f"{self.name}: {search}, {there}; then {off}, {to}. If the switch is active now, first {off}"
@@ -102,7 +100,7 @@ def describe_insertion(rig: RigFile, scenario: Scenario, positions: Mapping[str,
     """Return a line for the needle, and one for each axis with its position (mm or rad) and its speed."""
     depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
     to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
-    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
+    first = f"{rig.name}: the needle will be inserted from its present position to a target {to}."
     return [first, *describe_axes(rig, positions)]
 
 
@@ -177,7 +175,7 @@ def plan_retraction(
     if move.distance > -1.0 / abs(axis.scale):
         at = axis.shown(position)
         raise InputError(
-            f"to {axis.shown(goal)} mm: must be below {at} mm, where the insertion axis is: it only retracts"
+            f"to {axis.shown(goal)} mm: must be below {at} mm, the present position: the axis only retracts"
         )
     return move
 

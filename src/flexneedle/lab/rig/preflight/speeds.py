@@ -44,7 +44,7 @@ def _describe_speed(axis: Axis, speed: float) -> str:
     unit, most = axis.unit, axis.shown(axis.speed)
     if speed >= axis.speed * (1.0 - _ROUNDING):
         return f"{most} {unit}/s"
-    why = f"acceleration_{unit}_s2 = {axis.shown(axis.acceleration)} brakes from no more within the queue"
+    why = f"acceleration_{unit}_s2 = {axis.shown(axis.acceleration)} cannot brake a faster axis within the queue"
     return f"{speed / axis.size:.3g} of {most} {unit}/s: {why}"
 
 
@@ -67,8 +67,8 @@ def _pace_rule(axis: Axis, value: float, limits: tuple[float, float], per: str) 
     file = _SHOWN / (counts * axis.size)
     if value * counts < least:
         limit = math.ceil(least * file) / _SHOWN  # rounded to a value that is accepted
-        return f"must be at least {limit:.12g}: the controller takes {least:.12g} counts/{per} and more"
+        return f"must be at least {limit:.12g}: the controller takes at least {least:.12g} counts/{per}"
     if value * counts > most:
         limit = math.floor(most * file) / _SHOWN
-        return f"must be at most {limit:.12g}: the controller takes {most:.12g} counts/{per} and less"
+        return f"must be at most {limit:.12g}: the controller takes at most {most:.12g} counts/{per}"
     return ""

@@ -226,7 +226,7 @@ class RigAxes:
         if missing := [
             drive.axis.channel for drive in self.drives.values() if drive.axis.channel not in states
         ]:
-            raise DriverError(f"the driver reports no state of channel {', '.join(missing)}")
+            raise DriverError(f"the driver reports no state for channel {', '.join(missing)}")
         return MotorReading(states, begun, self._clock.now())
 
     @contextmanager

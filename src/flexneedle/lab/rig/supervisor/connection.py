@@ -111,7 +111,7 @@ class SupervisorConnection:
         """Report of the last tick."""
         with self._locked():
             if self._latest is None:
-                raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
+                raise DriverError(f"the supervisor has not reported: {self._ended or 'it is starting'}")
             return self._latest
 
     @property

@@ -256,9 +256,9 @@ class Supervisor:
     def _check_client(self, now: float) -> None:
         silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
         if self._motion is not None and silent > HEARTBEAT_S:
-            self.stop(f"no heartbeat of the controller for {silent:.2f} s")
+            self.stop(f"no heartbeat from the controller for {silent:.2f} s")
         elif self.state in (SupervisorState.INSERTING, SupervisorState.HOLDING) and silent > limit:
-            self.stop(f"no command of the controller for {silent:.2f} s, limit {limit:g} s")
+            self.stop(f"no command from the controller for {silent:.2f} s, limit {limit:g} s")
 
     # Faults and stops
 
@@ -343,7 +343,7 @@ class Supervisor:
         elif leg.is_overdue(axes.states, now):
             restless = leg.has_arrived(axes.states, now) and motion.released
             missing = f"the motors have not arrived: {leg.describe_missing(axes.states)} from the goal"
-            self._enter_fault(f"{restless.name}: does not rest" if restless else missing)
+            self._enter_fault(f"{restless.name}: has not come to rest" if restless else missing)
         elif motion.home is not None and axes.is_at_switch(motion.home):
             pass  # the motor controller slows it down, and takes no target meanwhile
         else:
@@ -386,7 +386,7 @@ class Supervisor:
             self._define_home(drive, self._axes.home_offset(drive))
             self._finish_motion(now)
         elif now > motion.until:
-            self._enter_fault(f"{drive.name}: does not rest")
+            self._enter_fault(f"{drive.name}: has not come to rest")
 
     def _define_home(self, drive: Drive, shift: float) -> None:
         """Shift the positions of an axis (counts), so that its home is at its position in the rig file."""

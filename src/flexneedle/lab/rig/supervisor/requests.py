@@ -52,7 +52,7 @@ class RequestRules:
         if home.axis not in self.drives:
             return self._missing_axes([home.axis])
         absolute = self.drives[home.axis].axis.home == "absolute"
-        return f"{home.axis}: has an absolute encoder, and no home to search" if absolute else ""
+        return f"{home.axis}: its absolute encoder needs no homing" if absolute else ""
 
     def _travel_problem(self, travel: Mapping[str, float]) -> str:
         """Return the problem of a travel by axis, or "".
@@ -65,7 +65,7 @@ class RequestRules:
         ends = {name: self.at[name] + way for name, way in moved.items()}
         problem = range_problem(self.drives, list(ends.items()))
         if not problem and moved.get("insertion", 0.0) > 0.0 and ends["insertion"] > self.deepest + _ROUNDING:
-            deepest = f"{self.deepest:.3f} mm, as far as this insertion may go"
+            deepest = f"{self.deepest:.3f} mm, the limit of this insertion"
             return f"insertion = {ends['insertion']:.3f} mm: must be at most {deepest}"
         return problem
 

@@ -32,7 +32,7 @@ def add_parser(commands: Commands) -> None:
         _check,
         "flexneedle em check power.csv",
         "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
-        about="Compare the distortion indicator with the power of the rig off and on, two environments of "
+        about="Compare the distortion indicator with the rig's power off and on, two environments in "
         "one table. Exit status 1 if the mean indicator of a sensor with power on exceeds the "
         "threshold.",
     )

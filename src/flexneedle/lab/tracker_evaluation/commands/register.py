@@ -24,7 +24,7 @@ def add_parser(commands: Commands) -> None:
         _register,
         "flexneedle em register pairs.csv --target 40 5 0",
         "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
-        about="Fit the rigid transform from the tracker's frame to the stage's to pairs of points, with its expected "
+        about="Fit the rigid transform from the tracker's to the stage's frame to pairs of points, and estimate its "
         "errors. Writes a table for a scenario and a figure (docs/tracking/register.md).",
     )
     parser.add_argument(

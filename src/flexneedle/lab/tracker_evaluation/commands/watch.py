@@ -32,7 +32,7 @@ def add_parser(commands: Commands) -> None:
         _watch,
         "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
         "flexneedle em watch --tracker replay:frames.csv@4 --json",
-        about="Print a line per second and per change of the verdict. Ends with Ctrl-C or the end of a replay.",
+        about="Print a line each second and at each change of the verdict. Ends with Ctrl-C or the end of a replay.",
     )
     parser.add_argument(
         "--tracker",

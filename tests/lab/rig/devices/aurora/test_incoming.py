@@ -58,7 +58,7 @@ def test_frames_after_ready_are_delivered_once():
         ([READY], frame(7, 100.1), "requested"),
         ([READY], frame(7, handles=("11",)), "has sensors 11, not 10"),
         ([READY], frame(7, handles=("10", "11")), "has sensors 10, 11, not 10"),
-        ([], ["ready", {"10": ["01", "00"], "11": ["01", "00"]}], "two sensors of one name"),
+        ([], ["ready", {"10": ["01", "00"], "11": ["01", "00"]}], "two sensors with one name"),
     ],
 )
 def test_a_message_out_of_order_or_a_frame_that_is_not_new_is_refused(sent, wrong, text):

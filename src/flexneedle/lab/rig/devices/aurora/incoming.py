@@ -129,7 +129,7 @@ class LinkReceiver:
     def _set_names(self, ports: Mapping[str, tuple[str, str]]) -> None:
         named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
         if len(set(named.values())) < len(named):
-            raise ValueError(f"two sensors of one name: {', '.join(named.values())}")
+            raise ValueError(f"two sensors with one name: {', '.join(named.values())}")
         self._named = named
         with self._lock:
             self._connections += 1

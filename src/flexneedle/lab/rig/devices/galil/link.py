@@ -143,7 +143,7 @@ def _require_silence(connection: socket.socket) -> None:
         data = connection.recv(_LARGEST_REPLY)
         if not data:
             raise ConnectionResetError
-        raise GarbledError(f"data that was not asked for: {data[:40]!r}")
+        raise GarbledError(f"unsolicited data: {data[:40]!r}")
 
 
 def _left(deadline: float) -> float:

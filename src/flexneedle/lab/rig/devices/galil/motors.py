@@ -117,7 +117,7 @@ class GalilMotors:
         for letter, kind in zip(self._letters, kinds, strict=True):
             if abs(kind) not in facts.SERVOS:
                 raise self._unfit_error(
-                    f"{letter} is no servo motor (MT {kind:g}): its position is not measured"
+                    f"{letter} is not a servo motor (MT {kind:g}): its position is not measured"
                 )
         self._read_states(deadline)
 

@@ -66,6 +66,6 @@ def _channel_problems(channels: Sequence[str]) -> Iterator[Problem]:
         if len(channel) != 1 or channel not in AXES:
             yield Problem("channel", channel, f"must be an axis of the controller, one of {', '.join(AXES)}")
         elif channels.count(channel) > 1:
-            yield Problem("channel", channel, "each axis once")
+            yield Problem("channel", channel, "must be listed only once")
     if not channels:
-        yield Problem("channel", None, "at least one")
+        yield Problem("channel", None, "needs at least one")
