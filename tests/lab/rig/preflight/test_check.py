@@ -157,7 +157,7 @@ def test_an_insertion_that_cannot_start_from_here_is_a_problem():
         ("LDB=3", "rotation", "switches in use", "reverse and forward disabled in the controller"),
         ("FLA=119000", "insertion", "controller's limits", "narrower than range_mm, 0 to 120 mm"),
         ("FLC=5000", "guide_y", "controller's limits", "narrower than range_mm, -15 to 15 mm"),
-        ("ERA=100;OEA=1", "insertion", "motor off on error", "below max_error_mm (0.2): it comes before"),
+        ("ERA=100;OEA=1", "insertion", "motor off on error", "below max_error_mm (0.2): it would act before"),
         ("FLA=121000;BLA=-1000;ERA=400;OEA=1", "insertion", "", ""),
     ],
 )
