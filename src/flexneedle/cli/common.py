@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
 
 SWITCHED_ON = (
-    "The motors of all axes are switched on first. One that rests away from its commanded position is switched off "
-    "and on again, and held where it is: support a vertical axis."
+    "The motors of all axes are switched on first. A motor that rests away from its commanded position is switched "
+    "off and on again at its present position: support a vertical axis."
 )
 """Notice before any motion of a rig."""
 ARMS = f"{SWITCHED_ON} Ctrl-C stops."

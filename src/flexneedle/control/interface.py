@@ -170,7 +170,7 @@ def _check_settings(name: str, settings: Any) -> None:
     try:
         settings.model_validate(default.model_dump(mode="json", exclude_none=True))
     except ValidationError as error:
-        rule = "must be of a TOML type: numbers, texts, true, false or lists of them"
+        rule = "must be of a TOML type: numbers, strings, true, false or lists of them"
         raise InputError(f"controller {name}: settings {rule}: {_keys(error)}") from None
 
 

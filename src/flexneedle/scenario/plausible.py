@@ -29,7 +29,7 @@ _ALPHA = Range(
 )
 USUAL = {
     "needle.outer_diameter_mm": Range(0.18, 3.4, _STANDARD),
-    "needle.inner_diameter_mm": Range(0.05, 3.0, f"what walls leave of {_STANDARD}"),
+    "needle.inner_diameter_mm": Range(0.05, 3.0, f"less the walls, {_STANDARD}"),
     "needle.length_mm": Range(13, 200, "from hypodermic to brachytherapy needles, as sold"),
     "needle.youngs_modulus_gpa": Range(
         3, 210, "PEEK 3 to 4 (doi:10.1016/j.biomaterials.2007.07.013), nitinol 28 to 83, steel 190 to 210"
@@ -67,14 +67,14 @@ USUAL = {
     "setup.guide_to_skin_mm": Range(5, 200, "41 in the paper; the ends are our estimate"),
     "setup.tip_to_skin_mm": Range(1, 200, "28.5 in the paper; the ends are our estimate"),
     "setup.stroke_mm": Range(
-        10, 200, f"110 in the paper, 150 of a robot ({_ROBOT}); the ends are our estimate"
+        10, 200, f"110 in the paper, 150 for a robot ({_ROBOT}); the ends are our estimate"
     ),
     "setup.max_guide_travel_mm": _TRAVEL,
     "setup.max_base_travel_mm": _TRAVEL,
     "setup.insertion_speed_mm_s": Range(
         1, 280, "robots from 1 (Hing et al., ICRA 2006), brachytherapy by hand up to 280"
     ),
-    "tracker.rate_hz": Range(1, 1000, "40 of an NDI Aurora; the ends are our estimate"),
+    "tracker.rate_hz": Range(1, 1000, "40 for an NDI Aurora; the ends are our estimate"),
     "tracker.jitter_mm": Range(0.01, 1, "0.07 in the paper; the ends are our estimate"),
     "phantom.friction_mn_per_mm": Range(
         5, 86, "measured in PVC phantoms (Li et al., Procedia Manufacturing 2015;1:866)"

@@ -145,7 +145,7 @@ def named_world(name: str) -> Scenario:
     """Return the world of a name. Raises ScenarioError."""
     found = _NAMED.fullmatch(name)
     if found is None or (found[2] or REAL) not in CASES:
-        rule = f"must be {WORLD}NUMBER, with :CASE, :RIG or :CASE:RIG after it"
+        rule = f"must be {WORLD}NUMBER, with :CASE, :RIG or :CASE:RIG appended"
         rule += f", cases: {', '.join(CASES)}, rigs: {', '.join(RIGS)}"
         raise ScenarioError(f"{make_printable(name)}: {rule}")
     return world(int(found[1]), found[2] or REAL, found[3] or PLANE)

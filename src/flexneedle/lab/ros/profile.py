@@ -224,7 +224,7 @@ def _find_problems(profile: TopicProfile) -> Iterator[Problem]:
     owners: dict[str, str] = {}
     for key, topic in profile.list_topics():
         if (other := owners.setdefault(topic.topic, key)) != key:
-            rule = f"is the topic of {other}, too: a published message must not be read back as a measurement"
+            rule = f"is also the topic of {other}: a published message must not be read back as a measurement"
             yield Problem(f"{key}.topic", topic.topic, rule)
         if isinstance(topic, PlacedTopic) and topic.frame not in profile.frames:
             yield Problem(f"{key}.frame", topic.frame, f"must be one of frames: {known}")

@@ -132,7 +132,7 @@ def open_table(
     except Error as error:
         reason = str(error).splitlines()[0]
         if "state machine" in reason:
-            reason = "lines end in LF and in CRLF, or a quoted field does not end"
+            reason = "lines end in LF and in CRLF, or a quoted field is not closed"
         raise InputError(f"{path}: cannot be read: {reason}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -113,7 +113,7 @@ def switch_problem(drive: Drive, state: MotorState) -> str:
     if not is_at_home(drive, state):
         return ""
     way = abs(position_after_homing(drive.axis) - drive.axis.at_home)
-    why = "it is stuck, or needs more room: a home further beyond the range"
+    why = "it is stuck, or the home must be further beyond the range"
     return (
         f"{drive.name}: the {drive.axis.home} switch is still active {drive.shown(way)} away from it: {why}"
     )

@@ -13,7 +13,7 @@ SERVOS = (1.0, 1.5, 4.0)
 POSITION_FORMAT = 10.0
 """Format of positions (PF): ten digits, no decimals. A shorter one would cut them off."""
 SAMPLE_TIME = 1000.0
-"""Sample time (TM) with which speeds are in counts/s; another one scales all speeds and accelerations."""
+"""Sample time (TM) at which speeds are in counts/s; another scales all speeds and accelerations."""
 
 _UNLIMITED = 2_147_483_647.0
 _SETUP = ("BL", "FL", "ER", "OE", "LD")

@@ -112,7 +112,7 @@ class GalilMotors:
                 f"positions have the format PF {form:g}: set PF {facts.POSITION_FORMAT:g}"
             )
         if sample != facts.SAMPLE_TIME:
-            rule = f"set TM {facts.SAMPLE_TIME:g}, with which speeds are in counts/s"
+            rule = f"set TM {facts.SAMPLE_TIME:g}, so that speeds are in counts/s"
             raise self._unfit_error(f"the sample time is TM {sample:g}: {rule}")
         for letter, kind in zip(self._letters, kinds, strict=True):
             if abs(kind) not in facts.SERVOS:
