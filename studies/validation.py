@@ -228,7 +228,7 @@ def solver(found: results.Found) -> list[str]:
     return [
         "## A second solver",
         "A second solver (`tests/reference/rods.py`) integrates the continuous rod from the tip to the base, from"
-        " force equilibrium instead of minimum energy. The test has 48 steps in all inputs with a retraction, two"
+        " force equilibrium instead of minimum energy. The test moves all inputs in 48 steps with a retraction, two"
         " flips, two layers, varying stiffness, start errors, bend and guide clearance. Largest differences of the"
         " tips:",
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
