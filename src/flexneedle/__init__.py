@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.sections.fields import Section
     from flexneedle.scenario.tissue.layer import Layer
     from flexneedle.simulator.control import controls
-    from flexneedle.simulator.simulator import Simulator
+    from flexneedle.simulator.simulator import Rollout, Simulator
     from flexneedle.simulator.state import State
     from flexneedle.types import (
         DB_PSI,
@@ -108,6 +108,7 @@ __all__ = [
     "Plant",
     "Pose",
     "Rig",
+    "Rollout",
     "RunError",
     "Scenario",
     "ScenarioError",
@@ -162,7 +163,7 @@ _HOMES = {
     "scenario.sections.fields": "Section",
     "scenario.tissue.layer": "Layer",
     "simulator.control": "controls",
-    "simulator.simulator": "Simulator",
+    "simulator.simulator": "Rollout Simulator",
     "simulator.state": "State",
     "types": "DB_PSI DB_THETA DB_X DB_Y DB_Z DG_Y DG_Z PSI ROLL SPIN THETA X Y Z Control Measurement Motion Pose",
 }

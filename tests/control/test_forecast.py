@@ -16,6 +16,7 @@ from flexneedle.control.forecast import (
     warn_of_miss,
 )
 from flexneedle.control.interface import Decision
+from flexneedle.errors import InputError
 from flexneedle.types import STILL
 
 CONTROL = flexneedle.load_scenario("phantom").control
@@ -39,11 +40,16 @@ def test_a_miss_that_is_certain_is_beyond_the_limit_or_not(miss, beyond):
     assert probability_beyond(2.0, miss, 1e-9) == pytest.approx(beyond)
 
 
-@pytest.mark.parametrize(("miss", "sd"), [(math.nan, math.nan), (math.nan, 1.0), (9.0, math.nan)])
+@pytest.mark.parametrize(("miss", "sd"), [(math.nan, math.nan), (math.nan, 1.0)])
 def test_without_a_prediction_there_is_neither_hold_nor_warning(miss, sd):
     assert probability_beyond(LIMIT, miss, sd) == 0.0
     assert reason_to_hold(predicting(miss, sd), CONTROL) == ""
     assert count_likely_misses(predicting(miss, sd), 5) == 0
+
+
+def test_a_predicted_miss_without_a_standard_deviation_is_refused():
+    with pytest.raises(InputError, match="miss_sd"):
+        predicting(9.0, math.nan)
 
 
 def test_where_no_path_was_found_the_needle_is_held():

@@ -49,13 +49,13 @@ def test_a_plan_charges_a_term_by_name_and_passes_the_target_to_one_that_takes_i
     assert "own_costs:guide_speed" not in free.terms
 
 
-def test_a_function_is_recorded_by_its_name(module):
-    module.guide_speed.__module__ = "own_costs"
-    try:
-        scenario = with_terms((module.guide_speed, 0.5))
-    finally:
-        module.guide_speed.__module__ = __name__
-    assert scenario.flat()["plan.own_terms.0.term"] == "own_costs:guide_speed"
+@pytest.mark.parametrize("section", ["plan", "control.ce_mpc", "control.adaptive_mpc"])
+def test_a_function_is_recorded_by_its_name(module, monkeypatch, section):
+    monkeypatch.setattr(module.guide_speed, "__module__", "own_costs")
+    values = with_terms((module.guide_speed, 0.5), section=section).values()
+    for key in section.split("."):
+        values = values[key]
+    assert values["own_terms"][0]["term"] == "own_costs:guide_speed"
 
 
 @pytest.mark.usefixtures("module")
@@ -87,8 +87,23 @@ def test_a_name_that_cannot_be_found_is_refused(name):
     assert caught.value.problems[0].startswith("plan.own_terms[0].term")
 
 
-@pytest.mark.parametrize("wrong", [lambda t: t.energy, lambda t: t.energy.sum(), lambda t: t.no_such_array])
-def test_values_of_another_shape_and_errors_name_the_term(module, wrong):
+def zero_controls(trajectories):
+    trajectories.controls[:] = 1.0
+    return trajectories.energy[:, 0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda t: t.energy,
+        lambda t: t.energy.sum(),
+        lambda t: t.no_such_array,
+        lambda t: t.energy[:, 0] * np.nan,
+        zero_controls,
+    ],
+    ids=["another shape", "a number", "an error", "NaN", "changed arrays"],
+)
+def test_wrong_values_errors_and_changed_arrays_name_the_term(module, wrong):
     module.wrong = wrong
     settings = with_terms(("own_costs:wrong", 1.0)).plan
     arrays = np.zeros((2, 4, 9)), np.zeros((2, 4, 5)), np.zeros((2, 4)), np.ones((2, 4), dtype=bool)

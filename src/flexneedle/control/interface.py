@@ -1,5 +1,6 @@
 """Interface of all controllers: a controller is a `begin` and a `decide`, in one file of `controllers`."""
 
+import cmath
 import math
 import re
 from collections.abc import Callable
@@ -36,9 +37,9 @@ class Decision:
         why: Reason, one line.
         cost: Predicted cost (default: NaN).
         spread: Standard deviation left in the guide step (mm; NaN: none).
-        miss: Lateral miss predicted at the target (mm): y or, in space, y + iz (NaN: not predicted). The loop warns and
-            holds by it.
-        miss_sd: Standard deviation of the miss on an axis, with the corrections to come (mm).
+        miss: Predicted tip minus target (mm) at the target's depth: y or, in space, y + iz (NaN: not predicted). The
+            loop warns and holds by it.
+        miss_sd: Standard deviation of the miss on an axis, with the corrections to come (mm); required with a miss.
         rest: Time (s) for which the needle rests, in place of the command, so that late readings arrive.
         predicted: Shape of the needle at the target, None if it is not predicted; not compared.
         samples: Samples of the search, None without one; not compared.
@@ -62,6 +63,10 @@ class Decision:
         if self.miss_sd < 0.0:
             raise InputError(
                 f"miss_sd = {self.miss_sd}: must be at least 0, or NaN where nothing is predicted"
+            )
+        if math.isnan(self.miss_sd) and not cmath.isnan(self.miss):
+            raise InputError(
+                "miss_sd = nan: a predicted miss must have a standard deviation; 0 if it is certain"
             )
         if not (math.isfinite(self.rest) and self.rest >= 0.0):
             raise InputError(f"rest = {self.rest}: must be finite and at least 0 (s)")
@@ -117,8 +122,7 @@ class Controller:
         arrived: Returns whether the insertion is complete.
         settings: Class of its settings, with a default for each, in the scenario's table `control.<table>`.
         needs_guide: Whether it is refused where the guide may not move.
-        predicts: Whether its decisions predict the miss. The loop then holds by the prediction, and accepts a plan
-            that misses.
+        predicts: Whether its decisions predict the miss, so that the loop accepts a plan that misses.
 
     Raises:
         InputError: A name or settings that cannot be used.

@@ -1,7 +1,7 @@
 """Costs as weighted sums of terms: trajectories, the table of terms, and the cost of each user."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from inspect import signature
 from typing import Any
@@ -165,11 +165,21 @@ def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callabl
 
     def checked(trajectories: Trajectories) -> Floats:
         try:
-            found = np.asarray(value(trajectories), dtype=float)
+            found = np.asarray(value(_lock_arrays(trajectories)), dtype=float)
         except Exception as error:
             raise InputError(f"cost term {name} raises {type(error).__name__}: {error}") from error
         if found.shape != (expected := trajectories.energy.shape[:1]):
             raise InputError(f"cost term {name}: must return an array of shape {expected}, not {found.shape}")
+        if np.isnan(found[trajectories.converged.all(axis=1)]).any():
+            raise InputError(f"cost term {name}: must return numbers, not NaN")
         return found
 
     return checked
+
+
+def _lock_arrays(trajectories: Trajectories) -> Trajectories:
+    """Return the trajectories with arrays that cannot be changed."""
+    views = {each.name: getattr(trajectories, each.name).view() for each in fields(trajectories)}
+    for view in views.values():
+        view.flags.writeable = False
+    return replace(trajectories, **views)

@@ -64,7 +64,7 @@ class ControllerConformance:
 
     def make(self) -> Controller:
         """Return the controller."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def _plan(self) -> Plan:
         return _planned(self.scenario, self.strategy)

@@ -34,7 +34,7 @@ class DriverConformance:
 
     def make(self) -> tuple[Driver, Clock]:
         """Return a driver at rest, and its clock."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def _require_motion(self, motion: object, command: Control, clock: Clock, start: float) -> Motion:
         """Return a motion whose control and times are valid."""

@@ -41,7 +41,7 @@ class MotorsConformance:
 
     def make(self) -> Motors:
         """Return the motors of `channels`, connected and at rest."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def now(self) -> float:
         """Return the time (s) of the motors."""

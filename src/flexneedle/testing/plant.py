@@ -28,7 +28,7 @@ class PlantConformance:
 
     def make(self, truth: Truth, roll: float) -> Plant:
         """Return the plant of a truth, with the roll of the needle (rad) at the start."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def _truth(self) -> Truth:
         return Truth(self.scenario or short_scenario())

@@ -35,7 +35,7 @@ class TipTrackerConformance:
 
     def make(self, scenario: Scenario, phantom: Phantom, rng: np.random.Generator) -> TipTracker:
         """Return the tracker of a phantom; rng: randomness of its noise."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def _made(self, seed: int = 0) -> tuple[TipTracker, Phantom, Scenario]:
         scenario = self.scenario or short_scenario()
@@ -126,7 +126,8 @@ class TipTrackerConformance:
             require_finite("a position", measured)
             off = math.dist(measured, true.point)
             require(
-                off <= self.tolerance_mm, f"the tip at {one.time} s was {true.point}, measured {measured} mm"
+                off <= self.tolerance_mm,
+                f"the position at {one.time} s is {off:.3f} mm off, more than tolerance_mm = {self.tolerance_mm}",
             )
             if one.direction is not None:
                 turned = math.dist(one.direction, (true.theta, true.psi))

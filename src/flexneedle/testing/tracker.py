@@ -39,7 +39,7 @@ class TrackerConformance:
 
     def make(self, clock: Clock) -> Any:
         """Return a tracker with `close`, or a context manager of one."""
-        raise NotImplementedError
+        raise NotImplementedError("make: define it in your class, and return your part")
 
     def make_clock(self) -> Clock:
         """Return the clock of the run (default: real time)."""

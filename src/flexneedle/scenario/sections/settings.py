@@ -16,7 +16,7 @@ from flexneedle.scenario.sections.fields import (
     count,
 )
 from flexneedle.scenario.sections.structure import Structure
-from flexneedle.scenario.sections.weights import with_weights
+from flexneedle.scenario.sections.weights import name_functions, with_weights
 
 
 class Target(Section):
@@ -96,6 +96,11 @@ class ControlSettings(Section):
     """Total hold time after which the insertion ends."""
     stale_after_s: Positive = 0.3
     """Age above which a reading is rejected."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_functions(cls, values: Any) -> Any:
+        return name_functions(values)
 
     @model_validator(mode="after")
     def _check_tables(self) -> Self:

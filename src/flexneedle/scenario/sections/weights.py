@@ -1,7 +1,7 @@
 """Weights of a cost as settings, and cost terms of the user."""
 
-from collections.abc import Callable, Iterable
-from inspect import Parameter, signature
+from collections.abc import Callable, Iterable, Mapping
+from inspect import Parameter, isroutine, signature
 from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, create_model
@@ -14,9 +14,13 @@ from flexneedle.scenario.sections.fields import NonNegative, Section
 _Settings = TypeVar("_Settings", bound=Section)
 
 
-def _with_name(given: Any) -> Any:
-    """Return `module:NAME` for a function; return anything else unchanged."""
-    return f"{given.__module__}:{given.__qualname__}" if callable(given) else given
+def name_functions(given: Any) -> Any:
+    """Return a value with `module:NAME` in place of each function, in tables and lists too."""
+    if isinstance(given, Mapping):
+        return {key: name_functions(value) for key, value in given.items()}
+    if isinstance(given, list | tuple):
+        return type(given)(map(name_functions, given))
+    return f"{given.__module__}:{given.__qualname__}" if isroutine(given) else given
 
 
 def _resolve(name: str) -> TermFunction:
@@ -27,7 +31,7 @@ def _resolve(name: str) -> TermFunction:
     rule = function_rule(function, "trajectories")
     required = [each.name for each in _parameters(function) if each.default is Parameter.empty]
     if rule and required[1:] != ["target"]:
-        raise InputError(rule)
+        raise InputError(rule.replace("(trajectories)", "(trajectories) or (trajectories, target)"))
     return cast(TermFunction, function)
 
 
@@ -52,7 +56,7 @@ class OwnTerm(Section):
 
     term: Annotated[
         str,
-        BeforeValidator(_with_name),
+        BeforeValidator(name_functions),
         AfterValidator(_check_name),
         _choose("a function in a module of the current directory or of a package."),
     ]

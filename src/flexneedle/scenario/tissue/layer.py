@@ -16,7 +16,7 @@ _BEVEL_MARGIN = 0.001
 
 
 class Layer(Section):
-    """One `[[tissue]]`. A law is a subclass, alone in a file of this folder: its parameters and three functions.
+    """One `[[tissue]]`. A law is a subclass with its parameters, `limit`, `energy`, `force` and `stiffness`.
 
     A lateral displacement u of the needle compresses tissue of length h radially by e = |u|/h. A law gives energy,
     force and stiffness over e, divided by k h², k h and k, where k is the stiffness at e = 0, `modulus` w/h for 1 mm of
