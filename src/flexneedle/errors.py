@@ -8,7 +8,7 @@ class FlexneedleError(Exception):
 
 
 class InputError(FlexneedleError):
-    """An input of the user is invalid (exit status 2)."""
+    """A user input is invalid (exit status 2)."""
 
 
 class FileError(InputError):

@@ -273,7 +273,7 @@ class Insertion:
 
     @property
     def summary(self) -> str:
-        """Outcome of the insertion in one line, which begins with "dry run" for one and ends with disturbances."""
+        """Outcome in one line, which begins with "dry run" for a dry run and ends with disturbances."""
         disturbed = f"; disturbed: {self.disturbed}" if self.disturbed else ""
         return f"{'dry run: ' if self.dry_run else ''}{self._ending}{disturbed}"
 

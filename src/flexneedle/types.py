@@ -57,7 +57,7 @@ def wrap_angles(angle: Floats) -> Floats:
 class Pose(NamedTuple):
     """Position x, y, z (mm), and slopes θ = dy/dx and ψ = dz/dx (rad).
 
-    For a needle that is bent far, the slopes are the angle by which it is tilted from x, in the directions y and z.
+    For a strongly bent needle, the slopes are its angle of tilt from x, in the directions y and z.
     """
 
     x: float
@@ -124,7 +124,7 @@ class Control(_Columns):
         dg_y: Motion of the guide along y (mm).
         dg_z: Motion of the guide along z (mm).
         roll: Roll of the needle before the step (rad).
-        spin: Even roll during the step (rad).
+        spin: Uniform roll during the step (rad).
 
     Raises:
         InputError: A value is not a number.

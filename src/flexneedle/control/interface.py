@@ -37,10 +37,10 @@ class Decision:
         why: Reason, one line.
         cost: Predicted cost (default: NaN).
         spread: Standard deviation left in the guide step (mm; NaN: none).
-        miss: Predicted tip minus target (mm) at the target's depth: y or, in space, y + iz (NaN: not predicted). The
-            loop warns and holds by it.
+        miss: Predicted tip minus target (mm) at the target's depth: y or, in space, y + iz (NaN: not predicted).
+            Basis of warnings and holds.
         miss_sd: Standard deviation of the miss on an axis, with the corrections to come (mm); required with a miss.
-        rest: Time (s) for which the needle rests, in place of the command, so that late readings arrive.
+        rest: Time (s) for which the needle rests, instead of the command, so that late readings arrive.
         predicted: Shape of the needle at the target, None if it is not predicted; not compared.
         samples: Samples of the search, None without one; not compared.
 
@@ -109,7 +109,7 @@ class Observer(Protocol):
 class Controller:
     """Definition of a controller.
 
-    Its memory is a frozen value of any type, carried from one period to the next. Without a given function the
+    Its memory is a frozen value of any type, carried from one period to the next. By default the
     estimate is the scenario's model corrected by the readings, the memory is None, and the insertion ends at the target
     depth.
 
@@ -117,11 +117,11 @@ class Controller:
         name: Name as in `--controller`: lower-case letters, digits and hyphens.
         summary: One line for lists.
         observer: Provides the estimate from the readings.
-        decide: Returns the next command and the memory after it.
+        decide: Returns the next command and the new memory.
         begin: Returns the memory at the start.
         arrived: Returns whether the insertion is complete.
         settings: Class of its settings, with a default for each, in the scenario's table `control.<table>`.
-        needs_guide: Whether it is refused where the guide may not move.
+        needs_guide: Whether it is refused if the guide may not move.
         predicts: Whether its decisions predict the miss, so that the loop accepts a plan that misses.
 
     Raises:

@@ -52,7 +52,7 @@ class Estimate(Protocol):
         ...
 
     def move(self, motion: Motion) -> "Estimate":
-        """Return the estimate after a motion as the driver carried it out, which limits of commands do not apply to."""
+        """Return the estimate after a motion as the driver carried it out; limits of commands do not apply."""
         ...
 
     def observe(self, measurements: Sequence[Measurement]) -> "Estimate":

@@ -13,7 +13,7 @@ def plot(record: Plan | Insertion) -> Figure:
     An insertion without a period is drawn as its plan.
 
     Raises:
-        InputError: Another object, or a record without a scenario.
+        InputError: Not a plan or insertion, or without a scenario.
     """
     scenario = scenario_of(record)
     if isinstance(record, Insertion) and record.periods:

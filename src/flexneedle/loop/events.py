@@ -64,7 +64,7 @@ An exception of a listener ends the insertion; raise StoppedError to interrupt i
 
 
 class Gate:
-    """Permission to move: this one never holds. Override what you need."""
+    """Permission to move. This class never holds; override what you need."""
 
     def confirm(self, rig: Any) -> None:
         """Return once the motors may be armed; raise an error to end the insertion before anything moves.

@@ -38,8 +38,8 @@ def insert(
 ) -> Insertion:
     """Execute a plan in closed loop and return the complete record.
 
-    The record is the same for the same seed, except for wall-clock durations. An insertion that ends early has its
-    reason and all periods until then: the outcome is "failed" after a DriverError of driver or tracker, "interrupted"
+    The record is the same for the same seed, except for wall-clock durations. If the insertion ends early, it
+    has the reason and all periods until then: the outcome is "failed" after a DriverError of driver or tracker, "interrupted"
     after a stop at the rig, and "held" after a command that the rig refuses. The driver is stopped at the end, after an
     error and after an interrupt.
 
@@ -49,18 +49,18 @@ def insert(
         plan: Plan to execute.
         seed: Seed of phantom, tracker and controller.
         controller: Name from `flexneedle insert --list`, `module:NAME`, or a Controller.
-        rig: Where the needle is (default: `VirtualRig()`, the scenario's phantom and tracker). A `Rig` has ports of
-            your own; `flexneedle.devices.open_rig` gives the rig of a rig file, from where its motors are.
+        rig: Source of the ports (default: `VirtualRig()`, the scenario's phantom and tracker). A `Rig` has custom
+            ports; `flexneedle.devices.open_rig` gives the rig of a rig file, at its present positions.
         force: Insert even if the plan misses its target, and do not hold if a miss is predicted.
         threads: Threads of rollouts (default: all cores), without effect on the result.
         listeners: Functions that receive each event (`flexneedle.loop.events`).
         gate: Confirms that motors may be armed, and may hold the needle (default: neither).
 
     Raises:
-        InputError: For an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
-            the guide where it may not move.
+        InputError: For an unknown name, an unsuitable object, a plan for another scenario, or a controller without
+            the movable guide that it needs.
         RigError: For a rig that breaks a rule or does not fit the scenario.
-        DriverError: If a device cannot be opened, or not stopped after another error.
+        DriverError: If a device cannot be opened, or stopped after another error.
         StoppedError: If the insertion is stopped before the first motion.
         ScenarioError: For a setting that the controller rejects.
         RunError: If the plan misses its target by more than 1 mm, unless `force` is set or the controller predicts the

@@ -44,10 +44,10 @@ def plan(
     *,
     threads: int | None = None,
 ) -> Plan:
-    """Plan an insertion to a target, the best found by cross-entropy. Same seed, same plan.
+    """Plan an insertion to a target by the cross-entropy method. Same seed, same plan.
 
-    A plan that misses its target although guide or base are free is searched again with wider samples, and the better
-    of the two is returned.
+    If the plan misses its target although guide or base may move, the search is repeated with wider samples, and the
+    better plan is returned.
 
     Args:
         scenario: A scenario, its name or its path, as for `load_scenario`.
@@ -55,9 +55,9 @@ def plan(
         strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
             needle itself, not on a softer one).
         seed: Seed of the search.
-        progress: Called with a dict after each iteration, which has the samples of the search as
-            `planning.horizon.Samples`.
-        threads: Threads of rollouts (default: all cores); changes no result.
+        progress: Called after each iteration with a dict, which includes the samples of the search
+            (`planning.horizon.Samples`).
+        threads: Threads of rollouts (default: all cores), without effect on the result.
 
     Raises:
         ScenarioError: The scenario excludes the target.

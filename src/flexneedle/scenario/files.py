@@ -18,7 +18,7 @@ _REGISTRATIONS = Library("a registration file", error=ScenarioError)
 
 
 def load_scenario(source: str | Path | Scenario) -> Scenario:
-    """Return the scenario of a preset's name, of a world's (`world:100012`) or of a TOML file.
+    """Return the scenario of a preset, a world (`world:100012`) or a TOML file.
 
     A scenario is returned unchanged. The name of a preset means the preset, even if a file of that name exists; a name
     that begins with `world:` is a world.

@@ -22,7 +22,7 @@ def controls(*shape: int, **columns: ArrayLike) -> Floats:
     """Return an array (*shape, 9) of controls: `columns` by name, the others 0.
 
     Raises:
-        InputError: Other names, sizes that are not whole numbers from 0, and values that do not broadcast to the shape.
+        InputError: Unknown names, sizes that are not whole numbers from 0, values that do not broadcast to the shape.
     """
     array = np.zeros((*(check_whole("size", size, 0, _SIZES) for size in shape), len(COLUMNS)))
     for name, values in columns.items():

@@ -121,7 +121,7 @@ class Simulator:
         return self._carry_out(state, np.array([control]))[0]
 
     def replay(self, state: State, controls: ArrayLike) -> tuple[State, Floats]:
-        """Carry out controls (m, 9), m ≥ 1, as repeated `step` does, but without limits.
+        """Carry out controls (m, 9), m ≥ 1, like repeated `step`, but without limits.
 
         Returns the state at the end and the tips (m, 5).
         """
@@ -172,7 +172,7 @@ class Simulator:
         shapes: bool = False,
         axes: ArrayLike | None = None,
     ) -> Rollout:
-        """Run each of N sequences of controls (N, m, 9) from `state`. Equal to repeated `step`, bit by bit.
+        """Run each of N sequences of controls (N, m, 9) from `state`. Bit-identical to repeated `step`.
 
         Args:
             state: The state before the first step.
@@ -185,7 +185,7 @@ class Simulator:
                 axis of the entry).
 
         Raises:
-            InputError: Another shape of the controls.
+            InputError: The controls have a wrong shape.
             CommandError: A value is out of range.
         """
         self._check_mechanics(state)
@@ -254,7 +254,7 @@ class Simulator:
         return total
 
     def load(self, path: str | Path) -> State:
-        """Read a state that `State.save` wrote. Raises StateError with the differing key under another scenario."""
+        """Read a state that `State.save` wrote. Raises StateError with the differing key for another scenario."""
         return load_state(path, self.start())
 
     def _assimilate(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:

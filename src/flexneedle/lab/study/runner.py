@@ -48,16 +48,16 @@ def run_study(
     on_no_workers: Callable[[], None] = lambda: None,
     command: str = "",
 ) -> Path:
-    """Run a study, a shipped name or a TOML file, and return its folder (default: a new one in `runs/`).
+    """Run a study (shipped name or TOML file) and return its folder (default: a new one in `runs/`).
 
     It runs on `workers` processes (default: one per core), or on the Dask cluster at the address `scheduler`;
     `on_no_workers` is called if the cluster has no workers yet, and the study waits for them. `resume` continues
-    the study in `out`. If the study ends early, the finished rows are kept. `runs.parquet` is identical to the bit for
+    the study in `out`. If the study ends early, the finished rows are kept. `runs.parquet` is bit-identical for
     any number of workers and interruptions. `command` is recorded in `study.json`. A script that calls this needs an
     `if __name__ == "__main__"` guard, since workers import it.
 
     Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker
-    dies or has other package versions than this process; KeyboardInterrupt, after the
+    dies or its package versions differ from this process; KeyboardInterrupt, after the
     tables are written, if the user interrupts it.
     """
     require_extra("study", "pyarrow")

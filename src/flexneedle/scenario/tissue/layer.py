@@ -49,7 +49,7 @@ class Layer(Section):
 
     @property
     def modulus(self) -> float:
-        """Initial modulus of the compression (MPa): 3μ, of incompressible tissue that is free to the sides."""
+        """Initial modulus of the compression (MPa): 3μ, for incompressible tissue that is free laterally."""
         return 3.0 * self.shear_modulus
 
     @property
