@@ -39,9 +39,9 @@ def insert(
     """Execute a plan in closed loop and return the complete record.
 
     The record is the same for the same seed, except for wall-clock durations. If the insertion ends early, it
-    has the reason and all periods until then: the outcome is "failed" after a DriverError of driver or tracker, "interrupted"
-    after a stop at the rig, and "held" after a command that the rig refuses. The driver is stopped at the end, after an
-    error and after an interrupt.
+    has the reason and all periods until then: the outcome is "failed" after a DriverError of driver or tracker,
+    "interrupted" after a stop at the rig, and "held" after a command that the rig refuses. The driver is stopped at the
+    end, after an error and after an interrupt.
 
     Args:
         scenario: Scenario, or its name or path as for `load_scenario`. It may differ from the plan's own only in
