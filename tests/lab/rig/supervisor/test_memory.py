@@ -7,7 +7,7 @@ from itertools import count, islice
 from flexneedle.lab.rig.supervisor import protocol
 from stages import Bench
 
-WARM, STEPS = 420, 80
+WARM, STEPS = 420, 40
 
 
 def move(bench, numbers, steps):
@@ -28,10 +28,16 @@ def test_ticks_make_no_cycles_and_keep_no_memory():
     gc.collect()
     gc.disable()
     try:
-        before = sys.getallocatedblocks()
-        move(bench, numbers, STEPS)
-        assert gc.collect() == 0
-        after = sys.getallocatedblocks()  # without Python's free lists, which a collection clears
+        grown = [count_kept_blocks(bench, numbers) for _ in range(3)]
     finally:
         gc.enable()
-    assert after - before < STEPS  # less than one block for each step
+    # Less than half a block for each step. The least: Python and other threads of the tests keep some once.
+    assert min(grown) < STEPS // 2
+
+
+def count_kept_blocks(bench, numbers):
+    """Return the number of memory blocks that steps leave behind, of which no cycles."""
+    before = sys.getallocatedblocks()
+    move(bench, numbers, STEPS)
+    assert gc.collect() == 0
+    return sys.getallocatedblocks() - before  # without Python's free lists, which a collection clears
