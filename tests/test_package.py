@@ -26,6 +26,13 @@ def modules_after(script: str) -> set[str]:
     return set(done.stdout.splitlines()[-1].split())
 
 
+def test_public_modules_are_imported_on_first_use():
+    names = "flexneedle.devices.Bridge.__name__, flexneedle.testing.PlantConformance.__name__"
+    script = f"import flexneedle; print({names})"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.split() == ["Bridge", "PlantConformance"]
+
+
 def test_the_import_loads_no_subpackage():
     loaded = modules_after("import flexneedle")
     assert {name for name in loaded if name.startswith("flexneedle")} == {"flexneedle"}

@@ -14,10 +14,12 @@ if TYPE_CHECKING:
         DriverError,
         FlexneedleError,
         InputError,
+        RigError,
         RunError,
         ScenarioError,
         ScenarioWarning,
         StateError,
+        StoppedError,
     )
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from flexneedle.phantom.draw import Truth
     from flexneedle.phantom.plants import Plant
     from flexneedle.planning.planner import plan
-    from flexneedle.ports import TipTracker
+    from flexneedle.ports import Clock, Driver, TipTracker
     from flexneedle.record.export import to_dataframe
     from flexneedle.record.loading import load
     from flexneedle.record.saving import save
@@ -85,11 +87,13 @@ __all__ = [
     "ROLL",
     "SPIN",
     "THETA",
+    "Clock",
     "CommandError",
     "Control",
     "Controller",
     "Decided",
     "Decision",
+    "Driver",
     "DriverError",
     "Ended",
     "Estimate",
@@ -108,6 +112,7 @@ __all__ = [
     "Plant",
     "Pose",
     "Rig",
+    "RigError",
     "Rollout",
     "RunError",
     "Scenario",
@@ -117,6 +122,7 @@ __all__ = [
     "Simulator",
     "State",
     "StateError",
+    "StoppedError",
     "Task",
     "TipTracker",
     "Trajectories",
@@ -141,7 +147,8 @@ __all__ = [
 _HOMES = {
     "control.interface": "Controller Decision travel_left",
     "costs.table": "Trajectories",
-    "errors": "CommandError DriverError FlexneedleError InputError RunError ScenarioError ScenarioWarning StateError",
+    "errors": "CommandError DriverError FlexneedleError InputError RigError RunError ScenarioError ScenarioWarning "
+    "StateError StoppedError",
     "estimation.estimate": "Estimate",
     "estimation.task": "Task",
     "figures.record": "plot",
@@ -153,7 +160,7 @@ _HOMES = {
     "phantom.draw": "Truth",
     "phantom.plants": "Plant",
     "planning.planner": "plan",
-    "ports": "TipTracker",
+    "ports": "Clock Driver TipTracker",
     "record.export": "to_dataframe",
     "record.loading": "load",
     "record.saving": "save",
@@ -171,7 +178,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its module on first use (PEP 562)."""
+    """Import a public name from its module, or a public module, on first use (PEP 562)."""
+    if name in ("devices", "testing"):
+        return import_module(f".{name}", __name__)
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

@@ -2,9 +2,11 @@
 
 import argparse
 import shlex
+from importlib.metadata import EntryPoint
 
 import pytest
 
+from flexneedle.cli import main
 from flexneedle.cli.main import build_parser
 
 
@@ -27,6 +29,13 @@ def examples_of(parser):
     _before, found, after = parser.format_help().rpartition("\nexamples:\n")
     assert found, "no examples"
     return after.splitlines()
+
+
+def test_a_command_of_a_broken_package_is_reported_and_left_out(capsys, monkeypatch):
+    broken = EntryPoint("broken", "no_such_package:add_parser", "flexneedle.commands")
+    monkeypatch.setattr(main, "entry_points", lambda **_: [broken])
+    assert "usage: flexneedle" in build_parser().format_help()
+    assert "no_such_package" in capsys.readouterr().err
 
 
 def test_all_commands_exist():

@@ -10,13 +10,13 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from flexneedle import __version__
 from flexneedle.cli import export, insert, plan, scenario, view
 from flexneedle.cli.commands import Commands, help_texts
-from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
+from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError, describe_error
 
 _CORE = {"plan": plan, "insert": insert, "view": view, "export": export, "scenario": scenario}
 _ORDER = ("plan", "insert", "serve", "study", "report", "view", "export", "scenario", "em", "rig", "emulate")
@@ -54,7 +54,23 @@ def _adders() -> Iterator[Callable[[Commands], None]]:
     """Yield the functions that add commands, or options to commands, of the core and of installed packages."""
     installed = {point.name: point for point in entry_points(group="flexneedle.commands")}
     for name in sorted({*_CORE, *installed}, key=_place):
-        yield _CORE[name].add_parser if name in _CORE else installed[name].load()
+        if name in _CORE:
+            yield _CORE[name].add_parser
+        elif (add := _load(installed[name])) is not None:
+            yield add
+
+
+def _load(point: EntryPoint) -> Callable[[Commands], None] | None:
+    """Return the function of an entry point; None, and a line on stderr, if its package cannot be imported."""
+    try:
+        add: Callable[[Commands], None] = point.load()
+    except Exception as error:  # noqa: BLE001  whatever an installed package raises
+        print(
+            f"flexneedle: command {point.name} ({point.value}) not loaded: {describe_error(error)}",
+            file=sys.stderr,
+        )
+        return None
+    return add
 
 
 def _place(name: str) -> tuple[int, str]:
