@@ -7,6 +7,8 @@ import decision_time as study
 import flexneedle
 from flexneedle.control.controllers import DEFAULT
 
+pytestmark = pytest.mark.long
+
 TARGET = (25.0, 0.0)
 
 

@@ -7,6 +7,8 @@ import pytest
 import far_targets
 from flexneedle.scenario.worlds import world
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.long
 def test_a_target_that_one_search_misses_is_planned_with_each_width():

@@ -5,6 +5,8 @@ import pytest
 import steering
 from flexneedle.planning.planner import bevel_reach
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("number", [2, 20])
 def test_targets_are_within_the_bevels_reach_at_the_worlds_depth(number):

@@ -52,9 +52,12 @@ def make_task(tmp_path_factory):
         yield make
 
 
+SHARED = f"shared-{os.getpid()}"  # the lock of an address is for the whole machine
+
+
 @pytest.fixture(scope="module")
 def shared(make_task):
-    with RecordingClient(make_task("shared")) as made:
+    with RecordingClient(make_task(SHARED)) as made:
         made.take_signals()
         yield made
 
@@ -220,8 +223,8 @@ def test_motors_are_stopped_after_the_computer_was_suspended(supervisor):
 def test_motors_are_moved_by_one_program_at_a_time(shared, make_task, capfd):
     """The second program is refused before it sends a command. What a driver prints is not on standard output."""
     before = notes_of(shared)
-    with pytest.raises(DriverError, match=rf"^shared: in use by pid {os.getpid()} \(.*: end it first$"):
-        SupervisorClient(make_task("shared"))
+    with pytest.raises(DriverError, match=rf"^{SHARED}: in use by pid {os.getpid()} \(.*: end it first$"):
+        SupervisorClient(make_task(SHARED))
     assert notes_of(shared) == before
     printed = capfd.readouterr()
     assert (printed.out, printed.err) == ("", "the stage is opened\n")
@@ -229,7 +232,7 @@ def test_motors_are_moved_by_one_program_at_a_time(shared, make_task, capfd):
 
 def test_a_dry_run_moves_no_motors_and_a_supervisor_that_is_killed_is_an_error(shared, make_task):
     before = notes_of(shared)
-    with SupervisorClient(replace(make_task("shared"), dry=True)) as dry:
+    with SupervisorClient(replace(make_task(SHARED), dry=True)) as dry:
         dry.arm()
         done = dry.step(0.0, {"insertion": 1.0}, 0.2)
         assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
