@@ -20,6 +20,7 @@ from observed import begun, in_tissue
 
 FAR = {"setup.max_guide_travel_mm": 60.0, "setup.max_guide_step_mm": 2.0}
 ASIDE = Control(dg_y=0.5)
+SPACE = PHANTOM.with_values({"setup.axes": 2})
 
 
 def guard_of(plan, **values):
@@ -104,6 +105,18 @@ def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, 
     assert re.fullmatch(reason, guard.refusal(estimate, worse))
     assert guard.refusal(estimate, back) == ""
     assert guard.refusal(estimate, STILL) == ""
+
+
+@pytest.mark.parametrize("degrees", [45.0, 90.0, 270.0])
+def test_the_force_of_the_guide_is_limited_alike_in_every_direction(plan, degrees):
+    """In air, where the needle is as stiff to all sides."""
+    simulator, angle = Simulator(SPACE, 1), math.radians(degrees)
+    along_y = abs(driven(simulator, simulator.start(), ASIDE, 5).reactions.guide_force[0])
+    command = Control(dg_y=0.5 * math.cos(angle), dg_z=0.5 * math.sin(angle))
+    estimate = estimate_at(driven(simulator, simulator.start(), command, 4))
+    refusal = guard_of(plan, guide_force_n=0.99 * along_y).refusal(estimate, command)
+    assert refusal.startswith("guard: guide force")
+    assert guard_of(plan, guide_force_n=1.01 * along_y).refusal(estimate, command) == ""
 
 
 def test_a_model_that_does_not_converge_is_no_prediction(plan, monkeypatch):

@@ -124,6 +124,11 @@ RULES = [
         1.0,
         "must be at most 0: the reverse-limit switch is at the low end of range_mm",
     ),
+    (
+        "axes.insertion.home",
+        "forward-limit",
+        "must be at least 120: the forward-limit switch is at the high end of range_mm",
+    ),
     ("axes.rotation.home_deg", 191, "must be within range_deg, -10 to 190"),
     ("axes.rotation.home_deg", -10.5, "must be within range_deg, -10 to 190"),
     ("axes.rotation.range_deg", [180, -180], "must be [lowest, highest]"),

@@ -1,12 +1,15 @@
 """The driver of the loop on a supervisor: columns and axes, rolls, limits; and whole insertions on the emulated rig."""
 
+import json
 import math
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,7 +31,7 @@ from flexneedle.results import Action
 from flexneedle.simulator.pace import travel_time
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control
-from stages import Bench
+from stages import RIG, Bench
 from synthetic import make_plan
 from traces import contents
 
@@ -338,6 +341,19 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     assert math.dist(found.tips[-1, :3], done.target) < 0.3
     assert done.periods[-1].true_tip is None
     assert np.mean([period.innovation[0] for period in done.periods]) == pytest.approx(0.0, abs=0.03)
+
+
+@pytest.mark.long
+def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])  # where ros_rig is
+    path, notes = tmp_path / "rig.toml", tmp_path / "notes"
+    devices = {"driver": {"kind": "ros_rig:motors", "notes": str(notes)}, "tracker": {"kind": "ros_rig:Tip"}}
+    path.write_text(tomli_w.dumps(RIG | devices))
+    scenario = PHANTOM.with_values({"setup.tip_to_skin_mm": PHANTOM.setup.tip_to_skin_mm + 9.0})
+    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 4)
+    with pytest.raises(RigError, match=r"tip = -28\.\d.* must be within"):
+        flexneedle.insert(scenario, plan, 0, rig=SupervisedRig(path))
+    assert {json.loads(line)[0] for line in notes.read_text().splitlines()} <= {"stop", "close"}
 
 
 def test_a_listener_that_fails_keeps_no_event_from_the_others():

@@ -1,7 +1,7 @@
 """Insertions that ROS nodes follow, arm, aim and stop: the command in a process, the other nodes in the test."""
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from threading import Thread
 
 import numpy as np
@@ -294,6 +294,18 @@ def test_an_arm_counts_while_it_is_awaited_only(bridge):
     assert "ignored" in ignored
     assert "/flexneedle/arm" in waits
     assert arm == "arm on /arm"
+
+
+@pytest.mark.parametrize("arm", [True, False])
+def test_a_stop_before_the_question_stops_the_rig(bridge, arm):
+    """It arrives while the insertion is planned, before there is a supervisor."""
+    rig, made = Rig(), bridge(Node([RosStop(0.0, "/stop", "")]), arm=arm)
+    until(lambda: listed(made))
+    with suppress(StoppedError):
+        made.confirm(rig)
+    assert rig.stops == ["ROS topic /stop"]
+    with pytest.raises(StoppedError, match=r"^stopped: ROS topic /stop$"):
+        made.check()
 
 
 @pytest.mark.parametrize("arm", [True, False])

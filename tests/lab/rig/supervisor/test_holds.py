@@ -116,6 +116,15 @@ def test_a_reading_is_judged_again_by_the_expectation_of_the_next_step(bench):
     assert bench.until(2).why == ""
 
 
+def test_a_tip_that_is_as_late_as_its_motor_does_not_hold_the_needle(bench):
+    motor = bench.stage.motors["A"]
+    bench.camera.tip = lambda time: (motor.position / 1000.0, 0.0, 1e-3 * time)
+    bench.step(expected=Expectation((0.0, 0.0, 0.0), (4.0, 0.0, 0.0), 1.0), duration=0.8, insertion=4.0)
+    motor.speed = 2500.0  # half of the speed of the step
+    assert bench.until(1).why == ""
+    assert bench.position("insertion") == pytest.approx(4.0, abs=2e-3)
+
+
 def test_a_lasting_jump_holds_the_needle_for_good(bench):
     bench.camera.tip = lambda time: (0.5 * time, 0.0, 0.01 * time)
     bench.step(expected=AHEAD, duration=2.0)

@@ -72,3 +72,26 @@ def test_a_rig_is_armed_where_lost_motion_may_have_left_it_and_otherwise_refused
     if armed:
         bench.step()
         assert bench.until(1).why == ""
+
+
+@pytest.mark.parametrize(
+    ("counts", "low", "why"),
+    [
+        (7600.0, -math.inf, "guide_y = -15.200 mm: must be within"),
+        (100.0, 100.0, "guide_y: the reverse limit switch is active at -0.200 mm"),
+    ],
+)
+def test_a_rig_is_not_armed_where_a_motor_has_moved_as_it_was_switched_on(counts, low, why):
+    bench = Bench()
+    power, motor = bench.stage.power, bench.stage.motors["C"]
+
+    def jerk(channel, on):
+        power(channel, on)
+        if channel == "C":
+            bench.place("C", counts).low = low
+
+    bench.stage.power = jerk
+    bench.armed()
+    assert motor.on
+    assert bench.state is SupervisorState.IDLE
+    assert bench.refusal.startswith(f"arm: refused: {why}")

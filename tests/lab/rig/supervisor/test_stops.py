@@ -259,6 +259,21 @@ def test_an_operator_may_move_an_axis_whose_limit_switch_is_active(side):
     assert bench.state is SupervisorState.ARMED
 
 
+def test_a_known_limit_switch_that_becomes_active_once_more_is_a_fault():
+    bench = Bench(tracked=False)
+    motor = bench.stage.motors["C"]
+    motor.low = 0.0
+    bench.tick()
+    bench.armed().tick()
+    motor.low = -math.inf
+    bench.tick()
+    assert bench.state is SupervisorState.ARMED
+    motor.low = 0.0
+    bench.tick()
+    assert bench.state is SupervisorState.FAULT
+    assert bench.why == "guide_y: at rest, reverse limit switch active"
+
+
 AWAY = ", but the home is at 15.000 mm"
 FREE = math.inf
 
