@@ -74,7 +74,7 @@ class _Upright(HandlerLine2D):
         return [line]
 
 
-class _Arrow(HandlerPatch):
+class _ArrowHandle(HandlerPatch):
     """Draws the mark of arrows as one of them."""
 
     def create_artists(self, *given: Any) -> list[Artist]:
@@ -89,7 +89,7 @@ class _Arrow(HandlerPatch):
         return [arrow]
 
 
-_MARKS: dict[str | None, HandlerBase] = {UPRIGHT: _Upright(), ARROW: _Arrow()}
+_MARKS: dict[str | None, HandlerBase] = {UPRIGHT: _Upright(), ARROW: _ArrowHandle()}
 
 
 def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:

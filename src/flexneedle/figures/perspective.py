@@ -247,7 +247,7 @@ def _draw_paths(ax: Any, insertion: Insertion) -> None:
         _line(ax, true, color=TRUE, linewidth=2.0, zorder=6.5, label="true path")
 
 
-class _Arrow(FancyArrowPatch):
+class _Arrow3D(FancyArrowPatch):
     """An arrow between two points (2, 3) in space."""
 
     def __init__(self, points: Floats, **how: Any) -> None:
@@ -265,7 +265,7 @@ class _Arrow(FancyArrowPatch):
 def _arrow(ax: Any, begin: Floats, end: Floats, color: str, gid: str) -> None:
     style = "Simple,tail_width=1.8,head_width=7,head_length=8"
     how: dict[str, Any] = {"arrowstyle": style, "color": color, "linewidth": 0.0, "zorder": 8}
-    ax.add_artist(_Arrow(np.stack([begin, end]), gid=gid, **how))
+    ax.add_artist(_Arrow3D(np.stack([begin, end]), gid=gid, **how))
 
 
 def _draw_rolls(ax: Any, insertion: Insertion) -> None:
