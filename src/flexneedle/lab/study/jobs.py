@@ -40,7 +40,7 @@ class InsertionJob:
 
 @dataclass(frozen=True)
 class PlanResult:
-    """A plan by field and its planning time (s), or the reason why there is none."""
+    """A plan by field and its planning time (s), or the reason why planning failed."""
 
     values: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
@@ -111,7 +111,7 @@ def insert_at(
     threads: int | None = None,
     listeners: Sequence[Listener] = (),
 ) -> Insertion:
-    """Return an insertion of a point, as `flexneedle.insert` does; threads and listeners are as there."""
+    """Return an insertion of a point. threads, listeners: as in `flexneedle.insert`."""
     with warnings.catch_warnings():
         # The study has checked all tables; a table of another of its controllers is not unused.
         warnings.simplefilter("ignore", ScenarioWarning)

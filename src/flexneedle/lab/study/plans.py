@@ -54,7 +54,7 @@ class StudyPlans:
         return made[1] if made else None
 
     def keep(self, key: str, planned: PlanResult) -> None:
-        """Store a plan, or the reason why there is none."""
+        """Store a plan, or the reason why planning failed."""
         if planned.refusal:
             self.refusals[key] = planned.refusal
         else:

@@ -83,7 +83,7 @@ def bind(host: str, port: int, limits: PageLimits) -> socket.socket:
 
 
 def _is_an_error(record: logging.LogRecord) -> bool:
-    """Return whether a record of uvicorn reports an error; a refused web socket is none."""
+    """Return whether a record of uvicorn reports an error. Refusing a web socket is not an error."""
     return not record.getMessage().startswith("ASGI callable returned without completing handshake")
 
 

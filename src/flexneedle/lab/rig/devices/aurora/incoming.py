@@ -99,7 +99,7 @@ class LinkReceiver:
 
     @property
     def reason(self) -> str:
-        """VISIBLE after a frame, else the reason why there is none."""
+        """VISIBLE after a frame, else the reason why no frame arrives."""
         with self._lock:
             return self._reason
 
