@@ -76,7 +76,7 @@ def inserted(client, pace):
 
 
 @pytest.mark.slow
-def test_everything_is_refused_and_the_insertion_is_not_disturbed(server, monkeypatch):
+def test_attacks_are_refused_and_change_no_row_of_the_insertion(server, monkeypatch):
     monkeypatch.setattr(
         page_clients, "PATIENCE_S", 200.0
     )  # a server and its workers start slowly beside others
@@ -169,4 +169,21 @@ def invalid(server):
     assert ask(server, method="POST", more=b"x" * 5_000_000, Content_Length=5_000_000)[0] in (0, 405)
 
 
-ATTACKS = (strangers, paths, invalid)
+NEED_CONTROL = {
+    "edit": {"values": {"target.depth_mm": 25.0}}, "preset": {"name": "phantom3d"}, "load": {"name": "x", "text": ""},
+    "options": {"seed": 7}, "start": {"work": "plan"}, "rest": {}, "insert": {}, "pace": {"pace": 0.0}, "advance": {},
+    "disturb": {"what": "push", "size": 1.0}, "cancel": {"job": 1}, "save": {"name": "x"}, "open": {"name": None},
+    "steer": {"take": True},
+}  # fmt: skip
+"""Requests that would change the insertion or the page, by type."""
+
+
+def without_control(server):
+    """Requests of a client with the token, while another client is in control."""
+    with Member(server) as client:
+        reason = f"person {client.newest['clients']['steering']} is in control"
+        for type_, values in NEED_CONTROL.items():
+            assert client.refused(type_, **values).startswith(reason)
+
+
+ATTACKS = (strangers, paths, without_control, invalid)
