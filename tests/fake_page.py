@@ -18,7 +18,7 @@ import flexneedle.lab.page
 from flexneedle.lab.page.protocol import DoneMessage, RefusedMessage, ServerMessage
 from flexneedle.lab.page.requests import REQUESTS
 from flexneedle.lab.page.server.access import _with_headers
-from recorded_page import TARGET, opening, people, scene, scene_frames, session
+from recorded_page import TARGET, clients, opening, scene, scene_frames, session
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
 _KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
@@ -164,7 +164,7 @@ class FakePage:
 
     def _consequences(self, request):
         if request["type"] == "steer":
-            return [people(steering=1 if request["take"] else None)]
+            return [clients(steering=1 if request["take"] else None)]
         if request["type"] == "edit" and set(request["values"]) <= set(_KEYS):
             self._revision += 1
             for axis, key in enumerate(_KEYS):

@@ -72,7 +72,7 @@ class Client:
         self._asked = 0
 
     def __enter__(self):
-        self.wait(lambda: "people" in self.newest and "session" in self.newest)
+        self.wait(lambda: "clients" in self.newest and "session" in self.newest)
         return self
 
     def __exit__(self, *_error) -> None:
@@ -107,7 +107,7 @@ class Client:
         self.do("steer", take=True)
         return self
 
-    def listed(self) -> list[str]:
+    def run_names(self) -> list[str]:
         """Return the names of the runs, the newest first; none before the first message."""
         return [run["name"] for run in self.newest.get("runs", {"runs": []})["runs"]]
 

@@ -38,7 +38,7 @@ WELCOME = WelcomeMessage(
 )
 
 
-def people(clients=1, steering=None):
+def clients(clients=1, steering=None):
     return ClientsMessage(clients=clients, steering=steering)
 
 
@@ -227,7 +227,7 @@ def opening(**changes):
     """Return what a new client gets: a scene, nothing planned."""
     return [
         WELCOME,
-        people(),
+        clients(),
         session(**changes),
         scene(),
         *scene_frames(),

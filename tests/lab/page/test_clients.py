@@ -17,8 +17,8 @@ def test_the_control_of_a_lost_client_ends(server):
     with Client(server) as watcher:
         with Client(server) as client:
             client.steer()
-            watcher.has("people", clients=2, steering=client.number)
-        watcher.has("people", clients=1, steering=None)
+            watcher.has("clients", clients=2, steering=client.number)
+        watcher.has("clients", clients=1, steering=None)
 
 
 def recovered(client):
@@ -75,9 +75,9 @@ def test_a_client_that_reads_nothing_is_disconnected_and_the_others_are_served(
         monkeypatch.delattr(socket, "TCP_USER_TIMEOUT", raising=False)
     with served(tmp_path, limits=replace(QUICK, send_s=2.0)) as server, Client(server) as client:
         stuck = SlowClient(server)
-        client.has("people", clients=2)
+        client.has("clients", clients=2)
         client.steer().do("insert")
-        client.has("people", clients=1)
+        client.has("clients", clients=1)
         client.wait(lambda: client.newest.get("frame 1 4") == packed_frame(ROWS - 1))
         client.got_rows(ROWS)
         stuck.socket.socket.close()
@@ -121,10 +121,10 @@ def test_unread_answers_are_limited(tmp_path):
     limits = replace(QUICK, answers=20, send_s=60.0)
     with served(tmp_path, limits=limits) as server, Client(server) as client:
         stuck = SlowClient(server)
-        client.has("people", clients=2)
+        client.has("clients", clients=2)
         for _ in range(3000):
             stuck.socket.send(json.dumps({"type": "preset", "name": "x" * 60, "request": 1}))
-        client.has("people", clients=1)
+        client.has("clients", clients=1)
         client.steer()  # the other client is served
         stuck.socket.socket.close()
 

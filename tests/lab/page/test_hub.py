@@ -16,7 +16,7 @@ from page_frames import unpack_frame
 def joined(hub):
     """Return the outbox of a client that has its first message."""
     outbox = hub.join(ClientsMessage(clients=0, steering=None))
-    assert '"people"' in outbox._take()
+    assert '"clients"' in outbox._take()
     return outbox
 
 
@@ -67,7 +67,7 @@ def test_a_client_gets_the_newest_of_each_key(hub, outbox):
         hub.publish(ClientsMessage(clients=clients, steering=None))
         hub.publish(JobMessage(job=clients, kind="plan", state="running"))
     found = drained(outbox)
-    assert types(found) == ["people", "job"]
+    assert types(found) == ["clients", "job"]
     assert found[0]["clients"] == found[1]["job"] == 999
 
 
@@ -174,7 +174,7 @@ def test_many_rows_are_interleaved_with_other_keys(hub):
     rows(hub, 0, 1000)
     hub.publish(ClientsMessage(clients=1, steering=None))
     found = types(drained(joined(hub)))
-    assert found.index("people") < len(found) - 1 - found[::-1].index("rows")
+    assert found.index("clients") < len(found) - 1 - found[::-1].index("rows")
 
 
 def test_the_end_of_a_job_follows_its_results(hub, outbox):

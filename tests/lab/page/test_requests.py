@@ -21,7 +21,7 @@ def test_a_new_client_gets_the_choices_and_the_first_plan(server):
         assert welcome["presets"] == ["phantom", "phantom3d"]
         assert welcome["controllers"][0]["name"] == "adaptive-mpc"
         assert (welcome["strategies"], welcome["rig"]) == (["manipulation", "steering"], None)
-        client.has("people", clients=1, steering=None)
+        client.has("clients", clients=1, steering=None)
         for key in ("plan manipulation", "scene", "estimate"):
             client.has(key, revision=1)
 
@@ -57,7 +57,7 @@ def test_a_requested_comparison_is_not_replaced_by_the_plan_of_a_rested_scenario
         for name in ("one", "two"):  # each is listed after 0.05 s
             (tmp_path / "runs" / name).mkdir(parents=True)
             (tmp_path / "runs" / name / "run.json").write_text("{}")
-            client.wait(lambda name=name: name in client.listed())
+            client.wait(lambda name=name: name in client.run_names())
         assert client.newest["job compare"]["state"] == "running"
 
 
@@ -78,14 +78,14 @@ def test_only_the_client_in_control_may_ask_for_what_needs_control(shared_server
         for request, values in IN_CONTROL.items():
             assert one.refused(request, **values).startswith("nobody is in control")
         other.steer()
-        one.has("people", clients=2, steering=other.number)
+        one.has("clients", clients=2, steering=other.number)
         for request, values in IN_CONTROL.items():
             assert one.refused(request, **values).startswith(f"person {other.number} is in control")
         for take in (True, False):
             assert one.refused("steer", take=take).startswith(f"person {other.number} is in control")
         other.do("steer", take=False)
         one.steer()
-        other.has("people", steering=one.number)
+        other.has("clients", steering=one.number)
 
 
 def test_an_edit_is_sent_to_all_and_computed(server, client):

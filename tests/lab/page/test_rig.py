@@ -183,7 +183,7 @@ def test_it_is_held_when_control_is_lost_and_never_continues_by_itself(server, w
         inserting(client.steer())
     held = watcher.has("rig", state="holding", why=LOST)
     assert (held["begun"], held["moves"]) == (True, ["wait 2"])
-    watcher.has("people", steering=None)
+    watcher.has("clients", steering=None)
     assert watcher.refused("go").startswith("nobody is in control")
     watcher.steer()
     refuses_to_go(watcher)

@@ -52,12 +52,12 @@ def test_runs_and_studies_are_listed_newest_first(runs):
     many = {"name": "many", "kind": "study", "summary": "Many: 150 insertions", "made": 1767700000.0}
     newer = {"name": "newer", "kind": "insertion", "summary": "Phantom, target 40, 5 mm: failed"}
     older = {"name": "older", "kind": "insertion", "summary": "Phantom, target 40, 5 mm: done, 0.016 mm off"}
-    assert folder.listed() == [many, newer | {"made": 1767355200.0}, older | {"made": 1767268800.0}]
+    assert folder.list_runs() == [many, newer | {"made": 1767355200.0}, older | {"made": 1767268800.0}]
     (runs / "older" / "run.json").write_text(
         json.dumps(RUN | {"status": "held", "timing": {"started": "2026-01-01"}})
     )
-    assert "held" in folder.listed()[2]["summary"]
-    assert RunsFolder(runs / "none").listed() == []
+    assert "held" in folder.list_runs()[2]["summary"]
+    assert RunsFolder(runs / "none").list_runs() == []
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_runs_and_studies_are_listed_newest_first(runs):
 def test_a_damaged_record_is_listed_as_damaged(runs, name, file, texts):
     for text in texts:
         (runs / name / file).write_bytes(text)
-        (entry,) = (entry for entry in RunsFolder(runs).listed() if entry["name"] == name)
+        (entry,) = (entry for entry in RunsFolder(runs).list_runs() if entry["name"] == name)
         assert (entry["kind"], entry["summary"]) == ("damaged", f"{file} cannot be read")
 
 
@@ -88,7 +88,7 @@ def test_no_other_name_is_a_run_or_a_study_or_one_to_save_under(runs):
     folder = RunsFolder(runs)
     for file in ("run.json", "study.json"):
         (runs / "no run" / file).symlink_to(runs.parent / "secret" / "run.json")
-    assert [entry["name"] for entry in folder.listed()] == ["many", "newer", "older"]
+    assert [entry["name"] for entry in folder.list_runs()] == ["many", "newer", "older"]
     assert (folder.run("older"), folder.study("many")) == (runs / "older", runs / "many")
     for find, names in ((folder.run, [*OTHERS, "many"]), (folder.study, [*OTHERS, "older"])):
         for name in names:
@@ -112,9 +112,9 @@ def test_an_archive_has_only_the_files_of_the_run(runs):
 
 
 def test_runs_are_listed_for_clients_also_new_ones(runs, client):
-    client.wait(lambda: client.listed() == ["many", "newer", "older"])
+    client.wait(lambda: client.run_names() == ["many", "newer", "older"])
     write_run(runs / "newest", 20)
-    client.wait(lambda: client.listed()[0] == "newest")
+    client.wait(lambda: client.run_names()[0] == "newest")
 
 
 def test_a_run_is_opened_and_closed(runs, server, client):
@@ -181,7 +181,7 @@ def test_the_last_insertion_is_saved_and_neither_cancelled_nor_replaced_meanwhil
     assert (runs / "mine" / "run.json").exists()
     client.has("insertion live", state="paused")
     (runs / GATE).unlink()
-    client.wait(lambda: "mine" in client.listed())
+    client.wait(lambda: "mine" in client.run_names())
 
 
 def test_files_of_a_run_are_downloaded(runs, server):

@@ -17,10 +17,10 @@ def session():
 
 
 def test_an_edit_changes_values_by_key_and_none_returns_to_the_default(session):
-    edited = session.edited({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0, "target.lateral_mm": 3.0})
+    edited = session.edit_scenario({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0, "target.lateral_mm": 3.0})
     assert edited.revision == session.revision + 1
     assert edited.scenario.target.depth_mm == 35.0
-    message = edited.edited({"target.lateral_mm": None}).describe()
+    message = edited.edit_scenario({"target.lateral_mm": None}).describe()
     assert message.changed == ["tissue.0.alpha", "target.depth_mm"]
     assert (message.values["tissue.0.alpha"], message.values["target.lateral_mm"]) == (9.0, 5.0)
 
@@ -28,8 +28,8 @@ def test_an_edit_changes_values_by_key_and_none_returns_to_the_default(session):
 @pytest.mark.parametrize(
     ("change", "stays"),
     [
-        (lambda one: one.edited({"target.depth_mm": 35.0, "target.lateral_mm": -3.0}), True),
-        (lambda one: one.edited({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0}), False),
+        (lambda one: one.edit_scenario({"target.depth_mm": 35.0, "target.lateral_mm": -3.0}), True),
+        (lambda one: one.edit_scenario({"target.depth_mm": 35.0, "tissue.0.alpha": 9.0}), False),
         (lambda one: one.with_options(OptionsRequest(type="options", controller="ce-mpc")), True),
         (lambda one: one.with_options(OptionsRequest(type="options", seed=3)), False),
         (lambda one: one.with_options(OptionsRequest(type="options", strategy="steering")), False),
@@ -37,7 +37,7 @@ def test_an_edit_changes_values_by_key_and_none_returns_to_the_default(session):
     ],
 )
 def test_a_reach_stays_while_only_target_and_controller_have_changed(session, change, stays):
-    before = session.edited({"needle.outer_diameter_mm": 0.9})
+    before = session.edit_scenario({"needle.outer_diameter_mm": 0.9})
     assert before.reach_since == before.revision
     after = change(before)
     assert after.describe().reach_since == (before.revision if stays else after.revision)
@@ -46,17 +46,19 @@ def test_a_reach_stays_while_only_target_and_controller_have_changed(session, ch
 @pytest.mark.parametrize("gauge", ["18G", "25G"])
 def test_gauge_and_diameters_of_a_needle_replace_each_other(session, gauge):
     """The scenario refuses one beside the other: each would have to be cleared before."""
-    by_gauge = session.edited({"needle.gauge": gauge})
+    by_gauge = session.edit_scenario({"needle.gauge": gauge})
     needle = by_gauge.scenario.needle
     assert (needle.gauge, needle.outer_diameter_mm, needle.inner_diameter_mm) == (gauge, None, None)
-    assert by_gauge.edited({"needle.gauge": "21G"}).scenario.needle.gauge == "21G"
+    assert by_gauge.edit_scenario({"needle.gauge": "21G"}).scenario.needle.gauge == "21G"
     known = dict(zip(("outer_diameter_mm", "inner_diameter_mm"), GAUGES[gauge], strict=True))
     for changed in ({"gauge": None}, {"outer_diameter_mm": 1.5}, {"inner_diameter_mm": 0.1}):
-        needle = by_gauge.edited({f"needle.{key}": value for key, value in changed.items()}).scenario.needle
+        needle = by_gauge.edit_scenario(
+            {f"needle.{key}": value for key, value in changed.items()}
+        ).scenario.needle
         expected = {"gauge": None} | known | changed
         assert {key: getattr(needle, key) for key in expected} == expected
     for other in ({"needle.stylet": True}, {"needle.inner_diameter_mm": None}):
-        assert by_gauge.edited(other).scenario.needle.gauge == gauge
+        assert by_gauge.edit_scenario(other).scenario.needle.gauge == gauge
 
 
 NUMBER = [float("nan"), float("inf"), 10**400, "5", [], {}, {"a": [{}]}, [[1.0]], True]
@@ -83,18 +85,18 @@ EDITS = [
 def test_a_wrong_edit_is_refused_with_all_problems_by_key(session):
     for values, keys in EDITS:
         with pytest.raises(Refusal) as refused:
-            session.edited(values)
+            session.edit_scenario(values)
         assert keys <= refused.value.problems.keys(), values
     assert set(refused.value.problems.values()) == {"must be above 0", "must be a number"}
 
 
 def test_implausible_values_are_doubts(session):
-    doubts = session.edited({"needle.youngs_modulus_gpa": 20_000}).describe().doubts
+    doubts = session.edit_scenario({"needle.youngs_modulus_gpa": 20_000}).describe().doubts
     assert any("youngs_modulus" in line for line in doubts)
 
 
 def test_a_preset_or_world_begins_a_new_scenario(session, tmp_path, monkeypatch):
-    begun = session.edited({"target.depth_mm": 35.0}).with_preset("phantom3d")
+    begun = session.edit_scenario({"target.depth_mm": 35.0}).with_preset("phantom3d")
     assert (begun.describe().changed, begun.name) == ([], "phantom3d")
     assert begun.revision == session.revision + 2
     assert session.with_preset("world:7").scenario == load_scenario("world:7")

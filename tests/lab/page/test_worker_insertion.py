@@ -158,14 +158,14 @@ def test_an_insertion_is_listed_once_it_is_completely_saved_and_is_read_again(
 
     def watched(insertion, folder):
         save(insertion, folder)
-        while_saving.append((runs.listed(), list(tmp_path.glob("*/run.json"))))
+        while_saving.append((runs.list_runs(), list(tmp_path.glob("*/run.json"))))
 
     monkeypatch.setattr(recordings, "save", watched)
     worker.save(task("save", folder=str(tmp_path / "saved")))
     ((listed, (written,)),) = while_saving
     assert listed == []
     assert not written.exists()  # it has moved
-    assert [run["name"] for run in runs.listed()] == ["saved"]
+    assert [run["name"] for run in runs.list_runs()] == ["saved"]
     assert [path.name for path in tmp_path.iterdir()] == ["saved"]
     again = task("read", "recording", folder=str(tmp_path / "saved"), of="second")
     read_run(again)

@@ -65,7 +65,7 @@ class WelcomeMessage(ServerMessage):
 class ClientsMessage(ServerMessage):
     """Number of connected clients. steering: number of the client in control, None without one."""
 
-    type: Literal["people"] = "people"
+    type: Literal["clients"] = "clients"
     clients: int
     steering: int | None
 

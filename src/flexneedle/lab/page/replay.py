@@ -115,18 +115,18 @@ def _convert_module(static: Path, name: str) -> _Module:
         imports.append(normpath(join(dirname(name), path)))
         return f'modules["{imports[-1]}"]'
 
-    def imported(found: re.Match[str]) -> str:
+    def convert_import(found: re.Match[str]) -> str:
         names, default, path = found.groups()
         taken = f"default: {default}" if names is None else " ".join(names.split()).replace(" as ", ": ")
         return f"const {{ {taken} }} = {module(path)};"
 
-    def exported(found: re.Match[str]) -> str:
+    def collect_exports(found: re.Match[str]) -> str:
         exports.extend(": ".join(reversed(each.split(" as "))) for each in found[1].split(","))
         return ""
 
-    text = _IMPORT.sub(imported, source)
+    text = _IMPORT.sub(convert_import, source)
     text = _LATER.sub(lambda found: f"Promise.resolve({module(found[1])})", text)
-    text = _EXPORTS.sub(exported, _EXPORT.sub("", text))
+    text = _EXPORTS.sub(collect_exports, _EXPORT.sub("", text))
     if left := _LEFT.search(text):
         raise ValueError(
             f"{name}: {left[0][:80]!r}: a form of import or export that replay.py cannot convert"

@@ -4,7 +4,7 @@ import pytest
 
 from fake_page import until
 from flexneedle.scenario.files import load_scenario
-from recorded_page import inserting, insertion, opening, people, planned, rows, session
+from recorded_page import clients, inserting, insertion, opening, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -87,7 +87,7 @@ def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
     tab_to(page, "Insert")
     page.keyboard.press("Enter")
     assert server.wait_for("insert") == [{"type": "insert"}]
-    server.send(people(steering=1), insertion("running", periods=3), rows(0, 3))
+    server.send(clients(steering=1), insertion("running", periods=3), rows(0, 3))
     until(page, "document.querySelector('[data-panel=insertion] [role=toolbar] .danger:not([hidden])')")
     assert tab_to(page, "Stop") == []  # in place of the button that started it
     page.keyboard.press(" ")

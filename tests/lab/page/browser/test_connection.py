@@ -7,7 +7,7 @@ import pytest
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage
 from flexneedle.lab.page.shape_frames import FrameSource
-from recorded_page import insertion, people, period_frames, planned, rows, session
+from recorded_page import clients, insertion, period_frames, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -27,14 +27,14 @@ def test_control_is_taken_shared_and_released(visit, server):
     page.wait_for_selector("text=nobody is in control")
     assert page.evaluate(FOCUSED) == "Take control"
     assert server.asked("steer") == [{"type": "steer", "take": True}, {"type": "steer", "take": False}]
-    server.send(people(2))
+    server.send(clients(2))
     page.wait_for_selector("text=2 people connected, you are person 1, nobody is in control")
     server.answers["steer"] = RefusedMessage(what="steer", reason="Person 2 is in control: ask for it first.")
     page.click("text=Take control")
     page.wait_for_selector("[role=alert] >> text=Person 2 is in control")
     page.click("[role=alert] >> text=Close")
     page.wait_for_selector("text=Person 2 is in control", state="detached")
-    server.send(people(3, steering=2))
+    server.send(clients(3, steering=2))
     page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
 
 
@@ -115,7 +115,7 @@ def test_after_a_restart_a_dead_line_and_a_lost_connection_the_state_is_recovere
     page.wait_for_selector("text=seed 0")
     assert page.evaluate("flexneedle.store.get('refusals').length") == 1
     server.wait_for("ping", 3)  # while all is quiet
-    server.news = [*planned()[:1], people(clients=3), session(revision=9, seed=4)]
+    server.news = [*planned()[:1], clients(clients=3), session(revision=9, seed=4)]
     server.cut()
     page.wait_for_selector("text=3 people connected")
     page.wait_for_selector("#title:has-text('seed 4')")

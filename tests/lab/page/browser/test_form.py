@@ -10,7 +10,7 @@ from flexneedle.lab.page.protocol import RefusedMessage, SessionMessage
 from flexneedle.lab.page.server.catalog import build_catalog
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
-from recorded_page import WELCOME, people, scene, scene_frames
+from recorded_page import WELCOME, clients, scene, scene_frames
 
 pytestmark = pytest.mark.page
 
@@ -36,7 +36,7 @@ def form(visit):
     """A function that opens the page with a session and returns it once its form is made."""
 
     def opened(given=None, **how):
-        news = [WELCOME, people(), given or session(), scene(), *scene_frames()]
+        news = [WELCOME, clients(), given or session(), scene(), *scene_frames()]
         return visit(news, ready=f"{FORM} details", **how)
 
     return opened
@@ -324,7 +324,7 @@ def test_options_are_chosen_doubts_shown_and_all_is_disabled_while_another_is_in
         {"type": "options", "controller": "ce-mpc"},
         {"type": "options", "seed": 1},
     ]
-    server.send(people(2, steering=2))
+    server.send(clients(2, steering=2))
     until(page, f"document.querySelector('{DEPTH}').matches(':disabled')")
     disabled = "all => all.map((each) => each.matches(':disabled'))"
     options = page.locator("#option-seed, #option-strategy, #option-controller")

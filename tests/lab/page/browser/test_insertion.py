@@ -13,7 +13,7 @@ from flexneedle.lab.page.protocol import (
     RigStateMessage,
     RowsMessage,
 )
-from recorded_page import WELCOME, insertion, opening, people, row, rows, session
+from recorded_page import WELCOME, clients, insertion, opening, row, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -63,7 +63,7 @@ def test_a_virtual_insertion_is_started_paused_paced_stepped_and_stopped(panel, 
     server.send(insertion("done", periods=3, pace=0.0, error_mm=0.0161))
     page.wait_for_selector("text=The tip ended 0.016 mm from the target.")
     until(page, f"{FOCUSED} === 'Insert'")
-    server.send(people(2, steering=2), insertion("running"))
+    server.send(clients(2, steering=2), insertion("running"))
     page.wait_for_selector(f"{PANEL} button:text-is('Pause'):disabled")
     click(page, "Stop")  # which anybody may
     assert len(server.wait_for("stop", 2)) == 2
@@ -171,7 +171,7 @@ def rig_panel(panel):
 
     def opened(*news, **how):
         welcome = WELCOME.model_copy(update={"rig": "Bench"})
-        return panel([welcome, people(), *opening()[2:], rig("idle"), *news], **how)
+        return panel([welcome, clients(), *opening()[2:], rig("idle"), *news], **how)
 
     return opened
 
@@ -239,7 +239,7 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
     page.check("#rig-free")
     shows("armed", "It is armed for one start.", True)
     shows("holding", "not started within 60 s", False, "not started within 60 s: arm it again")
-    server.send(people(2, steering=2))
+    server.send(clients(2, steering=2))
     page.check("#rig-free")
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
     click(page, "Stop")

@@ -5,7 +5,7 @@ import pytest
 from browser_layout import too_wide
 from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage, StudyRow, StudyRowsMessage
 from flexneedle.scenario.files import load_scenario
-from recorded_page import REACH, WELCOME, inserting, insertion, people, planned, rows, session
+from recorded_page import REACH, WELCOME, clients, inserting, insertion, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -50,7 +50,7 @@ def test_each_state_fits_its_width_and_the_switch_changes_the_colours(visit, ser
         "inserting": inserting(),
         "rig": [
             WELCOME.model_copy(update={"rig": "Bench"}),
-            people(),
+            clients(),
             insertion("ready", rig="Bench"),
             waits,
         ],

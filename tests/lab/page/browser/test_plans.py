@@ -10,10 +10,10 @@ from fake_page import until
 from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
 from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import (
+    clients,
     insertion,
     iteration,
     opening,
-    people,
     period_frames,
     plan,
     plan_frames,
@@ -93,7 +93,7 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     highest = max(max(column) for column in columns[4:])  # of dots, near the first iteration
     np.testing.assert_allclose(lowest, [share_of(cost) for cost in iteration(3).best], atol=3.0 / height)
     assert highest == pytest.approx(share_of(iteration(3).median[0]), abs=4.0 / height)
-    server.send(people(2, steering=2))
+    server.send(clients(2, steering=2))
     until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
     assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
 

@@ -12,11 +12,11 @@ from flexneedle.lab.page.shape_frames import FrameSource
 from recorded_page import (
     REACH,
     TARGET,
+    clients,
     estimate,
     inserting,
     insertion,
     opening,
-    people,
     plan,
     plan_frames,
     planned,
@@ -269,9 +269,9 @@ def test_nothing_is_moved_during_an_insertion_and_the_way_back_is_shown_after_it
     server.send(insertion("done", periods=11))
     note.wait_for()
     assert not handle(page, "target").count()
-    server.send(people(2, steering=2))
+    server.send(clients(2, steering=2))
     note.wait_for(state="hidden")  # who watches can move nothing
-    server.send(people(2, steering=1))
+    server.send(clients(2, steering=1))
     page.locator(SECTION).get_by_role("button", name="Target and plan").click()
     handle(page, "target").wait_for()
     assert not note.is_visible()

@@ -15,12 +15,12 @@ from recorded_page import (
     PERIODS,
     REACH,
     TARGET,
+    clients,
     estimate,
     inserting,
     insertion,
     needle,
     opening,
-    people,
     period_frames,
     plan,
     planned,
@@ -156,7 +156,7 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     version = "return view.shapes.group.children[0].geometry.attributes.position.version"
     painted(page)
     before = on_view(page, version)
-    server.send(people(clients=2))
+    server.send(clients(clients=2))
     page.wait_for_selector("text=2 people")
     painted(page)
     assert on_view(page, version) == before
@@ -295,7 +295,7 @@ def drag_target(page, pixels):
 
 def test_dragging_the_target_edits_the_scenario(space, server):
     page = space()
-    until(page, "flexneedle.store.get('people')")
+    until(page, "flexneedle.store.get('clients')")
     start = page.evaluate("performance.now()")
     drag_target(page, 40)
     until(page, "!flexneedle.store.get('draft')")
@@ -329,7 +329,7 @@ def test_in_the_plane_the_target_keeps_its_plane_and_rests_while_another_is_in_c
     drag_target(page, 20)
     until(page, "!flexneedle.store.get('draft')")
     assert set(server.asked("edit")[0]["values"]) == {"target.depth_mm", "target.lateral_mm"}
-    for news in ([people(2, steering=2)], [people(1, steering=1), insertion("running", periods=0)]):
+    for news in ([clients(2, steering=2)], [clients(1, steering=1), insertion("running", periods=0)]):
         server.send(*news)
         arrived(page)
         edits, place = len(server.asked("edit")), on_view(page, "return view.target.ball.position.toArray()")

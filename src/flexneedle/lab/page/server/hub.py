@@ -123,7 +123,7 @@ class ClientOutbox:
         if key.startswith(_ROWS):
             return self._missing_rows(key)
         shapes = self._hub.shapes.get(key)
-        return self._hub.encoded(key) if shapes is None else self._missing_shapes(key, shapes)
+        return self._hub.encode_newest(key) if shapes is None else self._missing_shapes(key, shapes)
 
     def _missing_rows(self, key: str) -> str | None:
         """Return some of the rows after the last that this client has; other keys precede the rest."""
@@ -168,7 +168,7 @@ class Hub:
         """Return the newest message of a key, None without one."""
         return self._newest.get(key)
 
-    def encoded(self, key: str) -> str | bytes | None:
+    def encode_newest(self, key: str) -> str | bytes | None:
         """Return the newest message of a key as it is sent, None without one."""
         if key not in self._newest:
             return None

@@ -54,7 +54,7 @@ class PageSession:
         """Return a session of a scenario, with the default controller."""
         return cls(name, scenario, scenario)
 
-    def edited(self, values: Mapping[str, Any]) -> "PageSession":
+    def edit_scenario(self, values: Mapping[str, Any]) -> "PageSession":
         """Return the session with changed values by key. Raises Refusal with the problems by key."""
         with _refuse_problems():
             changed = {**_cross_section(self.scenario.needle, values), **values}

@@ -143,7 +143,7 @@ class RequestHandler:
             case ask.SteerRequest():
                 self._steer(client, request.take)
             case ask.EditRequest():
-                self._begin(self.session.edited(request.values))
+                self._begin(self.session.edit_scenario(request.values))
             case ask.RestRequest():
                 if self._stop_timer("plan"):
                     self._plan_unless_inserting()
@@ -352,7 +352,7 @@ class RequestHandler:
         before: list[dict[str, Any]] | None = None
         while True:
             if self.clients.connected or before is None:
-                listed = await asyncio.to_thread(self.runs.listed)
+                listed = await asyncio.to_thread(self.runs.list_runs)
                 if listed != before:
                     before = listed
                     self.hub.publish(RunsMessage(runs=listed))

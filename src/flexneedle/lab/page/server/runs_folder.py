@@ -33,7 +33,7 @@ class RunsFolder:
         self.path = path.resolve()
         self._read = dict[Path, tuple[tuple[int, int], dict[str, Any]]]()
 
-    def listed(self) -> list[dict[str, Any]]:
+    def list_runs(self) -> list[dict[str, Any]]:
         """Return name, kind, summary and time (s since 1970) of each run and study, newest first."""
         marked = ((name, self._find_mark(name)) for name in self._names())
         found = [(name, *record) for name, record in marked if record is not None]

@@ -36,7 +36,7 @@ export function mount(element, store, link) {
     legendOf(legend, [...parts, ...measuredTip(store)], reached);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
-  store.subscribe([...SHOWN, "people", "welcome"], () => stage.schedule());
+  store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());
 
   function handleOf(map, { axes }, target) {
     const move = (y, z) => link.edit(targetEdit(store, [target[0], y, axes === 2 ? z : target[2]]));

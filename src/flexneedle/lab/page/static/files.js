@@ -27,7 +27,7 @@ export function mount(element, store, link) {
   file.addEventListener("change", () => loadFile(file, store, link, status));
   acceptDrops(element, store, link, status);
   store.subscribe(["welcome", "session"], () => choosePreset(preset, store));
-  store.subscribe(["people", "welcome"], () => {
+  store.subscribe(["clients", "welcome"], () => {
     steered.disabled = !maySteer(store);
   });
   showRuns(runs, store, link);

@@ -33,7 +33,7 @@ export async function mount(element, store, link) {
     if (form.update()) find();
     showDoubts(doubts, store.get("session")?.doubts ?? []);
   });
-  store.subscribe(["people", "welcome"], () => {
+  store.subscribe(["clients", "welcome"], () => {
     fields.disabled = !maySteer(store);
   });
 }

@@ -8,7 +8,7 @@ import { inWords } from "./insertion/words.js";
 import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const SHOWN_BY = ["insertion live", "people", "welcome", "rig"];
+const SHOWN_BY = ["insertion live", "clients", "welcome", "rig"];
 const BEFORE_IT = ["waiting", "planning"];
 const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 

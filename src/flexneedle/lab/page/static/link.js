@@ -92,8 +92,8 @@ export class Link {
   }
 
   #mustSteer(message) {
-    const people = this.#store.get("people");
-    return !FREE.includes(message.type) && people?.steering === null;
+    const clients = this.#store.get("clients");
+    return !FREE.includes(message.type) && clients?.steering === null;
   }
 
   #send(message) {

@@ -23,10 +23,10 @@ export function mount(element, store, link) {
 
   const plot = new CostPlot(cost, store, STRATEGIES);
   const sweeps = STRATEGIES.map((strategy) => new SweepView(figures, store, strategy));
-  store.subscribe(["people", "welcome"], () => {
+  store.subscribe(["clients", "welcome"], () => {
     for (const each of starts) each.disabled = !maySteer(store);
   });
-  store.subscribe(["job ", "people", "welcome"], () => {
+  store.subscribe(["job ", "clients", "welcome"], () => {
     const [job] = activeJobs(store);
     cancel.hidden = progress.hidden = !job;
     cancel.disabled = !maySteer(store);

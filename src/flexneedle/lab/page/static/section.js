@@ -54,7 +54,7 @@ class SectionView {
     [this.#legend, this.#store, this.#link] = [legend, store, link];
     this.#handles = new Handles(stage, () => link.rest());
     this.#stage = new Stage(canvas, (pen, { width, height }) => this.#draw(pen, width, height));
-    store.subscribe([...SHOWN, "people", "welcome"], () => this.#stage.schedule());
+    store.subscribe([...SHOWN, "clients", "welcome"], () => this.#stage.schedule());
   }
 
   choose(plane) {

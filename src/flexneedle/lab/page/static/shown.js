@@ -93,14 +93,14 @@ export function targetEdit(store, point) {
 
 // Return whether this client is in control, or can take control.
 export function maySteer(store) {
-  const [people, welcome] = [store.get("people"), store.get("welcome")];
-  return Boolean(people) && (people.steering === null || people.steering === welcome?.client);
+  const [clients, welcome] = [store.get("clients"), store.get("welcome")];
+  return Boolean(clients) && (clients.steering === null || clients.steering === welcome?.client);
 }
 
 // Return whether this client is in control.
 export function steers(store) {
-  const people = store.get("people");
-  return Boolean(people) && people.steering !== null && people.steering === store.get("welcome")?.client;
+  const clients = store.get("clients");
+  return Boolean(clients) && clients.steering !== null && clients.steering === store.get("welcome")?.client;
 }
 
 // Return whether the shown state can be edited: the scene before an insertion.

@@ -59,14 +59,14 @@ function followSteering(element, store, link) {
   const words = make("span", { "aria-live": "polite" });
   const change = button("", () => link.ask({ type: "steer", take: !mine }));
   element.append(words, change);
-  store.subscribe(["people", "welcome", "connection"], () => {
-    const [people, welcome] = [store.get("people"), store.get("welcome")];
-    element.hidden = !people || !welcome || store.get("connection") !== "open";
+  store.subscribe(["clients", "welcome", "connection"], () => {
+    const [clients, welcome] = [store.get("clients"), store.get("welcome")];
+    element.hidden = !clients || !welcome || store.get("connection") !== "open";
     if (element.hidden) return;
-    mine = people.steering === welcome.client;
-    renew(words, [make("span", {}, inControl(people, welcome.client))]);
+    mine = clients.steering === welcome.client;
+    renew(words, [make("span", {}, inControl(clients, welcome.client))]);
     [change.textContent, change.title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
-    change.hidden = !mine && people.steering !== null;
+    change.hidden = !mine && clients.steering !== null;
   });
 }
 

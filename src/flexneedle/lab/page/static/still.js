@@ -14,7 +14,7 @@ export function stillNote(store) {
   });
   const words = make("span");
   const note = make("p.tools.quiet", { hidden: true }, words, back);
-  store.subscribe([...SHOWN, "people", "welcome"], () => {
+  store.subscribe([...SHOWN, "clients", "welcome"], () => {
     const still = Boolean(store.get("scene")) && shownOf(store) !== "scene"; // a replay has no scene
     words.textContent = `This is ${shownOf(store) === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
     note.hidden = !still || !maySteer(store) || runs(store.get("insertion live"));

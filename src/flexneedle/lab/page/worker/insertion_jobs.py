@@ -52,10 +52,10 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
     """Insert on a virtual rig that can be disturbed."""
     task, order, control = reporter.task, reporter.task.order, reporter.task.control
 
-    def planning(info: dict[str, Any]) -> None:
+    def report_iteration(info: dict[str, Any]) -> None:
         reporter.take(Iterated(order.strategy, info))
 
-    plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, progress=planning)
+    plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, progress=report_iteration)
     reporter.report_plan(plan)
     disturber = Disturber(with_planned_entry(task.scenario, plan), task.report)
 

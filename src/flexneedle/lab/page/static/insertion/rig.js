@@ -48,7 +48,7 @@ export function rigForm(store, link) {
     go.disabled = !steers || !isArmed(store);
   };
   free.addEventListener("change", show);
-  store.subscribe(["rig", "welcome", "people", "insertion live", "job check"], show);
+  store.subscribe(["rig", "welcome", "clients", "insertion live", "job check"], show);
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
   return form;
 }

@@ -36,7 +36,7 @@ export class SpaceView {
     this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.target.group, ...lights(this.camera.camera));
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
     new IntersectionObserver(([{ isIntersecting }]) => this.#appear(isIntersecting)).observe(canvas);
-    store.subscribe([...SHOWN, "people", "welcome"], () => this.#update());
+    store.subscribe([...SHOWN, "clients", "welcome"], () => this.#update());
   }
 
   // Draw the scene and return its canvas. Read it before returning to the browser, which clears it.
