@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 import psutil
 
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 
 PERIOD_S = 0.02  # of the loop of the caller

@@ -22,7 +22,7 @@ import numpy as np
 import psutil
 
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 
 SPEED_MM_S, COUNTS_PER_MM, PERIOD_S = 5.0, 2000, 0.025

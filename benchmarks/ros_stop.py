@@ -25,7 +25,7 @@ from ros import LOOPBACK
 
 import flexneedle
 from flexneedle.errors import StoppedError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.rig_file import RigFile, RosSettings
 from flexneedle.lab.rig.supervised import Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient

@@ -21,10 +21,10 @@ from time import monotonic
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators import aurora, codec
+from flexneedle.lab.emulators.aurora_server import SerialPort
 from flexneedle.lab.emulators.motion import RATE_HZ, SENSORS, sensor_pose
-from flexneedle.lab.emulators.server import SerialPort
-from flexneedle.lab.rig.devices.aurora import tracker
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora import aurora_tracker
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.types import VISIBLE, Frame
 from fuzzing import Failure, mutate
 
@@ -268,7 +268,7 @@ class Tally:
 def episodes(random: Random) -> Iterator[str]:
     """Yield a note on all episodes after each episode. Raises Failure."""
     # More connections in the time; the waits are nothing that is tried here.
-    tracker._FIRST_WAIT_S, tracker._LONGEST_WAIT_S = 0.05, 0.5
+    aurora_tracker._FIRST_WAIT_S, aurora_tracker._LONGEST_WAIT_S = 0.05, 0.5
     tally = Tally()
     with served() as line:
         while True:

@@ -11,9 +11,9 @@ from random import Random
 import numpy as np
 
 from flexneedle.geometry.quaternion import to_matrix
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.rig.supervisor.protocol import Expectation
-from flexneedle.lab.rig.supervisor.watch import TipWatch
+from flexneedle.lab.rig.supervisor.tip_watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.phantom.tracking.stage import tip_on_stage
 from flexneedle.scenario.sections.monitor import MonitorSettings

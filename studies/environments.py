@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.lab.tracker_evaluation.simulate import Columns, Experiment, measure_grid
-from flexneedle.phantom.tracking.table import REFERENCE, TIP
+from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
 
 Floats = NDArray[np.float64]

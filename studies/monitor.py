@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from flexneedle import Scenario, load_scenario
 from flexneedle.figures import style
-from flexneedle.loop.insert import insert
+from flexneedle.loop.insertions import insert
 from flexneedle.loop.virtual import Seeds, virtual_rig, virtual_room
 from flexneedle.phantom.plants import DEFAULT_PLANT
 from flexneedle.planning.planner import plan as make_plan

@@ -38,7 +38,7 @@ from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
 from flexneedle.loop import closed_loop
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Stream
-from flexneedle.loop.insert import prepare
+from flexneedle.loop.insertions import prepare
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import draw
 from flexneedle.planning.planner import plan as make_plan

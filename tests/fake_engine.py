@@ -24,7 +24,7 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
 
 
 def carry_out(_scenario, plan, choices, stream, *, miss=0.06, stop=None, outcome="done"):
-    """Insert as `flexneedle.loop.insert.carry_out` does; stop: number of periods, and a function to call then."""
+    """Insert as `flexneedle.loop.insertions.carry_out` does; stop: number of periods, and a function to call then."""
     if not (plan.reached or choices.force or choices.controller.predicts):
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, limited by {plan.limit}")
     periods = []

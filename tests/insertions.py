@@ -11,7 +11,7 @@ import flexneedle
 from flexneedle.loop import closed_loop
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Gate, PeriodEnded, Stream
-from flexneedle.loop.insert import prepare
+from flexneedle.loop.insertions import prepare
 from flexneedle.loop.rig import Rig
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom

@@ -5,7 +5,11 @@ from itertools import product
 
 import numpy as np
 
-from flexneedle.lab.tracker_evaluation.recording.record import StageOperator, open_session, record_grid
+from flexneedle.lab.tracker_evaluation.recording.grid_recording import (
+    StageOperator,
+    open_session,
+    record_grid,
+)
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 GRID = """\

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flexneedle.errors import DriverError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.devices import clock
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile

@@ -2,13 +2,13 @@
 
 from types import SimpleNamespace
 
-from flexneedle.control import tables
+from flexneedle.control import controller_tables
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 
 
 def task_of(simulator, plan, controller=DEFAULT):
     """Task of a controller, with its settings in the simulator's scenario."""
-    return tables.make_task(CONTROLLERS[controller], simulator, plan)
+    return controller_tables.make_task(CONTROLLERS[controller], simulator, plan)
 
 
 def begun_with(simulator, roll=0.0, controller=DEFAULT):

@@ -7,7 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
-from flexneedle.costs.table import Trajectories
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.phantom.draw import draw

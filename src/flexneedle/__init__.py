@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Controller, Decision, travel_left
-    from flexneedle.costs.table import Trajectories
+    from flexneedle.costs.weighted_sum import Trajectories
     from flexneedle.errors import (
         CommandError,
         DriverError,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         PeriodEnded,
         Planned,
     )
-    from flexneedle.loop.insert import insert
+    from flexneedle.loop.insertions import insert
     from flexneedle.loop.rig import Rig
     from flexneedle.loop.virtual import VirtualRig
     from flexneedle.phantom.draw import Truth
@@ -146,7 +146,7 @@ __all__ = [
 
 _HOMES = {
     "control.interface": "Controller Decision travel_left",
-    "costs.table": "Trajectories",
+    "costs.weighted_sum": "Trajectories",
     "errors": "CommandError DriverError FlexneedleError InputError RigError RunError ScenarioError ScenarioWarning "
     "StateError StoppedError",
     "estimation.estimate": "Estimate",
@@ -154,7 +154,7 @@ _HOMES = {
     "figures.record": "plot",
     "lab.study.runner": "run_study",
     "loop.events": "Decided Ended Event Gate Iterated PeriodEnded Planned",
-    "loop.insert": "insert",
+    "loop.insertions": "insert",
     "loop.rig": "Rig",
     "loop.virtual": "VirtualRig",
     "phantom.draw": "Truth",

@@ -13,7 +13,7 @@ from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_o
 from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.control.interface import travel_left
 from flexneedle.control.path import path_of_plan
-from flexneedle.costs.table import evaluate_cost
+from flexneedle.costs.weighted_sum import evaluate_cost
 from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world

@@ -9,8 +9,8 @@ import flexneedle
 from flexneedle.control import mpc
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import is_at_depth
-from flexneedle.costs.table import Trajectories, evaluate_cost
 from flexneedle.costs.terms import CE_MPC
+from flexneedle.costs.weighted_sum import Trajectories, evaluate_cost
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DB_Y, DG_Y, DG_Z, ROLL, STILL, Control, X, Y

@@ -8,8 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import check_tables
-from flexneedle.costs.table import Trajectories, evaluate_cost
 from flexneedle.costs.terms import CE_MPC, PLAN
+from flexneedle.costs.weighted_sum import Trajectories, evaluate_cost
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.types import DG_Y
 

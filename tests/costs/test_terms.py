@@ -8,7 +8,7 @@ import pytest
 
 from flexneedle import controls as controls_of
 from flexneedle.costs import terms
-from flexneedle.costs.table import Term, Trajectories, evaluate_cost, evaluate_terms
+from flexneedle.costs.weighted_sum import Term, Trajectories, evaluate_cost, evaluate_terms
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, SPIN, THETA, X, Y
 
 # Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.

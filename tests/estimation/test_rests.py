@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.identification import Identification, Identified
+from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move
-from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL, Measurement, Motion
 from identified import QUIET

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along
-from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Measurement, Motion
 from identified import QUIET, Needle

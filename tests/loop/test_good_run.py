@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flexneedle.control.controllers import DEFAULT
-from flexneedle.loop import insert as insertion
+from flexneedle.loop import insertions
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.plants import PLANTS
@@ -111,9 +111,9 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
         return Insertion(plan, 0, (), Outcome("done"), "")
 
     monkeypatch.setattr("flexneedle.loop.virtual.virtual_rig", virtual_rig)
-    monkeypatch.setattr(insertion, "run", no_run)
+    monkeypatch.setattr(insertions, "run", no_run)
     for seed, phantom in ((0, "exact"), (1, "exact"), (0, "model")):
-        insertion.insert(PHANTOM, plan, seed, rig=VirtualRig(phantom))
+        insertions.insert(PHANTOM, plan, seed, rig=VirtualRig(phantom))
     assert len(set(drawn)) == 8
     assert drawn[:4] == drawn[8:]
     assert plants == [PLANTS["exact"], PLANTS["exact"], PLANTS["model"]]

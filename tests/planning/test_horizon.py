@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flexneedle import controls as controls_of
 from flexneedle.costs import terms
-from flexneedle.costs.table import Term, Trajectories, evaluate_cost
+from flexneedle.costs.weighted_sum import Term, Trajectories, evaluate_cost
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning import horizon
 from flexneedle.types import DB_X, DG_Y, X, Y

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flexneedle import controls as controls_of
-from flexneedle.costs.table import Trajectories, evaluate_terms
 from flexneedle.costs.terms import PLAN
+from flexneedle.costs.weighted_sum import Trajectories, evaluate_terms
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.primitives import make_controls, search_primitives, widen_search
 from flexneedle.planning.problem import PlanProblem

@@ -10,7 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from flexneedle.costs.table import Trajectories
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.problem import PlanProblem

@@ -5,15 +5,15 @@ import pytest
 
 from emulated import emulated
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.devices.replay import Replay
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
+from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
 from flexneedle.phantom.tracking.field.poses import tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.field.tracker import FieldTracker
 from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.testing import (

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flexneedle.control.controller_tables import scenario_class
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.tables import scenario_class
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "reference" / "scenario.md"

@@ -130,7 +130,7 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.control.controllers import DEFAULT
     from flexneedle.loop.choices import Choices
-    from flexneedle.loop.insert import check_choices
+    from flexneedle.loop.insertions import check_choices
     from flexneedle.record.folder import Folder
 
     if args.list:

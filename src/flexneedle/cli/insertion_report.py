@@ -78,7 +78,7 @@ def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
 
 
 def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
-    from flexneedle.geometry.registration import expected_error
+    from flexneedle.geometry.rigid import expected_error
 
     if scenario.tracker.registration is None:
         return []

@@ -130,8 +130,8 @@ def _checked(args: argparse.Namespace) -> Scenario:
 def _schema(_args: argparse.Namespace) -> int:
     import json
 
+    from flexneedle.control.controller_tables import scenario_class
     from flexneedle.control.controllers import CONTROLLERS
-    from flexneedle.control.tables import scenario_class
 
     schema = scenario_class(tuple(CONTROLLERS.values())).model_json_schema()
     print(json.dumps(schema, indent=2, ensure_ascii=False))

@@ -7,8 +7,8 @@ import numpy as np
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.guide import guide_reach, largest_guide_step
 from flexneedle.control.interface import travel_left
-from flexneedle.costs.table import Trajectories
 from flexneedle.costs.terms import CE_MPC
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Samples, Variables, find_best
 from flexneedle.results import Plan

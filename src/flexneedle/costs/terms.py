@@ -22,7 +22,7 @@ The terms with sums over steps are from the paper (eq. 10 and 13) and depend on 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.costs.table import Cost, Trajectories, Weight, cost_term
+from flexneedle.costs.weighted_sum import Cost, Trajectories, Weight, cost_term
 from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
 
 PLAN, CE_MPC, ADAPTIVE_MPC = Cost("plan"), Cost("ce_mpc"), Cost("adaptive_mpc")

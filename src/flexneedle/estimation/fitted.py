@@ -7,9 +7,9 @@ from typing import Self, TypeVar
 import numpy as np
 
 from flexneedle.estimation.lateral import components, from_components
+from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.prior import Prior, Priors, Slots
-from flexneedle.estimation.readings import MoveMeans
 from flexneedle.estimation.sensors import Sensor, sensors_of
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator

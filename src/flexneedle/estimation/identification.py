@@ -24,9 +24,9 @@ from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.fit import improve_fit
 from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import directions, from_components, variance_of
+from flexneedle.estimation.move_means import fit_constant
 from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, check_cells
-from flexneedle.estimation.readings import fit_constant
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
 from flexneedle.types import STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from flexneedle.geometry.quaternion import to_matrix
-from flexneedle.geometry.registration import Rigid, fit_rigid, identity
+from flexneedle.geometry.rigid import Rigid, fit_rigid, identity
 from flexneedle.loop.events import Stream
 from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
 from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, TipTrackerFactory, find_tracker
+from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.field.tracker import FieldTracker
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.phantom.tracking.placement import placed_references
 from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage, tilt_of
-from flexneedle.phantom.tracking.table import TIP
 from flexneedle.ports import TipTracker
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexneedle.costs.table import RolloutFunction, Term, Trajectories, evaluate_cost, evaluate_terms
+from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories, evaluate_cost, evaluate_terms
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.types import Floats
 

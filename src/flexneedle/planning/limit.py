@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from flexneedle.costs.table import RolloutFunction
 from flexneedle.costs.terms import PLAN
+from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.problem import LATERAL, PlanProblem
 from flexneedle.planning.steering import radius, reach
 from flexneedle.scenario.model import Scenario

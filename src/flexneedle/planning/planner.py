@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.arguments import check_point, check_whole
-from flexneedle.costs.table import RolloutFunction, Trajectories
+from flexneedle.costs.weighted_sum import RolloutFunction, Trajectories
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.entry import mounted_axes, with_entry

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.costs.table import RolloutFunction
+from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.entry import add_along, entry_bounds, mount_needle, read_entry
 from flexneedle.planning.horizon import Found, Variables, find_best

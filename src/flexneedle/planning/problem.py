@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.costs.table import Term
 from flexneedle.costs.terms import PLAN
+from flexneedle.costs.weighted_sum import Term
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
 from flexneedle.scenario.sections.settings import PlanSettings

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexneedle.costs.table import RolloutFunction, Term, Trajectories
 from flexneedle.costs.terms import past_target
+from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.entry import entry_bounds, mount_needle, read_entry
 from flexneedle.planning.horizon import Found, OnIteration, Variables, count_iterations, find_best

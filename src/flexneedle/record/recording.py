@@ -7,7 +7,7 @@ from typing import Any
 from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_line
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import Ended, Event, Gate, Iterated, Listener, PeriodEnded, Planned, Stream
-from flexneedle.loop.insert import carry_out, check_choices
+from flexneedle.loop.insertions import carry_out, check_choices
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import Folder

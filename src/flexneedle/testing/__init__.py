@@ -11,10 +11,10 @@ Subclass a kit in a pytest file, and return your part from `make`:
 
 from flexneedle.testing.controller import ControllerConformance
 from flexneedle.testing.driver import DriverConformance
-from flexneedle.testing.motors import MotorsConformance
+from flexneedle.testing.motors_kit import MotorsConformance
 from flexneedle.testing.plant import PlantConformance
 from flexneedle.testing.tip_tracker import TipTrackerConformance
-from flexneedle.testing.tracker import TrackerConformance
+from flexneedle.testing.tracker_kit import TrackerConformance
 
 __all__ = [
     "ControllerConformance",

@@ -14,7 +14,7 @@ from flexneedle.control.interface import Controller, Decision
 from flexneedle.errors import CommandError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.loop.insert import insert
+from flexneedle.loop.insertions import insert
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.planning.planner import plan
 from flexneedle.results import Insertion, Outcome, Plan

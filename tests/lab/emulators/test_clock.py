@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexneedle.lab.emulators.server import device_time
+from flexneedle.lab.emulators.aurora_server import device_time
 
 PERIOD_S = 1 / 40
 

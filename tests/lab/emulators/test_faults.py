@@ -8,6 +8,7 @@ import pytest
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import codec
 from flexneedle.lab.emulators.aurora import FAULTS, power_on
+from flexneedle.lab.emulators.aurora_server import EmulatorSession, execute
 from flexneedle.lab.emulators.faults import (
     Fault,
     FaultSchedule,
@@ -17,7 +18,6 @@ from flexneedle.lab.emulators.faults import (
     parse_order,
 )
 from flexneedle.lab.emulators.motion import sensor_pose
-from flexneedle.lab.emulators.server import EmulatorSession, execute
 from flexneedle.lab.rig.devices.aurora.readings import make_reading
 
 

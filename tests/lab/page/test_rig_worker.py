@@ -64,7 +64,7 @@ def in_tmp(tmp_path, monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Calls of `loop.insert.carry_out`: plan and loop are invented, the rig is `supervisor`."""
+    """Calls of `loop.insertions.carry_out`: plan and loop are invented, the rig is `supervisor`."""
     found, supervisor = [], SupervisorClient()
     fake_engine.install(monkeypatch.setattr)
 

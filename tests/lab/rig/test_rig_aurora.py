@@ -10,7 +10,7 @@ import bench_rig
 import flexneedle
 from commands import run
 from emulated import emulated, until
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.loop.virtual import to_stage
 from flexneedle.phantom.tracking.stage import OnStage

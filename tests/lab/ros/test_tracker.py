@@ -8,7 +8,7 @@ import pytest
 
 from emulated import until
 from flexneedle.errors import RigError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import NodeLoss, RosRefusal, ShapeReading, TipReading

@@ -68,7 +68,7 @@ def test_the_reach_is_computed_for_the_phantom_of_the_insertion(monkeypatch):
     monkeypatch.setattr("flexneedle.lab.study.reach.draw", recorded)
     monkeypatch.setattr("flexneedle.loop.virtual.draw", recorded)
     monkeypatch.setattr(
-        "flexneedle.loop.insert.run",
+        "flexneedle.loop.insertions.run",
         lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Outcome.DONE, ""),
     )
     scenario = world(15).with_values(COARSE)

@@ -10,7 +10,7 @@ from flexneedle import load_scenario
 from flexneedle.cli.main import main
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import from_vector, to_matrix
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.tracker_evaluation.register import read_pairs, register
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.scenario.files import load_registration

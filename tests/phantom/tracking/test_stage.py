@@ -7,10 +7,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flexneedle.geometry.registration import Rigid, identity
+from flexneedle.geometry.rigid import Rigid, identity
+from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
 from flexneedle.phantom.tracking.field.poses import tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.field.tracker import FieldTracker
 from flexneedle.phantom.tracking.stage import OnStage, tip_on_stage
 from flexneedle.types import Frame, Pose, SensorReading
 from rooms import ManualClock, environment

@@ -6,8 +6,8 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
+from flexneedle.control.controller_tables import complete_tables, find_unowned_tables
 from flexneedle.control.interface import Controller
-from flexneedle.control.tables import complete_tables, find_unowned_tables
 from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.plugins import find_part, is_own, missing_parts, name_kind
 from flexneedle.scenario.model import Scenario

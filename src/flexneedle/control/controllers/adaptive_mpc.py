@@ -22,8 +22,8 @@ from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
-from flexneedle.costs.table import Term, Trajectories
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
+from flexneedle.costs.weighted_sum import Term, Trajectories
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.lateral import bevel_directions

@@ -135,9 +135,9 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
     from flexneedle.lab.emulators.aurora import FAULTS, FIRMWARE, power_on
+    from flexneedle.lab.emulators.aurora_server import EmulatorSession, SerialPort, execute, serve
     from flexneedle.lab.emulators.faults import parse_fault
     from flexneedle.lab.emulators.motion import CENTRE, CIRCLE, RestingTip
-    from flexneedle.lab.emulators.server import EmulatorSession, SerialPort, execute, serve
     from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
@@ -159,7 +159,7 @@ def _emulate_galil(args: argparse.Namespace) -> int:
 
     from flexneedle.lab.emulators.faults import parse_fault
     from flexneedle.lab.emulators.galil.controller import ControllerState
-    from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer, execute, serve
+    from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer, execute, serve
     from flexneedle.lab.rig.devices.priority import set_realtime_priority
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
@@ -175,7 +175,7 @@ def _emulate_galil(args: argparse.Namespace) -> int:
 
 
 def _emulate_rig(args: argparse.Namespace) -> int:
-    from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig, split_fault
+    from flexneedle.lab.emulators.emulated_rig.emulated_rig import EmulatedRig, split_fault
 
     faults = tuple(split_fault(given) for given in args.fault)
     job = _job(args, faults)

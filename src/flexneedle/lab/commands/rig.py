@@ -15,8 +15,8 @@ from flexneedle.cli.values import finite, positive
 from flexneedle.errors import DriverError
 
 if TYPE_CHECKING:
-    from flexneedle.lab.rig.preflight.check import Finding, IntendedInsertion
     from flexneedle.lab.rig.preflight.moves import AxisHoming, AxisMove
+    from flexneedle.lab.rig.preflight.rig_check import Finding, IntendedInsertion
     from flexneedle.lab.rig.rig_file import RigFile
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
@@ -176,9 +176,9 @@ def _add_yes(parser: argparse.ArgumentParser, action: str = "move") -> None:
 
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.lab.rig.devices.clock import WallClock
-    from flexneedle.lab.rig.preflight.check import check_rig
+    from flexneedle.lab.rig.preflight.rig_check import check_rig
     from flexneedle.lab.rig.rig_file import load_rig
-    from flexneedle.lab.ros.check import check_ros
+    from flexneedle.lab.ros.topic_check import check_ros
 
     rig, clock = load_rig(args.rig), WallClock()
     findings = [*check_rig(rig, clock, args.seconds, _wanted(args)), *check_ros(rig, clock, args.seconds)]
@@ -197,7 +197,7 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _wanted(args: argparse.Namespace) -> IntendedInsertion | None:
-    from flexneedle.lab.rig.preflight.check import IntendedInsertion
+    from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion
     from flexneedle.scenario.files import load_scenario
 
     return None if args.scenario is None else IntendedInsertion(load_scenario(args.scenario), args.strategy)

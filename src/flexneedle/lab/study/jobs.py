@@ -11,7 +11,7 @@ from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.reach import compute_reach
 from flexneedle.loop.events import Listener
-from flexneedle.loop.insert import insert
+from flexneedle.loop.insertions import insert
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.planning.planner import plan

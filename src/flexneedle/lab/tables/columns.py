@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from flexneedle.errors import InputError
-from flexneedle.phantom.tracking.table import COLUMNS
+from flexneedle.phantom.tracking.measurement_table import COLUMNS
 
 _OPTION = "--columns NAME=COLUMN"
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flexneedle.errors import InputError
 from flexneedle.figures.style import save
 from flexneedle.geometry.quaternion import from_matrix
-from flexneedle.geometry.registration import (
+from flexneedle.geometry.rigid import (
     Rigid,
     check_pairs,
     fiducial_error,
@@ -21,10 +21,10 @@ from flexneedle.geometry.registration import (
     target_error,
 )
 from flexneedle.lab.tables.columns import map_columns
-from flexneedle.lab.tables.rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
-from flexneedle.lab.tables.table import SampleTable, open_table
+from flexneedle.lab.tables.row_rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
+from flexneedle.lab.tables.sample_table import SampleTable, open_table
 from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
-from flexneedle.phantom.tracking.table import REQUIRED
+from flexneedle.phantom.tracking.measurement_table import REQUIRED
 from flexneedle.scenario.sections.registration import Registration
 
 Floats = NDArray[np.float64]

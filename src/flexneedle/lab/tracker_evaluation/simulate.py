@@ -12,7 +12,7 @@ from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import along, z_axis
 from flexneedle.phantom.tracking.field.room import REFERENCES, Room, grid
 from flexneedle.phantom.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
-from flexneedle.phantom.tracking.table import COLUMNS, REFERENCE, TIP
+from flexneedle.phantom.tracking.measurement_table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
 
 Floats = NDArray[np.float64]

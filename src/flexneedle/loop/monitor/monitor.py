@@ -7,7 +7,7 @@ from itertools import pairwise
 from statistics import median
 
 from flexneedle.loop.monitor import rules
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import OK, Frame, Measurement, Point, Verdict, VerdictKind
 

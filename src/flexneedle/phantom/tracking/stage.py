@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from flexneedle.geometry.quaternion import z_axis
-from flexneedle.geometry.registration import Rigid
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.geometry.rigid import Rigid
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Tracker
 from flexneedle.types import VISIBLE, Floats, Frame, Lateral, Measurement
 

@@ -71,7 +71,7 @@ class PlanSettings(Section):
 class ControlSettings(Section):
     """Section `control`: settings of all controllers. Each table below it has the settings of one controller."""
 
-    # The controllers check their tables (`flexneedle.control.tables`).
+    # The controllers check their tables (`flexneedle.control.controller_tables`).
     model_config = ConfigDict(extra="allow")
 
     load_gain: Fraction = 0.3

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, create_model
 
-from flexneedle.costs.table import Cost, TermFunction, Weight
+from flexneedle.costs.weighted_sum import Cost, TermFunction, Weight
 from flexneedle.errors import InputError
 from flexneedle.plugins import function_rule, is_own, load_part
 from flexneedle.scenario.sections.fields import NonNegative, Section

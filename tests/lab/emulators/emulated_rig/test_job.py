@@ -10,13 +10,13 @@ import pytest
 from flexneedle.cli.main import main
 from flexneedle.errors import InputError, RigError, RunError
 from flexneedle.lab.emulators.emulated_rig.child import Parent
+from flexneedle.lab.emulators.emulated_rig.driven_needle import DrivenNeedle
+from flexneedle.lab.emulators.emulated_rig.emulated_rig import split_fault
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob, make_job
-from flexneedle.lab.emulators.emulated_rig.motors import address_of, make_controller
-from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle
+from flexneedle.lab.emulators.emulated_rig.motors_part import address_of, make_controller
 from flexneedle.lab.emulators.emulated_rig.phantom import draw_phantom, make_sensor
-from flexneedle.lab.emulators.emulated_rig.rig import split_fault
 from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
-from flexneedle.lab.emulators.emulated_rig.tracker import noise_of, port_of
+from flexneedle.lab.emulators.emulated_rig.tracker_part import noise_of, port_of
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.rig_file import RIGS, RigFile, load_rig
 from flexneedle.loop.virtual import Seeds, registration_error, virtual_rig

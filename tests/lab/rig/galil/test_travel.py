@@ -6,7 +6,7 @@ import pytest
 
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.galil.controller import ControllerState
-from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession
+from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession
 
 
 def observed(*faults):

@@ -8,7 +8,7 @@ from threading import Thread
 import pytest
 
 from flexneedle.errors import DriverError, RefusedError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.supervisor import connection, protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient

@@ -12,7 +12,7 @@ import pytest
 
 from emulated import until
 from flexneedle.errors import DriverError, RefusedError, StoppedError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.interrupts import SIGNALS
 from flexneedle.lab.rig.rig_file import DeviceSection
 from flexneedle.lab.rig.supervisor import protocol

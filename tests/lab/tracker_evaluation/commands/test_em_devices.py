@@ -9,7 +9,7 @@ import pytest
 from emulated import emulated
 from flexneedle.cli import main as cli
 from flexneedle.errors import InputError
-from flexneedle.lab.emulators.server import SerialPort
+from flexneedle.lab.emulators.aurora_server import SerialPort
 
 GRID = """\
 environment = "ideal"

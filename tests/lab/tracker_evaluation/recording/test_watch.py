@@ -3,8 +3,8 @@
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.rig.devices.recording import read_frames
 from flexneedle.lab.rig.devices.replay import ENDED, Replay
+from flexneedle.lab.rig.devices.tracker_recording import read_frames
 from flexneedle.lab.tracker_evaluation.recording.watch import check_field, make_field_check, watch_tracker
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings

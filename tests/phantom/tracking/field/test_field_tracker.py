@@ -7,10 +7,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
+from flexneedle.phantom.tracking.field.field_tracker import MISSING, FieldTracker
 from flexneedle.phantom.tracking.field.poses import SensorPose, reference_poses, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import REFERENCES, Room
-from flexneedle.phantom.tracking.field.tracker import MISSING, FieldTracker
 from flexneedle.types import VISIBLE
 from rooms import ManualClock, environment, shipped
 

@@ -20,8 +20,8 @@ from flexneedle.lab.emulators.emulated_rig.axes import (
     start_positions,
 )
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
+from flexneedle.lab.emulators.emulated_rig.driven_needle import DrivenNeedle, PhantomSensor
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
-from flexneedle.lab.emulators.emulated_rig.needle import DrivenNeedle, PhantomSensor
 from flexneedle.lab.emulators.emulated_rig.stream import ChannelEnded, Record, receive_records, send_record
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter
 from flexneedle.lab.emulators.galil.controller import AXES as CHANNELS

@@ -21,8 +21,8 @@ class Catalog:
 @cache
 def build_catalog() -> Catalog:
     """Return the choices. The first call imports the controllers, which takes about 0.6 s."""
+    from flexneedle.control.controller_tables import scenario_class
     from flexneedle.control.controllers import CONTROLLERS
-    from flexneedle.control.tables import scenario_class
 
     controllers = [{"name": one.name, "summary": one.summary} for one in CONTROLLERS.values()]
     schema = scenario_class(tuple(CONTROLLERS.values())).model_json_schema()

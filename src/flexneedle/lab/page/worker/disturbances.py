@@ -15,7 +15,7 @@ from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, VirtualRig, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import ExactPlant
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import TipTracker
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario

@@ -11,7 +11,7 @@ from flexneedle.lab.page.worker.recordings import save_complete
 from flexneedle.lab.page.worker.rig_insertion import insert_on_rig
 from flexneedle.lab.page.worker.task import Cancelled, JobControl, WorkerTask
 from flexneedle.loop.events import Event, Iterated, PeriodEnded
-from flexneedle.loop.insert import insert
+from flexneedle.loop.insertions import insert
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.results import Insertion

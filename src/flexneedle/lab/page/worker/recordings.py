@@ -20,7 +20,7 @@ from flexneedle.lab.page.protocol import (
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.loop.monitor.rules import has_indicator
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.record.fields import page_values
 from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save

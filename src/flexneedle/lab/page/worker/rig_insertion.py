@@ -19,17 +19,17 @@ from flexneedle.lab.page.rigs import usable_rig
 from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.lab.rig.devices.clock import WallClock
-from flexneedle.lab.rig.preflight.check import IntendedInsertion, check_rig
 from flexneedle.lab.rig.preflight.moves import describe_insertion
+from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_rig
 from flexneedle.lab.rig.supervised import SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import CONTROLLER, SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.bridge import Bridge
-from flexneedle.lab.ros.check import check_ros
+from flexneedle.lab.ros.topic_check import check_ros
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.events import AllGates, Event, Gate, Listener
-from flexneedle.loop.insert import check_choices
+from flexneedle.loop.insertions import check_choices
 from flexneedle.record.folder import Folder
 from flexneedle.record.recording import record_insertion
 from flexneedle.results import Insertion

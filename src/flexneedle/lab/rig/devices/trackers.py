@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from flexneedle.errors import InputError
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
-from flexneedle.lab.rig.devices.recording import read_frames
 from flexneedle.lab.rig.devices.replay import Replay
+from flexneedle.lab.rig.devices.tracker_recording import read_frames
 from flexneedle.lab.rig.rig_file import check_settings
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock
 from flexneedle.record.folder import TRACE_FILE
 from flexneedle.scenario.sections.fields import Positive, Section, one_line

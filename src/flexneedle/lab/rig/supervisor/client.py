@@ -7,7 +7,7 @@ from time import monotonic
 from typing import Self
 
 from flexneedle.errors import DriverError, RefusedError
-from flexneedle.geometry.registration import identity
+from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.connection import END_S, SupervisorConnection

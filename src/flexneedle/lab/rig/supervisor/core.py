@@ -17,7 +17,7 @@ from flexneedle.lab.rig.supervisor.homing import end_leaving_switch, leave_switc
 from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
 from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
 from flexneedle.lab.rig.supervisor.requests import RequestRules, make_move, make_step, start_problem
-from flexneedle.lab.rig.supervisor.watch import TrackedTip
+from flexneedle.lab.rig.supervisor.tip_watch import TrackedTip
 from flexneedle.ports import Clock, Motors, Tracker
 
 HEARTBEAT_S = 0.5

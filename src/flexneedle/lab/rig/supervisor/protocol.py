@@ -6,7 +6,7 @@ Positions of axes are in mm or rad, times in s on the run's clock.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.rig.devices.lock import describe_program
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.machine import SupervisorState

@@ -10,7 +10,7 @@ from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
 from flexneedle.cli.values import positive
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
-from flexneedle.lab.tracker_evaluation.commands.tables import (
+from flexneedle.lab.tracker_evaluation.commands.terminal_tables import (
     format_interval,
     format_number,
     print_notes,
@@ -18,7 +18,7 @@ from flexneedle.lab.tracker_evaluation.commands.tables import (
 )
 
 if TYPE_CHECKING:
-    from flexneedle.lab.tracker_evaluation.evaluation.check import PowerCheck, PowerComparison
+    from flexneedle.lab.tracker_evaluation.evaluation.power_check import PowerCheck, PowerComparison
 
 _THRESHOLD = 0.0547  # paper, section IV-B
 
@@ -59,8 +59,8 @@ def add_parser(commands: Commands) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.evaluation.check import check_power
     from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions
+    from flexneedle.lab.tracker_evaluation.evaluation.power_check import check_power
 
     options = EvaluationOptions(
         tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment

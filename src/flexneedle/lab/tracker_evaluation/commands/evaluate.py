@@ -44,7 +44,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.commands.results import print_evaluation
+    from flexneedle.lab.tracker_evaluation.commands.evaluation_tables import print_evaluation
     from flexneedle.lab.tracker_evaluation.evaluation.evaluate import (
         RESULT_FILES,
         EvaluationOptions,

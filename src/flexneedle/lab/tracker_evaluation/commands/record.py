@@ -14,7 +14,7 @@ from flexneedle.lab.tracker_evaluation.commands.arguments import make_number_typ
 
 if TYPE_CHECKING:
     from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
-    from flexneedle.lab.tracker_evaluation.recording.record import StageOperator
+    from flexneedle.lab.tracker_evaluation.recording.grid_recording import StageOperator
 
 
 def add_parser(commands: Commands) -> None:
@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
 
 def _record(args: argparse.Namespace) -> int:
     from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
-    from flexneedle.lab.tracker_evaluation.recording.record import open_session, record_grid
+    from flexneedle.lab.tracker_evaluation.recording.grid_recording import open_session, record_grid
     from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
 
     grid, clock = read_grid(args.grid), make_clock(args.tracker)
@@ -78,7 +78,7 @@ def _operator(
     grid: StageGrid, dwell: float | None, force: bool, wait: Callable[[float], None]
 ) -> StageOperator:
     """Return the operator: a person who presses Enter, or a wait. Mismatches are confirmed only at a terminal."""
-    from flexneedle.lab.tracker_evaluation.recording.record import StageOperator
+    from flexneedle.lab.tracker_evaluation.recording.grid_recording import StageOperator
 
     def announce(stop: GridStop) -> None:
         _print(f"{_progress(grid, stop)}: {_target(stop)}")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.geometry.registration import Rigid, fiducial_error, fit_rigid
+from flexneedle.geometry.rigid import Rigid, fiducial_error, fit_rigid
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import (
     CONFIDENCE,
     Interval,

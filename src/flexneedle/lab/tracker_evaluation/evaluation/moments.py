@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.geometry.registration import Rigid
-from flexneedle.lab.tables.rules import (
+from flexneedle.geometry.rigid import Rigid
+from flexneedle.lab.tables.row_rules import (
     INDICATORS,
     ORIENTATIONS,
     POSITIONS,
@@ -21,8 +21,8 @@ from flexneedle.lab.tables.rules import (
     TRUE_POSITIONS,
     require_text,
 )
-from flexneedle.lab.tables.table import EMPTY, Rule, SampleTable, first_violation
-from flexneedle.phantom.tracking.table import REFERENCE, TIP
+from flexneedle.lab.tables.sample_table import EMPTY, Rule, SampleTable, first_violation
+from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from flexneedle.errors import InputError
-from flexneedle.geometry.registration import misfit
+from flexneedle.geometry.rigid import misfit
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
     compute_errors,
     register_grid,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.library import Library
 from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title, count

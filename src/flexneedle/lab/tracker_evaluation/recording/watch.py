@@ -9,8 +9,8 @@ from math import inf
 from pathlib import Path
 
 from flexneedle.errors import InputError
-from flexneedle.lab.rig.devices.recording import COLUMNS, rows_of
 from flexneedle.lab.rig.devices.replay import ENDED
+from flexneedle.lab.rig.devices.tracker_recording import COLUMNS, rows_of
 from flexneedle.loop.monitor.monitor import field_verdict, is_distorted
 from flexneedle.ports import Clock, Tracker
 from flexneedle.scenario.sections.monitor import MonitorSettings

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.environment import Environment, Plate
 from flexneedle.types import Floats
 

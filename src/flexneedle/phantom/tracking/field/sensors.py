@@ -12,7 +12,7 @@ import numpy as np
 
 from flexneedle.geometry.quaternion import from_vector, product, z_axis
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.environment import Environment
 from flexneedle.types import Floats
 

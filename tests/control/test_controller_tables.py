@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 import flexneedle
-from flexneedle.control import tables
+from flexneedle.control import controller_tables
 from flexneedle.control.controllers import (
     CONTROLLERS,
     DEFAULT,
@@ -71,9 +71,11 @@ def test_all_defaults_are_filled_in_and_nothing_else_changes():
 
 def test_a_task_has_the_settings_of_its_controller():
     scenario = PHANTOM.with_values({"control.my_pid.gain": 0.25})
-    task = tables.make_task(OWN, Simulator(scenario, 1), None)
+    task = controller_tables.make_task(OWN, Simulator(scenario, 1), None)
     assert task.settings == Gains(gain=0.25)
-    assert tables.make_task(CONTROLLERS["open-loop"], Simulator(scenario, 1), None).settings is None
+    assert (
+        controller_tables.make_task(CONTROLLERS["open-loop"], Simulator(scenario, 1), None).settings is None
+    )
 
 
 @pytest.mark.parametrize(

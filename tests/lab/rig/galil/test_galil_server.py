@@ -10,7 +10,7 @@ from emulated import DEADLINE_S, emulator, until
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.galil.controller import ControllerState, reply
-from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer
+from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer
 
 PAGE = (Path(__file__).parents[4] / "docs" / "rig" / "galil.md").read_text()
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from flexneedle.lab.rig.supervisor.protocol import Expectation
-from flexneedle.lab.rig.supervisor.watch import TipWatch
+from flexneedle.lab.rig.supervisor.tip_watch import TipWatch
 from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, VerdictKind

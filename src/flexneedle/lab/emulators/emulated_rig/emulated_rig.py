@@ -9,13 +9,13 @@ from typing import Any, NoReturn, Self
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.emulators import aurora
+from flexneedle.lab.emulators.aurora_server import SerialPort
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
-from flexneedle.lab.emulators.emulated_rig.motors import address_of
-from flexneedle.lab.emulators.emulated_rig.tracker import port_of
+from flexneedle.lab.emulators.emulated_rig.motors_part import address_of
+from flexneedle.lab.emulators.emulated_rig.tracker_part import port_of
 from flexneedle.lab.emulators.faults import FaultKind, parse_fault, parse_order
-from flexneedle.lab.emulators.galil import server as galil
+from flexneedle.lab.emulators.galil import galil_server as galil
 from flexneedle.lab.emulators.orders import Orders
-from flexneedle.lab.emulators.server import SerialPort
 from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.rig_file import RigFile
 
@@ -23,7 +23,7 @@ DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "gali
 """Kinds of fault by device."""
 
 _PHANTOM, _GALIL, _AURORA = "phantom", "galil", "aurora"
-_MODULES = {_PHANTOM: "phantom", _GALIL: "motors", _AURORA: "tracker"}
+_MODULES = {_PHANTOM: "phantom", _GALIL: "motors_part", _AURORA: "tracker_part"}
 _END_S = 3.0  # for a process to end by itself
 _FOLLOW_S = 0.5  # a process that has lost another may end before it
 

@@ -1,6 +1,6 @@
 """Tracker of an emulated rig: a process with an Aurora that measures the tip of the phantom.
 
-`python -m flexneedle.lab.emulators.emulated_rig.tracker PARENT PHANTOM`, with descriptors of channels.
+`python -m flexneedle.lab.emulators.emulated_rig.tracker_part PARENT PHANTOM`, with descriptors of channels.
 """
 
 import select
@@ -10,13 +10,13 @@ from time import monotonic
 
 from flexneedle.errors import RigError
 from flexneedle.lab.emulators.aurora import FAULTS, power_on
+from flexneedle.lab.emulators.aurora_server import EmulatorSession, SerialPort, serve
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
 from flexneedle.lab.emulators.emulated_rig.following import TipHistory
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.stream import Record, receive_records
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.motion import SensorNoise
-from flexneedle.lab.emulators.server import EmulatorSession, SerialPort, serve
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile

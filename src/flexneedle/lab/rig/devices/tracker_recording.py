@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.table import EMPTY, SampleTable, open_table
+from flexneedle.lab.tables.row_rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
+from flexneedle.lab.tables.sample_table import EMPTY, SampleTable, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from flexneedle.lab.rig.preflight.check import Finding, check_device
+from flexneedle.lab.rig.preflight.rig_check import Finding, check_device
 from flexneedle.lab.rig.rig_file import DeviceSection, RigFile, RosSettings
 from flexneedle.lab.ros.bridge import load_checked_profile
 from flexneedle.lab.ros.client import check_installed

@@ -5,7 +5,7 @@ import csv
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.rig.devices.recording import COLUMNS, read_frames, rows_of
+from flexneedle.lab.rig.devices.tracker_recording import COLUMNS, read_frames, rows_of
 from flexneedle.types import Frame, SensorReading
 
 MEASURED = SensorReading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)

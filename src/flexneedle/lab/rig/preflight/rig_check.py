@@ -16,7 +16,7 @@ from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import active_switches, resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import VISIBLE, Frame, is_reference

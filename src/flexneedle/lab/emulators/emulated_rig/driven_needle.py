@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.emulators.emulated_rig.axes import ROTATION, control_between
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import tip_of

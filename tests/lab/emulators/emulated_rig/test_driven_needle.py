@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flexneedle.geometry.quaternion import along, to_matrix
-from flexneedle.geometry.registration import Rigid
+from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.emulators.emulated_rig.axes import NAMES
-from flexneedle.lab.emulators.emulated_rig.needle import RESOLUTION_MM, DrivenNeedle, PhantomSensor
+from flexneedle.lab.emulators.emulated_rig.driven_needle import RESOLUTION_MM, DrivenNeedle, PhantomSensor
 from flexneedle.loop.virtual import Seeds
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom

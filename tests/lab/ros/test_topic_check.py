@@ -15,8 +15,8 @@ from commands import run
 from emulated import until
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros import client
-from flexneedle.lab.ros.check import check_ros
 from flexneedle.lab.ros.dds import DomainDirectory, join_domain
+from flexneedle.lab.ros.topic_check import check_ros
 from ros_peers import Bool, publishing, tip
 
 ROS, TOPICS = {"ros__profile": "neutral", "ros__arm": True}, {"tracker__kind": "ros"}

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.errors import InputError
-from flexneedle.geometry.registration import (
+from flexneedle.geometry.rigid import (
     Rigid,
     check_pairs,
     fiducial_error,

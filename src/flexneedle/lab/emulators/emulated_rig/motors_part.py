@@ -1,6 +1,6 @@
 """Motors of an emulated rig: a process with a Galil whose travel is sent to the phantom.
 
-`python -m flexneedle.lab.emulators.emulated_rig.motors PARENT PHANTOM`, with descriptors of channels.
+`python -m flexneedle.lab.emulators.emulated_rig.motors_part PARENT PHANTOM`, with descriptors of channels.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.stream import Record, send_record
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.galil.controller import ControllerState
-from flexneedle.lab.emulators.galil.server import FAULTS, GalilSession, TcpServer, serve
+from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer, serve
 from flexneedle.lab.process import MessageChannel
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile

@@ -11,7 +11,7 @@ from bench_rig import Clock, Motors, Tracker, rig
 from flexneedle.errors import RunError
 from flexneedle.lab.emulators.galil.controller import reply
 from flexneedle.lab.rig.devices.galil.motors import factory
-from flexneedle.lab.rig.preflight.check import IntendedInsertion, check_motors, check_rig, check_tracker
+from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_motors, check_rig, check_tracker
 from flexneedle.scenario.files import load_scenario
 from flexneedle.types import SensorReading
 from galil_peer import peer
@@ -57,7 +57,7 @@ def test_a_failed_device_does_not_hide_the_other(monkeypatch):
     failing = Motors(fails="A: no reply to TPA")
     for drivers, item, line in (
         (disconnected, "connection", "192.168.1.2: no connection: timed out"),
-        (broken, "connection", "driver bench_rig:drivers: ValueError: bad byte (test_check.py, line "),
+        (broken, "connection", "driver bench_rig:drivers: ValueError: bad byte (test_rig_check.py, line "),
         (lambda *_: failing, "reading", "A: no reply to TPA"),
     ):
         monkeypatch.setattr(bench_rig, "drivers", drivers)

@@ -18,7 +18,7 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.interrupts import uninterrupted
 from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
 from flexneedle.lab.tracker_evaluation.recording.steps import StageVisit, find_mismatch
-from flexneedle.phantom.tracking.table import COLUMNS
+from flexneedle.phantom.tracking.measurement_table import COLUMNS
 from flexneedle.ports import Clock, Tracker
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 

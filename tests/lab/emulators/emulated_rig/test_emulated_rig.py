@@ -13,12 +13,12 @@ import pytest
 from emulated import DEADLINE_S, read_until, until
 from emulated_rig import emulated_rig, gone, rig_file, started
 from flexneedle.errors import InputError, RunError
+from flexneedle.lab.emulators.emulated_rig.emulated_rig import EmulatedRig
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
-from flexneedle.lab.emulators.emulated_rig.rig import EmulatedRig
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.emulators.motion import RATE_HZ
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.loop.virtual import to_stage
 from flexneedle.scenario.files import load_scenario

@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.rules import POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.table import open_table
+from flexneedle.lab.tables.row_rules import POSITIONS, require_numbers, require_text
+from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tables.write import write_table
 
 COMMAS, SEMICOLONS = "sensor,x_mm,y_mm\n", "sensor;x_mm;y_mm\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from flexneedle.lab.tracker_evaluation.commands.tables import (
+from flexneedle.lab.tracker_evaluation.commands.terminal_tables import (
     format_interval,
     format_number,
     print_notes,
@@ -15,7 +15,7 @@ from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, IndicatorSummary
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples
-from flexneedle.phantom.tracking.table import REFERENCE
+from flexneedle.phantom.tracking.measurement_table import REFERENCE
 
 _ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
 _INDICATOR = ("mean", "sd", "max", "min", "p95")

@@ -10,9 +10,9 @@ import pytest
 
 from emulated import DEADLINE_S, emulated, until
 from flexneedle.errors import InputError
-from flexneedle.lab.tracker_evaluation.recording import record as recording
+from flexneedle.lab.tracker_evaluation.recording import grid_recording as recording
 from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
-from flexneedle.lab.tracker_evaluation.recording.record import open_session
+from flexneedle.lab.tracker_evaluation.recording.grid_recording import open_session
 from recordings import ALL, GRID, Stage, assert_complete, rows_of, run
 
 

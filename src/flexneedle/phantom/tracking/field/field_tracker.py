@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flexneedle.geometry.quaternion import along, from_matrix, product, z_axis
-from flexneedle.geometry.registration import Rigid, identity
+from flexneedle.geometry.rigid import Rigid, identity
 from flexneedle.phantom.tracking.field.poses import SensorPose
 from flexneedle.phantom.tracking.field.room import SENSORS, Room
 from flexneedle.phantom.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
-from flexneedle.phantom.tracking.table import TIP
+from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock
 from flexneedle.types import VISIBLE, Floats, Frame, Point, Quaternion, SensorReading
 

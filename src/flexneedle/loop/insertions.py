@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flexneedle.arguments import check_instance
-from flexneedle.control import tables
+from flexneedle.control import controller_tables
 from flexneedle.control.controllers import DEFAULT, with_controller_defaults
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
@@ -102,7 +102,7 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
             "to insert anyway: flexneedle insert --force (force=True)"
         )
-    task = tables.make_task(
+    task = controller_tables.make_task(
         chosen, Simulator(with_controller_defaults(scenario, chosen), choices.threads), plan
     )
     return Steering(task, choices, Guard.of(task.scenario, plan), Seeds.controller(choices.seed), stream)

@@ -13,8 +13,8 @@ import pytest
 from emulated import assert_true_and_new, emulated, emulator, read_until, until
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.rig.devices.aurora import incoming, library, link, tracker
-from flexneedle.lab.rig.devices.aurora.tracker import Aurora
+from flexneedle.lab.rig.devices.aurora import aurora_tracker, incoming, library, link
+from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.types import VISIBLE
 
@@ -208,8 +208,8 @@ def test_a_broken_connection_is_reported_and_opened_again(path, order, fault, te
     ],
 )
 def test_a_link_that_crashes_or_hangs_is_replaced(path, kill, text, monkeypatch):
-    monkeypatch.setattr(tracker, "_SILENT_S", 0.5)
-    monkeypatch.setattr(tracker, "_STOP_S", 0.2)
+    monkeypatch.setattr(aurora_tracker, "_SILENT_S", 0.5)
+    monkeypatch.setattr(aurora_tracker, "_STOP_S", 0.2)
     with Aurora(path, WallClock()) as aurora:
         before, _ = read_until(aurora, at_least(3))
         os.kill(process_of("aurora.link").pid, kill)
@@ -239,8 +239,8 @@ def test_a_link_that_sends_no_message_is_ended_counted_and_replaced(path, monkey
     def start(module, *arguments, **options):
         return ChildProcess(modules.pop() if modules else module, *arguments, **options)
 
-    monkeypatch.setattr(tracker, "_STOP_S", 0.1)
-    monkeypatch.setattr(tracker, "ChildProcess", start)
+    monkeypatch.setattr(aurora_tracker, "_STOP_S", 0.1)
+    monkeypatch.setattr(aurora_tracker, "ChildProcess", start)
     with Aurora(path, WallClock()) as aurora:
         frames, statuses = read_until(aurora, at_least(3))
         counts = aurora.counts

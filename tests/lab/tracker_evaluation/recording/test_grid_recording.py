@@ -5,8 +5,13 @@ import pytest
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
-from flexneedle.lab.tracker_evaluation.recording.record import EXTRA, StageOperator, open_session, record_grid
-from flexneedle.phantom.tracking.table import COLUMNS
+from flexneedle.lab.tracker_evaluation.recording.grid_recording import (
+    EXTRA,
+    StageOperator,
+    open_session,
+    record_grid,
+)
+from flexneedle.phantom.tracking.measurement_table import COLUMNS
 from flexneedle.types import Frame, SensorReading
 from recordings import ALL, Stage, assert_complete, rows_of, run
 
