@@ -10,6 +10,7 @@ from flexneedle.errors import DriverError
 from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.devices import clock
 from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.devices.galil import motors as galil
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import core, protocol
 from flexneedle.lab.rig.supervisor.core import Supervisor
@@ -372,6 +373,14 @@ def real_motors(settings, channels):
     stage.address = settings["address"]
     clock.suspended_s = lambda: 3600.0 * Path(settings["suspended"]).exists()
     return stage
+
+
+def patient_galil(settings, channels):
+    """Motors of a Galil for which a client, ticks and replies may be late: the driver `stages:patient_galil`."""
+    core.HEARTBEAT_S = core._STALL_S = galil.CONNECT_S = 60.0
+    found = galil.factory(settings, channels)
+    found._timeout = 60.0
+    return found
 
 
 class Still:

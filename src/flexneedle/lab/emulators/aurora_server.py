@@ -18,7 +18,7 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.emulators.aurora import AuroraState, EmulatedFrame
-from flexneedle.lab.emulators.faults import Fault, FaultSchedule, is_order
+from flexneedle.lab.emulators.faults import Fault, FaultSchedule, damage_reply, is_order, reply_time
 from flexneedle.lab.emulators.motion import (
     CIRCLE,
     ORDINARY,
@@ -44,48 +44,39 @@ class EmulatorSession:
     """Device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
 
     faults: scheduled, from when tracking first begins; tip: source of its pose; noise: errors of the tip's sensor;
-    on_tracking: called when tracking first begins.
+    on_tracking: called with the time when tracking first begins.
     """
 
     device: AuroraState
     faults: Sequence[Fault]
     seed: int
     power_on: float
-    tracked_since: float | None = None
     tip: TipSource = CIRCLE
     noise: SensorNoise = ORDINARY
-    on_tracking: Callable[[], None] = lambda: None
+    on_tracking: Callable[[float], None] = lambda _: None
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
         self._repeated: dict[Fault, EmulatedPose] = {}
         self.schedule = FaultSchedule(aurora.FAULTS, self.faults)
 
-    def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; scheduled ones begin with tracking."""
-        return {fault.kind: fault for fault in self._active_faults(now)}
-
-    def _active_faults(self, now: float) -> tuple[Fault, ...]:
-        return self.schedule.at(now, self.tracked_since)
-
     def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
         """Return time and data of the reply to a command (b"": no reply)."""
-        faults = self.faults_at(now)
+        faults = self.schedule.by_kind(now)
         if "silence" in faults:
             return now, b""
         if "error" in faults:
             return now, codec.encode_text(f"ERROR{faults['error'].detail}")
         self.device, complete = aurora.reply(self.device, line, self._frame(now, faults))
-        if self.device.mode == "tracking" and self.tracked_since is None:
-            self.tracked_since = now
-            self.on_tracking()
-        delay = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + delay, self._damage(complete, faults)
+        if self.device.mode == "tracking" and self.schedule.since is None:
+            self.schedule.since = now
+            self.on_tracking(now)
+        return reply_time(now, faults), damage_reply(complete, faults, self._random)
 
     def _frame(self, now: float, faults: dict[str, Fault]) -> EmulatedFrame:
         taken = faults["frozen"].start if "frozen" in faults else now
         number = self.tip.newest(int((taken - self.power_on) * RATE_HZ))
-        present = self._active_faults(now)
+        present = self.schedule.at(now)
         by_sensor = {fault.detail: fault.kind for fault in present if fault.kind in aurora.OF_STATUS}
         if is_missing(number, self.seed, self.noise):
             by_sensor.setdefault(SENSORS[0], "missing")
@@ -101,14 +92,6 @@ class EmulatorSession:
                 made = self._repeated.setdefault(fault, made)
             made = with_fault(name, made, fault)
         return made
-
-    def _damage(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
-        if "cut" in faults:
-            return complete[: len(complete) // 2]
-        if "garbled" not in faults:
-            return complete
-        at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
-        return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
 
 
 def with_fault(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
@@ -223,7 +206,7 @@ def serve(
     received, due = b"", list[tuple[float, bytes]]()
     now = served = monotonic()
     while True:
-        unplugged = "unplug" in session.faults_at(now)
+        unplugged = "unplug" in session.schedule.by_kind(now)
         if unplugged != (serial.ends is None):
             (serial.unplug if unplugged else serial.plug)()
             received, due = b"", []

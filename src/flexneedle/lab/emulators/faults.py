@@ -4,9 +4,11 @@ A fault may also be ordered while the device works: `fault KIND[=DETAIL][:DURATI
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+
+import numpy as np
 
 from flexneedle.errors import InputError
 
@@ -118,31 +120,28 @@ def _parse_number(given: str, text: str, form: str) -> float:
         raise InputError(f"{given}: {text} is not a number{of}") from None
 
 
-def active_faults(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
-    """Return the faults that are active at a time (s, with the origin of their times)."""
-    return tuple(fault for fault in faults if fault.start <= time < fault.end)
-
-
 @dataclass
 class FaultSchedule:
     """Faults of a device.
 
-    Times of `scheduled` faults count from when the device began to work (`since`, None: not yet); times of `ordered`
-    faults are the device's (s).
+    Times of `scheduled` faults count from `since`, when the device began to work (s; None: not yet); times of
+    `ordered` faults are the device's (s).
     """
 
     kinds: Mapping[str, FaultKind]
     scheduled: Sequence[Fault] = ()
+    since: float | None = None
     ordered: tuple[Fault, ...] = ()
 
-    def at(self, now: float, since: float | None) -> tuple[Fault, ...]:
+    def at(self, now: float) -> tuple[Fault, ...]:
         """Return the active faults, with the device's times."""
-        begun = (
-            []
-            if since is None
-            else [replace(one, start=since + one.start, end=since + one.end) for one in self.scheduled]
-        )
-        return active_faults((*begun, *self.ordered), now)
+        begun, since = self.scheduled if self.since is not None else (), self.since or 0.0
+        present = (replace(one, start=since + one.start, end=since + one.end) for one in begun)
+        return tuple(fault for fault in (*present, *self.ordered) if fault.start <= now < fault.end)
+
+    def by_kind(self, now: float) -> dict[str, Fault]:
+        """Return the active faults by kind."""
+        return {fault.kind: fault for fault in self.at(now)}
 
     def obey(self, line: str, now: float) -> str:
         """Inject the fault of a line from `now` (s) on, or end all; return its description. Raises InputError."""
@@ -154,3 +153,20 @@ class FaultSchedule:
         kept = [one for one in self.ordered if one.end > now and (one.kind, one.detail) != same]
         self.ordered = (*kept, fault)
         return f"{fault.kind}{fault.detail and '='}{fault.detail}"
+
+
+def reply_time(now: float, faults: Mapping[str, Fault]) -> float:
+    """Return the time of a reply (s) to a command received at `now`, with the faults by kind."""
+    return now + float(faults["delay"].detail) if "delay" in faults else now
+
+
+def damage_reply(complete: bytes, faults: Mapping[str, Fault], random: np.random.Generator) -> bytes:
+    """Return a reply as the line delivers it, with the faults by kind."""
+    if "silence" in faults:
+        return b""
+    if "cut" in faults:
+        return complete[: len(complete) // 2]
+    if "garbled" not in faults:
+        return complete
+    at, flipped = random.integers(len(complete)), random.integers(1, 256)
+    return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]

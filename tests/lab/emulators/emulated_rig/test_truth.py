@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter, read_truth
+from flexneedle.lab.emulators.emulated_rig.truth import TruthRow, TruthWriter, column_names, read_truth
 
 AXES = ("insertion", "rotation")
 TIP = np.array([1.0, 2.0, 3.0, 0.1, -0.2])
@@ -63,13 +63,17 @@ def test_a_file_is_never_overwritten(path):
         TruthWriter(path.parent / "none" / "truth.csv", AXES)
 
 
+HEAD = ",".join(column_names(AXES)) + "\n"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "must have the columns"),
         ("a,b\n1,2\n", "must have the columns"),
-        ("time_s,x_mm\n1,two\n", "could not convert"),
-        ("time_s,x_mm\n1\n", "all rows must have 2 cells"),
+        (HEAD, "must have the columns"),
+        (HEAD + "1,two\n", "could not convert"),
+        (HEAD + "1,2\n", "all rows must have"),
     ],
 )
 def test_another_file_is_refused_in_one_line(path, text, message):

@@ -7,13 +7,34 @@ import pytest
 
 from bench_rig import Clock
 from flexneedle.errors import InputError, RigError
+from flexneedle.lab.rig.devices.replay import ENDED, Replay
 from flexneedle.lab.rig.devices.trackers import aurora, read_run_frames, replay
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.types import VISIBLE, CheckedMeasurement, Frame, Measurement, SensorReading
 
+FRAMES = [Frame(100.0 + n / 40, 7 + n, {"tip": SensorReading((float(n), 0.0, 0.0))}) for n in range(5)]
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n5.0,1,tip,1,2,3\n6.0,2,tip,1,2,3\n"
 
 
-@pytest.mark.parametrize(("speed", "due"), [({}, 1.0), ({"speed": 4}, 0.25), ({"speed": 0.5}, 2.0)])
+def test_recorded_frames_arrive_at_their_time_and_only_once_until_the_end():
+    clock = Clock()
+    clock.wait(3.0)
+    with Replay(FRAMES, clock) as made:
+        assert [frame.number for frame in made.read()] == [7]
+        assert made.read() == ()
+        clock.wait(0.06)
+        later = made.read()
+        assert [frame.number for frame in later] == [8, 9]
+        assert [frame.time for frame in later] == pytest.approx([3.025, 3.05])
+        assert later[0].readings == FRAMES[1].readings
+        assert made.status == VISIBLE
+        clock.wait(96.0)
+        assert [frame.number for frame in made.read()] == [10, 11]
+        assert (made.ended, made.status, made.read()) == (True, ENDED, ())
+    with pytest.raises(InputError, match="at least one frame"):
+        Replay([], clock)
+
+
+@pytest.mark.parametrize(("speed", "due"), [({"speed": 4}, 0.25), ({"speed": 0.5}, 2.0)])
 def test_a_recording_is_replayed_at_its_speed(tmp_path, speed, due):
     path, clock = tmp_path / "recorded.csv", Clock()
     path.write_text(RECORDING)
@@ -43,14 +64,12 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, sensors, names):
     [
         (aurora, {}, "port: missing"),
         (aurora, {"port": 3}, "port = 3: must be text in quotes"),
-        (aurora, {"port": ""}, 'port = "": must be one line of printable text'),
         (
             aurora,
             {"port": "a", "prot": 1},
             "prot = 1: unknown key; did you mean port? valid keys: port, sensors",
         ),
         (aurora, {"port": "a", "sensors": ["tip", "tip"]}, "sensor names must be different identifiers"),
-        (aurora, {"port": "a", "sensors": ["a b"]}, "sensor names must be different identifiers"),
         (aurora, {"port": "a", "sensors": []}, "sensor names must be different identifiers"),
         (replay, {"file": "a", "speed": 0}, "speed = 0: must be above 0"),
         (replay, {"file": "a", "speed": float("inf")}, "speed = inf: must be a finite number"),

@@ -102,13 +102,6 @@ def test_a_stop_slows_down_and_an_abort_does_not():
     assert [value(aborted, f"MG _MO{axis}") for axis in "ABC"] == [0, 1, 0], "B is switched off on errors"
 
 
-def test_deceleration_may_change_after_a_stop_and_in_a_jog():
-    device = switched_on("SPA=2000", "PAA=99999", "BGA", ms=100)
-    stopping = after(device, "STA;DCA=10240", ms=400)
-    assert value(stopping, "TPA") - value(device, "TPA") == pytest.approx(2000**2 / (2 * 10240), abs=3)
-    after(switched_on("JGA=2000", "BGA", ms=100), "DCA=10240")
-
-
 def test_position_tracking_follows_new_positions_without_begin():
     device = switched_on("SPA=2000", "PTA=1")
     for goal in range(10, 210, 10):
@@ -119,13 +112,6 @@ def test_position_tracking_follows_new_positions_without_begin():
     assert value(stopped, "PTA=?") == 0
     again = after(stopped, "PTA=1", ms=500)
     assert value(again, "TPA") == value(stopped, "TPA"), "the old target is forgotten"
-
-
-def test_position_tracking_continues_a_move_and_ends_a_jog():
-    device = switched_on("SPA=2000", "PAA=400", "BGA", ms=50)
-    assert value(after(device, "PTA=1", ms=400), "TPA") == 400
-    device = switched_on("DCA=102400", "JGA=2000", "BGA", ms=100)
-    assert value(after(device, "PTA=1", ms=400), "TPA") - value(device, "TPA") < 30
 
 
 # Limits
@@ -170,12 +156,6 @@ def test_a_motor_that_does_not_follow_is_switched_off_beyond_its_position_error(
     device = switched_on("SPA=2000", "ERA=40", "OEA=1", "PRA=2000", "BGA", ms=2000, fault=fault)
     assert (value(device, "MG _MOA"), value(device, "SCA")) == (1, 8)
     assert abs(value(device, "TPA")) < 600
-
-
-def test_without_an_error_limit_a_motor_stays_on():
-    device = switched_on("SPA=2000", "ERA=-1", "OEA=1", "PRA=2000", "BGA", ms=2000, fault="stall")
-    assert value(device, "MG _MOA") == 0
-    assert int(value(device, "TSA")) & 64
 
 
 def test_a_motor_that_is_off_does_not_move_and_its_commanded_position_follows_the_encoder():

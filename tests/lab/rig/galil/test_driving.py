@@ -31,9 +31,9 @@ def order(controller):
 
 
 @contextmanager
-def driven(controller, mode="tracking", timeout_ms=1000):
+def driven(controller, timeout_ms=1000):
     """Motors A and B at 0, switched on."""
-    given = {"address": controller[0], "mode": mode, "reply_timeout_ms": timeout_ms}
+    given = {"address": controller[0], "reply_timeout_ms": timeout_ms}
     with factory(given, ("A", "B")) as motors:
         for channel in "AB":
             motors.power(channel, False)
@@ -77,17 +77,6 @@ def stream(motors, seconds):
     return first, readings
 
 
-@pytest.mark.parametrize("mode", ["tracking", "moves"])
-def test_a_motor_reaches_its_target_and_returns(controller, mode):
-    with driven(controller, mode) as motors:
-        for goal in (3000.0, -500.0):
-            motors.follow({"A": goal, "B": -goal})
-            assert motors.read()["A"].moving
-            states = settled(motors)
-            assert (states["A"].position, states["B"].position) == (goal, -goal)
-            assert states["A"].stopped == ""
-
-
 def test_streamed_targets_are_followed_within_a_fiftieth_of_a_millimetre(motors):
     """The time at which the first target was carried out is only known to the duration of its call.
 
@@ -106,44 +95,6 @@ def test_streamed_targets_are_followed_within_a_fiftieth_of_a_millimetre(motors)
         assert least <= state.position <= most
         assert state.commanded == pytest.approx(state.position, abs=1)
     assert readings[-1][1].position == pytest.approx(COUNTS_PER_MM, abs=1)
-
-
-def test_after_the_last_target_the_motor_stops_within_the_motion_sent_ahead(motors):
-    for _ in range(5):
-        at = motors.read()["A"].commanded
-        motors.follow({"A": at + SPEED * AHEAD_S})
-    end = settled(motors)["A"].position
-    assert 0 < end - at <= SPEED * AHEAD_S + 1
-
-
-def test_speed_changes_under_way_while_targets_are_streamed(motors):
-    for k in range(1, 21):
-        motors.set_speed("A", SPEED * (0.5 if k % 2 else 1.0), ACCELERATION)
-        motors.follow({"A": 100.0 * k, "B": -100.0 * k})
-        motors.read()
-    states = settled(motors)
-    assert (states["A"].position, states["B"].position) == (2000, -2000)
-
-
-def test_a_reset_position_is_visible(motors, order):
-    motors.follow({"A": 5000.0})
-    assert settled(motors)["A"].position == 5000
-    order("fault reset=A")
-    until(lambda: motors.read()["A"].position == 0)
-
-
-@pytest.mark.parametrize("fault", ["stall", "lag", "overshoot", "reversed"])
-def test_a_motor_that_does_not_follow_is_reported_beside_its_commanded_position(motors, order, fault):
-    order(f"fault {fault}=A")
-    motors.follow({"A": 5000.0})
-    states = []
-
-    def differs():
-        states.append(motors.read()["A"])
-        return abs(states[-1].commanded - states[-1].position) > 0.02 * COUNTS_PER_MM
-
-    until(differs)
-    assert all((state.on, state.stopped) == (True, "") for state in states)
 
 
 def lose(motors):
@@ -174,7 +125,6 @@ def is_reconnected(motors):
     [
         ("unplug:0.3", "closed the connection|reset"),
         ("silence:0.3", "no reply in time"),
-        ("delay=0.5:0.3", "no reply in time"),
         ("garbled:0.3", "no reply in time|numbers|not a reply|refusal|refused|position|byte|more than"),
     ],
 )
@@ -199,9 +149,3 @@ def test_motors_whose_state_is_unknown_are_stopped_far_from_their_targets(contro
         lose(motors)
         until(lambda: is_reconnected(motors))
         assert 0 < settled(motors)["A"].position < 1e6
-
-
-def test_delays_within_the_timeout_are_waited_for(motors, order):
-    order("fault delay=0.05")
-    motors.follow({"A": 500.0})
-    assert settled(motors)["A"].position == 500

@@ -43,12 +43,6 @@ def test_commands_are_sent_in_a_line_and_answered_one_by_one():
     ]
 
 
-def test_commands_that_do_not_fit_into_a_line_take_another():
-    with linked() as (link, device):
-        assert len(ask(link, *["TPABCD"] * 20)) == 20
-    assert len(device.lines) == 2
-
-
 def test_a_host_that_is_not_known_is_refused_in_one_line():
     with pytest.raises(DriverError, match=r"^no-such-host\.invalid:23: unknown host: "):
         Link("no-such-host.invalid", 23)

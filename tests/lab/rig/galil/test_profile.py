@@ -12,7 +12,6 @@ from flexneedle.lab.emulators.galil.profile import (
     SAMPLE_S,
     MotionProfile,
     advance_profile,
-    halt,
     slow_to_rest,
 )
 
@@ -79,17 +78,3 @@ def test_a_stop_takes_the_distance_of_its_deceleration(velocity):
     expected = math.copysign(0.5 * velocity**2 / 40_000.0, velocity)
     assert after[-1].position == pytest.approx(expected, rel=1e-9)
     assert after[-1].velocity == 0.0
-
-
-def test_a_jog_goes_on_at_its_speed():
-    profile = MotionProfile(goal=None, cruise=-2_000.0, acceleration=100_000.0)
-    for _ in range(1_020):
-        profile = advance_profile(profile)
-    assert profile.velocity == -2_000.0
-    assert profile.position == pytest.approx(-2_000.0 * (1.02 - 0.5 * 0.02))
-
-
-def test_a_halt_rests_at_once():
-    profile = halt(MotionProfile(position=3.0, velocity=700.0, goal=1e6))
-    assert profile.at_rest
-    assert advance_profile(profile).position == 3.0

@@ -7,7 +7,6 @@ from flexneedle.lab.rig.supervisor.machine import (
     TABLE,
     RigEvent,
     SupervisorState,
-    accepted_events,
     next_state,
 )
 
@@ -43,15 +42,3 @@ def test_only_requests_of_a_motion_begin_one(event):
     begins = {new for (old, found), new in TABLE.items() if found is event and old in REST and new in MOVING}
     if begins:
         assert event in (RigEvent.HOME, RigEvent.JOG, RigEvent.RETRACT, RigEvent.STEP)
-
-
-def test_a_refused_event_changes_nothing_and_the_choices_are_known():
-    assert next_state(SupervisorState.IDLE, RigEvent.STEP) is None
-    assert accepted_events(SupervisorState.IDLE) == (RigEvent.ARM, RigEvent.STOP, RigEvent.FAULT)
-
-
-def test_every_state_can_be_reached():
-    reached = {SupervisorState.IDLE}
-    for _ in SupervisorState:
-        reached |= {new for (old, _), new in TABLE.items() if old in reached}
-    assert reached == set(SupervisorState)

@@ -15,13 +15,11 @@ from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.geometry.rigid import identity
 from flexneedle.interrupts import SIGNALS
 from flexneedle.lab.rig.rig_file import DeviceSection
-from flexneedle.lab.rig.supervisor import protocol
+from flexneedle.lab.rig.supervisor import connection, protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from stages import rig_file
-
-TESTS = Path(__file__).parents[3]
 
 
 class RecordingClient(SupervisorClient):
@@ -33,7 +31,7 @@ class RecordingClient(SupervisorClient):
 
 
 @pytest.fixture(scope="module")
-def make_task(tmp_path_factory):
+def make_task(tmp_path_factory, patient):  # noqa: ARG001  no limit of time on a busy machine
     """Return a function that makes a task for motors in memory with a name; their commands are in a file `name`."""
     folder = tmp_path_factory.mktemp("motors")
 
@@ -47,9 +45,7 @@ def make_task(tmp_path_factory):
             rig, monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3
         )
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(TESTS)  # where the process finds `stages`
-        yield make
+    return make
 
 
 SHARED = f"shared-{os.getpid()}"  # the lock of an address is for the whole machine
@@ -198,8 +194,9 @@ def test_a_stop_from_other_threads_ends_a_motion(supervisor):
         thread.join()
 
 
-def test_a_supervisor_that_hangs_is_an_error(supervisor):
+def test_a_supervisor_that_hangs_is_an_error(supervisor, monkeypatch):
     supervisor.arm()
+    monkeypatch.setattr(connection, "_SILENT_S", 0.5)
     os.kill(supervisor.pid, signal.SIGSTOP)
     try:
         with pytest.raises(DriverError, match="the supervisor has not reported for"):

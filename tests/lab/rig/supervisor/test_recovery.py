@@ -7,10 +7,10 @@ import pytest
 import tomli_w
 
 import bench_rig
+import stages
 from commands import run
 from emulated import emulator
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.rig_file import DeviceSection
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
@@ -99,7 +99,7 @@ def test_a_motor_that_cannot_be_switched_off_does_not_keep_the_others_on():
 
 
 @pytest.fixture(scope="module")
-def controller():
+def controller(patient):  # noqa: ARG001  no limit of time on a busy machine
     """Address of an emulated controller, and a function that gives it an order."""
     with emulator(device="galil") as given:
         yield given
@@ -117,7 +117,7 @@ def configure(address, line):
 
 def test_an_axis_that_was_blocked_or_switched_off_moves_again_after_reset_and_arm(controller):
     address, order = controller
-    driver = DeviceSection(kind="galil", address=address, reply_timeout_ms=1000.0)
+    driver = DeviceSection(kind="stages:patient_galil", address=address)
     with SupervisorClient.of_operator(rig_file().model_copy(update={"driver": driver})) as supervisor:
         for setup, why, note in (
             ("OEA=0", "insertion: the motor does not follow: 0.", HELD),
@@ -143,14 +143,15 @@ def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, caps
     address, order = controller
     configure(address, "OEA=0")
     file = tmp_path / "rig.toml"
-    file.write_text(tomli_w.dumps(bench_rig.values() | {"driver": {"kind": "galil", "address": address}}))
+    driver = {"kind": "stages:patient_galil", "address": address}
+    file.write_text(tomli_w.dumps(bench_rig.values() | {"driver": driver}))
 
     def command(name, *words):
         status, _, err = run(capsys, "rig", name, str(file), *words, "--yes")
         return status, err.splitlines()[-1]
 
     def read():
-        with factory({"address": address}, ["A", "B", "C"]) as motors:
+        with stages.patient_galil({"address": address}, ["A", "B", "C"]) as motors:
             return motors.read()
 
     order("fault stall=C")

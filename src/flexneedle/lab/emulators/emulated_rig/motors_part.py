@@ -71,9 +71,9 @@ class _Observer:
         if (moving != self._was_moving) or (moving and time > self._sent) or due:
             send_record(self._phantom, Record(time, tuple(travel), moving), "phantom")
             self._sent, self._was_moving = time, moving
-        if not self._announced and self._session.moved_since is not None:
+        if not self._announced and (begun := self._session.schedule.since) is not None:
             self._announced = True
-            self._parent.report(event="first motion", time_s=self._session.moved_since)
+            self._parent.report(event="first motion", time_s=begun)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> N
     followed = TipHistory(begun := monotonic(), _receive_first(phantom))
     parent.others, parent.take = channels, lambda: followed.add(receive_records(phantom))
     session = EmulatorSession(power_on(), faults, job.seed, begun, tip=followed, noise=noise_of(job.scenario))
-    session.on_tracking = lambda: parent.report(event="tracking", time_s=session.tracked_since)
+    session.on_tracking = lambda now: parent.report(event="tracking", time_s=now)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then, too
     with SerialPort(Path(port_of(job.rig))) as serial:
         set_realtime_priority()

@@ -1,6 +1,5 @@
 """Record of the true states of an emulated rig: a CSV file that is written continuously, and its reader."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import degrees
@@ -9,7 +8,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from flexneedle.errors import InputError, RunError
+from flexneedle.errors import InputError, RunError, make_printable
 from flexneedle.types import Floats
 
 _TIP = ("x_mm", "y_mm", "z_mm", "theta_rad", "psi_rad")
@@ -122,11 +121,21 @@ def read_truth(path: Path) -> TruthRecord:
 
     Raises InputError: file, rule.
     """
-    names, rows = _read_rows(path)
-    table = dict(zip(names, np.array(rows, dtype=float).reshape(-1, len(names)).T, strict=True))
-    axes = [name.removesuffix("_counts") for name in names if name.endswith("_counts")]
-    if names != column_names(axes) or not rows:
-        raise InputError(f"{path}: must have the columns of emulate rig --truth, and a row")
+    try:
+        text = path.read_text(encoding="utf-8")
+        head, *rows = text[: text.rfind("\n") + 1].splitlines() or [""]
+        names = tuple(head.split(","))
+        axes = [name.removesuffix("_counts") for name in names if name.endswith("_counts")]
+        if names != column_names(axes) or not rows:
+            raise InputError(f"{path}: must have the columns of emulate rig --truth, and a row")
+        columns = np.loadtxt(rows, delimiter=",", ndmin=2, unpack=True)
+        if len(columns) != len(names):
+            raise InputError(f"{path}: all rows must have {len(names)} cells")
+        table = dict(zip(names, columns, strict=True))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # also of a file that is no text
+        raise InputError(f"{path}: {make_printable(str(error))}") from None
     positions = {name: table[f"{name}_{_unit(name)}"] for name in axes}
     return TruthRecord(
         table["time_s"],
@@ -138,21 +147,3 @@ def read_truth(path: Path) -> TruthRecord:
         table["converged"],
         1e-3 * table["lag_ms"],
     )
-
-
-def _read_rows(path: Path) -> tuple[tuple[str, ...], list[list[float]]]:
-    """Return the names of the columns, and the complete rows."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be read: {reason}") from None
-    head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
-    names = tuple(head.split(","))
-    try:
-        rows = [[float(cell) for cell in row] for row in csv.reader(lines)]
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-    if any(len(row) != len(names) for row in rows):
-        raise InputError(f"{path}: all rows must have {len(names)} cells")
-    return names, rows

@@ -16,7 +16,15 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.lab.emulators.faults import SECONDS, Fault, FaultKind, FaultSchedule, is_order
+from flexneedle.lab.emulators.faults import (
+    SECONDS,
+    Fault,
+    FaultKind,
+    FaultSchedule,
+    damage_reply,
+    is_order,
+    reply_time,
+)
 from flexneedle.lab.emulators.galil import motor_axis as one
 from flexneedle.lab.emulators.galil.axis_commands import ERRORS
 from flexneedle.lab.emulators.galil.controller import (
@@ -76,15 +84,14 @@ and whether one moves, or has been commanded to, from then on."""
 class GalilSession:
     """Controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
 
-    seed: of garbled replies; moved_since: when an axis first moved, from which scheduled faults count; done: faults of
-    one instant that have happened. observe: called after every few samples, and after every command.
+    faults: scheduled, from when an axis first moves; seed: of garbled replies; done: faults of one instant that have
+    happened. observe: called after every few samples, and after every command.
     """
 
     device: ControllerState
     faults: Sequence[Fault]
     power_on: float
     seed: int = 0
-    moved_since: float | None = None
     observe: Observer | None = None
     _samples: int = 0
     _done: set[Fault] = field(default_factory=set)
@@ -93,13 +100,6 @@ class GalilSession:
     def __post_init__(self) -> None:
         self.schedule = FaultSchedule(FAULTS, self.faults)
         self._random = np.random.default_rng((self.seed, 1))
-
-    def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; scheduled ones begin with the first motion."""
-        return {fault.kind: fault for fault in self._active_faults(now)}
-
-    def _active_faults(self, now: float) -> tuple[Fault, ...]:
-        return self.schedule.at(now, self.moved_since)
 
     @property
     def _sample_time(self) -> float:
@@ -115,9 +115,9 @@ class GalilSession:
         self._advance(now, max(0, due))
 
     def _advance(self, now: float, samples: int) -> None:
-        if self.moved_since is None and any(axis.running for axis in self.device.axes):
-            self.moved_since = self._sample_time
-        present = self._active_faults(now)
+        if self.schedule.since is None and any(axis.running for axis in self.device.axes):
+            self.schedule.since = self._sample_time
+        present = self.schedule.at(now)
         before = tuple(self._with_faults(axis, AXES[k], present) for k, axis in enumerate(self.device.axes))
         self.device = advance_controller(replace(self.device, axes=before), samples)
         self._samples += samples
@@ -143,26 +143,14 @@ class GalilSession:
     def reply(self, line: str, now: float) -> tuple[float, bytes]:
         """Return time and data of the reply to a line (b"": no reply)."""
         self.advance(now)
-        faults = self.faults_at(now)
+        faults = self.schedule.by_kind(now)
         if "refuse" in faults:
             self.device, answer = _refuse(self.device, line, int(faults["refuse"].detail))
         else:
             self.device, answer = reply(self.device, line)
         self._report_travel([0.0] * len(AXES))
-        delay = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + delay, self._damage(answer.encode("ascii", "replace"), faults)
-
-    def _damage(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
-        if "silence" in faults:
-            return b""
-        if "chatter" in faults:
-            complete = _CHATTER + complete
-        if "cut" in faults:
-            return complete[: len(complete) // 2]
-        if "garbled" in faults:
-            at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
-            complete = complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
-        return complete
+        complete = _CHATTER * ("chatter" in faults) + answer.encode("ascii", "replace")
+        return reply_time(now, faults), damage_reply(complete, faults, self._random)
 
 
 def _refuse(device: ControllerState, line: str, code: int) -> tuple[ControllerState, str]:
@@ -308,7 +296,7 @@ def serve(
     """
     while True:
         now = monotonic()
-        faults = session.faults_at(now)
+        faults = session.schedule.by_kind(now)
         if ("unplug" in faults) == tcp.is_plugged:
             (tcp.unplug if tcp.is_plugged else tcp.plug)()
             say("listens again" if tcp.is_plugged else "unplugged")

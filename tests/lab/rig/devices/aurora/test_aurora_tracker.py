@@ -289,27 +289,6 @@ def test_an_interrupt_while_connecting_leaves_no_process(terminal, monkeypatch):
     assert not started()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("error", [OSError(11, "Resource temporarily unavailable"), ValueError("no JSON")])
-def test_a_link_that_cannot_be_started_is_reported_and_retried(path, error, monkeypatch):
-    connect = Aurora._connect_once
-    with Aurora(path, WallClock()) as aurora:
-        failures = [error, error]
-
-        def fail_twice(self, may_break):
-            if failures:
-                raise failures.pop()
-            return connect(self, may_break)
-
-        monkeypatch.setattr(Aurora, "_connect_once", fail_twice)
-        process_of("aurora.link").kill()
-        reported = set()
-        until(lambda: reported.add(aurora.status) or aurora.counts.reconnections == 1)
-        counts = aurora.counts
-    assert f"the link failed: {error}" in reported
-    assert counts.errors["crash"] == 3  # including the killed one
-
-
 def test_a_link_that_cannot_be_started_at_first_is_an_error(terminal, monkeypatch):
     def fail(*_):
         raise OSError(24, "Too many open files")
