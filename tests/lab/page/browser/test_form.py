@@ -302,6 +302,27 @@ def test_a_refused_choice_stays_with_the_problem_of_its_part_and_others_follow_t
     )
 
 
+RECONNECTED = """(welcome) => {
+  const [made, other] = ["target", "tissue.1"].map((name) => document.querySelector(`details[data-section='${name}']`));
+  const toggled = (section) => new Promise((resolve) => section.addEventListener("toggle", resolve));
+  const both = Promise.all([toggled(made), toggled(other)]);
+  flexneedle.store.receive(JSON.parse(welcome));
+  [made.open, other.open] = [false, true];
+  return both;
+}"""
+"""Close and open sections after the first message of a new connection, before its session has arrived."""
+
+
+def test_sections_are_opened_while_a_new_connection_has_not_sent_its_session(form, server):
+    """The browser reports an opened section later, and a message may arrive in between."""
+    page = form()
+    page.evaluate(RECONNECTED, WELCOME.model_dump_json())
+    assert page.evaluate("flexneedle.store.get('session')") is None
+    assert page.locator("#field-tissue-1-law").input_value() == "ogden"
+    server.send(clients(), session(3, **{"tissue.1.alpha": 7.5}))
+    until(page, "document.querySelector('#field-tissue-1-alpha').value === '7.5'")
+
+
 def test_options_are_chosen_doubts_shown_and_all_is_disabled_while_another_is_in_control(form, server):
     page = form(session(changed=["target.depth_mm"], doubts=["plan.samples = 3: few"]))
     assert "plan.samples = 3" in page.inner_text(f"{FORM} .doubts")

@@ -50,6 +50,7 @@ class Form {
   #link;
   #made = ""; // name, keys and layers of the form
   #sections = [];
+  #session = null; // the last one: between two connections the store has none
   #problems = {}; // by key
   #refusal = 0; // number of the newest refusal
   #revision;
@@ -63,6 +64,7 @@ class Form {
   update() {
     const session = this.#store.get("session");
     if (!session) return false;
+    this.#session = session;
     const remade = this.#remake(session);
     this.#readProblems(session);
     for (const section of this.#sections) this.#fill(section);
@@ -116,7 +118,7 @@ class Form {
   // Make the fields of a section when it is first opened.
   #make(section) {
     if (section.views.length) return;
-    const { values } = this.#store.get("session");
+    const { values } = this.#session;
     section.views = section.fields.map((field) => {
       const edit = (value) => this.#edit(field, value);
       return Object.assign(new FieldView(field, valueOf(field, values), edit), { key: field.key, field });
@@ -142,14 +144,14 @@ class Form {
   #edit(field, value) {
     this.#chosen = field.key;
     const [, name] = LAW.exec(field.key) ?? [];
-    const { values } = this.#store.get("session");
+    const { values } = this.#session;
     if (!name) return this.#link.edit(editOf(field, value, values));
     const [layers, layer] = [layersOf(values), Number(name.split(".")[1])];
     return this.#link.edit({ tissue: layers.with(layer, withLaw(this.#schema, layers[layer], value)) });
   }
 
   #fill(section) {
-    const [{ values, changed }, draft] = [this.#store.get("session"), this.#store.get("draft") ?? {}];
+    const [{ values, changed }, draft] = [this.#session, this.#store.get("draft") ?? {}];
     for (const view of section.views) {
       const edited = editedOf(view.field, draft);
       const pending = edited !== undefined;
@@ -176,11 +178,10 @@ class Form {
 
   #layerTools(name) {
     const layer = Number(name.split(".")[1]);
-    const change = (make) => this.#link.edit({ tissue: make(layersOf(this.#store.get("session").values)) });
+    const change = (make) => this.#link.edit({ tissue: make(layersOf(this.#session.values)) });
     const add = () => change((layers) => layers.toSpliced(layer, 0, { ...layers[layer], thickness_mm: layers[layer].thickness_mm ?? 10 }));
     const remove = button("Remove", () => change((layers) => layers.toSpliced(layer, 1)), { "aria-label": `Remove layer ${layer + 1}` });
-    const { values } = this.#store.get("session");
-    remove.disabled = !("tissue.1.shear_modulus_kpa" in values);
+    remove.disabled = !("tissue.1.shear_modulus_kpa" in this.#session.values);
     return make("div.tools", {}, button("Add a layer above", add, { "aria-label": `Add a layer above layer ${layer + 1}` }), remove);
   }
 }

@@ -18,7 +18,7 @@ export function followOptions(element, store, link) {
   const problem = make("p.problem.bad", { id: "option-seed-problem", role: "alert", hidden: true });
   const takeSeed = (value) => {
     const valid = Number.isInteger(value) && value >= 0 && value <= MOST;
-    mark(valid ? "" : `must be a whole number from 0 to ${MOST}; the seed is still ${store.get("session").seed}`);
+    mark(valid ? "" : `must be a whole number from 0 to ${MOST}; the seed is still ${known}`);
     if (valid) ask({ seed: value });
   };
   function mark(text) {
@@ -27,7 +27,7 @@ export function followOptions(element, store, link) {
     seed.setAttribute("aria-invalid", String(Boolean(text)));
     seed.setAttribute("aria-describedby", problem.id);
   }
-  const next = button("Next", () => takeSeed(store.get("session").seed + 1), { "aria-label": "Next seed" });
+  const next = button("Next", () => takeSeed(known + 1), { "aria-label": "Next seed" });
   const strategy = make("select", { id: "option-strategy", change: () => ask({ strategy: strategy.value }) });
   const controller = make("select", { id: "option-controller", change: () => ask({ controller: controller.value }) });
   const help = make("p.help.quiet", { id: "option-help" });
