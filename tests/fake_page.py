@@ -21,6 +21,7 @@ from flexneedle.lab.page.server.access import _with_headers
 from recorded_page import TARGET, clients, opening, scene, scene_frames, session
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
+PATIENCE_S = 60.0
 _KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 
 
@@ -64,7 +65,7 @@ class FakePage:
 
     def __enter__(self):
         self._thread.start()
-        assert self._started.wait(20.0)
+        assert self._started.wait(PATIENCE_S)
         port = self._server.servers[0].sockets[0].getsockname()[1]
         self.url = f"http://127.0.0.1:{port}/"
         return self
@@ -72,22 +73,22 @@ class FakePage:
     def __exit__(self, *_):
         self._server.should_exit = True
         self.drop()
-        self._thread.join(20.0)
+        self._thread.join(PATIENCE_S)
 
     def begin_anew(self):
         """Wait until all clients have left, and reset the server; return the invalid requests."""
-        asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(20.0)
+        asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(PATIENCE_S)
         invalid = self.invalid
         self._begin()
         return invalid
 
     def send(self, *news):
         """Send messages and frames to all clients."""
-        asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(20.0)
+        asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(PATIENCE_S)
 
     def drop(self, reason=""):
         """Close all connections."""
-        asyncio.run_coroutine_threadsafe(self._drop(reason), self._loop).result(20.0)
+        asyncio.run_coroutine_threadsafe(self._drop(reason), self._loop).result(PATIENCE_S)
 
     def cut(self):
         """Send nothing more over the present connections, and leave them open, like a dead line."""
@@ -104,7 +105,7 @@ class FakePage:
     def wait_for(self, kind, count=1):
         """Wait for `count` requests of a type, and return them."""
         with self._heard:
-            assert self._heard.wait_for(lambda: len(self.asked(kind)) >= count, 20.0), self.requests
+            assert self._heard.wait_for(lambda: len(self.asked(kind)) >= count, PATIENCE_S), self.requests
         return self.asked(kind)
 
     def _begin(self):
@@ -199,7 +200,7 @@ def until(page, condition):
     """Wait until a condition in JavaScript holds; the policy of the page forbids Playwright's `wait_for_function`."""
     page.evaluate(
         f"""() => new Promise((resolve, reject) => {{
-          const deadline = performance.now() + 20000;
+          const deadline = performance.now() + {1000 * PATIENCE_S};
           const check = () => {{
             if ({condition}) resolve();
             else if (performance.now() > deadline) reject(new Error({condition!r}));

@@ -24,10 +24,20 @@ from page_frames import unpack_frame
 from page_worker import WorkerThread
 
 STUB = ("page_worker",)
-PATIENCE_S = 20.0
-"""Deadline of a wait, which takes milliseconds on an idle machine."""
+PATIENCE_S = 200.0
+"""Deadline of a wait, which takes milliseconds on an idle machine; workers start slowly beside other processes."""
 QUICK = PageLimits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
 """Limits with short waits; a changed scenario is planned only on request."""
+
+IN_CONTROL = {
+    "edit": {"values": {"target.depth_mm": 35.0}}, "preset": {"name": "phantom3d"},
+    "load": {"name": "mine", "text": ""},
+    "options": {"seed": 3}, "start": {"work": "plan"}, "cancel": {"job": 1}, "insert": {}, "check": {},
+    "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}, "rest": {}, "pace": {"pace": 1.0}, "advance": {},
+    "disturb": {"what": "drop", "size": 1.0}, "open": {"name": None}, "study": {"name": "mine"},
+    "save": {"name": "mine"},
+}  # fmt: skip
+"""Requests that only the client in control may send, by type."""
 
 
 def start_worker(module, *arguments):

@@ -252,7 +252,7 @@ class WorkerThread:
     def end(self, seconds):
         self._killed |= seconds == 0.0
         self.channel.end_sending()
-        self._thread.join(20.0)
+        self._thread.join(100.0)
         assert not self._thread.is_alive()
         return -9 if self._killed else self._code
 

@@ -8,7 +8,7 @@ import pytest
 from flexneedle.lab.page import requests as r
 from flexneedle.lab.page.server.connected_rig import RigReference
 from flexneedle.scenario.files import dump_scenario, load_scenario
-from page_clients import QUICK, STUB, Client, get, served
+from page_clients import IN_CONTROL, QUICK, STUB, Client, get, served
 from page_worker import HANGS, ROWS, WORKS_ON
 
 NONE_RUNS = "no insertion runs: start one first"
@@ -59,15 +59,6 @@ def test_a_requested_comparison_is_not_replaced_by_the_plan_of_a_rested_scenario
             (tmp_path / "runs" / name / "run.json").write_text("{}")
             client.wait(lambda name=name: name in client.run_names())
         assert client.newest["job compare"]["state"] == "running"
-
-
-IN_CONTROL = {
-    "edit": {"values": {DEPTH: 35.0}}, "preset": {"name": "phantom3d"}, "load": {"name": "mine", "text": ""},
-    "options": {"seed": 3}, "start": {"work": "plan"}, "cancel": {"job": 1}, "insert": {}, "check": {},
-    "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}, "rest": {}, "pace": {"pace": 1.0}, "advance": {},
-    "disturb": {"what": "drop", "size": 1.0}, "open": {"name": None}, "study": {"name": "mine"},
-    "save": {"name": "mine"},
-}  # fmt: skip
 
 
 def test_only_the_client_in_control_may_ask_for_what_needs_control(shared_server):

@@ -18,14 +18,13 @@ import psutil
 import pytest
 
 import flexneedle
-import page_clients
 from emulated import until
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.page.job_orders import SILENT_S
 from flexneedle.lab.page.server.clients import RIG_LIMITS
 from flexneedle.scenario.files import dump_scenario
-from page_clients import Client, port_of
+from page_clients import PATIENCE_S, Client, port_of
 from page_tasks import short
 
 pytestmark = pytest.mark.long
@@ -36,12 +35,6 @@ RESTS_S = 0.5
 """From a stop of the supervisor until all motors rest: the queue, and a tick."""
 LONGER = {"target.depth_mm": 20.0, "setup.insertion_speed_mm_s": 2.0}
 """Settings of an insertion with time to interrupt it."""
-
-
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    """Workers start slowly beside other processes."""
-    monkeypatch.setattr(page_clients, "PATIENCE_S", 100.0)
 
 
 @dataclass
@@ -66,7 +59,7 @@ class Bench:
 
     def advanced(self, distance):
         """Wait until the base has advanced by a distance (mm)."""
-        until(lambda: np.ptp(self.base[1]) > distance, page_clients.PATIENCE_S)
+        until(lambda: np.ptp(self.base[1]) > distance, PATIENCE_S)
 
     def visitor(self):
         """Return a client that receives messages while it is not read, as a browser does."""
@@ -80,7 +73,7 @@ class Bench:
     def run_file(self):
         """The record of the only run, completed."""
         (folder,) = self.runs.iterdir()
-        until(lambda: (folder / "insertion.png").exists(), page_clients.PATIENCE_S)
+        until(lambda: (folder / "insertion.png").exists(), PATIENCE_S)
         return flexneedle.load(folder)
 
     def timing(self):

@@ -219,7 +219,9 @@ PATHS = [
         "/static//etc/passwd",
         "/static/..\\protocol.py",
     ),
-    *("/static/", "//etc/passwd", "/../../etc/passwd"),
+    *("/static/", "//etc/passwd", "/../../etc/passwd", "/live/../run.json", "/runs/older/....//secret.txt"),
+    *("/runs/%252e%252e%252fsecret/run.zip", "/runs/older/%00", "/static/%ff%fe", "/runs/~root/run.zip"),
+    *(f"{place}{'.' * 100}" for place in ("/", "/static/", "/runs/older/")),
 ]
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from chromium import ARGUMENTS, CHROMIUM
+from fake_page import PATIENCE_S, FakePage
 
 # In software each drawing of the view in space takes as long as the rest of a test.
 DRAWS_NOTHING = """for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
@@ -26,7 +27,6 @@ def browser():
 
 @pytest.fixture(scope="session")
 def kept_server():
-    from fake_page import FakePage
     from flexneedle.lab.page.server.catalog import build_catalog
 
     with FakePage(build_catalog().schema) as server:
@@ -77,7 +77,7 @@ def tab(browser, kept_tabs):
 
     def made(before, draws, touch=False):
         page = browser.new_context(has_touch=touch).new_page()
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(1000 * PATIENCE_S)
         for script in ("" if draws else DRAWS_NOTHING, before):
             if script:
                 page.add_init_script(script)

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-import page_clients
 import small_study
 from fake_page import until
 from flexneedle.lab.page.server.clients import PageLimits
-from page_clients import served
+from page_clients import PATIENCE_S, served
 
 pytestmark = pytest.mark.page
 
@@ -21,13 +20,10 @@ WORKER = "flexneedle.lab.page.worker"
 LIMITS = replace(
     PageLimits(), rest_s=60.0, runs_s=0.2
 )  # a changed scenario keeps its estimate until it is planned
-PATIENCE_MS = 100_000
-"""Workers start slowly beside other processes."""
 
 
 @pytest.fixture
-def address(tmp_path, monkeypatch):
-    monkeypatch.setattr(page_clients, "PATIENCE_S", PATIENCE_MS / 1000)
+def address(tmp_path):
     with served(
         tmp_path / "runs", limits=LIMITS, workers=((WORKER, "plans"), (WORKER, "insertion"))
     ) as server:
@@ -36,12 +32,12 @@ def address(tmp_path, monkeypatch):
 
 def see(page, selector):
     """Wait for a result of a worker."""
-    page.wait_for_selector(selector, timeout=PATIENCE_MS)
+    page.wait_for_selector(selector, timeout=1000 * PATIENCE_S)
 
 
 def downloaded(page, name, path):
     """Return the path of a link's download."""
-    with page.expect_download(timeout=PATIENCE_MS) as download:
+    with page.expect_download(timeout=1000 * PATIENCE_S) as download:
         page.click(f"[aria-label='{name}']")
     download.value.save_as(path)
     return path
