@@ -73,6 +73,7 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert stored["scenario"]["target"] == {"depth_mm": 40.0, "lateral_mm": -4.5, "lateral_z_mm": 0.0}
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("real_figures")
 def test_parts_are_recorded_and_drawn_and_view_redraws_the_same_bytes(engine, capsys):
     engine()
@@ -112,6 +113,7 @@ def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     engine()
     for compiled in (False, True):
         monkeypatch.setattr("flexneedle.phantom.kernels.all_compiled", lambda _axes, done=compiled: done)
+        monkeypatch.setattr("flexneedle.phantom.kernels.compile_kernels", lambda _axes: None)
         assert ("Compiling kernels (first run only) …" in run(capsys, "plan")[2]) is not compiled
 
 

@@ -232,7 +232,7 @@ def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monke
     step=st.floats(0.01, 0.5), reach=st.floats(0.02, 6.0), advance=st.floats(0.3, 2.0),
     stretch=st.floats(-3.0, 3.0), seed=st.integers(0, 99),
 )  # fmt: skip
-@hypothesis_settings(max_examples=8)
+@hypothesis_settings(max_examples=5)
 def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, stretch, seed):
     """The simulator raises CommandError for a step or place out of range; the plan is one of a larger setup."""
     scenario = QUICK.with_values(

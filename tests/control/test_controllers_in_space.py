@@ -73,11 +73,11 @@ def plans():
         ("two axes", "broyden-mpc", 0.2),
         ("one axis", "open-loop", 0.05),
         ("one axis", "adaptive-mpc", 0.15),
-        ("one axis", "ce-mpc", 0.3),
-        ("one axis", "resolved-rate", 0.3),
+        pytest.param("one axis", "ce-mpc", 0.3, marks=pytest.mark.long),
+        pytest.param("one axis", "resolved-rate", 0.3, marks=pytest.mark.long),
         ("no guide", "open-loop", 0.05),
         ("no guide", "adaptive-mpc", 0.2),
-        ("no guide", "ce-mpc", 0.3),
+        pytest.param("no guide", "ce-mpc", 0.3, marks=pytest.mark.long),
         ("no guide", "bevel-only", 0.3),
     ],
 )
@@ -91,7 +91,9 @@ def test_a_controller_reaches_a_target_off_both_axes(plans, rig, controller, mos
         assert all(period.command[DG_Z] == 0.0 for period in done.periods)
 
 
-@pytest.mark.parametrize("controller", ["ce-mpc", "resolved-rate", "broyden-mpc"])
+@pytest.mark.parametrize(
+    "controller", [pytest.param("ce-mpc", marks=pytest.mark.long), "resolved-rate", "broyden-mpc"]
+)
 def test_the_guide_moves_about_its_home_on_each_axis(plans, controller):
     """If needle and plan are moved by more than the guide's travel, the commands stay the same."""
     y, z = -4.0, 7.0
@@ -120,7 +122,10 @@ def quiet_plan():
     return flexneedle.plan(scenario_of(0.0, tracker__jitter_mm=0.0), threads=1)
 
 
-@pytest.mark.parametrize("controller", ["resolved-rate", "broyden-mpc", "bevel-only"])
+@pytest.mark.parametrize(
+    "controller",
+    ["resolved-rate", *(pytest.param(one, marks=pytest.mark.long) for one in ("broyden-mpc", "bevel-only"))],
+)
 def test_a_target_on_the_other_axis_is_reached_in_the_same_way(quiet_plan, controller):
     """Target and plan turned by 90° turn all commands and tips.
 

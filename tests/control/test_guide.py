@@ -50,12 +50,6 @@ def test_only_controllers_of_the_guide_are_refused_without_one(name):
         check_guide(CONTROLLERS[name], PHANTOM.setup, "steering")
 
 
-@pytest.mark.parametrize("name", GUIDE_CONTROLLERS)
-def test_a_steering_plan_is_refused_before_anything_moves(name, steered):
-    with pytest.raises(InputError, match="'manipulation'"):
-        flexneedle.insert(QUICK, steered, controller=name, threads=1)
-
-
 def test_the_refusal_comes_before_the_plan(tmp_path):
     folder = Folder.claim(tmp_path / "run", "run", "insertion", PHANTOM, 0)
     choices = Choices.of(0, "resolved-rate")
@@ -77,7 +71,9 @@ def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
     assert choice.spread == 0.0
 
 
-@pytest.mark.parametrize("name", ["ce-mpc", "bevel-only", "open-loop"])
+@pytest.mark.parametrize(
+    "name", ["ce-mpc", *(pytest.param(one, marks=pytest.mark.long) for one in ("bevel-only", "open-loop"))]
+)
 def test_a_steering_plan_is_carried_out_with_the_guide_still(name, steered):
     rig = flexneedle.VirtualRig("model")
     done = flexneedle.insert(QUICK, steered, 5000, controller=name, rig=rig, threads=1)

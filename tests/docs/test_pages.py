@@ -15,7 +15,7 @@ from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 from scenario_reference import schema, tables
 
 # Pages that take more than about 5 s, and the longest pages.
-LONG = {"emulate.md", "index.md"}
+LONG = {"emulate.md", "index.md", "warnings.md"}
 SLOW = {
     "controllers.md",
     "extend.md",

@@ -25,6 +25,8 @@ from identified import (
 )
 from tasks import begun_with
 
+IN_ALL = ("base turn", "bend", "modulus", "bevel")  # constants that the needle with all of them has, too
+
 
 def test_it_begins_with_the_scenario():
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), math.pi))
@@ -46,7 +48,9 @@ def test_readings_of_the_scenarios_own_needle_leave_the_prior_mean():
     assert estimate.residual == pytest.approx(0.0, abs=1e-7)
 
 
-@pytest.mark.parametrize("name", NEEDLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=pytest.mark.long if one in IN_ALL else ()) for one in NEEDLES]
+)
 def test_it_predicts_a_needle_with_other_constants(name):
     """8 mm further, without a reading; a variation along the depth is known only as far as it is correlated."""
     needle = NEEDLES[name]
@@ -135,7 +139,7 @@ def test_in_air_the_wall_that_the_needle_bears_on_is_found():
     assert max(off) < 5e-3, off
 
 
-@pytest.mark.parametrize("layers", [1, 3])
+@pytest.mark.parametrize("layers", [pytest.param(1, marks=pytest.mark.long), 3])
 def test_tissue_of_other_layers_is_identified_too(layers):
     """One layer, and three whose upper boundary is displaced to below the place of the lower one."""
     top = PHANTOM.values()["tissue"][0]

@@ -46,6 +46,8 @@ CASES = {
     ),
 }
 
+DAILY = ("reached", "deep", "without truth")
+
 
 @cache
 def drawn(case="reached"):
@@ -188,14 +190,19 @@ def test_the_band_is_two_standard_deviations_to_either_side_of_the_predicted_sha
     assert not [text for text in texts(drawn("without truth")) if "predicted" in text]
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[] if case in DAILY else pytest.mark.long) for case in CASES]
+)
 def test_no_labels_overlap_or_are_cut(case):
     assert overlapping(drawn(case)) == []
 
 
 @pytest.mark.parametrize(
     ("scenario", "count"),
-    [(HALF_TURNS, 2), (NO_GUIDE, 1), *(pytest.param(SPACE, k, marks=pytest.mark.long) for k in (1, 2))],
+    [
+        (HALF_TURNS, 2),
+        *(pytest.param(one, k, marks=pytest.mark.long) for one, k in ((NO_GUIDE, 1), (SPACE, 1), (SPACE, 2))),
+    ],
 )
 def test_no_labels_of_plans_overlap(scenario, count):
     plans = [turned_plan(make_plan(), ANGLE), turned_plan(make_plan("steering"), ANGLE)]

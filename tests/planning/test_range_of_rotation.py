@@ -55,8 +55,10 @@ def inside(most, direction, share):
 @pytest.mark.parametrize(
     ("most", "direction"),
     [
-        (45.0, 0.0), (45.0, 135.0), (90.0, 180.0), (90.0, 270.0), (120.0, 0.0), (120.0, 270.0),
-        (135.0, 135.0), (135.0, 180.0), (180.0, 0.0), (180.0, 135.0), (270.0, 180.0), (270.0, 270.0),
+        (45.0, 135.0), (90.0, 180.0), (120.0, 270.0), (135.0, 180.0), (270.0, 180.0),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (
+            (45.0, 0.0), (90.0, 270.0), (120.0, 0.0), (135.0, 135.0), (180.0, 0.0), (180.0, 135.0), (270.0, 270.0),
+        )),
     ],
 )  # fmt: skip
 def test_every_target_in_reach_of_the_range_is_reached_within_it(most, direction):

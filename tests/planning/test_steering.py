@@ -98,7 +98,7 @@ def test_a_roll_leaves_the_other_steps_where_they_are():
 
 
 @given(share=st.floats(-0.95, 0.95), seed=st.integers(0, 2**32))
-@hypothesis_settings(max_examples=10)
+@hypothesis_settings(max_examples=5)
 def test_every_target_within_reach_is_reached(share, seed):
     found = steering.search_rolls(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
     tip = kinematic(found.controls[None], math.cos(found.roll)).tips[0, -1]
