@@ -474,6 +474,7 @@ MUTANTS = [
     (of_motors(ReadsOneChannel), "test_read_returns_the_state_of_each_channel"),
     (of_motors(ReadsTuples), "test_read_returns_the_state_of_each_channel"),
     (of_motors(LeapsWhenSwitchedOn), "test_power_holds_the_motor_where_it_is"),
+    (type("Kit", (of_motors(Motors),), {"switches_off": False}), "test_power_holds_the_motor_where_it_is"),
     (of_motors(FailsAsOSError), "test_failures_are_driver_errors"),
     (of_motors(AddsToThePosition), "test_follow_moves_to_a_position_and_stops_there"),
     (of_motors(with_values(Motors, identity=3)), "test_has_the_parts_of_the_port"),

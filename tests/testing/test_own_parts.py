@@ -1,13 +1,26 @@
 """The controllers, plants, drivers and trackers of the package pass their conformance kits."""
 
+from concurrent.futures import Future
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from emulated import emulated
 from flexneedle.control.controllers import CONTROLLERS
+from flexneedle.lab.page.worker.disturbances import DisturbedPlant, DisturbedTracker
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.galil.motors import factory
 from flexneedle.lab.rig.devices.replay import Replay
+from flexneedle.lab.rig.dry_run import dry_run_ports
+from flexneedle.lab.rig.supervised import SupervisedDriver
+from flexneedle.lab.rig.supervisor.dry import DryRunMotors
+from flexneedle.lab.rig.supervisor.protocol import StepCommand
+from flexneedle.lab.ros import motors as ros_motors
+from flexneedle.lab.ros.records import JointReading, NodeLoss, TipReading
+from flexneedle.lab.ros.tracker import RosTracker
+from flexneedle.loop.rig import Rig
+from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
@@ -25,9 +38,11 @@ from flexneedle.testing import (
     TrackerConformance,
 )
 from flexneedle.testing.checks import short_scenario
-from flexneedle.types import Frame, SensorReading
+from flexneedle.types import VISIBLE, Frame, SensorReading
 from galil_peer import CLOSE, peer
 from rooms import ManualClock, environment
+from stages import Bench, Stage
+from stages import rig_file as rig_in_memory
 
 PERIOD = 1 / 40
 
@@ -59,6 +74,11 @@ _add_classes(OfController, CONTROLLERS)
 _add_classes(OfPlant, PLANTS)
 
 
+class TestDisturbedPlant(PlantConformance):
+    def make(self, truth, roll):
+        return DisturbedPlant(truth, roll)
+
+
 class TestVirtualDriver(DriverConformance):
     def make(self):
         phantom = Phantom(Truth(short_scenario()), 0.0, "model")
@@ -79,6 +99,49 @@ class TestNoisyTracker(TipTrackerConformance):
             direction_at=direction_at,
             direction_jitter=0.005,
         )
+
+
+class TestDisturbedTracker(TestNoisyTracker):
+    def make(self, scenario, phantom, rng):
+        return DisturbedTracker(super().make(scenario, phantom, rng))
+
+
+class TestDryRunTracker(TestNoisyTracker):
+    def make(self, scenario, phantom, rng):
+        rig = Rig(phantom, phantom, super().make(scenario, phantom, rng))
+        return dry_run_ports(rig, rig).tracker
+
+
+class SupervisorOnBench:
+    """A client of a supervisor in memory and in simulated time."""
+
+    def __init__(self):
+        self.bench, self.number = Bench().armed(), 0
+        self.rig = rig_in_memory()
+
+    def step(self, roll, travel, duration, expected, roll_duration):
+        self.number += 1
+        command = StepCommand(self.number, roll, travel, duration, expected, roll_duration)
+        self.bench.core.request(command)
+        return self.bench.until(self.number)
+
+    def stop(self):
+        self.bench.stop()
+        self.bench.tick()
+
+
+class TestSupervisedDriver(DriverConformance):
+    def make(self):
+        supervisor = SupervisorOnBench()
+        return SupervisedDriver(supervisor, short_scenario(), 0.0), supervisor.bench.clock
+
+
+class TestDryRunDriver(TestSupervisedDriver):
+    def make(self):
+        driver, clock = super().make()
+        virtual = virtual_rig(short_scenario(), 0.0, Seeds.of(0), "model")
+        ports = dry_run_ports(Rig(clock, driver, virtual.tracker), virtual)
+        return ports.driver, ports.clock
 
 
 class TestTrackerInAField(TipTrackerConformance):
@@ -157,3 +220,104 @@ class TestGalil(MotorsConformance):
     def disconnect(self, motors):
         del motors
         self.peer.damage = lambda *_: CLOSE
+
+
+class InMemory(MotorsConformance):
+    """Motors on the clock of the test."""
+
+    @pytest.fixture(autouse=True)
+    def _clock(self):
+        self.clock = ManualClock()
+
+    def now(self):
+        return self.clock.now()
+
+    def wait(self, seconds):
+        self.clock.wait(seconds)
+
+
+class TestDryRunMotors(InMemory):
+    channels, switches_off = ("A", "B", "C"), False
+
+    def make(self):
+        return DryRunMotors(Stage(self.clock), self.clock)
+
+
+class JointNode:
+    """A ROS node whose joints are at once at their goals."""
+
+    ended = ""
+
+    def __init__(self, clock, positions):
+        self.clock, self.positions = clock, positions
+
+    def poll(self):
+        if not self.ended:
+            return [JointReading(self.clock.now(), dict(self.positions))]
+        ended, self.ended = self.ended, "reported"
+        return [] if ended == "reported" else [NodeLoss(self.clock.now(), ended)]
+
+    def publish(self, targets):
+        self.positions |= targets.positions
+
+    def close(self):
+        pass
+
+
+class TestRosMotors(InMemory):
+    channels, switches_off = ("insertion", "roll"), False
+    distance, speed, acceleration = 0.02, 0.1, 1.0  # m, m/s, m/s²
+    tolerance = 1.1e-3  # a reading is older than the set point of the same call
+
+    @pytest.fixture(autouse=True)
+    def _node(self, _clock, monkeypatch):
+        def connect_at_once(connect):
+            opened = Future()
+            opened.set_result(connect())
+            return opened
+
+        self.node = JointNode(self.clock, dict.fromkeys(self.channels, 0.01))
+        time = SimpleNamespace(monotonic=self.clock.now, time=self.clock.now, sleep=self.clock.wait)
+        monkeypatch.setattr(ros_motors, "time", time)
+        monkeypatch.setattr(ros_motors, "NodeClient", lambda *_, **__: self.node)
+        monkeypatch.setattr(ros_motors, "connect_in_thread", connect_at_once)
+
+    def make(self):
+        return ros_motors.make_motors({}, self.channels)
+
+    def disconnect(self, motors):
+        del motors
+        self.node.ended = "the ROS node has ended"
+
+
+class TipNode:
+    """A ROS node that receives 40 tips a second."""
+
+    status = VISIBLE
+
+    def __init__(self, clock):
+        self.clock, self.number = clock, 0
+
+    def poll(self):
+        due = int(self.clock.now() / PERIOD) if self.status == VISIBLE else 0
+        fresh = range(self.number + 1, due + 1)
+        self.number = max(self.number, due)
+        return [TipReading(n * PERIOD, n, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)) for n in fresh]
+
+    def close(self):
+        pass
+
+
+class TestRosTracker(InSimulatedTime):
+    @pytest.fixture(autouse=True)
+    def _patch(self, monkeypatch):
+        self.monkeypatch = monkeypatch
+
+    def make(self, clock):
+        self.monkeypatch.setattr("flexneedle.lab.ros.tracker.monotonic", clock.now)
+        self.node = TipNode(clock)
+        return RosTracker(self.node, clock, late_s=0.25)
+
+    def disconnect(self, tracker):
+        del tracker
+        self.node.status = "the ROS node has ended"

@@ -71,7 +71,7 @@ class JointLink:
         topic = profile.subscribe.joint_states
         self._topic = topic.topic if topic else ""
         self._reading: JointReading | None = None
-        self._refused = ""
+        self._refused = self._lost = ""
         self._node = NodeClient(profile, epoch=time.time() - time.monotonic())
         try:
             self._await_states(time.monotonic() + _CONNECT_S)
@@ -88,7 +88,9 @@ class JointLink:
             elif isinstance(record, RosRefusal):
                 self._refused = f": {record.reason}"
             elif isinstance(record, NodeLoss):
-                raise DriverError(record.reason)
+                self._lost = record.reason
+        if self._lost:
+            raise DriverError(self._lost)
 
     def read(self) -> JointReading:
         """Return the newest joint states. Raises DriverError if they are missing, too old or lack a channel."""
@@ -179,6 +181,7 @@ class RosMotors:
         self._check({channel: speed})
         if not speed > 0.0:
             raise DriverError(f"joint {channel}: speed {speed:g}: must be above 0")
+        self._get_link().poll()
         self._speeds[channel] = speed
         if channel in self._points:
             self._points[channel] = replace(self._points[channel].advance(time.monotonic()), speed=speed)
@@ -218,6 +221,7 @@ class RosMotors:
         self._check({channel: 0.0})
         if not on:
             raise DriverError(f"joint {channel}: joints of topics cannot be switched off here")
+        self._get_link().poll()
 
     def reconnect(self) -> None:
         """Start a new node in a thread, without the motions of the old one.

@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import isfinite
 
+from flexneedle.errors import DriverError
 from flexneedle.ports import Clock, Motors, MotorState
 
 
@@ -53,6 +55,8 @@ class DryRunMotors:
 
     def follow(self, positions: Mapping[str, float]) -> None:
         """Set the targets of the simulated motors."""
+        if not all(map(isfinite, positions.values())):
+            raise DriverError(f"positions {dict(positions)}: must be finite")
         for channel, target in positions.items():
             self._change(channel, target=target)
 
