@@ -21,8 +21,10 @@ class Bench:
 
     def apply(self, command, duration):
         """Roll at 360°/s, then travel within `duration` seconds; return the motion with its times."""
-        begun, turned = self.time, self.time + abs(command.roll) / (2 * np.pi)
-        self.time, self.x = turned + duration, self.x + command.db_x
+        if abs(command.db_x) > 1.0:
+            raise flexneedle.DriverError(f"db_x = {command.db_x:g} mm: must be at most 1")
+        begun, turned = self.time, self.time + abs(command.roll) / (2 * np.pi) if command.roll else None
+        self.time, self.x = (turned or begun) + duration, self.x + command.db_x
         return flexneedle.Motion(command, begun, self.time, turned)
 
     def stop(self):
@@ -36,5 +38,4 @@ class Bench:
 def insert(scenario, plan):
     """Execute a plan on the bench."""
     bench = Bench(scenario.setup.start_tip_x)
-    rig = flexneedle.Rig(clock=bench, driver=bench, tracker=bench)
-    return flexneedle.insert(scenario, plan, rig=rig)
+    return flexneedle.insert(scenario, plan, rig=flexneedle.Rig(clock=bench, driver=bench, tracker=bench))

@@ -1,8 +1,14 @@
+from bench import Bench
 from camera import Camera
 from follow_path import CONTROLLER
 from unicycle import Unicycle
 
-from flexneedle.testing import ControllerConformance, PlantConformance, TipTrackerConformance
+from flexneedle.testing import (
+    ControllerConformance,
+    DriverConformance,
+    PlantConformance,
+    TipTrackerConformance,
+)
 
 
 class TestFollowPath(ControllerConformance):
@@ -18,3 +24,9 @@ class TestUnicycle(PlantConformance):
 class TestCamera(TipTrackerConformance):
     def make(self, scenario, phantom, rng):
         return Camera(scenario, phantom, rng)
+
+
+class TestBench(DriverConformance):
+    def make(self):
+        bench = Bench(tip_x=-4.0)
+        return bench, bench
