@@ -44,12 +44,6 @@ def test_rigs_depend_on_the_number_alone_and_are_of_all_families(rigs):
     assert 200.0 <= min(counts) < 500.0 < 8000.0 < max(counts) <= 20_000.0
 
 
-def test_worlds_have_numbers_that_no_other_study_uses(rigs):
-    numbers = [int(name.split()[1]) for rig in rigs if (name := rig.scenario.name).startswith("World")]
-    assert all(13_000_000 + 100 * 40 > number >= 13_000_000 for number in numbers)
-    assert len(set(numbers)) == len(numbers) > 15
-
-
 @pytest.mark.parametrize("motors", [Stage, Moves])
 def test_every_rig_carries_out_steps_and_rolls_with_no_more_than_the_queue(rigs, motors):
     for rig in rigs[::4]:

@@ -99,13 +99,6 @@ def test_ticks_that_no_stall_explains_and_late_decisions_are_not_as_required():
     assert most.problems == []  # it leaves 50 ms, which a busy machine needs
 
 
-def test_the_interval_is_that_of_the_mean():
-    values = np.random.default_rng(3).normal(0.0, 0.1, 100)
-    mean, low, high = study.mean_with_interval(values)
-    assert mean == pytest.approx(values.mean())
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 10, rel=0.05)
-
-
 def test_table_and_picture(tmp_path):
     study.draw(rows(0.01), tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000

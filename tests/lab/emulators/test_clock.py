@@ -20,11 +20,6 @@ def clocks(waits):
     return np.array(times).T
 
 
-def test_without_pauses_it_is_real_time():
-    real, device = clocks([0.005, 0.001, 0.009, 0.0] * 50)
-    np.testing.assert_array_equal(device, real)
-
-
 def test_after_a_pause_it_catches_up_at_ten_percent():
     real, device = clocks([0.06] + [0.005] * 200)
     behind = real - device
@@ -41,8 +36,3 @@ def test_it_never_decreases_is_never_ahead_and_never_jumps_by_half_a_frame(waits
     assert (real - device <= 0.2 + 1e-9).all()
     jumps = np.diff(device) > PERIOD_S / 2
     assert (real - device)[1:][jumps] == pytest.approx(0.2)  # it jumps only if it is too far behind
-
-
-def test_after_a_long_stop_it_jumps():
-    real, device = clocks([0.005, 60.0])
-    assert device[-1] == pytest.approx(real[-1] - 0.2)

@@ -66,15 +66,6 @@ def test_an_invalid_command_returns_its_error_code(command, error):
     assert send(set_up(), "ECHO:Aurora 1")[1] == "Aurora 1"
 
 
-def test_a_command_with_a_wrong_checksum_is_rejected():
-    assert aurora.reply(power_on(), b"INIT:0000", FRAME)[1] == codec.encode_text("ERROR04")
-
-
-def test_a_reading_in_text_has_pose_status_and_frame_number():
-    _, reply = send(set_up(1), "TSTART:", "TX:0001")
-    assert reply == f"010A{codec.encode_pose_text(FRAME.poses['tip'])}0000003100000007\n0000"
-
-
 def faulty(fault, command):
     """Return the reading of a single sensor with a fault."""
     frame = EmulatedFrame(7, FRAME.poses, {"tip": fault})
@@ -111,12 +102,3 @@ def test_the_system_status_is_at_the_end_of_a_reading(read):
     device, _ = send(set_up(1), "TSTART:")
     _, reply = send(device, f"{read}:0801", frame=EmulatedFrame(7, FRAME.poses, system=0x21))
     assert reply.endswith("0021") if read == "TX" else reply[-4:-2] == b"\x21\0"
-
-
-def test_there_are_no_more_handles_than_two_digits_have():
-    device = set_up(1)
-    for handle in range(0x0B, 0x100):
-        device, reply = send(device, "PHRQ:*********1****")
-        assert reply == f"{handle:02X}"
-    assert send(device, "PHRQ:*********1****")[1] == "ERROR2D"
-    assert max(device.ports) == 0xFF

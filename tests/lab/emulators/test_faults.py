@@ -169,10 +169,6 @@ def test_values_that_are_not_numbers_are_reported_and_rejected_by_the_adapter(ki
     assert make_reading(0, 0x31, found).status == "bad transform"
 
 
-def test_a_fault_of_another_sensor_does_not_change_the_tip():
-    assert values(tracking("nan=ref1@0", "stuck=ref2@0"), 11.5) == values(tracking(), 11.5)
-
-
 def test_orders_count_from_now_and_scheduled_faults_from_the_begin_of_work():
     schedule = FaultSchedule(FAULTS, (Fault("silence", 1.0, 2.0),))
     schedule.obey("fault cut:0.5", 100.0)

@@ -21,10 +21,13 @@ def inserting(time, **options):
     return TickReport(time, SupervisorState.INSERTING, **options)
 
 
-def test_delays_and_durations_are_summed_for_each_tick():
-    found = summary(inserting(0.0, late=0.004, work=0.001), inserting(0.025, late=0.0, work=0.003))
-    assert (found["late_max_ms"], found["work_max_ms"]) == pytest.approx((4.0, 3.0))
-    assert (found["ended_p50_ms"], found["ended_max_ms"]) == pytest.approx((4.0, 5.0))
+def test_delays_durations_and_stalls_of_ticks_are_summed():
+    """A stall is at the tick after the missed ones."""
+    found = summary(inserting(1.0, late=0.004, work=0.001), inserting(1.1, late=0.075, work=0.003, missed=3))
+    assert (found["late_max_ms"], found["work_max_ms"]) == pytest.approx((75.0, 3.0))
+    assert (found["ended_p50_ms"], found["ended_max_ms"]) == pytest.approx((41.5, 78.0))
+    assert (found["count"], found["missed"]) == (2, 3)
+    assert found["stalls"] == [{"time_s": pytest.approx(101.1), "late_s": 0.075}]
     assert summary()["ended_p99_ms"] is None
 
 
@@ -33,12 +36,6 @@ def test_the_time_of_a_state_is_the_end_of_its_tick_since_a_fault_may_occur_with
     found = summary(inserting(1.0, work=0.002), inserting(1.025, work=0.002), fault)["states"]
     assert [(one["state"], one["why"]) for one in found] == [("inserting", ""), ("fault", "the motor is off")]
     assert [one["time_s"] for one in found] == pytest.approx([101.002, 101.054])
-
-
-def test_a_stall_is_at_the_tick_after_the_missed_ones():
-    found = summary(inserting(1.0), inserting(1.1, late=0.075, missed=3))
-    assert (found["count"], found["missed"]) == (2, 3)
-    assert found["stalls"] == [{"time_s": pytest.approx(101.1), "late_s": 0.075}]
 
 
 def test_the_largest_motion_in_the_queue_is_kept_by_axis():

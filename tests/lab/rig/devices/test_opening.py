@@ -121,16 +121,6 @@ def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
     assert tuple(motors.states) == ("A", "B", "C")
 
 
-def test_an_installed_package_has_drivers_and_trackers_by_name(package):
-    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
-    package("acme-camera", TRACKERS, acme="bench_rig:trackers")
-    found = rig(driver={"kind": "acme"}, tracker={"kind": "acme", "rate": 20.0})
-    clock = Clock()
-    assert tuple(open_motors(found).read()) == ("A", "B", "C")
-    tracker = open_tracker(found, clock)
-    assert (tracker.rate, tracker.clock) == (20.0, clock)
-
-
 def test_a_tracker_is_closed_by_its_close_or_as_a_context_manager():
     clock = Clock()
     tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), clock)

@@ -8,7 +8,6 @@ import pytest
 
 from emulated import until
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.devices.galil.dialogue import Dialogue
 from flexneedle.lab.rig.devices.galil.link import Link
 from galil_peer import CLOSE, peer
 
@@ -168,5 +167,5 @@ def test_after_the_deadline_nothing_is_sent_and_the_connection_remains():
 def test_control_characters_of_a_refused_query_are_printed():
     with linked(lambda line, true: true if line == "TC1" else b"?") as (link, device):
         with pytest.raises(DriverError) as refused:
-            Dialogue(link).text("\x12\x16", monotonic() + PATIENT_S)
+            link.text("\x12\x16", monotonic() + PATIENT_S)
         assert str(refused.value) == f"127.0.0.1:{device.port}: ^R^V refused: 0"

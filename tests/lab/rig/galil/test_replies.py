@@ -59,11 +59,6 @@ def test_replies_are_one_for_each_command():
     )
 
 
-@pytest.mark.parametrize("received", [b"", b" 1", b" 1\r\n", b":", b" 1\r\n: 2\r\n"])
-def test_replies_that_are_not_complete_are_waited_for(received):
-    assert parse_replies(received, 2) is None
-
-
 @pytest.mark.parametrize(
     "received",
     [b"\xb1\xb7\r\n: 1\r\n:", b"\x00:", b"::\x07", b": 1\r\n::", b":::", b":: 1\r\n", b" 1\r\n?:", b"\xff"],

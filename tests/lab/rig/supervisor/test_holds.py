@@ -125,18 +125,6 @@ def test_a_tip_that_is_as_late_as_its_motor_does_not_hold_the_needle(bench):
     assert bench.position("insertion") == pytest.approx(4.0, abs=2e-3)
 
 
-def test_a_lasting_jump_holds_the_needle_for_good(bench):
-    bench.camera.tip = lambda time: (0.5 * time, 0.0, 0.01 * time)
-    bench.step(expected=AHEAD, duration=2.0)
-    bench.tick(10)
-    bench.camera.tip = lambda time: (0.3, 1.9, 0.01 * time)
-    assert bench.until(1).why.startswith("jump: 1.9")
-    for number in range(2, 7):
-        bench.tick(40)
-        bench.step(number, expected=AHEAD)
-        assert bench.until(number).travelled["insertion"] == 0.0
-
-
 def test_no_step_begins_with_a_tracker_that_has_not_replied(bench):
     bench.camera.tip = lambda _: None
     bench.tick(20)

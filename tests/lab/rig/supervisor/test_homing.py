@@ -220,15 +220,14 @@ def lose_position(bench, _motor):
     bench.stage.read = reported
 
 
+def change_motor(**values):
+    return lambda _, motor: vars(motor).update(values)
+
+
 @pytest.mark.parametrize(
     ("at", "change", "state", "why"),
     [
-        (
-            SWITCH_MM,
-            stay_active,
-            SupervisorState.IDLE,
-            "guide_y: the reverse-limit switch is still active 0.6",
-        ),
+        (SWITCH_MM, stay_active, SupervisorState.IDLE, "guide_y: the reverse-limit switch is still active"),
         (
             7.0,
             stay_active,
@@ -236,13 +235,8 @@ def lose_position(bench, _motor):
             "guide_y: the reverse-limit switch is still active 0.600 mm",
         ),
         (7.0, lose_position, SupervisorState.FAULT, "guide_y: the motor controller reports position nan"),
-        (7.0, lambda _, motor: setattr(motor, "coasts", 1e3), SupervisorState.FAULT, "guide_y: "),
-        (
-            7.0,
-            lambda _, motor: setattr(motor, "fault", "stall"),
-            SupervisorState.FAULT,
-            "the motors have not",
-        ),
+        (7.0, change_motor(coasts=1e3), SupervisorState.FAULT, "guide_y: "),
+        (7.0, change_motor(fault="stall"), SupervisorState.FAULT, "the motors have not"),
     ],
 )
 def test_a_search_that_fails_sets_no_home(at, change, state, why):

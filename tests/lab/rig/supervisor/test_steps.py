@@ -143,16 +143,6 @@ def test_a_step_that_moves_nothing_ends_at_once(bench):
     assert bench.sent[-1].travelled == {"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}
 
 
-def test_ticks_continue_while_the_controller_decides(bench):
-    bench.step()
-    bench.until(1)
-    before = len(bench.reports)
-    bench.tick(10, beat=False)
-    assert all(report.measurements for report in bench.reports[before:])
-    assert bench.state is SupervisorState.INSERTING
-    assert bench.reports[-1].time - bench.reports[-2].time == pytest.approx(TICK_S)
-
-
 # Rolls
 
 

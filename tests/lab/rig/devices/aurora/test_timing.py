@@ -49,16 +49,6 @@ def test_a_drifting_clock_is_followed():
     assert np.abs(error).max() < 0.0021
 
 
-def test_lost_frames_leave_a_gap_in_time():
-    times = stamps([0, 1, 41], [0.0, 0.025, 1.030])
-    np.testing.assert_allclose(np.diff(times), [0.025, 1.0])
-
-
-def test_numbers_are_the_trackers_while_they_increase():
-    numbering = Numbering(RATE)
-    assert [numbering.count(n, n / RATE) for n in (7, 8, 12)] == [7, 8, 12]
-
-
 def test_numbers_continue_when_the_tracker_restarts_its_count():
     numbering = Numbering(RATE)
     assert numbering.count(500, 10.0) == 500

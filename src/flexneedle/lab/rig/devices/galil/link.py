@@ -1,4 +1,4 @@
-"""The TCP line to a Galil controller: a line of commands, and the replies to them, within a time limit.
+"""The TCP line to a Galil controller: lines of commands and queries, and the replies to them, within a time limit.
 
 A reply belongs to the line before it and to no other. If this is in doubt (no reply in time, garbled or surplus bytes,
 an unsolicited message, a broken connection), the connection is closed, so that late data are attributed to no command;
@@ -15,13 +15,16 @@ from flexneedle.lab.rig.devices.galil.replies import (
     GarbledError,
     Reply,
     format_commands,
+    parse_numbers,
     parse_replies,
+    parse_text,
     split_lines,
 )
 
 _LARGEST_REPLY = 4096  # bytes; a reply to the longest line has a few hundred
 _MOST_UNREAD = 1 << 20
 _END = b"\r"
+_REASON = "TC1"
 _REMEDY = "check the power, the cable and the address of the controller, and start again"
 
 
@@ -81,6 +84,47 @@ class Link:
         return tuple(
             reply for line in split_lines(tuple(commands)) for reply in self._exchange(line, deadline)
         )
+
+    def do(self, commands: Sequence[str], deadline: float) -> None:
+        """Have commands carried out. Raises DriverError, with the controller's reason if it refuses one."""
+        if any(self._data(commands, deadline)):
+            raise self.failed(f"data in the reply to {format_commands(commands)}")
+
+    def numbers(
+        self, queries: Sequence[str], counts: Sequence[int], deadline: float
+    ) -> list[tuple[float, ...]]:
+        """Return the answers to queries, `counts` numbers each. Raises DriverError, as in `do`."""
+        found = self._data(queries, deadline)
+        try:
+            return [parse_numbers(data, count) for data, count in zip(found, counts, strict=True)]
+        except GarbledError as error:
+            raise self.failed(f"{error} (to {format_commands(queries)})") from None
+
+    def text(self, query: str, deadline: float) -> str:
+        """Return the line of text that answers a query. Raises DriverError, as in `do`."""
+        (data,) = self._data([query], deadline)
+        try:
+            return parse_text(data)
+        except GarbledError as error:
+            raise self.failed(str(error)) from None
+
+    def _data(self, commands: Sequence[str], deadline: float) -> tuple[str, ...]:
+        """Return the data in the replies to commands that are all accepted."""
+        replies = self.ask(commands, deadline)
+        refused = [command for command, reply in zip(commands, replies, strict=True) if not reply.accepted]
+        if refused:
+            why = self._reason_of(refused, deadline)
+            raise DriverError(f"{self.name}: {format_commands(refused)} refused: {why}")
+        return tuple(reply.data for reply in replies)
+
+    def _reason_of(self, refused: Sequence[str], deadline: float) -> str:
+        """Return the controller's reason, its code and text, for the last refused command."""
+        if _REASON in refused:
+            return "no reason given"
+        try:
+            return self.text(_REASON, deadline)
+        except DriverError as error:
+            return f"unknown reason: {error}"
 
     def _exchange(self, line: tuple[str, ...], deadline: float) -> tuple[Reply, ...]:
         if self._socket is None:

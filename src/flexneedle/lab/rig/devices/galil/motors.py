@@ -10,17 +10,17 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import DriverError
-from flexneedle.lab.rig.devices.galil import facts
-from flexneedle.lab.rig.devices.galil.dialogue import Dialogue
 from flexneedle.lab.rig.devices.galil.link import Link
 from flexneedle.lab.rig.devices.galil.replies import LONGEST_LINE, GarbledError
 from flexneedle.lab.rig.devices.galil.settings import AXES, GalilSettings, check_galil_settings
 from flexneedle.lab.rig.devices.galil.states import (
     ABORTED,
+    SETUP,
     STOPPED,
     ChannelState,
     MotorReport,
     make_report,
+    make_setup,
     take_report,
 )
 from flexneedle.ports import MotorPaces, MotorSetup, MotorState
@@ -30,6 +30,13 @@ CONNECT_S = 2.0
 
 _REVISION = "\x12\x16"  # Ctrl-R Ctrl-V
 _FARTHEST = 2_147_483_647
+_SERVOS = (
+    1.0,
+    1.5,
+    4.0,
+)  # types of motor (MT, either sign) whose position an encoder measures; others are steppers
+_POSITION_FORMAT = 10.0  # PF: ten digits, no decimals; a shorter format would cut positions off
+_SAMPLE_TIME = 1000.0  # TM at which speeds are in counts/s; another scales all speeds and accelerations
 _SPEED_STEP, _RATE_STEP = 2, 1024  # the controller rounds down to multiples, at its default sample time
 _PACES = MotorPaces((_SPEED_STEP, 15_000_000.0), (_RATE_STEP, 1_073_740_800.0))
 _SLOWING_S = 0.5  # time to come to rest if speed and acceleration were not set here
@@ -64,7 +71,6 @@ class GalilMotors:
         self._tracks = settings.mode == "tracking"
         self._letters = "".join(sorted(channels))
         self._link = Link(settings.host, settings.port)
-        self._dialogue = Dialogue(self._link)
         self._channels = dict.fromkeys(self._letters, ChannelState())
         self._rates: dict[str, int] = {}
         self._slowing: dict[str, float] = {}
@@ -97,25 +103,23 @@ class GalilMotors:
     def _execute(self, commands: Sequence[str], deadline: float) -> None:
         """Have commands carried out; from the first on, a connection in doubt is left with a stop of the motors."""
         self._farewell = self._link.farewell = f"ST{self._letters}"
-        self._dialogue.do(commands, deadline)
+        self._link.do(commands, deadline)
 
     def _identify(self, deadline: float) -> None:
         """Identify the device. Raises DriverError if it is not a controller that can be read without another setup."""
         self._link.ask(["EO 0"], deadline)  # refused where there is no echo to switch off, as on Ethernet
-        self.identity = self._dialogue.text(_REVISION, deadline)
+        self.identity = self._link.text(_REVISION, deadline)
         if "DMC" not in self.identity:
             raise self._unfit_error(f"not a Galil motion controller: {self.identity}")
-        queries = ["MG _PF,_TM", f"MG {facts.format_operands('MT', self._letters)}"]
-        (form, sample), kinds = self._dialogue.numbers(queries, [2, len(self._letters)], deadline)
-        if form != facts.POSITION_FORMAT:
-            raise self._unfit_error(
-                f"positions have the format PF {form:g}: set PF {facts.POSITION_FORMAT:g}"
-            )
-        if sample != facts.SAMPLE_TIME:
-            rule = f"set TM {facts.SAMPLE_TIME:g}, so that speeds are in counts/s"
+        queries = ["MG _PF,_TM", f"MG {','.join(f'_MT{letter}' for letter in self._letters)}"]
+        (form, sample), kinds = self._link.numbers(queries, [2, len(self._letters)], deadline)
+        if form != _POSITION_FORMAT:
+            raise self._unfit_error(f"positions have the format PF {form:g}: set PF {_POSITION_FORMAT:g}")
+        if sample != _SAMPLE_TIME:
+            rule = f"set TM {_SAMPLE_TIME:g}, so that speeds are in counts/s"
             raise self._unfit_error(f"the sample time is TM {sample:g}: {rule}")
         for letter, kind in zip(self._letters, kinds, strict=True):
-            if abs(kind) not in facts.SERVOS:
+            if abs(kind) not in _SERVOS:
                 raise self._unfit_error(
                     f"{letter} is not a servo motor (MT {kind:g}): its position is not measured"
                 )
@@ -155,7 +159,7 @@ class GalilMotors:
 
     def _query(self, names: Sequence[str], letters: str, deadline: float) -> list[tuple[float, ...]]:
         queries = [f"{name}{letters}" for name in names]
-        return self._dialogue.numbers(queries, [len(letters)] * len(queries), deadline)
+        return self._link.numbers(queries, [len(letters)] * len(queries), deadline)
 
     def _report(self, position: float, commanded: float, switches: float, code: float) -> MotorReport:
         try:
@@ -293,7 +297,7 @@ class GalilMotors:
     def _end_tracking(self, letter: str, deadline: float) -> None:
         """End position tracking, in which the controller refuses other commands; stop motion of unknown origin."""
         self._read_states(deadline)
-        moving = self._read_states(deadline)[letter].moving  # the second one: see `seen`
+        moving = self._read_states(deadline)[letter].moving  # the second one: see `take_report`
         channel = self._channels[letter]
         if moving and channel.target is not None:
             raise DriverError(f"{self._link.name}: {letter} is in motion")
@@ -307,9 +311,9 @@ class GalilMotors:
         """Return limits and position errors of the controller for each channel. It changes nothing."""
         found = {}
         for letter in self._letters:
-            query, count = facts.make_query(letter)
-            (values,) = self._dialogue.numbers([query], [count], self._deadline())
-            found[letter] = facts.make_setup(values)
+            query = f"MG {','.join(f'_{name}{letter}' for name in SETUP)}"
+            (values,) = self._link.numbers([query], [len(SETUP)], self._deadline())
+            found[letter] = make_setup(values)
         return found
 
 

@@ -1,13 +1,14 @@
 """Settings of the driver `galil` in a rig file, beside `kind`."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
 from flexneedle.errors import RigError
-from flexneedle.scenario.problems import Problem, describe, to_line
+from flexneedle.lab.rig.rig_file import check_settings
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.fields import Section
 
 AXES = "ABCDEFGH"
@@ -50,22 +51,9 @@ class GalilSettings(Section):
 
 def check_galil_settings(settings: Mapping[str, Any], channels: Sequence[str]) -> GalilSettings:
     """Return the settings of a driver with these channels. Raises RigError with one line for each problem."""
-    problems = [to_line(problem) for problem in _channel_problems(channels)]
-    try:
-        found = GalilSettings.model_validate(dict(settings))
-    except ValidationError as error:
-        found = None
-        problems = [f"driver.{line}" for line in describe(error, GalilSettings)] + problems
-    if found is None or problems:
-        raise RigError(*problems)
+    found = check_settings(GalilSettings, settings)
+    rule = f"must be an axis of the controller, one of {', '.join(AXES)}"
+    unknown = [channel for channel in channels if len(channel) != 1 or channel not in AXES]
+    if unknown:
+        raise RigError(*(to_line(Problem("channel", channel, rule)) for channel in unknown))
     return found
-
-
-def _channel_problems(channels: Sequence[str]) -> Iterator[Problem]:
-    for channel in channels:
-        if len(channel) != 1 or channel not in AXES:
-            yield Problem("channel", channel, f"must be an axis of the controller, one of {', '.join(AXES)}")
-        elif channels.count(channel) > 1:
-            yield Problem("channel", channel, "must be listed only once")
-    if not channels:
-        yield Problem("channel", None, "needs at least one")

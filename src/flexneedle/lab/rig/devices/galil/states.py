@@ -1,12 +1,14 @@
-"""Reports of the controller about an axis, and the state of its motor that follows from them and from the commands.
+"""Reports of the controller about an axis: its setup, and the state of its motor after them and the commands.
 
-Source of the bits and codes: Galil, Command Reference, DMC-4103, TS and SC.
+Source of the bits, codes and operands: Galil, Command Reference, DMC-4103.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 from flexneedle.lab.rig.devices.galil.replies import GarbledError
-from flexneedle.ports import MotorState
+from flexneedle.ports import MotorSetup, MotorState
 
 _MOVING, _OFF, _FORWARD_INACTIVE, _REVERSE_INACTIVE = 1 << 7, 1 << 5, 1 << 3, 1 << 2  # bits of TS
 _FARTHEST = 2_147_483_648.0
@@ -29,6 +31,25 @@ _REASONS = {
     71: "EtherCAT drive error",
     99: "not in position in time",
 }
+
+
+SETUP = ("BL", "FL", "ER", "OE", "LD")
+"""Operands of the setup of an axis."""
+_UNLIMITED = 2_147_483_647.0
+_DISABLED = {0: "", 1: "forward", 2: "reverse"}
+_SWITCHES_OFF = (1, 3)  # values of OE
+
+
+def make_setup(values: Sequence[float]) -> MotorSetup:
+    """Return the setup of an axis with these values of `SETUP`. A negative ER disables the check of the error."""
+    reverse, forward, error, on_error, disabled = values
+    return MotorSetup(
+        lowest=-inf if reverse <= -_UNLIMITED else reverse,
+        highest=inf if forward >= _UNLIMITED else forward,
+        most_error=error if error >= 0.0 else inf,
+        off_on_error=int(on_error) in _SWITCHES_OFF,
+        disabled=_DISABLED.get(int(disabled), "reverse and forward"),
+    )
 
 
 @dataclass(frozen=True)
