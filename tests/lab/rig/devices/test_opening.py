@@ -4,6 +4,7 @@ import sys
 import tomllib
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -28,22 +29,35 @@ class Halves:
         type(self).closed = True
 
 
-def keeps_settings(settings, channels):
-    motors = Motors(channels)
-    motors.settings = settings
-    return motors
+class Faulty(Motors):
+    """Motors of a user, whose code has an error in one of its parts."""
+
+    @property
+    def identity(self):
+        raise OSError("no such port")
+
+    def read(self):
+        return {"A": int("bad\nbyte")}
 
 
-def refuses(settings, _about):
-    raise RigError(f"port = {settings['port']}: must be text", "speed = 0: must be above 0")
+class Refusing(Motors):
+    """Motors of a user that call functions of this package, whose errors they do not know."""
+
+    def read(self):
+        raise RigError("a = 1: no such key", "b = 2: no such key")
+
+    def follow(self, _positions):
+        raise DriverError("no reply within 100 ms")
 
 
-def refuses_in_one_line(_settings, _about):
-    raise InputError("/dev/tty9: no such port")
+class Made(Motors):
+    """Motors that are kept, with their settings and their paces."""
 
+    paces = MotorPaces((500.0, 10_000.0), (1024.0, 200_000.0))
 
-def does_not_reply(_settings, _clock):
-    raise RunError("/dev/tty9: no tracker: no reply")
+    def __init__(self, settings, channels):
+        super().__init__(channels)
+        self.settings, Made.newest = settings, self
 
 
 @contextmanager
@@ -53,34 +67,40 @@ def managed(_settings, clock):
     tracker.close()
 
 
-def halves(_settings, _clock):
-    return Halves()
-
-
-def paced(_settings, channels):
-    paced.made = motors = Motors(channels)
-    motors.paces = MotorPaces((500.0, 10_000.0), (1024.0, 200_000.0))
-    return motors
-
-
-def lists(_settings, _about):
-    return []
-
-
-def takes_one(_settings):
-    return None
-
-
 @contextmanager
 def managed_lists(_settings, _clock):
     yield []
     Halves.closed = True
 
 
+def raising(error):
+    def make(_settings, _about):
+        raise error
+
+    return make
+
+
+PARTS = ModuleType("parts")
+vars(PARTS).update(
+    Faulty=lambda _settings, channels: Faulty(channels),
+    Refusing=lambda _settings, channels: Refusing(channels),
+    Made=Made,
+    halves=lambda _settings, _about: Halves(),
+    lists=lambda _settings, _about: [],
+    managed=managed,
+    managed_lists=managed_lists,
+    refuses=raising(RigError("port = 3: must be text", "speed = 0: must be above 0")),
+    refuses_in_one_line=raising(InputError("/dev/tty9: no such port")),
+    does_not_reply=raising(RunError("/dev/tty9: no tracker: no reply")),
+    does_not_open=raising(KeyError("nothing")),
+    takes_one=lambda _settings: None,
+    PROJECT=PROJECT,
+)
+
+
 @pytest.fixture(autouse=True)
 def _importable(monkeypatch):
-    """This module is importable as `parts`."""
-    monkeypatch.setitem(sys.modules, "parts", sys.modules[__name__])
+    monkeypatch.setitem(sys.modules, "parts", PARTS)
     Halves.closed = False
 
 
@@ -116,7 +136,8 @@ def test_registered_parts_exist(group):
 
 
 def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
-    motors = open_motors(rig(driver={"kind": "parts:keeps_settings", "port": 7, "deep": {"a": [1]}}))
+    driver = {"kind": "parts:Made", "port": 7, "deep": {"a": [1]}}
+    motors = open_motors(rig(driver=driver, axes__rotation__speed_deg_s=90.0))
     assert motors.settings == {"port": 7, "deep": {"a": [1]}}
     assert tuple(motors.states) == ("A", "B", "C")
 
@@ -134,52 +155,19 @@ def test_a_tracker_is_closed_by_its_close_or_as_a_context_manager():
     assert tracker.tracker.closed
 
 
-class Faulty(Motors):
-    """Motors of a user, whose code has an error in one of its parts."""
-
-    @property
-    def identity(self):
-        raise OSError("no such port")
-
-    def read(self):
-        return {"A": int("bad\nbyte")}
-
-
-def faulty(_settings, channels):
-    return Faulty(channels)
-
-
-def does_not_open(settings, _about):
-    return settings["nothing"]
-
-
-class Refusing(Motors):
-    """Motors of a user that call functions of this package, whose errors they do not know."""
-
-    def read(self):
-        raise RigError("a = 1: no such key", "b = 2: no such key")
-
-    def follow(self, _positions):
-        raise DriverError("no reply within 100 ms")
-
-
-def refusing(_settings, channels):
-    return Refusing(channels)
-
-
 def test_errors_of_the_package_in_a_device_are_errors_of_the_driver():
-    motors = open_motors(rig(driver={"kind": "parts:refusing"}))
-    with pytest.raises(DriverError, match=r"^driver parts:refusing: read: a = 1: .*; b = 2: "):
+    motors = open_motors(rig(driver={"kind": "parts:Refusing"}))
+    with pytest.raises(DriverError, match=r"^driver parts:Refusing: read: a = 1: .*; b = 2: "):
         motors.read()
     with pytest.raises(DriverError, match=r"^no reply within 100 ms$"):
         motors.follow({})
 
 
 def test_other_errors_in_a_device_name_it_and_the_call_and_the_line():
-    motors = open_motors(rig(driver={"kind": "parts:faulty"}))
-    with pytest.raises(DriverError, match=r"^driver parts:faulty: read: ValueError: .* line \d+\)$"):
+    motors = open_motors(rig(driver={"kind": "parts:Faulty"}))
+    with pytest.raises(DriverError, match=r"^driver parts:Faulty: read: ValueError: .* line \d+\)$"):
         motors.read()
-    with pytest.raises(DriverError, match=r"^driver parts:faulty: identity: OSError: no such port \("):
+    with pytest.raises(DriverError, match=r"^driver parts:Faulty: identity: OSError: no such port \("):
         _ = motors.identity
     motors.stop()
     assert not hasattr(motors, "describe")
@@ -270,15 +258,15 @@ def test_settings_that_a_device_refuses_are_reported_with_its_kind():
 )
 def test_speeds_and_accelerations_beyond_the_controllers_are_refused(changes, rules):
     changed = {"rotation__speed_deg_s": 90.0, "guide_y__counts_per_mm": 500.0} | changes
-    found = rig(driver={"kind": "parts:paced"}, **{f"axes__{key}": value for key, value in changed.items()})
+    found = rig(driver={"kind": "parts:Made"}, **{f"axes__{key}": value for key, value in changed.items()})
     if not rules:
         open_motors(found)
         return
     lines = message(open_motors, found).splitlines()
     assert len(lines) == len(rules)
     assert all(line.startswith(f"axes.{rule}") for line, rule in zip(lines, rules, strict=True)), lines
-    assert paced.made.closed
-    assert paced.made.calls == []
+    assert Made.newest.closed
+    assert Made.newest.calls == []
 
 
 def test_a_device_that_does_not_reply_is_no_error_of_the_file():
