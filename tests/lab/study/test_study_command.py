@@ -93,21 +93,12 @@ def test_bad_input_is_one_line(capsys, argv, words):
     assert words in err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("text", ["two", "0", "1.5", "٢"])
-def test_an_invalid_number_of_workers_is_rejected(capsys, text):
-    with pytest.raises(SystemExit) as caught:
-        cli.main(("study", "phantom", f"--workers={text}"))
-    assert caught.value.code == 2
-    assert f"--workers: {text}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("command", ["insert", "plan"])
-def test_no_run_is_written_to_the_folder_of_a_study(capsys, tmp_path, command):
-    (tmp_path / "study.json").write_text("{}")
-    status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
-    assert (status, out) == (2, "")
-    assert "already contains a study" in err.splitlines()[-1]
-    assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
+def test_an_invalid_number_of_workers_is_rejected(capsys):
+    for text in ("two", "0", "1.5", "٢"):
+        with pytest.raises(SystemExit) as caught:
+            cli.main(("study", "phantom", f"--workers={text}"))
+        assert caught.value.code == 2
+        assert f"--workers: {text}" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")
@@ -187,10 +178,18 @@ def test_a_cluster_without_workers_is_reported(capsys, monkeypatch):
     assert "tcp://host:1: no workers yet, waiting\n" in err
 
 
+def test_no_run_is_written_to_the_folder_of_a_study(capsys, tmp_path):
+    (tmp_path / "study.json").write_text("{}")
+    for command in ("insert", "plan"):
+        status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
+        assert (status, out) == (2, "")
+        assert "already contains a study" in err.splitlines()[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
+
+
 def test_a_separate_line_is_printed_unchanged_also_in_a_terminal(monkeypatch, capsys):
-    Progress().print_line("[red]x")
-    assert capsys.readouterr().err == "[red]x\n"
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    with Progress() as progress:
-        progress.print_line("[red]x")
-    assert "[red]x\n" in capsys.readouterr().err
+    for terminal in (False, True):
+        monkeypatch.setattr("sys.stderr.isatty", lambda terminal=terminal: terminal)
+        with Progress() as progress:
+            progress.print_line("[red]x")
+        assert "[red]x\n" in capsys.readouterr().err

@@ -79,9 +79,7 @@ FIGURES = {
     "targeting, one": lambda: draw_targeting([target_panel(unfinished=(3,))]),
     "targeting, all": lambda: draw_targeting([target_panel(k, 0.2 * k, unfinished=(3, 9)) for k in range(7)]),
     "errors": lambda: by_controller(samples()),
-    "depths, one": lambda: draw_errors(error_panels(1), DEPTH),
     "depths, all": lambda: draw_errors(error_panels(), DEPTH),
-    "sweep, one": lambda: draw_sweep(sweeps(1, missing=1), "G (mm)", PLACES),
     "sweep, all": lambda: draw_sweep(sweeps(7, missing=2), "mismatch", PLACES),
     "sweep, close": lambda: draw_sweep(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
     "shares, three": lambda: draw_shares([panel(k, samples(), "150 worlds") for k in range(3)]),
@@ -123,20 +121,21 @@ def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
     assert_allclose(crosses.get_xydata(), own.content.tips[[0, 7]])
 
 
+def test_the_close_up_shows_tips_relative_to_their_targets_without_unknown_ones():
+    own = target_panel(unfinished=(0,))
+    own.content.tips[0] = np.nan
+    close = draw_targeting([own]).axes[1]
+    off = (own.content.tips - own.content.targets)[1:]
+    assert_allclose(dots(close, TIP)[0].get_offsets(), off)
+    assert close.get_xlim()[1] == pytest.approx(1.15 * np.hypot(*off.T).max())
+
+
 def test_tips_far_outside_are_counted():
     own = target_panel()
     own.content.tips[:2] += 30.0
     figure = draw_targeting([own, target_panel(1)])
     assert texts(figure).count("2 tips outside") == 1
     assert figure.axes[0].get_xlim()[1] == pytest.approx(45.0 + 6.0)
-
-
-def test_the_close_up_shows_where_tips_ended_from_their_targets():
-    own = target_panel()
-    close = draw_targeting([own]).axes[1]
-    assert_allclose(dots(close, TIP)[0].get_offsets(), own.content.tips - own.content.targets)
-    farthest = np.hypot(*(own.content.tips - own.content.targets).T).max()
-    assert close.get_xlim()[1] == pytest.approx(1.15 * farthest)
 
 
 def test_targets_that_are_many_are_laid_on_one_another():
@@ -149,16 +148,9 @@ def test_targets_that_are_many_are_laid_on_one_another():
     assert_allclose(dots(ax, TIP)[0].get_offsets(), own.content.tips - own.content.targets)
 
 
-def test_unknown_tips_are_left_out():
-    own = target_panel(unfinished=(0,))
-    own.content.tips[0] = np.nan
-    drawn = [dot.get_offsets() for ax in draw_targeting([own]).axes for dot in dots(ax, TIP)]
-    places = np.concatenate([np.ma.filled(offsets, np.nan) for offsets in drawn])
-    assert len(places) > 0
-    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(own.content.tips) - 1)
-
-
-def test_rows_show_quartiles_median_mean_and_95_percent():
+def test_rows_show_quartiles_median_mean_95_percent_and_their_numbers():
+    perfect = by_controller([ErrorSample("perfect", look(0), np.array([0.0, 0.1]), 2)]).axes[0]
+    assert dots(perfect, "one insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
     row = samples()[3]
     ax = by_controller([row]).axes[0]
     errors = row.errors
@@ -167,9 +159,6 @@ def test_rows_show_quartiles_median_mean_and_95_percent():
     assert_allclose(lines(ax, "median")[0].get_xdata(), [np.median(errors)])
     assert_allclose(lines(ax, "mean")[0].get_xdata(), [errors.mean()])
     assert_allclose(lines(ax, "95 %")[0].get_xdata(), [np.quantile(errors, 0.95)] * 2)
-
-
-def test_rows_say_how_many_did_not_finish():
     found = texts(by_controller(samples()))
     assert found.count("n = 150") == 6
     assert "n = 151\n1 not finished" in found
@@ -199,19 +188,13 @@ def test_sweeps_show_median_quartiles_and_mean_at_each_level():
     at_end = at_end[at_end[:, 0] == 2.0][:, 1]
     assert_allclose([at_end.min(), at_end.max()], [low, high])
     assert ax.get_xlabel() == "G (mm)"
-
-
-def test_a_level_without_a_finished_insertion_leaves_a_gap():
-    (sweep,) = sweeps(1)
     last = replace(sweep.content[4], errors=np.empty(0))
-    empty = replace(sweep, content=[*sweep.content[:4], last])
-    ax = draw_sweep([empty], "G (mm)", PLACES).axes[0]
-    assert np.isnan(lines(ax, "median")[0].get_ydata()[4])
+    ax = draw_sweep([replace(sweep, content=[*sweep.content[:4], last])], "G (mm)", PLACES).axes[0]
+    assert np.isnan(lines(ax, "median")[0].get_ydata()[4]), "a gap without a finished insertion"
     assert {"not finished:", "40"} <= set(texts(ax.figure))
 
 
-def test_a_share_is_that_of_the_insertions_that_end_nearer():
-    """Steps at the errors; short of 100 % by what did not finish."""
+def test_a_line_of_shares_has_steps_at_the_errors_and_lacks_unfinished_insertions():
     row = ErrorSample("a", look(0), np.array([0.4, 0.1, 0.2]), 4)
     (ax,) = draw_shares([Panel("real", "4 worlds", "#000000", [row])]).axes
     (line,) = lines(ax, "a")
@@ -237,12 +220,6 @@ def test_differences_that_hold_zero_are_hollow():
     assert faces == [look(0).color, look(0).color, "white", "white"]
     ends = [line.get_xdata().tolist() for line in lines(ax, "interval")]
     assert ends == [[row.low, row.high] for row in rows[:3]]
-
-
-def test_an_error_of_nothing_is_still_drawn():
-    row = ErrorSample("perfect", look(0), np.array([0.0, 0.1]), 2)
-    ax = by_controller([row]).axes[0]
-    assert dots(ax, "one insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
 
 
 def test_names_are_no_mathematics_and_never_too_long():

@@ -49,28 +49,20 @@ def load(tmp_path):
     return study
 
 
-def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
-    study = load()
-    for point in study.points:
-        assert point.scenario == check_tables(world(point.world, point.case))
-        assert point.world_case == point.case
-        assert "world" not in point.varied
-
-
-def test_insertions_that_need_a_guide_are_omitted_in_worlds_without_one(load):
-    """They are not insertions, and therefore not failures."""
+def test_points_have_their_world_and_case_and_none_needs_a_guide_that_is_not_there(load):
+    """Omitted points are not insertions, and therefore not failures."""
     found = {(point.case, point.world, point.controller) for point in load().points}
     assert found == {
         *((case, GUIDED, name) for case in CASES for name in ("open-loop", "resolved-rate")),
         *((case, FREE, "open-loop") for case in CASES[:2]),
     }
-    assert load().definition["insertions"] == len(load()) == len(found)
-
-
-def test_a_world_has_the_phantom_of_its_number_in_every_case_and_with_every_controller(load):
     study = load()
-    seeds = [(study.insertion(index).point.world, study.insertion(index).seed) for index in range(len(study))]
-    assert all(number == seed for number, seed in seeds)
+    assert study.definition["insertions"] == len(study) == len(found)
+    for index in range(len(study)):
+        point = study.insertion(index).point
+        assert point.scenario == check_tables(world(point.world, point.case))
+        assert (point.world_case, study.insertion(index).seed) == (point.case, point.world)
+        assert "world" not in point.varied
 
 
 def test_other_worlds_can_be_requested(load):
@@ -79,6 +71,18 @@ def test_other_worlds_can_be_requested(load):
     assert chosen.definition["axes"]["world"] == [100, 101, 102, 103]
 
 
+IN_SPACE = f"""
+name = "few"
+[[axes]]
+key = "world"
+values = [{FREE}, {GUIDED}]
+[[axes]]
+key = "world_rig"
+values = "all"
+[[axes]]
+key = "controller"
+values = ["open-loop", "resolved-rate"]
+"""
 NAMED = 'name = "a"\n'
 ODD = STUDY.replace('"structure" }', '"odd" }')
 FRACTION = STUDY.replace(f"[{FREE}, {GUIDED}]", "[1.5]")
@@ -109,7 +113,9 @@ FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
             "values.world = 3: not allowed here: set worlds with an axis",
         ),
         (NAMED + 'values = { world_case = "real" }', None, "world_case: needs an axis of worlds"),
+        (NAMED + 'values = { world_rig = "two-axes" }', None, "world_rig: needs an axis of worlds"),
         (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
+        (IN_SPACE.replace('"all"', '["three"]'), None, 'world_rig = "three": must be one of plane, two-axes'),
     ],
 )
 def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message):
@@ -119,15 +125,21 @@ def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message
 
 
 @pytest.mark.slow
-def test_the_shipped_study_has_two_hundred_worlds_not_used_for_tuning():
+def test_the_shipped_studies_have_two_hundred_worlds_not_used_for_tuning():
     study = load_study("worlds")
     numbers = {point.world for point in study.points}
     assert numbers == set(range(100_000, 100_200))
+    guided = {number for number in numbers if world(number).setup.has_guide}
     for case, plant in (("perfect", "model"), ("real", "exact"), ("structure", "exact")):
         points = [point for point in study.points if point.case == case]
         assert {point.plant for point in points} == {plant}
-        worlds = numbers if case != "structure" else {n for n in numbers if world(n).setup.has_guide}
+        worlds = numbers if case != "structure" else guided
         assert {point.world for point in points if point.controller == "open-loop"} == worlds
+    study = load_study("worlds-space")
+    with_guide, without = 4 * 4, 2 * 3  # drivers by controllers; resolved-rate needs a guide
+    assert len(study) == 2 * (with_guide * len(guided) + without * (200 - len(guided)))
+    assert {point.scenario.setup.axes for point in study.points} == {2}
+    assert all(study.insertion(k).seed == study.insertion(k).point.world for k in range(0, len(study), 97))
 
 
 def test_the_reach_is_computed_once_for_all_controllers_of_a_world_and_case(load):
@@ -205,20 +217,6 @@ def test_an_unfinished_insertion_is_a_failure_if_the_target_is_within_reach(outc
     assert is_failure(row) == failure
 
 
-IN_SPACE = f"""
-name = "few"
-[[axes]]
-key = "world"
-values = [{FREE}, {GUIDED}]
-[[axes]]
-key = "world_rig"
-values = "all"
-[[axes]]
-key = "controller"
-values = ["open-loop", "resolved-rate"]
-"""
-
-
 def test_each_world_has_the_rigs_that_it_can_have(load):
     """Of those with the guide of the world, and that in the plane."""
     study = load(IN_SPACE)
@@ -231,20 +229,3 @@ def test_each_world_has_the_rigs_that_it_can_have(load):
     for point in study.points:
         assert point.scenario == check_tables(world(point.world, "real", point.world_rig))
         assert point.varied["world_rig"] == point.world_rig
-
-
-def test_a_rig_needs_an_axis_of_worlds(load):
-    with pytest.raises(InputError, match="world_rig: needs an axis of worlds"):
-        load('name = "a"\n[values]\nworld_rig = "two-axes"\n')
-    with pytest.raises(InputError, match='world_rig = "three": must be one of plane, two-axes'):
-        load(IN_SPACE.replace('"all"', '["three"]'))
-
-
-@pytest.mark.slow
-def test_the_shipped_worlds_in_space_have_every_rig_in_both_cases():
-    study = load_study("worlds-space")
-    guided = sum(world(number).setup.has_guide for number in range(100000, 100200))
-    with_guide, without = 4 * 4, 2 * 3  # drivers by controllers; resolved-rate needs a guide
-    assert len(study) == 2 * (with_guide * guided + without * (200 - guided))
-    assert {point.scenario.setup.axes for point in study.points} == {2}
-    assert all(study.insertion(k).seed == study.insertion(k).point.world for k in range(0, len(study), 97))

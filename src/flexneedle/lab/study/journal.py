@@ -98,7 +98,7 @@ def _complete_length(data: bytes) -> int:
 def _parse_line(line: bytes) -> Any:
     try:
         return json.loads(line)
-    except (ValueError, RecursionError):
+    except ValueError:
         return None
 
 

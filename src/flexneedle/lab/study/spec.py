@@ -1,7 +1,7 @@
 """Study files in TOML; every problem in one line."""
 
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -168,17 +168,17 @@ def _check_axis_values(key: str, values: Any, name: str = "values") -> Iterator[
 
 
 def _find_duplicate(values: list[Any]) -> Any:
-    """Return a duplicate value of a list, or None; equal numbers are duplicates, also 25 and 25.0."""
+    """Return a duplicate value of a list, or None; equal values are duplicates, also 25 and 25.0."""
     times = Counter(map(_make_comparable, values))
     return next((value for value in values if times[_make_comparable(value)] > 1), None)
 
 
-def _make_comparable(value: Any) -> Hashable:
+def _make_comparable(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(map(_make_comparable, value))
     if isinstance(value, dict):
         return frozenset((key, _make_comparable(item)) for key, item in value.items())
-    return (bool, value) if isinstance(value, bool) else value  # True is not equal to 1 here
+    return value
 
 
 def _check_range(values: dict[str, Any], largest: int) -> Iterator[Problem]:

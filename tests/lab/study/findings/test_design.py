@@ -45,21 +45,13 @@ def described(found):
     return {factor.key: factor.names for factor in found.factors}
 
 
-def test_a_study_of_one_setting_varies_nothing(design):
-    assert described(design(make_rows(targets=TARGETS, repeats=2))) == {"controller": (OURS,)}
-
-
-def test_a_setting_not_varied_in_study_json_is_not_a_factor(design):
-    """Rows that differ in it for another reason, for example a random draw, are one group."""
-    rows = make_rows(targets=TARGETS, repeats=2)
-    for row in rows:
-        row["phantom.run_out_mm"] = 0.01 * row["index"]
-    assert described(design(rows)) == {"controller": (OURS,)}
-
-
-def test_the_default_controller_comes_first(design):
+def test_the_controllers_are_a_factor_with_the_default_first_and_draws_seeds_and_targets_are_none(design):
+    """A setting that varies for another reason than an axis of study.json is none, either."""
     rows = make_rows(("ce-mpc", "open-loop", OURS), targets=TARGETS, repeats=2)
-    assert design(rows).controller.names == (OURS, "ce-mpc", "open-loop")
+    for row in rows:
+        row |= {"phantom.run_out_mm": 0.01 * row["index"], "plan_seed": row["seed"]}
+    axes = {key: [0, 1] for key in ("seed", "plan_seed", "target.depth_mm")}
+    assert described(design(rows, axes=axes)) == {"controller": (OURS, "ce-mpc", "open-loop")}
 
 
 def test_a_number_that_varies_is_an_axis_in_ascending_order(along):
@@ -85,14 +77,6 @@ def test_levels_of_other_kinds_are_names(along, key, values, names):
     (axis,) = along({key: values, "tracker.jitter_mm": [0.1]}).axes
     assert axis.names == axis.titles == names
     assert_allclose(axis.positions, range(len(names)))
-
-
-@pytest.mark.parametrize("key", ["seed", "plan_seed", "target.depth_mm"])
-def test_axes_of_seeds_and_targets_are_not_factors(design, key):
-    rows = make_rows(targets=TARGETS, repeats=2)
-    for row in rows:
-        row["plan_seed"] = row["seed"]
-    assert described(design(rows, axes={key: [0, 1]})) == {"controller": (OURS,)}
 
 
 def test_cases_that_change_one_setting_each_are_cases(in_cases):
@@ -143,19 +127,15 @@ def test_names_that_differ_in_more_than_a_number_are_cases(in_cases, names):
     assert (found.cases.names, found.axes) == (names, ())
 
 
-@pytest.mark.parametrize(
-    ("key", "label"),
-    [
-        ("tissue.0.shear_modulus_kpa", "tissue 0: shear modulus (kPa)"),
-        ("phantom.friction_mn_per_mm", "phantom: friction (mN/mm)"),
-        ("setup.insertion_speed_mm_s", "setup: insertion speed (mm/s)"),
-        ("phantom.delay_periods", "phantom: delay periods"),
-        ("needle.gauge", "needle gauge"),
-        ("plant", "plant"),
-    ],
-)
-def test_labels_have_units(key, label):
-    assert label_column(key) == label
+def test_labels_have_units():
+    labels = {
+        "tissue.0.shear_modulus_kpa": "tissue 0: shear modulus (kPa)",
+        "phantom.friction_mn_per_mm": "phantom: friction (mN/mm)",
+        "phantom.delay_periods": "phantom: delay periods",
+        "needle.gauge": "needle gauge",
+        "plant": "plant",
+    }
+    assert {key: label_column(key) for key in labels} == labels
 
 
 def environment(name):
@@ -164,16 +144,13 @@ def environment(name):
     return {key: value for key, value in flat.items() if key not in BASE}
 
 
-@pytest.mark.parametrize("names", [("none", "ideal", "noisy"), ("ideal", "noisy"), ("none", "noisy")])
-def test_environments_are_one_axis_by_their_names(design, names):
+def test_environments_are_one_axis_by_their_names_and_nameless_tables_by_their_values(design):
     """Not one factor for each of their values."""
+    names = ("none", "ideal", "noisy")
     rows = make_rows(cases={name: environment(name) for name in names}, targets=TARGETS, repeats=1)
     rows = [row | {"case": ""} for row in rows]
     (axis,) = design(rows, axes={"tracker.environment": list(names)}).axes
     assert (axis.label, axis.names) == ("tracker environment", names)
-
-
-def test_a_table_without_a_name_is_an_axis_as_well(design):
     plates = [{"phantom.plate.x_mm": 1.0, "phantom.plate.y_mm": y} for y in (2.0, 3.0)]
     rows = make_rows(cases=dict(zip("ab", plates, strict=True)), targets=TARGETS, repeats=1)
     (axis,) = design([row | {"case": ""} for row in rows], axes={"phantom.plate": [{}, {}]}).axes

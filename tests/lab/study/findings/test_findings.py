@@ -69,84 +69,57 @@ def test_unfinished_insertions_are_counted_and_not_averaged(read):
     assert (group.count, group.finished, group.missed, group.unconverged) == (5, 3, 0, 1)
     assert group.estimates["mean_mm"].value == pytest.approx(0.2)
     assert group.largest_mm == 0.3
-
-
-def test_a_finished_insertion_with_unknown_error_is_counted(read):
-    rows = make_rows(targets=TARGETS[:1], repeats=3)
-    rows[0]["true_error_mm"] = None
-    rows[1]["true_error_mm"] = float("nan")
-    found = read(rows)
-    (group,) = group_rows(found.rows, find_design(found).factors)
+    rows[0]["true_error_mm"], rows[1]["true_error_mm"] = None, float("nan")
+    (group,) = group_rows(read(rows).rows, find_design(found).factors)
     assert (group.finished, group.known) == (3, 1)
 
 
-def test_groups_are_every_level_of_every_factor(read):
-    axes = {"contact.spacing_mm": [1.0, 0.5]}
-    rows = make_rows((OURS, "open-loop"), axes=axes, targets=TARGETS, repeats=2)
-    found = read(rows, axes=axes)
-    groups = group_rows(found.rows, find_design(found).factors)
-    assert [group.levels for group in groups] == [
-        {"controller": name, "contact.spacing_mm": spacing}
-        for name in (OURS, "open-loop")
-        for spacing in ("0.5", "1")
-    ]
-    assert sum(group.count for group in groups) == len(rows)
+def of_both(repeats, targets=TARGETS):
+    """Rows of the open loop and of the default, and the latter's errors by seed."""
+    rows = make_rows(("open-loop", OURS), targets=targets, repeats=repeats)
+    return rows, {row["seed"]: row["true_error_mm"] for row in rows if row["controller"] == OURS}
 
 
-def compared(rows, read, **more):
-    found = read(rows, **more)
-    return compare_controllers(found.rows, find_design(found))
-
-
-def test_controllers_are_compared_pair_by_pair(read):
-    """The other controller is 0.05 mm worse in each pair: the differences have no spread."""
-    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=5)
-    own = {(row["seed"], row["repeat"]): row["true_error_mm"] for row in rows if row["controller"] == OURS}
+@pytest.mark.parametrize(("more", "verdict"), [(0.05, "better"), (-0.05, "worse"), (0.0, "not separable")])
+def test_controllers_are_compared_pair_by_pair(read, more, verdict):
+    """The other controller is worse by the same in each pair: the differences have no spread."""
+    rows, ours = of_both(5)
     for row in rows:
         if row["controller"] == "open-loop":
-            row["true_error_mm"] = own[row["seed"], row["repeat"]] + 0.05
-    (found,) = compared(rows, read)
+            row["true_error_mm"] = ours[row["seed"]] + more
+    found = read(rows)
+    (found,) = compare_controllers(found.rows, find_design(found))
     assert (found.name, found.against, found.pairs, found.left_out) == (OURS, "open-loop", 10, 0)
-    assert_allclose([found.mean_mm.value, found.mean_mm.low, found.mean_mm.high], -0.05, atol=1e-12)
-    assert found.verdict == "better"
+    assert_allclose([found.mean_mm.value, found.mean_mm.low, found.mean_mm.high], -more, atol=1e-12)
+    assert found.verdict == verdict
 
 
-def test_a_worse_default_is_called_worse(read):
-    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=20)
-    for row in rows:
-        row["true_error_mm"] *= 100.0 if row["controller"] == OURS else 1.0
-    assert compared(rows, read)[0].verdict == "worse"
-
-
-def test_equal_controllers_are_not_separable(read):
-    rows = make_rows(("ce-mpc", OURS), targets=TARGETS, repeats=10)
-    rng = np.random.default_rng(3)
-    for row in rows:
-        row["true_error_mm"] = float(rng.lognormal(-2.0, 0.5))
-    assert compared(rows, read)[0].verdict == "not separable"
-
-
-def test_a_pair_with_one_unfinished_is_left_out_and_counted(read):
-    rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=5)
+def test_a_pair_with_one_unfinished_is_left_out_and_few_pairs_have_no_verdict(read):
+    rows, _ = of_both(5)
     rows[2], rows[13] = unfinished(rows[2]), unfinished(rows[13], "error", "?")
-    (found,) = compared(rows, read)
-    assert (found.pairs, found.left_out) == (8, 2)
+    for own, counts in ((rows, (8, 2)), (of_both(1, TARGETS[:1])[0], (1, 0))):
+        found = read(own)
+        (found,) = compare_controllers(found.rows, find_design(found))
+        assert (found.pairs, found.left_out) == counts
+        assert found.verdict is None
 
 
-def test_too_few_pairs_give_no_verdict(read):
-    rows = make_rows(("open-loop", OURS), targets=TARGETS[:1], repeats=1)
-    (found,) = compared(rows, read)
-    assert (found.pairs, found.verdict) == (1, None)
-
-
-def test_pairs_never_cross_settings(read):
+def test_groups_are_all_settings_and_pairs_never_cross_them(read):
     """Errors that depend on the axis alone, the same for both controllers, differ in no pair."""
     axes = {"tracker.jitter_mm": [0.01 * k for k in range(30)]}
     rows = make_rows(("open-loop", OURS), axes=axes, targets=TARGETS, repeats=5)
     shuffled = np.random.default_rng(0).permutation(len(rows)).tolist()
     for row, index in zip(rows, shuffled, strict=True):
         row |= {"true_error_mm": 0.1 + row["tracker.jitter_mm"], "index": index}
-    (found,) = compared(rows, read, axes=axes)
+    found = read(rows, axes=axes)
+    groups = group_rows(found.rows, find_design(found).factors)
+    levels = [
+        {"controller": name, "tracker.jitter_mm": f"{0.01 * k:.6g}"}
+        for name in (OURS, "open-loop")
+        for k in range(30)
+    ]
+    assert [group.levels for group in groups] == levels
+    (found,) = compare_controllers(found.rows, find_design(found))
     assert (found.pairs, found.mean_mm.low, found.mean_mm.high) == (300, 0.0, 0.0)
 
 

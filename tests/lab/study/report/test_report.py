@@ -5,6 +5,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -135,13 +136,6 @@ def test_cases_of_one_controller_have_separate_panels(sketched_on):
         assert "pooled" not in drawn[name].caption
 
 
-@pytest.mark.parametrize(("outcome", "figures"), [("refused", []), ("held", ["targeting"])])
-def test_a_study_without_finished_insertions_is_reported(sketched_on, rows, outcome, figures):
-    report, page = sketched_on([unfinished(row, outcome, "why") for row in rows])
-    assert [drawn.name for drawn in report.figures] == figures
-    assert f"finished 0 of 24 {outcome} 24 of 24 within 1 mm of the target 0 of 24" in page.text
-
-
 def test_numbers_of_the_page_are_those_of_the_summary(plain):
     report, page = plain
     group = report.values()["groups"][0]
@@ -160,11 +154,8 @@ def test_numbers_of_the_page_are_those_of_the_summary(plain):
 @pytest.mark.parametrize(
     ("error", "verdict"),
     [
-        (None, "is better than every other controller in mean true error."),
-        (
-            0.9,
-            "is better than 0 of 2 other controllers in mean true error; not separable from open-loop; worse than",
-        ),
+        (None, "every other controller in mean true error."),
+        (0.9, "0 of 2 other controllers in mean true error; not separable from open-loop; worse than"),
     ],
 )
 def test_the_headline_compares_the_default_with_the_others(report_on, error, verdict):
@@ -172,7 +163,7 @@ def test_the_headline_compares_the_default_with_the_others(report_on, error, ver
     for row in rows:
         if error and row["controller"] != "bevel-only":
             row["true_error_mm"] = error + 0.001 * row["seed"]
-    assert f"{OURS} {verdict}" in report_on(rows)[1].text
+    assert f"{OURS} is better than {verdict}" in report_on(rows)[1].text
 
 
 def test_effort_is_reported_relative_to_the_plan(report_on):
@@ -259,12 +250,9 @@ def test_coverage_counts_both_axes_of_tip_and_middle(report_on):
     assert (found.count, found.tip_covered, found.middle_covered) == (4, (7 / 8,) * 3, (6 / 8,) * 3)
     assert "87.5 %" in page.text
     assert "75.0 %" in page.text
-
-
-def test_a_controller_that_predicts_shapes_alone_warns_of_nothing(report_on, rows):
-    assert report_on(rows)[0].findings.predictions == []
+    assert report_on(make_rows(repeats=1))[0].findings.predictions == []
     rows = [row | sds((0.5, None), (0.5, None)) for row in make_rows(targets=TARGETS[:1], repeats=4)]
-    (found,) = report_on(rows)[0].findings.predictions
+    (found,) = report_on(rows)[0].findings.predictions  # of shapes alone, without warnings
     assert (found.tip_covered, found.unwarned) == ((1.0,) * 3, None)
     assert np.isnan(found.in_vain)
 
@@ -294,47 +282,45 @@ def test_two_reports_of_the_same_rows_differ_at_most_in_the_run(tmp_path, plain,
         assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes()
 
 
-def test_a_report_that_cannot_be_written_is_an_error(tmp_path, rows, report_on):
-    report_on(rows)
+@pytest.mark.parametrize(("outcome", "figures"), [("refused", []), ("held", ["targeting"])])
+def test_a_study_without_finished_insertions_is_reported(sketched_on, tmp_path, rows, outcome, figures):
+    report, page = sketched_on([unfinished(row, outcome, "why") for row in rows])
+    assert [drawn.name for drawn in report.figures] == figures
+    assert f"finished 0 of 24 {outcome} 24 of 24 within 1 mm of the target 0 of 24" in page.text
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
         write_report(tmp_path / "study", tmp_path / "file")
+
+
+def rewrite(change):
+    """Return a function that changes the table of the bytes of `runs.parquet`."""
+
+    def changed(data):
+        sink = pa.BufferOutputStream()
+        pq.write_table(change(pq.read_table(pa.BufferReader(data))), sink)
+        return sink.getvalue().to_pybytes()
+
+    return changed
 
 
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
         ("study.json", None, "no study.json: give the folder"),
-        ("runs.parquet", None, "no runs.parquet: the study was killed or is still running"),
-        ("runs.parquet", lambda data: data[:-100], "runs.parquet: damaged, or not a Parquet file"),
-        ("study.json", lambda _: b"{", "study.json: damaged"),
         ("study.json", lambda _: b"[1]", "study.json: damaged"),
         ("study.json", lambda _: b'{"study": {}}', "study.json: damaged: KeyError"),
         ("study.json", lambda data: data.replace(b'"cases": {}', b'"cases": 3'), "study.json: damaged"),
+        ("runs.parquet", None, "no runs.parquet: the study was killed or is still running"),
+        ("runs.parquet", lambda data: data[:-100], "runs.parquet: damaged, or not a Parquet file"),
+        ("runs.parquet", rewrite(lambda table: table.slice(0, 0)), "contains no insertions"),
+        ("runs.parquet", rewrite(lambda table: table.drop_columns("outcome")), "missing columns outcome"),
     ],
 )
 def test_an_invalid_study_folder_is_rejected_in_one_line(tmp_path, rows, file, change, message):
     path = write_study(tmp_path / "study", rows) / file
     path.write_bytes(change(path.read_bytes())) if change else path.unlink()
-    assert message in rejection(tmp_path / "study")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda table: table.slice(0, 0), "contains no insertions"),
-        (lambda table: table.drop_columns("outcome"), "missing columns outcome"),
-    ],
-)
-def test_rows_that_cannot_be_reported_are_rejected(tmp_path, rows, change, message):
-    path = write_study(tmp_path / "study", rows) / "runs.parquet"
-    pq.write_table(change(pq.read_table(path)), path)
-    assert message in rejection(tmp_path / "study")
-
-
-def rejection(folder):
     with pytest.raises(InputError) as caught:
-        write_report(folder)
-    assert "\n" not in str(caught.value)
-    assert str(folder) in str(caught.value)
-    return str(caught.value)
+        write_report(tmp_path / "study")
+    (line,) = str(caught.value).splitlines()
+    assert str(tmp_path / "study") in line
+    assert message in line

@@ -116,37 +116,20 @@ def test_groups_are_controllers_cases_and_whether_there_is_a_guide(report):
     assert report.findings.planned == len(report.findings.study.rows) == 22
 
 
-def test_errors_are_those_of_the_finished_insertions(report):
-    found = group(report, DEFAULT, "perfect", "with a guide")
+def test_errors_shares_and_energy_are_over_finished_insertions(report):
+    """Errors 0.02, 0.5 and 1.6 mm; 2, 4 and 1 times the planned energy in worlds 1, 2, 3."""
+    guided, free = (group(report, DEFAULT, "perfect", guide) for guide in ("with a guide", "no guide"))
     errors = [0.02, 0.5, 1.6]
-    assert (found.count, found.finished) == (4, 3)
-    expected = [np.median(errors), np.mean(errors), *np.quantile(errors, (0.95, 0.99)), 1.6, 1 / 3]
-    measured = (found.median_mm, found.mean_mm, found.p95_mm, found.p99_mm, found.max_mm, found.above)
-    assert_allclose(measured, expected)
-
-
-def test_shares_are_relative_to_open_loop_and_reach_in_each_world(report):
-    guided = group(report, DEFAULT, "perfect", "with a guide")
+    assert (guided.count, guided.finished) == (4, 3)
+    expected = [np.median(errors), np.mean(errors), *np.quantile(errors, (0.95, 0.99)), 1.6, 1 / 3, 2.0]
+    measured = (guided.median_mm, guided.mean_mm, guided.p95_mm, guided.p99_mm, guided.max_mm, guided.above)
+    assert_allclose((*measured, guided.energy_ratio), expected)
     assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
     assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
     assert_allclose(guided.within_reach, 2 / 3)  # 0.02 and 0.5 ≤ 0.5, 1.6 above
-    free = group(report, DEFAULT, "perfect", "no guide")
-    assert (
-        free.within_twice_open_loop == free.within_open_loop == 1.0
-    )  # of world 15; in 16 open loop did not finish
+    assert free.within_twice_open_loop == free.within_open_loop == 1.0  # open loop did not finish in world 16
     assert free.within_reach == 1.0  # 4.4 ≤ 4.0 + 0.5
-    assert group(report, "open-loop", "perfect", "with a guide").within_open_loop == 1.0
-
-
-def test_an_unfinished_insertion_is_a_failure_only_within_reach(report):
-    assert group(report, DEFAULT, "perfect", "with a guide").failures == 1
-    assert group(report, DEFAULT, "perfect", "no guide").failures == 0  # world 31 is 3 mm out of reach
-    assert group(report, "open-loop", "perfect", "no guide").failures == 0
-
-
-def test_energy_is_a_geometric_mean(report):
-    """2, 4 and 1 times the planned energy in worlds 1, 2, 3."""
-    assert_allclose(group(report, DEFAULT, "perfect", "with a guide").energy_ratio, 2.0)
+    assert (guided.failures, free.failures) == (1, 0)  # world 31 is 3 mm out of reach
 
 
 def test_predictions_are_reported_for_groups_that_have_any(report):
@@ -157,13 +140,11 @@ def test_predictions_are_reported_for_groups_that_have_any(report):
     assert_allclose(guided.tip_covered, (2 / 3, 1 / 3, 2 / 3))
     assert_allclose(guided.middle_covered, (2 / 3, 2 / 3, 1.0))
     assert_allclose(free.tip_covered, (np.nan, np.nan, 1.0))
-
-
-def test_false_warnings_and_misses_without_warning_are_counted(report):
-    """World 1 ends at 0.02 mm, 2 at 0.5, which is not below 0.5, 3 at 1.6 without a warning, 15 at 0.1 with one."""
-    guided, free = report.findings.predictions
-    assert (guided.in_vain, guided.unwarned) == (0.0, 1)
-    assert (free.in_vain, free.unwarned) == (1.0, 0)
+    assert (guided.in_vain, guided.unwarned) == (
+        0.0,
+        1,
+    )  # 2 ends at 0.5 mm, not below; 3 at 1.6 without warning
+    assert (free.in_vain, free.unwarned) == (1.0, 0)  # 15 ends at 0.1 mm, with a warning
 
 
 def test_the_worst_have_the_largest_error_beyond_reach_of_the_default_controller(report):
@@ -184,10 +165,6 @@ def test_the_page_has_the_table_and_the_figure(report):
     cells = re.findall(r"<td [^>]*>(.*?)</td>", row[1])
     assert cells[:4] == ["4", "3", "1", "0.500"]
     assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT
-
-
-def test_each_cell_of_the_tables_of_worlds_has_its_heading_as_label(report):
-    """Tables of the groups and of the predictions."""
     tables = Page(report.page).tables
     for start in ("Errors, shares and energy", "Finished insertions. Covered"):
         (found,) = (table for caption, table in tables.items() if caption.startswith(start))
