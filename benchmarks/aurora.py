@@ -6,15 +6,11 @@ and processor time taken by the host (Linux in a virtual machine). A process tha
 loses it. Exit status 1 if a frame was lost.
 """
 
-import argparse
-import json
-import subprocess
 import sys
-from contextlib import contextmanager
 from time import perf_counter
 
 import numpy as np
-import psutil
+from measuring import parser_of, running, show, steal
 
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
@@ -24,25 +20,21 @@ PERIOD_S = 0.02  # of the loop of the caller
 
 def main() -> int:
     """Run both measurements and print them."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     normal = measure(args.seconds)
     silent = measure(6.0, "--fault", "silence@1:3")
-    if args.json:
-        print(json.dumps({"normal operation": normal, "silent from 1 to 4 s": silent}))
-    else:
-        for title, result in (("normal operation", normal), ("silent from 1 to 4 s", silent)):
-            print(title, *(f"  {name}: {value}" for name, value in result.items()), sep="\n")
+    show({"normal operation": normal, "silent from 1 to 4 s": silent}, as_json=args.json)
     return 1 if normal["frames lost"] else 0
 
 
 def measure(seconds: float, *arguments: str) -> dict[str, float]:
     """Read for `seconds`; return counts of frames and delays of the caller."""
     frames, waits, late = [], [], 0.0
-    stolen = getattr(psutil.cpu_times(), "steal", 0.0)
-    with emulated(*arguments) as path, Aurora(path, clock := WallClock()) as aurora:
+    stolen = steal()
+    command = (sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments)
+    with running(*command) as (_, path), Aurora(path, clock := WallClock()) as aurora:
         start = clock.now()
         while clock.now() - start < seconds:
             begun = perf_counter()
@@ -64,20 +56,8 @@ def measure(seconds: float, *arguments: str) -> dict[str, float]:
             1e3 * float(np.abs(start_times - np.median(start_times)).max()), 3
         ),
         "caller, largest wake-up delay, ms": round(1e3 * late, 1),
-        "processor time taken by the host, s": round(getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1),
+        "processor time taken by the host, s": round(steal() - stolen, 1),
     }
-
-
-@contextmanager
-def emulated(*arguments: str):
-    """Run the emulator; yield its path."""
-    command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-    try:
-        yield process.stdout.readline().strip()
-    finally:
-        process.terminate()  # SIGINT is ignored in a background process of a shell
-        process.wait()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Measure speed: python benchmarks/bench.py [--json]. Times and ratios of one run, no thresholds."""
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -13,6 +11,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from measuring import parser_of, show
 from scipy.linalg.lapack import dpbsv
 
 import flexneedle
@@ -122,10 +121,8 @@ def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], inserti
     base, tip = (nd.NodePose(x, 0j, 0j) for x in (SCENARIO.start_base_x, setup.start_tip_x))
     rest = np.zeros(model.nodes.size, complex)
     work = rest.copy(), rest.copy(), nd.work_array(rest)
-    needle = insertion.settle(
-        model, nd.start(base, tip, 1.0 + 0j, complex(SCENARIO.guide_home)), *work, complex(np.nan)
-    )
-    start = needle, rest, rest.copy()
+    begun = nd.start(base, tip, 1.0 + 0j, complex(SCENARIO.guide_home))
+    start = nd.from_plain(insertion.settle(model, begun, *work, complex(np.nan))), rest, rest.copy()
     count, steps = controls.shape[:2]
 
     def call() -> insertion.Outputs:
@@ -276,107 +273,20 @@ PARTS = {
 }
 
 
-def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return name, value and remark of each measurement."""
-    return [*step_rows(found["step"]), *depth_rows(found["depth"]), *process_rows(found)]
-
-
-def step_rows(step: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the rows of a step and of one solve by LAPACK."""
-    return [
-        (
-            "rollout step",
-            f"{step['step_us']:.2f} µs",
-            f"{STEPS} steps to {DEPTH_MM:g} mm, one thread, all included",
-        ),
-        (
-            "one dpbsv",
-            f"{step['dpbsv_us']:.2f} µs",
-            f"on the final matrix, {step['unknowns']} unknowns, kd = 3",
-        ),
-        (
-            "step / dpbsv",
-            f"{step['step_over_dpbsv']:.2f}",
-            f"dpbsv reproduces the state to {step['dpbsv_differs_from_the_state_mm']:.0e} mm",
-        ),
-        (
-            "step in space / dpbsv",
-            f"{step['step_in_space_over_dpbsv']:.2f}",
-            f"{step['step_in_space_us']:.2f} µs, planar controls, within {step['space_differs_from_plane_mm']:.0e} mm",
-        ),
-    ]
-
-
-def depth_rows(depth: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the rows of the step time by depth."""
-    a, b = depth["fit_us"]
-    return [
-        *(
-            (f"step at {mm} mm", f"{us:.2f} µs", "")
-            for mm, us in zip(DEPTHS_MM, depth["step_us"], strict=True)
-        ),
-        ("growth with depth", f"d^{depth['exponent']:.2f}", "exponent 1: linear"),
-        ("linear fit", f"{a:.2f} + {b:.3f} d µs", f"largest deviation {depth['fit_residual_us']:.2f} µs"),
-        (
-            "slope deep / shallow",
-            f"{depth['slope_deep_over_shallow']:.2f}",
-            "1: linear, above 1: faster",
-        ),
-    ]
-
-
-def process_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the rows of threads, plan, control period and start."""
-    start, plans, period = found["start"], found["plan"], found["period"]["period_ms"]
-    return [
-        (
-            "2 threads / 1",
-            f"{found['threads']['speedup']:.2f} ×",
-            f"{found['threads']['cores']} cores available",
-        ),
-        (
-            "plan",
-            f"{median(plans['plan_s']):.2f} s",
-            f"N = 128, {plans['iterations'][0]} iterations, median of 3",
-        ),
-        (
-            "control period",
-            f"{period['p50']:.1f} ms",
-            f"p99 {period['p99']:.1f} ms, max {period['max']:.1f} ms",
-        ),
-        ("flexneedle --help", f"{found['help']['help_s']:.2f} s", "wall time, median of 5"),
-        (
-            "first process",
-            f"{start['first_process_s']:.1f} s",
-            f"with compilation, {start['cache_files']} cache files",
-        ),
-        (
-            "second process",
-            f"{start['second_process_s']:.1f} s",
-            f"{start['written_by_second_process']} cache files written again",
-        ),
-    ]
-
-
 def main() -> None:
-    """Measure all and print a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description="Measure the speed of flexneedle on this machine.")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    chosen = parser.parse_args()
+    """Measure and print."""
+    chosen = parser_of("Measure the speed of flexneedle on this machine.").parse_args()
     load = os.getloadavg()[0]
     found: dict[str, Any] = {}
     for name, measure in PARTS.items():
         print(f"measuring {name} …", file=sys.stderr, flush=True)
         found[name] = measure()
     found["load"] = {"before": load, "after": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}
-    if chosen.json:
-        print(json.dumps(found))
-        return
-    for what, figure, remark in rows(found):
-        print(f"{what:<22}{figure:>20}   {remark}")
-    cores = found["load"]["cores"]
-    print(f"\nLoad average before the run {load:.2f} on {cores} cores; the run itself adds 1 to 2.")
-    print("Other processes slow the measurements, ratios less than times: use an idle machine.")
+    show(found, as_json=chosen.json)
+    if not chosen.json:
+        print(
+            "\nThe run itself adds 1 to 2 to the load. Other processes slow the measurements, ratios less than times."
+        )
 
 
 if __name__ == "__main__":

@@ -6,8 +6,6 @@ wall-clock time, processor time and the largest resident memory. No thresholds; 
 the wall-clock time.
 """
 
-import argparse
-import json
 import os
 import sys
 import tempfile
@@ -21,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as csv
 import pyarrow.parquet as parquet
+from measuring import parser_of, show
 
 ROWS, PART = 10_000_000, 1_000_000
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -68,7 +67,7 @@ def write(folder: Path, rows: int, all_columns: bool) -> list[Path]:
     return paths
 
 
-def measure(path: Path, out: Path) -> dict[str, float | str]:
+def measure(path: Path, out: Path) -> dict[str, float]:
     """Run the command on a table and return its time and memory."""
     command = [sys.executable, "-m", "flexneedle", "em", "evaluate", str(path), "--out", str(out), "--json"]
     begun = time.perf_counter()
@@ -78,7 +77,6 @@ def measure(path: Path, out: Path) -> dict[str, float | str]:
     if status:
         raise RuntimeError(f"{' '.join(command)}: status {os.waitstatus_to_exitcode(status)}")
     return {
-        "table": path.name,
         "mb": path.stat().st_size / 1e6,
         "seconds": time.perf_counter() - begun,
         "processor_seconds": used.ru_utime + used.ru_stime,
@@ -87,14 +85,11 @@ def measure(path: Path, out: Path) -> dict[str, float | str]:
 
 
 def main() -> None:
-    """Print one line per run."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Measure and print."""
+    parser = parser_of(__doc__)
     parser.add_argument("--rows", type=int, default=ROWS)
     parser.add_argument("--times", type=int, default=2, help="runs of each (default: 2)")
     parser.add_argument("--all-columns", action="store_true", help="also orientations")
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -102,15 +97,9 @@ def main() -> None:
             1, get_context("spawn")
         ) as writer:  # a child starts with the resident memory of its parent
             paths = writer.submit(write, folder, args.rows, args.all_columns).result()
-        found = [measure(path, folder / f"{path.name}-{k}") for k in range(args.times) for path in paths]
-    if args.json:
-        print(json.dumps({"rows": args.rows, "runs": found}))
-        return
-    for run in found:
-        line = (
-            "{table:14} {mb:6.0f} MB  {seconds:5.1f} s  {processor_seconds:5.1f} s CPU  {memory_mb:4.0f} MB"
-        )
-        print(line.format(**run))
+        runs = [(k, path) for k in range(1, args.times + 1) for path in paths]
+        found = {f"{path.name}, run {k}": measure(path, folder / f"{path.name}-{k}") for k, path in runs}
+    show(found, as_json=args.json)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,9 @@ time of each process over the time of the motion (in % of a core), and the lag o
 99 %, largest). To judge the machine: processor time taken by the host and by other processes.
 """
 
-import argparse
 import json
 import os
-import signal
 import socket
-import subprocess
 import sys
 import tempfile
 from importlib.resources import files
@@ -20,6 +17,7 @@ from time import monotonic
 
 import numpy as np
 import psutil
+from measuring import parser_of, quantiles, running, show, steal
 
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
@@ -32,16 +30,10 @@ HALF_TURN = 18_000
 
 def main() -> int:
     """Run both insertions and print them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true")
+    parser = parser_of(__doc__)
     parser.add_argument("--depth", type=float, default=DEPTH_MM, help="mm (default: 40)")
     args = parser.parse_args()
-    results = {name: measure(name, args.depth) for name in ("phantom", "phantom3d")}
-    if args.json:
-        print(json.dumps(results))
-    else:
-        for title, result in results.items():
-            print(title, *(f"  {name}: {value}" for name, value in result.items()), sep="\n")
+    show({name: measure(name, args.depth) for name in ("phantom", "phantom3d")}, as_json=args.json)
     return 0
 
 
@@ -49,15 +41,9 @@ def measure(scenario: str, depth: float) -> dict[str, float]:
     """Insert into a scenario's phantom; return shares of the processor (%) and lags (ms)."""
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder) / "truth.csv"
-        command = [sys.executable, "-m", "flexneedle", "emulate", "rig", rig_in(Path(folder)), scenario]
-        process = subprocess.Popen(
-            [*command, "--truth", str(truth)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        try:
-            return inserted(json.loads(process.stdout.readline()), truth, depth)
-        finally:
-            process.send_signal(signal.SIGTERM)
-            process.communicate()
+        command = (sys.executable, "-m", "flexneedle", "emulate", "rig", rig_in(Path(folder)), scenario)
+        with running(*command, "--truth", truth) as (_, ready):
+            return inserted(json.loads(ready), truth, depth)
 
 
 def rig_in(folder: Path) -> str:
@@ -135,21 +121,12 @@ def busy(processes: dict[str, psutil.Process]) -> dict[str, float]:
     return {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
 
 
-def steal() -> float:
-    """Processor time (s) that the host has taken until now."""
-    return float(getattr(psutil.cpu_times(), "steal", 0.0))
-
-
 def lags(path: Path) -> dict[str, float]:
     """Lags (ms) of the phantom while the motors moved."""
     truth = read_truth(path)
     travel = np.stack(list(truth.counts.values()), axis=-1)
     moving = np.append((np.diff(travel, axis=0) != 0.0).any(axis=1), False)
-    median, most = np.percentile(1e3 * truth.lag[moving], (50, 99)).tolist()
-    return {
-        "lag, median, ms": round(median, 2),
-        "lag, 99 %, ms": round(most, 2),
-        "lag, largest, ms": round(1e3 * float(truth.lag[moving].max()), 2),
+    return quantiles("lag", truth.lag[moving]) | {
         "rows a second in motion": round(1.0 / float(np.median(np.diff(truth.time)[moving[:-1]]))),
     }
 

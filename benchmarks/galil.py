@@ -8,17 +8,14 @@ Exit status 1 if the 99 % of read() or follow() are above 2 ms; 2 if the 99 % of
 machine is busy, and the times do not describe the driver.
 """
 
-import argparse
-import json
 import socket
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
 
 import numpy as np
-import psutil
+from measuring import parser_of, quantiles, running, show, steal
 
 from flexneedle.lab.rig.devices.galil.motors import GalilMotors, factory
 
@@ -38,16 +35,11 @@ _REPLY = b" 12345, -12345, 0, 0\r\n:" * 4
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--calls", type=int, default=5000)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     found = measure(args.calls)
-    if args.json:
-        print(json.dumps(found))
-    else:
-        for name, value in found.items():
-            print(f"{name}: {value}")
+    show(found, as_json=args.json)
     if found["echo, 99 %, ms"] > BUSY_MS:
         return 2
     return 1 if max(found["read(), 99 %, ms"], found["follow(), 99 %, ms"]) > BAR_MS else 0
@@ -55,8 +47,9 @@ def main() -> int:
 
 def measure(calls: int) -> dict[str, float]:
     """Return the times of `calls` calls of each kind."""
-    stolen = getattr(psutil.cpu_times(), "steal", 0.0)
-    with emulated() as address, echo() as line, connected(address) as motors:
+    stolen = steal()
+    emulator = running(sys.executable, "-m", "flexneedle", "emulate", "galil")
+    with emulator as (_, address), echo() as line, connected(address) as motors:
         prepare(motors)
         motion = targets()
         kinds: dict[str, Callable[[], object]] = {
@@ -69,15 +62,13 @@ def measure(calls: int) -> dict[str, float]:
             for name, call in kinds.items():
                 begun = perf_counter()
                 call()
-                times[name].append(1e3 * (perf_counter() - begun))
+                times[name].append(perf_counter() - begun)
         motors.stop()
-    found = {text: value for name, values in times.items() for text, value in summary(name, values)}
+    found = {text: value for name, values in times.items() for text, value in quantiles(name, values).items()}
     for name in ("read()", "follow()"):
         ratio = np.median(times[name]) / np.median(times["echo"])
         found[f"{name}, times the echo (medians)"] = round(float(ratio), 2)
-    found["processor time taken by the host, s"] = round(
-        getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1
-    )
+    found["processor time taken by the host, s"] = round(steal() - stolen, 1)
     return found
 
 
@@ -101,12 +92,6 @@ def targets() -> Iterator[dict[str, float]]:
         yield {"A": position, "B": -position}
 
 
-def summary(name: str, values: list[float]) -> Iterator[tuple[str, float]]:
-    """Yield median, 99 % and largest of times, with what they are."""
-    for text, percent in (("median", 50), ("99 %", 99), ("largest", 100)):
-        yield f"{name}, {text}, ms", round(float(np.percentile(values, percent)), 3)
-
-
 def exchanged(line: socket.socket) -> None:
     """Send as many bytes as a reading has, and receive them."""
     line.sendall(_REPLY)
@@ -116,32 +101,14 @@ def exchanged(line: socket.socket) -> None:
 
 
 @contextmanager
-def emulated() -> Iterator[str]:
-    """Run the emulated controller; yield its address."""
-    command = [sys.executable, "-m", "flexneedle", "emulate", "galil"]
-    with running(command) as process:
-        yield process.stdout.readline().strip() if process.stdout else ""
-
-
-@contextmanager
 def echo() -> Iterator[socket.socket]:
     """Run the echo server; yield a connection to it."""
-    with running([sys.executable, "-c", _ECHO]) as process:
-        port = int(process.stdout.readline()) if process.stdout else 0
-        with socket.create_connection(("127.0.0.1", port)) as line:
-            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            yield line
-
-
-@contextmanager
-def running(command: list[str]) -> Iterator["subprocess.Popen[str]"]:
-    """Run a process, and end it."""
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait()
+    with (
+        running(sys.executable, "-c", _ECHO) as (_, port),
+        socket.create_connection(("127.0.0.1", int(port))) as line,
+    ):
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        yield line
 
 
 if __name__ == "__main__":

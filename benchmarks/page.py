@@ -24,6 +24,7 @@ import psutil
 from playwright.sync_api import Browser, Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from measuring import steal
 from page_drive import DEPTHS, SHARES, VIEWS, Pointer, inserted, loaded, new_page, until, until_ended
 from page_figures import (
     Figure,
@@ -116,11 +117,6 @@ class Server:
 def busy(process: psutil.Process) -> float:
     """Processor time (s) of a process."""
     return float(sum(process.cpu_times()[:2]))
-
-
-def steal() -> float:
-    """Processor time (s) that the host has taken until now."""
-    return float(getattr(psutil.cpu_times(), "steal", 0.0))
 
 
 @contextmanager

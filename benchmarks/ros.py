@@ -8,7 +8,6 @@ loopback interface.
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import rosbags.typesys.stores.ros2_humble as ros
+from measuring import LOOPBACK, parser_of, quantiles, show
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from flexneedle.lab.ros.client import NodeClient, open_node
@@ -28,24 +28,16 @@ from flexneedle.results import Period, Plan
 from flexneedle.types import Shape
 from synthetic import make_periods, make_plan
 
-LOOPBACK = (
-    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
-    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    '<Peers><Peer Address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
-)
 SUBSCRIBERS, PERIOD_S = 4, 0.025
 SLOW = "slow"
 
 
 def main() -> int:
     """Run the measurements and print them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--periods", type=int, default=400)
     parser.add_argument("--stops", type=int, default=200)
     parser.add_argument("--profile", default="neutral")
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--subscriber", help=argparse.SUPPRESS)
     args = parser.parse_args()
     os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
@@ -53,12 +45,7 @@ def main() -> int:
     profile = load_profile(args.profile)
     if args.subscriber:
         return subscribe(profile, slow=args.subscriber == SLOW)
-    found = measure(profile, args)
-    if args.json:
-        print(json.dumps(found))
-    else:
-        for title, values in found.items():
-            print(title, *(f"  {name}: {value}" for name, value in values.items()), sep="\n")
+    show(measure(profile, args), as_json=args.json)
     return 0
 
 
@@ -100,11 +87,8 @@ def _periods(node: NodeClient, plan: Plan, periods: list[Period], count: int) ->
         due += PERIOD_S
         time.sleep(max(0.0, due - time.perf_counter()))
     cost = (sum(process.cpu_times()[:2]) - before) / count
-    return {
-        "publish and poll in the rig, median, ms": _ms(np.median(spent)),
-        "publish and poll in the rig, 99 %, ms": _ms(np.percentile(spent, 99)),
-        "publish and poll in the rig, largest, ms": _ms(max(spent)),
-        "processor time of the node for a period, ms": _ms(cost),
+    return quantiles("publish and poll in the rig", spent) | {
+        "processor time of the node for a period, ms": round(1e3 * cost, 3),
         "records dropped": node.dropped,
     }
 
@@ -128,13 +112,7 @@ def _stops(node: NodeClient, profile: TopicProfile, count: int, pause: float) ->
             due += pause
         taken.append(time.monotonic() - begun)
         arrived.append(stops[0].time - begun)
-    return {
-        "to the node, median, ms": _ms(np.median(arrived)),
-        "to the node, 99 %, ms": _ms(np.percentile(arrived, 99)),
-        "to the rig, median, ms": _ms(np.median(taken)),
-        "to the rig, 99 %, ms": _ms(np.percentile(taken, 99)),
-        "to the rig, largest, ms": _ms(max(taken)),
-    }
+    return quantiles("to the node", arrived) | quantiles("to the rig", taken)
 
 
 def subscribe(profile: TopicProfile, *, slow: bool) -> int:
@@ -166,10 +144,6 @@ def _await(condition, seconds: float = 30.0) -> None:
         if time.monotonic() > deadline:
             raise SystemExit("the nodes have not found each other")
         time.sleep(0.01)
-
-
-def _ms(seconds: float) -> float:
-    return round(1e3 * float(seconds), 3)
 
 
 if __name__ == "__main__":

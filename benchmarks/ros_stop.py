@@ -19,10 +19,9 @@ from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
+from measuring import LOOPBACK, parser_of, quantiles, show
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from ros import LOOPBACK
-
 import flexneedle
 from flexneedle.errors import StoppedError
 from flexneedle.geometry.rigid import identity
@@ -44,11 +43,8 @@ SUBSCRIBED = load_profile("neutral").subscribe
 
 def main() -> int:
     """Run the measurements and print them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--stops", type=int, default=200)
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--publisher", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
@@ -56,12 +52,7 @@ def main() -> int:
     if args.publisher:
         return publish()
     os.chdir(TESTS)  # where the supervisor finds the motors
-    found = measure(args.stops)
-    if args.json:
-        print(json.dumps(found))
-    else:
-        for title, values in found.items():
-            print(title, *(f"  {name}: {value}" for name, value in values.items()), sep="\n")
+    show(measure(args.stops), as_json=args.json)
     return 0
 
 
@@ -119,11 +110,7 @@ def _stops(
         sent = float(other.stdout.readline())
         lines = [json.loads(line) for line in notes.read_text().splitlines()[before:]]
         taken.append(next(at for what, at, _ in lines if what == "stop") - sent)
-    return {
-        "to the stop of the motors, median, ms": _ms(np.median(taken)),
-        "to the stop of the motors, 99 %, ms": _ms(np.percentile(taken, 99)),
-        "to the stop of the motors, largest, ms": _ms(max(taken)),
-    }
+    return quantiles("to the stop of the motors", taken)
 
 
 @contextmanager
@@ -171,10 +158,6 @@ def publish() -> int:
         writers[key].write(message)
         print(begun, flush=True)
     return 0
-
-
-def _ms(seconds: float) -> float:
-    return round(1e3 * float(seconds), 3)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import bench
 import pytest
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plane_space_and_the_banded_matrix_agree():
     found = bench.measure_step(repeats=1)
     assert found["space_differs_from_plane_mm"] < 1e-5

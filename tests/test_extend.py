@@ -138,6 +138,7 @@ def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch)
     assert other.periods[-1].guide != by_object.periods[-1].guide
 
 
+@pytest.mark.long
 def test_the_example_of_objects_runs_as_printed(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     (lab / "mine.toml").write_bytes((lab / "quick.toml").read_bytes())

@@ -65,6 +65,7 @@ def test_it_predicts_a_needle_with_other_constants(name):
     assert left < (0.4 if varied else 0.1) * naive
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("all_fresh")
 def test_with_fresh_derivatives_it_follows_the_tip_closely():
     """Derivatives of a few periods ago would leave a difference."""
@@ -163,8 +164,8 @@ def test_tissue_of_other_layers_is_identified_too(layers):
 @pytest.mark.usefixtures("all_fresh")
 def test_a_tracker_without_jitter_is_trusted_up_to_the_model_error():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
-    estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
-    np.testing.assert_array_equal(estimate.variances(), [np.full(66, unexplained(scenario, OWN) ** 2)])
+    estimate, states = followed(NEEDLES["all"], 50, scenario=scenario)
+    np.testing.assert_array_equal(estimate.variances(), [np.full(50, unexplained(scenario, OWN) ** 2)])
     assert estimate.tip[Y] == pytest.approx(
         NEEDLES["all"].measured(states[-1])[1], abs=unexplained(scenario, OWN)
     )

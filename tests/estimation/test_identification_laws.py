@@ -28,7 +28,7 @@ from reference.cases import MIRROR, numbers
 from tasks import begun_with
 
 
-@pytest.mark.parametrize("off", [1.9, -1.9])
+@pytest.mark.parametrize("off", [1.9, pytest.param(-1.9, marks=pytest.mark.long)])
 def test_parameters_stay_within_four_standard_deviations(off):
     """The readings are far off laterally, in air and in tissue; the solve still converges."""
     rows = commands(50)

@@ -60,8 +60,8 @@ def test_without_readings_a_hold_is_one_move_and_no_work(estimate, monkeypatch):
 
 
 def test_a_long_hold_keeps_no_more_readings_than_a_short_one(estimate):
-    short = held(estimate, 120, late)
-    long = held(short, 80, late, begun_at=120 * READING_S)
+    short = held(estimate, 105, late)
+    long = held(short, 25, late, begun_at=105 * READING_S)
     assert kept(long)[:2] == kept(short)[:2]
     assert kept(long)[2] <= 110
 

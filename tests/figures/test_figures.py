@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import matplotlib
 import numpy as np
@@ -297,10 +298,15 @@ def test_no_labels_overlap_or_are_cut(case):
     assert overlapping(drawn(case)) == []
 
 
+DAILY = {("a name without spaces", True), ("no guide", False), ("ten layers", False)}
+
+
 @pytest.mark.parametrize(
     ("name", "plans"),
-    [(name, k % 2 == 1) for k, name in enumerate(SCENARIOS)]
-    + [pytest.param(name, k % 2 == 0, marks=pytest.mark.long) for k, name in enumerate(SCENARIOS)],
+    [
+        pytest.param(*one, marks=() if one in DAILY else pytest.mark.long)
+        for one in product(SCENARIOS, (False, True))
+    ],
 )
 def test_no_labels_overlap_in_any_scenario(name, plans):
     make, target = SCENARIOS[name]
@@ -357,6 +363,7 @@ def test_a_long_reason_of_a_miss_stays_within_the_figure():
     assert title.get_window_extent().x1 <= figure.bbox.x1
 
 
+@pytest.mark.long
 def test_the_same_data_give_the_same_bytes_whatever_the_users_settings(tmp_path, saved):
     with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black", "svg.hashsalt": None}):
         paths = save(insertion_figure(PHANTOM, INSERTION), tmp_path, "insertion")

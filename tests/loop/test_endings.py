@@ -90,7 +90,7 @@ def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
 
     def lost(fitted, controls):
         outcome = rollout(fitted, controls)
-        kept = next(calls) < 20
+        kept = next(calls) < 8
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
     monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)

@@ -139,7 +139,9 @@ def test_with_a_perfect_model_it_ends_at_the_target(number):
     assert done.warning == ""
 
 
-@pytest.mark.parametrize(("controller", "gap"), [(DEFAULT, -2.0), ("resolved-rate", 2.0)])
+@pytest.mark.parametrize(
+    ("controller", "gap"), [pytest.param(DEFAULT, -2.0, marks=pytest.mark.long), ("resolved-rate", 2.0)]
+)
 def test_the_depth_is_reached_with_an_axial_start_error(plan, controller, gap):
     """The scenario's tip is 2 mm further from the skin than the plant's, or 2 mm nearer."""
     nothing = {

@@ -61,7 +61,7 @@ def test_a_cantilever_bends_as_the_elastica_and_converges_at_second_order(load):
         assert order(1.0 / counts, error) == pytest.approx(2.0, abs=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3, 4))])
 def test_a_second_solver_finds_the_same_bent_and_twisted_rod(seed):
     """Tip and its axes, with a second-order error; the last segment is half a segment before the tip."""
     rod = drawn(seed)

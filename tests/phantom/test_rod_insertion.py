@@ -73,6 +73,7 @@ def test_a_second_solver_finds_the_same_insertion():
     assert gaps[-1, 2] < 2e-5
 
 
+@pytest.mark.long
 def test_a_second_solver_finds_the_same_friction():
     """Its direction is the direction of the needle before a step: an error linear in the step."""
     rubbed = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})

@@ -87,7 +87,7 @@ def test_where_half_a_turn_is_in_the_range_the_plan_is_that_of_a_free_driver():
 def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
     """The messages state REACH, and REACH cos 60°, the least towards angle 0."""
     near, side, far = (
-        planned(off, setup__max_rotation_deg=60.0).limit
+        planned(off, setup__max_rotation_deg=60.0, plan__iterations=2, plan__max_iterations=2).limit
         for off in (0.3 * REACH + 0j, 0.8j * REACH, 2.0 * REACH + 0j)
     )
     assert near.startswith("setup.max_rotation_deg = 60")

@@ -27,7 +27,12 @@ def random_gaps(axes, seed, every):
 
 @pytest.mark.parametrize("axes", [1, 2])
 @pytest.mark.parametrize(
-    "seed", [0, 1, 2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 25))]
+    "seed",
+    [
+        *(0, 1),
+        *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3)),
+        *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 25)),
+    ],
 )
 def test_random_insertions_agree(axes, seed):
     """Steps of 1e-9 to 2 mm, retractions, all inputs, layers, a guide on two axes, on one, or none."""
