@@ -42,11 +42,11 @@ ENDED_HELD = Reaction("end held", {"end": "held"}, detected=("end",))
 class Fault:
     """A fault of the table. within: longest time (s), None where there is nothing to detect.
 
-    because: what the reason contains, in a pattern, with {axis} for the axis that is faulty; axis: its name, outside of
-    rolls; rolls: whether it falls in a roll in no case, in some ("some") or in all ("all"). decision_s: how long a
-    decision takes, where that is the fault. timed: the time that counts, by its key in a row: from the fault to
-    detection; to that from the beginning of the motion in which it shows, if that is later than the fault; or from the
-    fault until all axes rest.
+    because: pattern in the reason, with {axis} for the faulty axis; axis: its name, outside of rolls; rolls: whether
+    the fault occurs in a roll in no case, in some ("some") or in all ("all"); decision_s: duration of a decision, if
+    that is the fault; timed: the time that counts, by its key in a row: from the fault to its detection; from the
+    motion in which the fault shows to the detection, if the motion begins after the fault; or from the fault until all
+    axes rest.
     """
 
     group: str

@@ -152,7 +152,7 @@ def _attempt(trial: Trial, rng: np.random.Generator, keep: Path | None) -> dict[
 
 
 def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generator) -> tuple[str, ...]:
-    """Return the options for a custom controller, of which one decision is late or rolls."""
+    """Return the options for a custom controller, one decision of which is late or rolls the needle."""
     if not (roll or trial.fault.decision_s):
         return ()
     step = int(rng.integers(_FIRST_STEP, int(trial.case.steps) - _LEFT))

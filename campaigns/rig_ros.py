@@ -4,7 +4,7 @@ python campaigns/rig_ros.py [--pairs 3] [--stops 10] [--out runs/rig-ros] [--see
 
 Each insertion has a separate emulated rig (processes for motors, tracker and phantom), and a section `[ros]`.
 
-Cost: each insertion runs twice, without subscribers and with four processes that subscribe to all topics, one of which
+Cost: each insertion runs twice, without subscribers and with four processes that subscribe to all topics. One of them
 reads nothing for seconds at a time. A witness, a process that only sleeps, records the machine's own stalls: a tick
 that was left out counts as missed unless the witness was late at the same time.
 

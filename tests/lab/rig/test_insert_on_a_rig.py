@@ -57,17 +57,8 @@ def events(monkeypatch, in_tmp, engine, ends):
 
 
 @pytest.fixture
-def answer(monkeypatch, events):
-    """Return a function that makes stdin a terminal at which this text is typed; None: stdin is no terminal."""
-
-    def types(text):
-        def readline():
-            events.append("asked")
-            return text
-
-        monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: text is not None, readline=readline))
-
-    return types
+def answer(answer, events):
+    return partial(answer, asked=partial(events.append, "asked"))
 
 
 @pytest.mark.parametrize("number", SIGNALS)

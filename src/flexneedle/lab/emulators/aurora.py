@@ -42,7 +42,7 @@ FAULTS = {
         "a sensor's values repeat, while the frame number increases (tip, or stuck=SENSOR)"
     ),
     "nan": _fault_of_sensor("the values of a sensor are not numbers (tip, or nan=SENSOR)"),
-    "jump": FaultKind("the tip is reported 5 mm beside its position (along y, or jump=MM)", "5", MM),
+    "jump": FaultKind("the tip is reported 5 mm from its position (along y, or jump=MM)", "5", MM),
     "indicator": FaultKind("all indicators are high (0.2, or indicator=VALUE)", "0.2", RATIO),
     "unplug": FaultKind("the cable is pulled, and plugged in again after the duration"),
 }

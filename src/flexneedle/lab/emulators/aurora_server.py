@@ -183,10 +183,10 @@ class SerialPort:
 def device_time(before: float, served: float, now: float) -> float:
     """Return the device's time (s) at `now`, from its time `before` at the last call, at `served` (s).
 
-    It follows real time, but does not jump when the process was not scheduled: it stops meanwhile and then runs 10 %
-    faster until it has caught up. Otherwise a pause of the process by a frame period (virtual machines have pauses of
-    tens of ms) would lose frames that a real device does not lose. After more than 0.2 s it jumps, so that frames are
-    not stale: the process was stopped.
+    It follows real time, but does not jump after a pause of the process: it stops during the pause, and then runs 10 %
+    faster until it has caught up. Otherwise a pause of one frame period (virtual machines pause for tens of ms) would
+    lose frames that a real device does not lose. After more than 0.2 s, in which the process was stopped, it jumps, so
+    that frames are not stale.
     """
     stepped = before + _CATCH_UP_RATE * min(now - served, _LONGEST_STEP_S)
     return max(now - _MOST_BEHIND_S, min(now, stepped))

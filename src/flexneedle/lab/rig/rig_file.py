@@ -1,6 +1,6 @@
 """Rig file: the motors, trackers and links of a laboratory.
 
-A driver or tracker has further settings beside `kind`, which it checks itself.
+A driver or tracker has further settings besides `kind`, and checks them itself.
 """
 
 from collections.abc import Iterator, Mapping
@@ -81,7 +81,7 @@ class LoopSettings(Section):
     def queue_of(self, axis: Axis, speed: float) -> float:
         """Return the largest distance (mm or rad) of an axis from its target, at this speed (mm/s or rad/s).
 
-        It is at least two tolerances: a motor may rest within one, and shall move on.
+        It is at least two tolerances: a motor may rest one tolerance from its goal, and must still move on.
         """
         way = max(speed * self.queue, _LEAST_QUEUE * axis.tolerance)
         return min(way, self.queue_mm) if axis.unit == "mm" else way

@@ -157,9 +157,9 @@ class SupervisedDriver:
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll at the scenario's speed of rotation, confirm that by its position, then travel in `duration` s.
 
-        A motion that the monitor ended is returned as far as it went. Raises CommandError if the command breaks a limit
-        of the scenario, RefusedError if it breaks one of the rig or is faster than the scenario's speeds, DriverError
-        after a fault, StoppedError after a stop.
+        If the monitor ended the motion, its completed part is returned. Raises CommandError if the command breaks a
+        limit of the scenario, RefusedError if it breaks one of the rig or is faster than the scenario's speeds,
+        DriverError after a fault, StoppedError after a stop.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         if not duration >= (shortest := travel_time(self._scenario.setup, command)) - 2.0 * ROUNDING_S:

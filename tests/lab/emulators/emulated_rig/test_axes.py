@@ -20,10 +20,8 @@ from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 PHANTOM = load_scenario("phantom")
 FAR = (-1e9, 1e9)
-LINEAR = {"channel": "A", "counts_per_mm": 2000.0, "range_mm": [0.0, 110.0]} | {
-    "speed_mm_s": 10.0,
-    "acceleration_mm_s2": 250.0,
-}
+LINEAR = {"channel": "A", "counts_per_mm": 2000.0, "range_mm": [0.0, 110.0], "speed_mm_s": 10.0}
+LINEAR["acceleration_mm_s2"] = 250.0
 travels = st.lists(st.floats(-50_000.0, 50_000.0), min_size=1, max_size=30)
 
 

@@ -45,7 +45,7 @@ def insertions(name, seed, **values):
     z, turn, before = (-0.015 if truth.scenario.setup.axes == 2 else 0.0), 0.0, place(0.0)
     for k in range(62):
         if k in (0, 48, 57):
-            # A driver in the plane turns to and fro.
+            # A driver in the plane turns back and forth.
             turned = turn + math.pi if turn == 0.0 or truth.scenario.setup.axes == 2 else 0.0
             after = place(k, guide_y=0.03 * k, guide_z=z * k, rotation=turned)
             drive(driven, before, after, 3 * TICKS)
@@ -81,7 +81,7 @@ def test_the_truth_equals_the_virtual_rig_of_the_same_seed(name, seed, values, a
 
 
 def test_the_tip_turns_with_the_motor_and_returns_to_the_plane():
-    """Also in the plane the needle really turns: half-way its bend and run-out are out of the plane."""
+    """A needle in the plane turns, too: half-way, its bend and run-out are out of the plane."""
     needle = DrivenNeedle(truth_of("phantom", 0), place(0.0))
     drive(needle, place(0.0), place(45.0), 45 * TICKS)
     assert needle.tip[2] == 0.0

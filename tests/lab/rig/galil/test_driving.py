@@ -78,7 +78,7 @@ def stream(motors, seconds):
 
 
 def test_streamed_targets_are_followed_within_a_fiftieth_of_a_millimetre(motors):
-    """The time at which the first target was carried out is only known to the duration of its call.
+    """The time of the first target is known only to within the duration of its call.
 
     If this process was not scheduled until the motor ran out of targets, the test tries again.
     """

@@ -13,7 +13,6 @@ from emulated import until
 from flexneedle.errors import DriverError
 from flexneedle.lab.emulators.galil.controller import reply
 from flexneedle.lab.rig.devices.galil.motors import _split_assignment, factory
-from flexneedle.ports import MotorSetup
 from galil_peer import peer, settled
 
 HELLO = ["EO 0", "\x12\x16", "MG _PF,_TM;MG _MTA,_MTB", "TPAB;RPAB;TSAB;SCAB"]
@@ -83,14 +82,6 @@ def test_an_unsuitable_device_is_refused(query, answer, problem):
         device.damage = lambda line, true: answer if line == query else true
         with pytest.raises(DriverError, match=f"^127.0.0.1:{device.port}: .*{problem}"):
             factory({"address": f"127.0.0.1:{device.port}"}, ["A"] if query else ["A", "E"])
-
-
-def test_the_setup_has_limits_errors_and_disabled_switches_of_the_controller():
-    with driven() as (motors, device):
-        device.device, _ = reply(device.device, "FLB=1000;OEB=1;ERB=200;LDB=1")
-        found = motors.setup()
-    assert found["A"] == MotorSetup(-math.inf, math.inf, 16384.0, off_on_error=False)
-    assert found["B"] == MotorSetup(-math.inf, 1000.0, 200.0, off_on_error=True, disabled="forward")
 
 
 # Targets

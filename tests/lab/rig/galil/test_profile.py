@@ -64,10 +64,8 @@ def test_speed_and_acceleration_are_never_exceeded(goals, waits, speed, accelera
     most = max(acceleration, deceleration) * SAMPLE_S
     for before, after in itertools.pairwise(track):
         assert abs(after.velocity) <= speed * (1.0 + 1e-9)
-        changed = abs(after.velocity - before.velocity)
-        assert (
-            changed <= 2.0 * most * (1.0 + 1e-9) if after.velocity == 0.0 else changed <= most * (1.0 + 1e-9)
-        )
+        twice = 2.0 if after.velocity == 0.0 else 1.0
+        assert abs(after.velocity - before.velocity) <= twice * most * (1.0 + 1e-9)
         assert abs(after.position - before.position) <= speed * SAMPLE_S + 1.0
 
 

@@ -62,9 +62,8 @@ class ScriptedProcess:
                 requests, rests = self._next.pop(0)
                 self._report(requests, at_rest=rests)
             case protocol.ResetCommand() if self._next:
-                self._line.send(
-                    protocol.RequestRefused(0, "motors have not come to rest yet", SupervisorState.STOPPED)
-                )
+                why = "motors have not come to rest yet"
+                self._line.send(protocol.RequestRefused(0, why, SupervisorState.STOPPED))
                 self._report(self._requests, at_rest=False)
                 # The number of requests never falls, also if a late client sends heartbeats.
                 self._next = [(self._requests, rests) for _, rests in self._next]
@@ -83,7 +82,7 @@ class ScriptedProcess:
 @pytest.fixture(autouse=True)
 def scripted(monkeypatch):
     monkeypatch.setattr(connection, "ChildProcess", ScriptedProcess)
-    monkeypatch.setattr(connection, "_SILENT_S", 600.0)  # it reports only when it is asked
+    monkeypatch.setattr(connection, "_SILENT_S", 600.0)  # it reports only upon requests
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ def test_ticks_make_no_cycles_and_keep_no_memory():
 
 
 def count_kept_blocks(bench, numbers):
-    """Return the number of memory blocks that steps leave behind, of which no cycles."""
+    """Return the number of memory blocks that steps leave behind; none are cycles."""
     before = sys.getallocatedblocks()
     move(bench, numbers, STEPS)
     assert gc.collect() == 0

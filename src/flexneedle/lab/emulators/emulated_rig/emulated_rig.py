@@ -130,7 +130,7 @@ class EmulatedRig:
             raise RunError(f"the process of the {name} has ended with exit code {first.wait()}")
 
     def _first_to_fail(self, ended: str) -> str:
-        """Return the process that has failed: this one, or the one with which it has ended in good order."""
+        """Return the process that has failed: this one, or another that made it end in good order."""
         if self._parts[ended].wait() != 0:
             return ended
         failed = (name for name, part in self._parts.items() if part.wait(_FOLLOW_S) not in (0, None))

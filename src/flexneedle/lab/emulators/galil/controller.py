@@ -170,7 +170,7 @@ def _value_of(device: ControllerState, text: str) -> float:
 
 
 def _abort(device: ControllerState, rest: str) -> tuple[ControllerState, str]:
-    if rest not in ("", "0", "1"):  # 1: without the programs, of which it has none
+    if rest not in ("", "0", "1"):  # 1 spares the programs, and it has none
         raise CommandRefusal(6)
     return replace(device, axes=tuple(one.abort_motion(axis) for axis in device.axes)), ""
 

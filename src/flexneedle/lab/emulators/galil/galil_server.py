@@ -1,7 +1,7 @@
 """Emulated controller on TCP, with its time and faults. It runs until interrupted.
 
-Its motors run in real time, also while this process is not scheduled: before each command, and every few milliseconds,
-all samples up to the present are computed.
+Its motors run in real time, even while this process does not run: before each command, and every few milliseconds, all
+samples up to the present are computed.
 """
 
 import os
@@ -154,7 +154,7 @@ class GalilSession:
 
 
 def _refuse(device: ControllerState, line: str, code: int) -> tuple[ControllerState, str]:
-    """Return the state and the replies for a line of which every command but TC is refused with this code."""
+    """Refuse every command of a line but TC with this code; return the state and the replies."""
     answers = []
     for command in line.split(";"):
         if command.strip().startswith("TC"):

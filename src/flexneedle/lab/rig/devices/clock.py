@@ -23,7 +23,7 @@ class WallClock:
 
 
 class Suspension:
-    """Time for which the computer was suspended. The monotonic clock stops meanwhile: no other check notices."""
+    """Time for which the computer was suspended. The monotonic clock stops then: no other check notices it."""
 
     def __init__(self) -> None:
         self._before = suspended_s()

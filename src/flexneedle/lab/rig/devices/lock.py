@@ -58,7 +58,7 @@ def _open_file(path: Path) -> int:
     """Return a descriptor of the file, which is made for all users."""
     flags = os.O_RDWR | os.O_NOFOLLOW
     while True:
-        try:  # without O_CREAT, with which Linux refuses a file of another user (fs.protected_regular)
+        try:  # with O_CREAT, Linux would refuse another user's file (fs.protected_regular)
             return os.open(path, flags)
         except FileNotFoundError:
             pass

@@ -146,7 +146,7 @@ def plan_jog(rig: RigFile, name: str, distance: str, position: float, speed: flo
             _parse_speed(name, axis, speed),
         )
     )
-    # A driver whose counts are no steps of an encoder, such as m, has a finer resolution.
+    # Counts that are no steps of an encoder, such as m, have a finer resolution.
     if abs(move.distance) < min(1.0 / abs(axis.scale), axis.tolerance):
         raise InputError(f"distance {text_of(distance)}: must be at least one count of {name}")
     return move

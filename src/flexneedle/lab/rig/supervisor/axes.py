@@ -27,8 +27,8 @@ _REST_S = 0.02  # in which a servo that still follows has moved; readings after 
 class RigAxes:
     """Axes of a rig over their motors: drives by axis, readings, goals (counts by channel) and known limit switches.
 
-    lost: the motors could not be reached, so that they are not known to rest until they are stopped. A switch is
-    known if it was active when positions were taken, and still is. Calls of motors raise DriverError.
+    lost: the motors could not be reached, and do not count as resting until they are stopped. A switch is known if it
+    was active when positions were taken, and still is. Calls of motors raise DriverError.
     """
 
     def __init__(self, rig: RigFile, motors: Motors, clock: Clock) -> None:
@@ -171,7 +171,7 @@ class RigAxes:
             raise DriverError("; ".join(problems.values()))
 
     def home_offset(self, drive: Drive) -> float:
-        """Return the correction of a motor's position (counts) whose axis is at its home now."""
+        """Return the correction (counts) of a motor's position by which its axis is at its home now."""
         now = self.drives[drive.name]
         return now.to_counts(now.axis.at_home) - self.state(now).position
 

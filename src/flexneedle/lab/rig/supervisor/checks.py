@@ -9,9 +9,9 @@ from flexneedle.lab.rig.supervisor.motion import CommandedMotion
 from flexneedle.ports import MotorState
 
 STILL = 2.0
-"""Times the tolerance of its goal a motor at rest may move."""
-_HASTE = 1.5  # times its speed an axis may seem to move between two ticks, whose times are not exact
-_CREEP = 0.1  # of the tolerance a servo that still follows moves at least between two readings
+"""Largest motion of a motor at rest, in tolerances of its goal."""
+_HASTE = 1.5  # times its largest speed: so fast may an axis seem, since the times of ticks are not exact
+_CREEP = 0.1  # of the tolerance: least motion of a servo that still follows between two readings
 
 
 def number_problem(drive: Drive, state: MotorState) -> str:
@@ -62,9 +62,9 @@ def _distance_outside(drive: Drive, state: MotorState) -> float:
 
 
 def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: float) -> str:
-    """Report a motor that moved back on its way (counts, signed) since the reading before: its position was reset.
+    """Report a motor that moved against its travel (`way`, counts) since the reading before: its position was reset.
 
-    A jump within what its speed allows is found by its direction alone.
+    A jump that its speed allows shows only in its direction.
     """
     back = -(state.position - before.position) * (1.0 if way > 0.0 else -1.0) / abs(drive.axis.scale)
     if back > STILL * drive.axis.tolerance:
@@ -87,9 +87,9 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
 
 
 def is_at_rest(drive: Drive, state: MotorState, before: MotorState) -> bool:
-    """Return whether a motor rests, its servo included, which may still follow after the controller's profile.
+    """Return whether a motor rests with its servo, which may still follow after the controller's profile has ended.
 
-    before: long enough ago that a servo that follows on has moved. A state that is repeated does not show it.
+    before: state at a time from which a servo that still follows has moved. A repeated state shows no rest.
     """
     if state.repeated:
         return False

@@ -10,9 +10,9 @@ from flexneedle.ports import MotorState
 
 
 def make_homing(number: int, drive: Drive, *, at_switch: bool) -> CommandedMotion:
-    """Return the search of a home: `home` is the axis, or `here` for an axis whose home is its present position.
+    """Return the motion that searches a home. Its axis is `home`, or `here` if the home is the present position.
 
-    From an active switch the axis first moves away, and is `released` then: a switch that is stuck is no home.
+    An axis at an active switch (`released`) first moves off it, since a stuck switch is no home.
     """
     if not drive.axis.to_home:
         return CommandedMotion(number, [], here=drive, unlimited=True)

@@ -20,10 +20,10 @@ _MOST_WAITED = 10.0  # times its duration: slower motors do not do what they are
 class Leg:
     """Motors that move together.
 
-    drives: by channel, with the side of this direction; begun: start, s on the run's clock; samples: measured shares of
-    the way as (time, share); waited: time (s) for which the trajectory has waited for its motors; sent: last targets
-    (counts by channel); share: their share of the way; marked: distance of all motors (tolerances) and time (s) at the
-    last progress.
+    drives: by channel, with the side of this direction; begun: start, s on the run's clock; samples: measured
+    fractions of the travel as (time, fraction); waited: time (s) for which the trajectory has waited for its motors;
+    sent: last targets (counts by channel); share: their fraction of the travel; marked: distance of all motors
+    (tolerances) and time (s) at the last progress.
     """
 
     drives: Mapping[str, Drive]
@@ -40,8 +40,8 @@ class Leg:
     ) -> Mapping[str, float]:
         """Return the present targets of the motors (counts by channel), kept as `sent`.
 
-        Motors reach them a queue later, but no target is further from its motor than the motor moves in that time at
-        the speed of the motion: the trajectory waits for motors that are behind.
+        Motors reach them one queue later. No target is further from its motor than the motor moves in that time at the
+        speed of the motion: the trajectory waits for a late motor.
         """
         wanted = self.trajectory.share(now - self.begun - self.waited + loop.queue)
         most = self._largest_share(loop, states)
@@ -51,7 +51,7 @@ class Leg:
         return self.sent
 
     def _largest_share(self, loop: LoopSettings, states: Mapping[str, MotorState]) -> float:
-        """Return the largest share of the way at which no target is too far from its motor."""
+        """Return the largest fraction of the travel at which no target is too far from its motor."""
         speeds, shares = self.trajectory.speeds, [1.0]
         for name, drive in self.drives.items():
             if way := abs(self.way(name) / drive.axis.scale):
@@ -60,14 +60,14 @@ class Leg:
         return min(shares)
 
     def _travelled(self, channel: str, states: Mapping[str, MotorState]) -> float:
-        """Return the distance that a motor has moved on its way (mm or rad)."""
+        """Return the distance that a motor has moved towards its goal (mm or rad)."""
         gone = (states[channel].position - self.trajectory.start[channel]) / abs(
             self.drives[channel].axis.scale
         )
         return gone if self.way(channel) > 0.0 else -gone
 
     def queued_distances(self, states: Mapping[str, MotorState]) -> dict[str, float]:
-        """Return the distance of each axis from its last target (mm or rad), which it moves without another one."""
+        """Return the distance of each axis to its last target (mm or rad), to which it moves without a further one."""
         return {
             drive.name: abs((self.sent[name] - states[name].position) / drive.axis.scale)
             for name, drive in self.drives.items()
@@ -75,9 +75,9 @@ class Leg:
         }
 
     def record_progress(self, states: Mapping[str, MotorState], now: float) -> None:
-        """Record the share of the way that is done, and the time of the last progress.
+        """Record the fraction of the travel that is done, and the time of the last progress.
 
-        The share is measured by the motor with the longest way.
+        The motor with the longest travel measures it.
         """
         gone = sum(
             self._travelled(name, states) / drive.axis.tolerance for name, drive in self.drives.items()
@@ -89,11 +89,11 @@ class Leg:
             self.samples.append((now, (states[channel].position - self.trajectory.start[channel]) / way))
 
     def way(self, channel: str) -> float:
-        """Return a motor's way (counts, signed)."""
+        """Return a motor's travel (counts, signed)."""
         return self.trajectory.goal[channel] - self.trajectory.start[channel]
 
     def _seconds(self, channel: str) -> float:
-        """Return the duration (s) of a motor's way at its largest speed."""
+        """Return the duration (s) of a motor's travel at its largest speed."""
         axis = self.drives[channel].axis
         return abs(self.way(channel) / axis.scale) / axis.speed
 

@@ -122,7 +122,7 @@ def _tick(
 
 
 def _act_on_requests(channel: MessageChannel, core: Supervisor) -> str:
-    """Act on what the client has sent; return why the supervisor shall end, "" if it shall continue."""
+    """Act on the requests of the client; return the reason to end, "" to continue."""
     for request in channel.receive():
         if isinstance(request, protocol.CloseCommand):
             return _CLOSED

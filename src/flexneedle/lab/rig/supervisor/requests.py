@@ -100,8 +100,8 @@ def range_problem(
 ) -> str:
     """Return the problem of the first position (by axis) that is outside the axis's range, or "".
 
-    A position beyond it by less than the tolerance is accepted: a motor may rest there. resting: the lost motion is
-    accepted, too, for positions of motors whose goals were within the range.
+    A position beyond it by less than the tolerance is accepted, since a motor may rest there. resting: half of the
+    lost motion is accepted, too.
     """
     for name, position in ends:
         axis = drives[name].axis

@@ -1,7 +1,7 @@
-"""A motion of several motors over time: all start and end together, with one trapezoid of speed. Pure functions.
+"""Motion of several motors that start and end together, with one trapezoid of speed. Pure functions.
 
-With accelerating time h of a motion that takes T, a motor that travels d has the largest speed d/(T − h) and the
-acceleration d/((T − h) h). T and h are the smallest that keep the limits of every axis.
+A motor that travels d in time T, with ramps of time h, has the largest speed d/(T − h) and the acceleration
+d/((T − h) h). T and h are the smallest within the limits of all axes.
 """
 
 import math
@@ -26,7 +26,7 @@ class Trajectory:
     ramp: float
 
     def share(self, time: float) -> float:
-        """Return the share of the way that is done `time` (s) after the start."""
+        """Return the fraction of the travel that is done `time` (s) after the start."""
         if time <= 0.0:
             return 0.0
         if time >= self.duration:
@@ -37,14 +37,14 @@ class Trajectory:
         return part if near == time else 1.0 - part
 
     def at(self, share: float) -> dict[str, float]:
-        """Return the positions (counts) by channel with this share of the way done."""
+        """Return the positions (counts) by channel at this fraction of the travel."""
         if share == 1.0:  # exactly, without rounding
             return dict(self.goal)
         return {name: begin + share * (self.goal[name] - begin) for name, begin in self.start.items()}
 
     @property
     def cruise(self) -> float:
-        """Time (s) of the whole way at its largest speed."""
+        """Time (s) of the whole travel at its largest speed."""
         return self.duration - self.ramp
 
     @property
@@ -97,10 +97,11 @@ _LOW, _HIGH, _FEWEST, _LEAST_SPREAD = 0.05, 0.95, 3, 0.2
 def fit_span(
     samples: Sequence[tuple[float, float]], begun: float, ended: float, last: float = 1.0
 ) -> tuple[float, float]:
-    """Return begin and end (s) of the motion at constant speed that fits samples best (time in s, share of the way).
+    """Return begin and end (s) of the motion at constant speed that fits samples best.
 
-    A motor accelerates and slows down: a tip at constant speed from the command on would be ahead of it and then
-    behind. last: share at the end; begun, ended: returned if too few samples are on the way.
+    samples: time (s) and fraction of the travel. A motor accelerates and slows down: a tip at constant speed from the
+    command on would be ahead of it and then behind. last: fraction at the end; begun, ended: returned if too few
+    samples are between start and end.
     """
     way = [(time, share) for time, share in samples if _LOW < share < _HIGH]
     if len(way) < _FEWEST or max(way)[1] - min(way)[1] < _LEAST_SPREAD:

@@ -19,6 +19,7 @@ from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.types import VISIBLE
 
 ALL = {"tip", "ref1", "ref2", "ref3"}
+HIDDEN = {"tip": "missing", "ref1": "out of volume", "ref2": "partly out of volume", "ref3": "broken coil"}
 BAD_MODE = 0x0C
 
 
@@ -122,15 +123,7 @@ def test_old_firmware_is_read_in_text_and_ports_can_be_named():
 @pytest.mark.parametrize(
     ("kinds", "faults"),
     [
-        (
-            ("missing", "out-of-volume", "partly-out", "broken"),
-            {
-                "tip": "missing",
-                "ref1": "out of volume",
-                "ref2": "partly out of volume",
-                "ref3": "broken coil",
-            },
-        ),
+        (("missing", "out-of-volume", "partly-out", "broken"), HIDDEN),
         (("disabled",), {"tip": "disabled"}),
     ],
 )

@@ -32,9 +32,9 @@ class Link:
     """A connection to a controller, which `open` makes. Not for several threads.
 
     farewell: a line that is sent before a connection is closed because of a failure, without waiting for replies: the
-    stop of motors whose state is unknown. Deadlines are times of the monotonic clock; a reply that is there in time
-    counts even if this process notices it late. Raises DriverError if the host is unknown (that look-up, and no later
-    call, may take seconds).
+    stop of motors whose state is unknown. Deadlines are times of the monotonic clock; a reply that arrives in
+    time counts even if this process reads it late. Raises DriverError if the host is unknown (that look-up, and no
+    later call, may take seconds).
     """
 
     def __init__(self, host: str, port: int) -> None:

@@ -30,11 +30,8 @@ CONNECT_S = 2.0
 
 _REVISION = "\x12\x16"  # Ctrl-R Ctrl-V
 _FARTHEST = 2_147_483_647
-_SERVOS = (
-    1.0,
-    1.5,
-    4.0,
-)  # types of motor (MT, either sign) whose position an encoder measures; others are steppers
+# Types of motor (MT, either sign) whose position an encoder measures; others are steppers.
+_SERVOS = (1.0, 1.5, 4.0)
 _POSITION_FORMAT = 10.0  # PF: ten digits, no decimals; a shorter format would cut positions off
 _SAMPLE_TIME = 1000.0  # TM at which speeds are in counts/s; another scales all speeds and accelerations
 _SPEED_STEP, _RATE_STEP = 2, 1024  # the controller rounds down to multiples, at its default sample time

@@ -1,4 +1,4 @@
-"""Settings of the driver `galil` in a rig file, beside `kind`."""
+"""Settings of the driver `galil` in a rig file, besides `kind`."""
 
 import re
 from collections.abc import Mapping, Sequence
