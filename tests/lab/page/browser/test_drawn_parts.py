@@ -134,6 +134,15 @@ def test_the_sampled_horizon_is_shown_from_its_period_on(views, server):
             assert corners[:, 0].min() == {8: 5.0, 16: 12.0}[count]
 
 
+PLACE = """async ([selector, left, right, half, point]) => {
+  const { mappingOf } = await import("/static/flat/plane.js");
+  const stage = document.querySelector(`${selector} .stage`);
+  const handle = stage.querySelector("[data-handle=target]").getBoundingClientRect();
+  const { x, y, width, height } = stage.querySelector("canvas").getBoundingClientRect();
+  const map = mappingOf({ left, right, half }, width, height, 1);
+  return [handle.x + handle.width / 2 - x - map.toX(point[0]), handle.y + handle.height / 2 - y - map.toY(point[1])];
+}"""
+"""Distance (px) of the target's handle from its place in a view of a box."""
 OUTLINES = """async ([name, target, axes, reach, [paths, points, values], depth]) => {
   const { planeOf } = await import("/static/flat/plane.js");
   const { reachAt, reachIn } = await import("/static/flat/reach.js");
@@ -159,7 +168,9 @@ def cut(page, plane, outlines, depth=0.0, reach=REACH, axis=(0.0, 0.0), target=T
     return page.evaluate(OUTLINES, [plane, target, axis, reach.model_dump(), values, depth])
 
 
-def test_the_reach_is_cut_by_the_plane_of_the_section_and_at_the_depth_of_the_target(views):
+def test_the_reach_is_cut_by_the_plane_of_the_section_and_at_the_depth_of_the_target_and_is_in_view(
+    views, server
+):
     """In space; in the plane its outlines have no width, and its strip is measured from the axis."""
     page, depths = views(opening()), (15.0, 25.0, 40.0)
     for plane, slope in (("x–z", SLOPES[1]), ("target", np.hypot(5, 3) / np.hypot(5 / 0.2, 3 / 0.1))):
@@ -176,21 +187,7 @@ def test_the_reach_is_cut_by_the_plane_of_the_section_and_at_the_depth_of_the_ta
         section, _ = cut(page, plane, ends, reach=strip, axis=(2.0, 0.0), target=(40.0, 5.0, 0.0))
         wanted = [(15.0, -3.0 - off), (40.0, -8.0 - off), (40.0, 4.0 - off), (15.0, 1.5 - off)]
         np.testing.assert_allclose(section, wanted, atol=1e-6)
-
-
-PLACE = """async ([selector, left, right, half, point]) => {
-  const { mappingOf } = await import("/static/flat/plane.js");
-  const stage = document.querySelector(`${selector} .stage`);
-  const handle = stage.querySelector("[data-handle=target]").getBoundingClientRect();
-  const { x, y, width, height } = stage.querySelector("canvas").getBoundingClientRect();
-  const map = mappingOf({ left, right, half }, width, height, 1);
-  return [handle.x + handle.width / 2 - x - map.toX(point[0]), handle.y + handle.height / 2 - y - map.toY(point[1])];
-}"""
-"""Distance (px) of the target's handle from its place in a view of a box."""
-
-
-def test_the_whole_reach_is_in_view(views, server):
-    page, wide, deepest = views(opening()), 4.0, 60.0
+    wide, deepest = 4.0, 60.0
     page.click(f"{SECTION} [data-plane='x–y']")
     outlines = ellipses(15.0, 35.0, deepest, wide=wide)
     server.send(REACH, shape(FrameKind.REACH, FrameSource.SCENE, 0, *outlines))

@@ -45,7 +45,9 @@ def payload(name, data):
     return {"name": name, "mimeType": "application/toml", "buffer": data}
 
 
-def test_a_scenario_is_begun_from_preset_world_and_file_and_saved(files, server, tmp_path):
+def test_a_scenario_is_begun_from_preset_world_and_file_and_saved_and_changes_are_not_lost(
+    files, server, tmp_path
+):
     page = files()
     page.select_option("#files-preset", "phantom")
     page.click("[aria-label='Begin with the preset']")
@@ -64,11 +66,6 @@ def test_a_scenario_is_begun_from_preset_world_and_file_and_saved(files, server,
     assert download.value.suggested_filename == "scenario.toml"
     download.value.save_as(tmp_path / "saved.toml")
     assert (tmp_path / "saved.toml").read_text() == TEXT
-
-
-def test_it_asks_before_changes_are_lost(files, server):
-    """Once the scenario is kept, and once it is not."""
-    page = files()
     server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
     until(page, "flexneedle.store.get('session').changed.length")
     painted(page)  # presets chosen
@@ -92,8 +89,37 @@ def test_it_asks_before_changes_are_lost(files, server):
         server.wait_for(kind, asked + 1)
 
 
-def test_a_run_is_opened_compared_closed_and_downloaded(files, server, visit):
-    page, held = files(), []
+MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
+
+
+def download_two_files(page, errors):
+    """Download a file that the server refuses, and another one."""
+    held = []
+    page.route("**/runs/first/*", lambda route, _request: held.append(route))
+
+    def requested():
+        while not held:
+            painted(page)
+        return held.pop()
+
+    page.click("[aria-label='CSV of first']")
+    page.wait_for_selector("text=CSV of first is being made…")
+    requested().fulfill(status=404, body="the run has no trace\n")
+    page.wait_for_selector("text=CSV of first: the run has no trace")
+    page.click("[aria-label='Run folder of first']")
+    page.wait_for_selector("text=Run folder of first is being made…")
+    assert not page.is_visible("text=the run has no trace")
+    with page.expect_download() as download:
+        requested().fulfill(body=b"PK")
+    assert download.value.suggested_filename == "first-run.zip"
+    page.wait_for_selector("text=is being made…", state="detached")
+    page.unroute("**/runs/first/*")
+    assert len(errors) == 1  # the browser's own line of the refusal
+    errors.clear()
+
+
+def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, visit):
+    page = files()
     page.click("[aria-label='Open first']")
     page.click("[aria-label='Compare with first']")
     page.click("summary:has-text('Download')")
@@ -112,34 +138,9 @@ def test_a_run_is_opened_compared_closed_and_downloaded(files, server, visit):
     page.wait_for_selector("text=changed")
     assert page.locator(".run strong").all_inner_texts() == ["many", "first"]
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "CSV of first"
-
-    page.route("**/runs/first/*", lambda route, _request: held.append(route))
-
-    def requested():
-        while not held:
-            page.wait_for_timeout(20)
-        return held.pop()
-
-    page.click("[aria-label='CSV of first']")
-    page.wait_for_selector("text=CSV of first is being made…")
-    requested().fulfill(status=404, body="the run has no trace\n")
-    page.wait_for_selector("text=CSV of first: the run has no trace")
-    page.click("[aria-label='Run folder of first']")
-    page.wait_for_selector("text=Run folder of first is being made…")
-    assert not page.is_visible("text=the run has no trace")
-    with page.expect_download() as download:
-        requested().fulfill(body=b"PK")
-    assert download.value.suggested_filename == "first-run.zip"
-    page.wait_for_selector("text=is being made…", state="detached")
-    page.unroute("**/runs/first/*")
-    assert len(visit.errors) == 1  # the browser's own line of the refusal
-    visit.errors.clear()
+    download_two_files(page, visit.errors)
     server.send(RunsMessage(runs=[MANY]))
     page.wait_for_selector("text=changed", state="detached")
-
-
-def test_the_insertion_and_the_shown_row_are_saved_as_runs(files, server):
-    page = files()
     assert not page.is_visible("[aria-label='Name of the run to save']")
     server.send(insertion("done"))
     page.fill("[aria-label='Name of the run to save']", "../x")
@@ -162,9 +163,6 @@ def test_the_insertion_and_the_shown_row_are_saved_as_runs(files, server):
         {"type": "save", "name": "my run", "of": "live"},
         {"type": "save", "name": "worst", "of": "second"},
     ]
-
-
-MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
 
 
 def study_row(index, **changes):
@@ -257,11 +255,14 @@ async ([width, height, frames]) => {{
 """
 
 
-@pytest.mark.parametrize("size", [(37, 20), (120, 90)])
-def test_a_gif_has_the_pixels_of_its_frames(files, size):
-    """Also where the codes of a frame need 12 bits and begin anew, and end at any of their lengths."""
-    page = files()
-    rng = np.random.default_rng(3)
+def test_a_gif_has_the_pixels_of_its_frames(files):
+    """Also where the codes of a frame need 12 bits and begin again, and end at any of their lengths."""
+    page, rng = files(), np.random.default_rng(3)
+    for size in ((37, 20), (120, 90)):
+        check_gif(page, rng, size)
+
+
+def check_gif(page, rng, size):
     frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
     frames[..., 3] = 255
     frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs

@@ -70,7 +70,7 @@ FIELDS = """async ([schema, values]) => {
 }"""
 
 
-def test_every_value_and_table_of_a_scenario_has_a_field(form):
+def test_every_value_and_table_of_a_scenario_has_a_field_and_is_found_by_a_search(form):
     """A table has values to begin with; one after the other, since tables contain others."""
     page, scenario, known = form(), load_scenario("phantom3d"), {}
     search(page, ".")  # in all keys and descriptions
@@ -95,11 +95,6 @@ def test_every_value_and_table_of_a_scenario_has_a_field(form):
     units = {"mm", "mrad", "rad", "deg", "kpa", "gpa", "mn", "mj", "hz", "per"}
     left = {key for key, (label, _) in labels.items() if units & set(label.lower().split())}
     assert left == {"tracker.jitter_per_axis"} & set(labels)
-
-
-def test_settings_are_found_by_a_search(form):
-    """Options by their names and choices, too."""
-    page = form()
     search(page, "flip weight")
     page.wait_for_selector("#field-plan-flip_weight")
     visible = f"{FORM} .field[data-key]:visible"

@@ -69,14 +69,28 @@ def test_a_virtual_insertion_is_started_paused_paced_stepped_and_stopped(panel, 
     assert len(server.wait_for("stop", 2)) == 2
 
 
+def some_rows(first, *changed):
+    return RowsMessage(of="live", first=first, rows=[row(first + k) | one for k, one in enumerate(changed)])
+
+
+SAID = [
+    "rolls at 20.1 mm; predicted miss 0.012 ± 0.034 mm",
+    "rolls at 20.1 mm; predicted miss -0.3 ± 1e-05 mm",
+    "bevel kept; predicted miss 0.01 ± 0.03 mm",
+    "bevel kept; predicted miss 0.02 ± 0.03 mm",
+]
+"""Decisions of four periods; numbers are no other words."""
+
+
 def in_a_field():
     """A session whose tracker has a field."""
     given = session()
     return given.model_copy(update={"values": {**given.values, "tracker.environment.name": "noisy"}})
 
 
-def test_an_insertion_is_disturbed(panel, server):
-    page = panel([*opening(), insertion("running")])
+def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_words_change(panel, server):
+    decided = some_rows(0, *({"decision": text} for text in SAID))
+    page = panel([*opening(), insertion("running", periods=4), decided])
     why = page.locator(f"{PANEL} >> text=The tracker of this scenario has no field that metal distorts")
     bring = page.locator(PANEL).get_by_role("button", name="Bring", exact=True)
     assert (why.is_visible(), bring.is_enabled()) == (True, False)
@@ -112,24 +126,8 @@ def test_an_insertion_is_disturbed(panel, server):
     ]
     server.send(DisturbancesMessage(active=["0.25 N on the tip"]))
     page.wait_for_selector("text=Active: 0.25 N on the tip")
-
-
-def some_rows(first, *changed):
-    return RowsMessage(of="live", first=first, rows=[row(first + k) | one for k, one in enumerate(changed)])
-
-
-def test_decisions_are_listed_where_their_words_change(panel, server):
-    said = [
-        "rolls at 20.1 mm; predicted miss 0.012 ± 0.034 mm",
-        "rolls at 20.1 mm; predicted miss -0.3 ± 1e-05 mm",
-        "bevel kept; predicted miss 0.01 ± 0.03 mm",
-        "bevel kept; predicted miss 0.02 ± 0.03 mm",
-    ]
-    page = panel(
-        [*opening(), insertion("running", periods=4), some_rows(0, *({"decision": text} for text in said))]
-    )
-    page.wait_for_selector(f".decisions .now >> text={said[-1]}")
-    assert page.locator(".decisions li span").all_inner_texts() == [said[2], said[0]]
+    page.wait_for_selector(f".decisions .now >> text={SAID[-1]}")
+    assert page.locator(".decisions li span").all_inner_texts() == [SAID[2], SAID[0]]
     assert "held" not in page.inner_text(f"{PANEL} [role=status]")
     held = {
         "action": "hold",
@@ -145,7 +143,7 @@ def test_decisions_are_listed_where_their_words_change(panel, server):
     until(page, f"!document.querySelector('{PANEL} [role=status]').textContent.includes('held')")
     page.click(".decisions li:last-child button")
     until(page, "flexneedle.store.get('view period') === 0")
-    page.wait_for_selector(f".decisions .now >> text=Period 1, 0.0 s: {said[0]}")
+    page.wait_for_selector(f".decisions .now >> text=Period 1, 0.0 s: {SAID[0]}")
     page.wait_for_selector(".decisions li:last-child[aria-current=step]")
     whose = page.locator(f"{PANEL} >> text=Decisions of")
     assert not whose.is_visible()
@@ -182,11 +180,31 @@ def shown_buttons(page):
     return {each.inner_text(): each.is_enabled() for each in buttons}
 
 
-def test_a_rig_is_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
+def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
     page = rig_panel()
     assert shown_buttons(page) == {"Check": True, "Prepare": True}
-    click(page, "Prepare")
+    click(page, "Check")
     page.wait_for_selector("text=you are in control")
+    server.send(JobMessage(job=9, kind="check", state="running", text="each device is read, nothing moves"))
+    page.wait_for_selector("text=Checking: each device is read, nothing moves …")
+    assert page.is_disabled(f"{PANEL} button:text-is('Check')")
+    findings = [
+        {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
+        {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},
+    ]
+    server.send(RigCheckMessage(revision=1, findings=findings), JobMessage(job=9, kind="check", state="done"))
+    page.wait_for_selector("text=The check has found 1 problem.")
+    assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
+    assert page.locator(".findings details li").count() == 2
+    page.click(".findings summary")
+    server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
+    until(page, "flexneedle.store.get('session').seed === 3")
+    painted(page)
+    assert page.locator(".findings details[open]").count() == 1
+    server.send(*opening(revision=2)[2:3])
+    page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
+    click(page, "Prepare")
+    server.wait_for("prepare")
     server.send(insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7))
     page.wait_for_selector("text=is ready; nothing moves before it is armed and started")
     assert page.locator(".rig .moves li").all_inner_texts() == MOVES
@@ -245,27 +263,3 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
     click(page, "Stop")
     assert server.wait_for("stop") == [{"type": "stop"}]
     assert server.asked("arm") == []
-
-
-def test_a_check_lists_its_problems(rig_panel, server):
-    page = rig_panel()
-    click(page, "Check")
-    page.wait_for_selector("text=you are in control")
-    server.send(JobMessage(job=9, kind="check", state="running", text="each device is read, nothing moves"))
-    page.wait_for_selector("text=Checking: each device is read, nothing moves …")
-    assert page.is_disabled(f"{PANEL} button:text-is('Check')")
-    findings = [
-        {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
-        {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},
-    ]
-    server.send(RigCheckMessage(revision=1, findings=findings), JobMessage(job=9, kind="check", state="done"))
-    page.wait_for_selector("text=The check has found 1 problem.")
-    assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
-    assert page.locator(".findings details li").count() == 2
-    page.click(".findings summary")
-    server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
-    until(page, "flexneedle.store.get('session').seed === 3")
-    painted(page)
-    assert page.locator(".findings details[open]").count() == 1
-    server.send(*opening(revision=2)[2:3])
-    page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")

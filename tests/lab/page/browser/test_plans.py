@@ -64,6 +64,13 @@ def share_of(cost):
     return (np.log10(cost) - low) / (high - low)
 
 
+SAMPLED = """async () => {
+  const { sampledPaths } = await import("/static/planned.js");
+  return sampledPaths(flexneedle.store)?.number ?? null;
+}"""
+"""Iteration of the sampled paths in the views."""
+
+
 def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, server):
     """The lowest line is the best cost until then, on a logarithmic axis; the others are above it."""
     page = plans()
@@ -96,31 +103,17 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     server.send(clients(2, steering=2))
     until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
     assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
+    server.send(iteration(2), samples(2))
+    server.send(JobMessage(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
+    server.send(samples(3, source=FrameSource.STEERING))
+    until(page, "flexneedle.store.get('shape samples steering')")
+    assert page.evaluate(SAMPLED) == 3
+    server.send(JobMessage(job=4, kind="compare", state="done"))
+    until(page, "flexneedle.store.get('job compare').state === 'done'")
+    assert page.evaluate(SAMPLED) == 2
 
 
-def test_strategies_are_side_by_side_with_their_terms_and_their_age(plans, server):
-    page = plans(planned())
-    page.wait_for_selector(f"{PLANS} table")
-    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
-    cells = table(page)
-    assert cells["Cost: accuracy"] == ["0.020", "4.000"]
-    assert cells["Cost: energy"] == ["0.120", "–"]
-    assert cells["Cost"] == ["0.190", "4.200"]
-    assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
-    page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
-    page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")
-    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
-    for source in ("manipulation", "steering"):
-        canvas = f"{PLANS} .sweeps canvas[aria-label*={source}]"
-        frames = plan_frames(FrameSource[source.upper()], sway=3.0)
-        assert added(page, server, f"--{source}", *frames, canvases=[canvas])[0] > 50
-    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
-    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
-    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
-    page.wait_for_selector(f"{PLANS} .sweeps .stale")
-
-
-def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server):
+def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms_and_their_age(plans, server):
     page = plans([*opening(), plan(), *plan_frames()])
     page.wait_for_selector(f"{PLANS} table")
     page.evaluate(
@@ -142,21 +135,22 @@ def test_results_are_announced_and_drawn_once_not_at_every_period(plans, server)
     server.send(plan("steering"))
     page.wait_for_selector(f"{PLANS} >> text=Steering: ends 0.001 mm off.")
     assert page.evaluate("window.changes") > 0
-
-
-SAMPLED = """async () => {
-  const { sampledPaths } = await import("/static/planned.js");
-  return sampledPaths(flexneedle.store)?.number ?? null;
-}"""
-
-
-def test_in_a_comparison_the_paths_of_the_strategy_that_is_searched_are_shown(plans, server):
-    page = plans()
-    server.send(iteration(2), samples(2))
-    server.send(JobMessage(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
-    server.send(samples(3, source=FrameSource.STEERING))
-    until(page, "flexneedle.store.get('shape samples steering')")
-    assert page.evaluate(SAMPLED) == 3
-    server.send(JobMessage(job=4, kind="compare", state="done"))
-    until(page, "flexneedle.store.get('job compare').state === 'done'")
-    assert page.evaluate(SAMPLED) == 2
+    server.send(*planned())
+    page.wait_for_selector(f"{PLANS} table")
+    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
+    cells = table(page)
+    assert cells["Cost: accuracy"] == ["0.020", "4.000"]
+    assert cells["Cost: energy"] == ["0.120", "–"]
+    assert cells["Cost"] == ["0.190", "4.200"]
+    assert cells["Flips (half-turns of the bevel)"] == ["0", "2"]
+    page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
+    page.wait_for_selector(f"{PLANS} .sweeps figcaption:has-text('steering, lateral ×')")
+    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    for source in ("manipulation", "steering"):
+        canvas = f"{PLANS} .sweeps canvas[aria-label*={source}]"
+        frames = plan_frames(FrameSource[source.upper()], sway=3.0)
+        assert added(page, server, f"--{source}", *frames, canvases=[canvas])[0] > 50
+    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
+    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
+    page.wait_for_selector(f"{PLANS} .sweeps .stale")

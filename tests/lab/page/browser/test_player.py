@@ -48,7 +48,7 @@ def see_plots(page):
     page.locator(f"{PLOTS} figure").last.scroll_into_view_if_needed()  # others have grown above them
 
 
-def test_a_run_is_scrubbed_and_played(player, server):
+def test_a_run_is_scrubbed_and_played_and_a_period_without_a_shape_shows_none(player, server):
     page = player()
     page.focus(SCRUB)
     for key, period in (("Home", 0), ("ArrowRight", 1), (".", 2), (",", 1), ("End", 49)):
@@ -79,6 +79,12 @@ def test_a_run_is_scrubbed_and_played(player, server):
     server.send(insertion("running"), rows(0, 3))  # which ends playing
     until(page, f"!{PLAYING} && {PERIOD} === undefined")
     shows(page, "live")
+    path = np.zeros((1, 3), np.float32)
+    shapes = make_frame(FrameKind.PREDICTED, FrameSource.FIRST, 2, path + 2, path + np.nan, path + 4)
+    server.send(pack_frame(shapes))
+    until(page, "flexneedle.store.track('predicted', 'first', 4)")
+    read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
+    assert page.evaluate(read) == [2, None, 4, None]
 
 
 def play_slowly(page):
@@ -277,12 +283,3 @@ def test_unknown_values_are_gaps_and_each_run_has_its_line(player, server):
         page.evaluate(at_once, [each.model_dump_json() for each in run])
         until(page, f"{picture} !== '{before}'")
     page.wait_for_selector(f"{PLOTS} [aria-label^=Tracker][aria-label$=' at 9.8 s: indicator 0.200']")
-
-
-def test_a_period_without_a_shape_shows_none(player):
-    path = np.zeros((1, 3), np.float32)
-    shapes = make_frame(FrameKind.PREDICTED, FrameSource.FIRST, 2, path + 2, path + np.nan, path + 4)
-    page = player([*opening(), *recorded()[:2], pack_frame(shapes)])
-    until(page, "flexneedle.store.track('predicted', 'first', 4)")
-    read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
-    assert page.evaluate(read) == [2, None, 4, None]

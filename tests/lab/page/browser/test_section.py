@@ -71,8 +71,21 @@ def legend_has(page, panel, text):
 
 
 def test_legends_of_all_views_name_the_drawn_parts(views, server):
-    """The needle at the target is a line; with its deviation it is an area."""
-    page = views([*planned(), REACH])
+    """Before a plan they are of the first estimate, even if there is a plan of an earlier state of the scenario.
+
+    The needle at the target is a line; with its deviation it is an area.
+    """
+    earlier = [*opening(), plan(), *plan_frames()]
+    page = views([*earlier, session(2), scene(2), *plan_frames(FrameSource.SCENE), estimate(2)])
+    legend_has(page, "space", "first estimate")
+    wanted = {"first estimate", "needle at the target, first estimate", "needle", "target, 1 mm"}
+    assert legends(page) == [wanted] * 3
+    server.send(*plan_frames(), plan(revision=2))
+    for panel in ("axial", "space"):
+        legend_has(page, panel, "planned path")
+    wanted = {"planned path", "needle at the target, planned", "needle", "target, 1 mm"}
+    assert legends(page) == [wanted] * 3
+    server.send(*planned(), REACH)
     legend_has(page, "space", "reach")
     assert legends(page)[0] == {
         "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
@@ -97,20 +110,6 @@ def test_legends_of_all_views_name_the_drawn_parts(views, server):
     server.send(insertion("planning", periods=0), insertion(rig="Bench"), missing)
     until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
     assert [both & names for names in legends(page)] == [set()] * 3
-
-
-def test_before_a_plan_all_views_show_the_first_estimate(views, server):
-    """Even if there is a plan of an earlier state of the scenario."""
-    earlier = [*opening(), plan(), *plan_frames()]
-    page = views([*earlier, session(2), scene(2), *plan_frames(FrameSource.SCENE), estimate(2)])
-    legend_has(page, "space", "first estimate")
-    wanted = {"first estimate", "needle at the target, first estimate", "needle", "target, 1 mm"}
-    assert legends(page) == [wanted] * 3
-    server.send(*plan_frames(), plan(revision=2))
-    for panel in ("axial", "space"):
-        legend_has(page, panel, "planned path")
-    wanted = {"planned path", "needle at the target, planned", "needle", "target, 1 mm"}
-    assert legends(page) == [wanted] * 3
 
 
 def layers(thicknesses):
@@ -246,7 +245,7 @@ def test_boundaries_are_moved_and_those_below_stay(views, server):
     assert 19.0 < values["tissue.1.thickness_mm"] < TARGET[0]
 
 
-def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(views, server):
+def test_the_reach_stays_while_the_target_is_moved_and_nothing_is_moved_during_an_insertion(views, server):
     page = views([*planned(), REACH])
     legend_has(page, "space", "reach")
     for panel in (SECTION, AXIAL):
@@ -258,10 +257,7 @@ def test_the_reach_stays_while_the_target_is_moved_and_goes_with_another_change(
     until(page, "flexneedle.store.get('session').revision === 90")
     shown = "[...document.querySelectorAll('[data-panel] .legend')].some((one) => one.textContent.includes('reach'))"
     until(page, f"!{shown}")
-
-
-def test_nothing_is_moved_during_an_insertion_and_the_way_back_is_shown_after_it(views, server):
-    page = views([*inserting(10)])
+    server.send(*inserting(10))
     until(page, "!document.querySelector('.handle')")
     assert page.locator(f"{SECTION} .legend li").count() > 0  # it is drawn
     note = page.locator(f"{SECTION} >> text=This is an insertion")

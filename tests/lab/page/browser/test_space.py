@@ -119,7 +119,7 @@ def test_each_part_of_the_scene_is_drawn_at_each_size(space, pictures, state, si
     assert [each for each in counts if each[1] < LEAST] == []
 
 
-def test_lengths_are_to_scale_and_shapes_follow_the_period(space, server):
+def test_lengths_are_to_scale_the_legend_follows_and_only_a_change_is_drawn(space, server):
     page = space()
     position = on_view(page, "return [...view.shapes.group.children[0].geometry.attributes.position.array]")
     ring = np.reshape(position, (-1, 10, 3))[1]  # ring 0 closes the end
@@ -141,16 +141,6 @@ def test_lengths_are_to_scale_and_shapes_follow_the_period(space, server):
     )
     assert pixels[0] > 20.0
     assert pixels[0] == pytest.approx(pixels[1], rel=1e-3)
-    server.send(*inserting(50))
-    until(page, "flexneedle.store.get('rows live')?.length === 51")
-    page.evaluate("flexneedle.store.set('view period', 20)")
-    painted(page)
-    tip = on_view(page, "return view.shapes.bevel.position.toArray()")
-    np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
-
-
-def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, server):
-    page = space()
     assert "software" in page.inner_text(f"{SPACE} [role=note]")
     assert legend(page) == ["needle", "target, 1 mm"]
     version = "return view.shapes.group.children[0].geometry.attributes.position.version"
@@ -169,11 +159,12 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     server.send(*inserting(10))
     until(page, "document.querySelector('[data-panel=space] .legend').textContent.includes('true needle')")
     assert legend(page)[:3] == ["needle", "true needle", "predicted needle at the target ± 2 sd"]
-    painted(page)
-    page.wait_for_timeout(200)
+    for _ in range(5):
+        painted(page)
     count = "return view.renderer.info.render.frame"
     before = on_view(page, count)
-    page.wait_for_timeout(400)
+    for _ in range(15):
+        painted(page)
     assert on_view(page, count) == before
     server.send(rows(11, 1), *period_frames(11))
     until(page, "flexneedle.store.get('rows live')?.length === 12")
@@ -184,6 +175,12 @@ def test_the_legend_follows_and_the_scene_is_drawn_only_when_it_changes(space, s
     page.click("#theme")
     painted(page)
     assert on_view(page, color) != before
+    server.send(*inserting(50))
+    until(page, "flexneedle.store.get('rows live')?.length === 51")
+    page.evaluate("flexneedle.store.set('view period', 20)")
+    painted(page)
+    tip = on_view(page, "return view.shapes.bevel.position.toArray()")
+    np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
 
 
 BEVEL = """
@@ -249,7 +246,25 @@ PLACE = "return view.camera.camera.position.toArray()"
 DISTANCE = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
 
 
-def test_keys_pointer_and_wheel_move_the_camera_and_nothing_else(space, server):
+def drag_target(page, pixels):
+    """Drag the middle of the target's arrows to the right, in steps of one pixel."""
+    page.click("text=x–y")
+    painted(page)
+    x, y = on_view(
+        page,
+        """
+        const point = view.target.ball.position.clone().project(view.camera.camera);
+        const box = view.renderer.domElement.getBoundingClientRect();
+        return [box.x + (point.x + 1) / 2 * box.width, box.y + (1 - point.y) / 2 * box.height];
+        """,
+    )
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + pixels, y, steps=pixels)
+    page.mouse.up()
+
+
+def test_keys_pointer_and_wheel_move_the_camera_and_dragging_the_target_edits_the_scenario(space, server):
     page = space()
     page.focus(CANVAS)
     places = [on_view(page, PLACE)]
@@ -273,28 +288,6 @@ def test_keys_pointer_and_wheel_move_the_camera_and_nothing_else(space, server):
     assert distances[1] < 0.95 * distances[0]
     assert distances[2] > 1.05 * distances[0]
     assert not server.asked("edit")
-
-
-def drag_target(page, pixels):
-    """Drag the middle of the target's arrows to the right, in steps of one pixel."""
-    page.click("text=x–y")
-    painted(page)
-    x, y = on_view(
-        page,
-        """
-        const point = view.target.ball.position.clone().project(view.camera.camera);
-        const box = view.renderer.domElement.getBoundingClientRect();
-        return [box.x + (point.x + 1) / 2 * box.width, box.y + (1 - point.y) / 2 * box.height];
-        """,
-    )
-    page.mouse.move(x, y)
-    page.mouse.down()
-    page.mouse.move(x + pixels, y, steps=pixels)
-    page.mouse.up()
-
-
-def test_dragging_the_target_edits_the_scenario(space, server):
-    page = space()
     until(page, "flexneedle.store.get('clients')")
     start = page.evaluate("performance.now()")
     drag_target(page, 40)
@@ -334,6 +327,6 @@ def test_in_the_plane_the_target_keeps_its_plane_and_rests_while_another_is_in_c
         arrived(page)
         edits, place = len(server.asked("edit")), on_view(page, "return view.target.ball.position.toArray()")
         drag_target(page, 20)
-        page.wait_for_timeout(100)
+        arrived(page)
         assert len(server.asked("edit")) == edits
         assert on_view(page, "return view.target.ball.position.toArray()") == place

@@ -12,11 +12,6 @@ SECTION, INSERTION, PLAYER = (f"[data-panel={name}]" for name in ("section", "in
 PERIODS, STEPS = 21, 8
 
 
-@pytest.fixture
-def telephone(visit):
-    return visit(width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]")
-
-
 def drag(page, begin, right, up=0):
     """Put a finger on a place and move it."""
     finger = page.context.new_cdp_session(page)
@@ -37,8 +32,8 @@ def middle(element):
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-def test_a_finger_drags_the_target_and_the_page_stays(telephone, server):
-    page = telephone
+def test_by_finger_the_target_is_dragged_and_an_insertion_stopped_and_scrubbed(visit, server):
+    page = visit(width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]")
     page.locator(SECTION).scroll_into_view_if_needed()
     page.evaluate(PAINTED)
     scrolled = page.evaluate("scrollY")
@@ -47,10 +42,6 @@ def test_a_finger_drags_the_target_and_the_page_stays(telephone, server):
     assert server.asked("edit")[-1]["values"]["target.depth_mm"] > TARGET[0] + 4.0
     assert len(server.wait_for("rest")) == 1
     assert page.evaluate("scrollY") == scrolled
-
-
-def test_an_insertion_is_stopped_and_scrubbed(telephone, server):
-    page = telephone
     frames = [frame for period in range(PERIODS) for frame in period_frames(period)]
     server.send(insertion("running", periods=PERIODS), rows(0, PERIODS), *frames)
     page.locator(INSERTION).get_by_role("button", name="Stop", exact=True).tap()
