@@ -39,7 +39,7 @@ class FrameKind(IntEnum):
 
 
 class FrameSource(IntEnum):
-    """Owner of a frame."""
+    """Owner of a frame: the scene, an insertion or recording, or the plan of a strategy, by its name in capitals."""
 
     SCENE = 0
     LIVE = 1

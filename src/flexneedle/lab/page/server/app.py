@@ -28,7 +28,7 @@ STATIC = Path(__file__).parents[1] / "static"
 """Files that browsers load unchanged."""
 
 
-def make_application(handler: RequestHandler, rules: AccessRules, static: Path = STATIC) -> ASGIApp:
+def make_application(handler: RequestHandler, rules: AccessRules) -> ASGIApp:
     """Return the server's application (ASGI), behind the access rules."""
     downloads = Downloads(handler)
 
@@ -39,7 +39,7 @@ def make_application(handler: RequestHandler, rules: AccessRules, static: Path =
         await handler.end()
 
     async def index(_request: Request) -> Response:
-        return FileResponse(static / "index.html")
+        return FileResponse(STATIC / "index.html")
 
     async def schema(_request: Request) -> Response:
         return Response(build_catalog().schema, media_type="application/schema+json")
@@ -53,7 +53,7 @@ def make_application(handler: RequestHandler, rules: AccessRules, static: Path =
         Route("/scenario.toml", downloads.scenario),
         Route("/runs/{name}/{file}", downloads.of_run),
         WebSocketRoute("/live", socket),
-        Mount("/static", StaticFiles(directory=static)),
+        Mount("/static", StaticFiles(directory=STATIC)),
     ]
     handlers = {HTTPException: _answer_error}
     app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)

@@ -3,14 +3,13 @@
 import logging
 import socket
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import uvicorn
 
 from flexneedle.errors import InputError
 from flexneedle.lab.page.server.access import AccessRules, is_loopback
-from flexneedle.lab.page.server.app import STATIC, make_application
+from flexneedle.lab.page.server.app import make_application
 from flexneedle.lab.page.server.clients import PageLimits
 from flexneedle.lab.page.server.request_handler import PageSetup, RequestHandler
 
@@ -23,7 +22,7 @@ _LONGEST_MESSAGE = 1_000_000
 class PageServer(uvicorn.Server):
     """A server of the page; call `serve_until_interrupted`."""
 
-    def __init__(self, setup: PageSetup, host: str, port: int, static: Path = STATIC) -> None:
+    def __init__(self, setup: PageSetup, host: str, port: int) -> None:
         """Listen on a host and a port (0: any free one). Raises InputError if the address is not available."""
         self.socket = bind(host, port, setup.limits)
         self.handler = RequestHandler(setup)
@@ -31,7 +30,7 @@ class PageServer(uvicorn.Server):
         rules = AccessRules.of(host, self._port)
         self._token = rules.token
         self.on_start: Callable[[], None] = lambda: None
-        super().__init__(_config(make_application(self.handler, rules, static), setup.limits))
+        super().__init__(_config(make_application(self.handler, rules), setup.limits))
 
     @property
     def address(self) -> str:

@@ -34,7 +34,6 @@ from flexneedle.scenario.preset import PRESETS
 _SEARCHES: tuple[JobKind, ...] = ("plan", "compare", "reach")
 _RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
 _WORK: tuple[JobKind, ...] = ("needle", "estimate", *_SEARCHES, "recording", "study", "row")
-_SOURCES: dict[Recording, FrameSource] = {"first": FrameSource.FIRST, "second": FrameSource.SECOND}
 
 
 @dataclass(frozen=True)
@@ -292,7 +291,7 @@ class RequestHandler:
             order = replace(order, folder=str(self.runs.run(request.name)))
         self._plans.cancel_slot("recording", of)
         self.hub.forget((f"rows {of}", f"insertion {of}"))
-        self.hub.forget_frames(_SOURCES[of])
+        self.hub.forget_frames(FrameSource[of.upper()])
         if request.name is None:
             self.hub.publish(ClosedMessage(of=of))
         else:

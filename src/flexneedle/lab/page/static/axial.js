@@ -3,10 +3,10 @@
 import { make, shown } from "./dom.js";
 import { drawAxial, endsOf } from "./flat/axial.js";
 import { KEYS, Handles } from "./flat/handles.js";
-import { legendOf } from "./flat/legend.js";
-import { measuredTip, partsOf } from "./flat/parts.js";
+import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
 import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
+import { showLegend } from "./legend.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
 
 const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
@@ -33,7 +33,7 @@ export function mount(element, store, link) {
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
     const reached = drawAxial(pen, { width, height, map, scene, target, parts, ends, store });
-    legendOf(legend, [...parts, ...measuredTip(store)], reached);
+    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached));
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());

@@ -1,24 +1,22 @@
 // Paths from the shapes and rows of the store, for all views.
 
+import { pathOf } from "./frames.js";
 import { isStale } from "./shown.js";
 
 // Value of `key`, if its message belongs to the present state of the scenario.
 export const fresh = (store, news, key) => (isStale(store, store.get(news)) ? undefined : store.get(key));
 
 // First and last path of a shape, or null.
-export const first = (shape) => slice(shape, 0);
-export const last = (shape) => slice(shape, (shape?.paths ?? 1) - 1);
+export const first = (shape) => pathAt(shape, 0);
+export const last = (shape) => pathAt(shape, (shape?.paths ?? 1) - 1);
 
-// One path of a shape; the same object for the same shape, so that it is drawn once.
+// One path of a shape, or null; the same object for the same shape, so that it is drawn once.
 const slices = new WeakMap();
-function slice(shape, index) {
+export function pathAt(shape, index) {
   if (!shape || shape.paths === 0) return null;
   const known = slices.get(shape) ?? new Map();
   slices.set(shape, known);
-  if (!known.has(index)) {
-    const size = shape.points * shape.columns;
-    known.set(index, { ...shape, paths: 1, values: shape.values.subarray(index * size, (index + 1) * size) });
-  }
+  if (!known.has(index)) known.set(index, { ...shape, paths: 1, values: pathOf(shape, index) });
   return known.get(index);
 }
 

@@ -4,11 +4,11 @@ import { boxOf } from "./box.js";
 import { button, make, shown } from "./dom.js";
 import { KEYS, Handles } from "./flat/handles.js";
 import { boundaryEdit, guideEdit, guideOf, layersOf } from "./flat/layers.js";
-import { legendOf } from "./flat/legend.js";
-import { measuredTip, partsOf } from "./flat/parts.js";
+import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
 import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
 import { drawSection, outlineOf } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
+import { showLegend } from "./legend.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
 
@@ -83,7 +83,7 @@ class SectionView {
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
     const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, outline, store: this.#store });
-    legendOf(this.#legend, [...parts, ...measuredTip(this.#store)], reached);
+    showLegend(this.#legend, entriesOf([...parts, ...measuredTip(this.#store)], reached));
     this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
   }
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from time import monotonic
-from typing import Any
 
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
 from flexneedle.lab.page.worker.disturbances import DisturbedRig, Disturber
@@ -52,10 +51,12 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
     """Insert on a virtual rig that can be disturbed."""
     task, order, control = reporter.task, reporter.task.order, reporter.task.control
 
-    def report_iteration(info: dict[str, Any]) -> None:
-        reporter.take(Iterated(order.strategy, info))
-
-    plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, progress=report_iteration)
+    plan = make_plan(
+        task.scenario,
+        strategy=order.strategy,
+        seed=order.seed,
+        progress=lambda info: reporter.take(Iterated(order.strategy, info)),
+    )
     reporter.report_plan(plan)
     disturber = Disturber(with_planned_entry(task.scenario, plan), task.report)
 

@@ -25,7 +25,6 @@ BETWEEN_S = 0.1
 """Least time between reported iterations: drawing their samples takes processor time from the search."""
 _MOST_PATHS, _MOST_POINTS = 64, 48
 """Limits of a frame of samples."""
-SOURCES: dict[str, FrameSource] = {"manipulation": FrameSource.MANIPULATION, "steering": FrameSource.STEERING}
 
 
 def with_smaller_search(scenario: Scenario, samples: int, iterations: int, **changes: Any) -> Scenario:
@@ -82,7 +81,7 @@ def plan(task: WorkerTask) -> None:
         search = _Search(task, strategy, index, len(strategies))
         found = make_plan(task.scenario, strategy=strategy, seed=task.order.seed, progress=search.add)
         search.report()
-        for frame in shapes_of(found, SOURCES[strategy]):
+        for frame in shapes_of(found, FrameSource[strategy.upper()]):
             task.report(frame)
         task.report(describe_plan(found, task.order.revision))
 
@@ -126,7 +125,7 @@ class _Search:
                 median=list(self._median),
             )
         )
-        task.report(samples_of(self._newest["samples"], SOURCES[strategy], done))
+        task.report(samples_of(self._newest["samples"], FrameSource[strategy.upper()], done))
         share = (self._index + done / usual) / self._count
         task.report_job("running", share, f"{strategy}: iteration {done} of {usual}")
         self._newest, self._due = None, monotonic() + BETWEEN_S

@@ -28,8 +28,6 @@ from flexneedle.results import Insertion, Period, Plan, scenario_of
 from flexneedle.simulator.state import Contacts
 from flexneedle.types import Floats, Shape, X
 
-_SOURCES: dict[Recording, FrameSource] = {"first": FrameSource.FIRST, "second": FrameSource.SECOND}
-
 
 def read_run(task: WorkerTask) -> None:
     """Report a recorded insertion. Raises InputError or RunError for a folder without one."""
@@ -50,7 +48,7 @@ def describe_recording(
     insertion: Insertion, name: str, of: Recording, note: str, row: int | None = None
 ) -> Iterator[ServerMessage | ShapeFrame]:
     """Yield messages and frames of a recorded insertion. note: added to its summary; row: of its study."""
-    plan, source, error = insertion.plan, _SOURCES[of], insertion.error_mm
+    plan, source, error = insertion.plan, FrameSource[of.upper()], insertion.error_mm
     yield InsertionMessage(
         of=of,
         name=name,

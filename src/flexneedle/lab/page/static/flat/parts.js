@@ -1,6 +1,6 @@
 // Moving parts of views in two dimensions: {path, tone, width, alpha, dash, text, spread}, from back to front.
 
-import { first, pathOfRows, ranksOf } from "../paths.js";
+import { first, pathAt, pathOfRows, ranksOf } from "../paths.js";
 import { foreseen, plannedPaths, sampledPaths } from "../planned.js";
 import { isMeasured, shownOf, shownRow, shownSecond, shownShape } from "../shown.js";
 
@@ -28,9 +28,8 @@ function samples(store, of) {
   const shape = of === "scene" ? sampledPaths(store) : shownShape(store, "samples", of);
   if (!shape) return [];
   const ranks = ranksOf(shape);
-  const size = shape.points * shape.columns;
   return Array.from(ranks, (rank, at) => ({
-    path: { ...shape, values: shape.values.subarray(at * size, (at + 1) * size) },
+    path: pathAt(shape, at),
     tone: "--estimate", width: 1, alpha: 0.5 - 0.4 * rank, sampled: true,
     text: at === 0 ? `${shape.paths} sampled paths` : undefined,
   }));
@@ -67,4 +66,12 @@ function secondRun(store, radius) {
     { path: pathOfRows(rows, "estimate"), tone: "--second", width: 1.5 },
     { path: first(second.shape("needle")), tone: "--second", thick: 2 * radius, least: 2, text: "second run" },
   ];
+}
+
+// Entries of the legend of parts with a text, and of the reach.
+export function entriesOf(parts, reached) {
+  const entries = parts.filter(({ text }) => text).map(({ text, tone, dash, thick, sampled, spread, cross }) => ({
+    text, tone, form: cross ? "cross" : dash ? "dashed" : thick ? "thick" : sampled ? "thin" : spread ? "area" : "line",
+  }));
+  return [...(reached ? [{ text: "reach", tone: "--reach", form: "area" }] : []), ...entries];
 }

@@ -6,6 +6,7 @@ import { drawScene } from "../flat/section.js";
 import { inside, pointsOf, polyline } from "../flat/pen.js";
 import { lateral, mappingOf, planeOf, stretchIn } from "../flat/plane.js";
 import { Stage } from "../flat/stage.js";
+import { pathAt } from "../paths.js";
 import { isStale } from "../shown.js";
 
 const NEEDLES = 9;
@@ -54,10 +55,8 @@ export class SweepView {
     drawScene(pen, { width, height, map, plane, name: "target", scene });
     inside(pen, width, height, () => {
       for (const [order, step] of stepsOf(sweep.paths).entries()) {
-        const size = sweep.points * sweep.columns;
-        const path = { ...sweep, values: sweep.values.subarray(step * size, (step + 1) * size) };
         const strength = (order + 1) / Math.min(NEEDLES, sweep.paths);
-        polyline(pen, pointsOf(path, place), { tone: `--${this.#strategy}`, width: 1.75, alpha: FAINT + (1 - FAINT) * strength });
+        polyline(pen, pointsOf(pathAt(sweep, step), place), { tone: `--${this.#strategy}`, width: 1.75, alpha: FAINT + (1 - FAINT) * strength });
       }
     });
   }

@@ -2,7 +2,7 @@
 
 import { AmbientLight, DirectionalLight, Scene, WebGLRenderer } from "../vendor/three.js";
 import { boxOf } from "../box.js";
-import { make } from "../dom.js";
+import { showLegend } from "../legend.js";
 import { SHOWN, shownOf, shownScene, shownTarget } from "../shown.js";
 import { Camera } from "./camera.js";
 import { Labels } from "./labels.js";
@@ -20,7 +20,6 @@ export class SpaceView {
   #later = 0;
   #onScreen = true;
   #room = "";
-  #entries = "";
 
   // context: WebGL's of a canvas in a stage; legend: a list.
   constructor(context, legend, store, link) {
@@ -49,10 +48,7 @@ export class SpaceView {
     const scene = shownScene(this.#store);
     if (!scene) return;
     this.#updateRoom(scene);
-    this.#showLegend([
-      ...this.shapes.update(this.#store, scene, shownOf(this.#store)),
-      { text: "target, 1 mm", tone: "--target", form: "disc" },
-    ]);
+    showLegend(this.#legend, this.shapes.update(this.#store, scene, shownOf(this.#store)));
     this.target.update();
     this.#later ||= requestAnimationFrame(() => {
       this.#later = 0;
@@ -69,13 +65,6 @@ export class SpaceView {
     this.room.update(scene, box);
     this.#fitLabels();
     if (another && !this.target.dragged) this.camera.follow(box);
-  }
-
-  #showLegend(entries) {
-    const text = JSON.stringify(entries);
-    if (text === this.#entries) return;
-    this.#entries = text;
-    this.#legend.replaceChildren(...entries.map(entryOf));
   }
 
   #resize({ width, height }) {
@@ -115,15 +104,4 @@ function lights(camera) {
   sun.position.set(-0.5, 1, 0.6);
   camera.add(sun, sun.target);
   return [new AmbientLight("#ffffff", 1.4), camera];
-}
-
-function entryOf({ text, tone, form, ramp }) {
-  const swatch = make(`span.swatch.${ramp ? "area" : form ?? "line"}`, { "aria-hidden": "true" });
-  if (tone) swatch.style.color = `var(${tone})`;
-  if (ramp) {
-    const stops = ramp.map((rgb) => `rgb(${rgb.map((value) => Math.round(255 * value)).join(" ")})`);
-    swatch.style.background = `linear-gradient(to right, ${stops.join(", ")})`;
-    swatch.style.opacity = "1";
-  }
-  return make("li", {}, swatch, text);
 }
