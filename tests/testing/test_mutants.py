@@ -6,342 +6,50 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from flexneedle import Control, Controller, Decision, Motion, travel_left
-from flexneedle.errors import CommandError, DriverError
-from flexneedle.testing import (
-    ControllerConformance,
-    DriverConformance,
-    MotorsConformance,
-    PlantConformance,
-    TipTrackerConformance,
-    TrackerConformance,
-)
-from flexneedle.types import ROLL, VISIBLE, Frame, Measurement, SensorReading
+from flexneedle import Control, Controller, Decision, travel_left
+from flexneedle.testing import ControllerConformance
+from flexneedle.types import ROLL
 from kits import checks_of
-from rooms import ManualClock
-from stages import Stage
-
-
-class Unicycle:
-    """A plant: the tip cuts a circle, and base and guide move it."""
-
-    strain_energy, least_stretch, converged = 0.0, 1.0, True
-    metres, degrees, side, slips = 1.0, 1.0, 1.0, 0.0
-
-    def __init__(self, truth, roll):
-        self.truth, self.roll = truth, roll
-        self.at = np.array([truth.scenario.setup.start_tip_x, 0.0, 0.0, 0.0, 0.0])
-
-    @property
-    def tip(self):
-        return self.at.copy()
-
-    def step(self, row):
-        move = Control.of(row)
-        self.roll += self.degrees * move.roll
-        slope = self.at[3] + 1e-3 * self.side * math.cos(self.roll) * move.db_x
-        way = self.metres * move.db_x + self.slips
-        self.at = np.array(
-            [self.at[0] + way * math.cos(slope), self.at[1] + way * math.sin(slope), 0.0, slope, 0.0]
-        )
-
-
-class ChangesItsRow(Unicycle):
-    def step(self, row):
-        super().step(row)
-        row[:] = 0.0
-
-
-class SharesItsState(Unicycle):
-    shared = None
-
-    def __init__(self, truth, roll):
-        super().__init__(truth, roll)
-        SharesItsState.shared = self.at
-
-    @property
-    def tip(self):
-        return SharesItsState.shared.copy()
-
-    def step(self, row):
-        super().step(row)
-        SharesItsState.shared = self.at
-
-
-class MovesWhenRead(Unicycle):
-    @property
-    def tip(self):
-        self.at = self.at + 1e-3
-        return self.at.copy()
-
-
-def with_values(part, **values):
-    return type(f"{part.__name__}With{'And'.join(values)}", (part,), values)
-
-
-def of_plant(plant):
-    return type("Kit", (PlantConformance,), {"make": lambda _, truth, roll: plant(truth, roll)})
-
-
-class Axes:
-    """A driver, and its clock."""
-
-    limit, unit, first, stops = 1.0, 1.0, 0.0, 0.0
-
-    def __init__(self):
-        self.time = 10.0
-
-    def now(self):
-        return self.time
-
-    def wait(self, seconds):
-        self.time += seconds
-
-    def stop(self):
-        self.time += self.stops
-
-    def apply(self, command, duration):
-        if abs(command.db_x) > self.limit:
-            raise CommandError("db_x", command.db_x, self.limit, f"must be at most {self.limit} mm")
-        begun = self.time
-        self.time += abs(command.roll) + self.first + duration
-        turned = begun + abs(command.roll) + self.first if command.roll or self.first else None
-        return self.report(Motion(command, begun, self.time, turned))
-
-    def report(self, motion):
-        return motion
-
-
-def reporting(change):
-    return type("Reporting", (Axes,), {"report": lambda _, motion: change(motion)})
-
-
-def of_driver(driver):
-    def make(_):
-        made = driver()
-        return made, made
-
-    return type("Kit", (DriverConformance,), {"make": make})
-
-
-class Camera:
-    """A tracker of the tip: 20 images a second, with 0.01 mm noise."""
-
-    status, unit, lag, rate, order, late = VISIBLE, 1.0, 0.0, 20.0, 1, 0
-
-    def __init__(self, scenario, phantom, rng):
-        del scenario
-        self.phantom, self.rng, self.next = phantom, rng, 0
-
-    def read(self):
-        due = math.floor(self.phantom.now() * self.rate + 1e-6) + 1 - self.late
-        taken, self.next = range(self.next, due), due
-        return tuple(map(self.image, taken))[:: self.order]
-
-    def image(self, number):
-        time = number / self.rate
-        x, y = (self.unit * value + self.rng.normal(0.0, 0.01) for value in self.phantom.tip_at(time)[:2])
-        return Measurement(time + self.lag, x, y)
-
-
-class Repeats(Camera):
-    def read(self):
-        return (*super().read(), self.image(self.next - 1))
-
-
-class Waits(Camera):
-    def read(self):
-        self.phantom.wait(0.05)
-        return super().read()
-
-
-class DrawsFromTheGlobalGenerator(Camera):
-    def image(self, number):
-        one = super().image(number)
-        return replace(one, y=one.y + 0.01 * np.random.normal())  # noqa: NPY002
-
-
-def of_camera(camera):
-    def make(_, scenario, phantom, rng):
-        return camera(scenario, phantom, rng)
-
-    return type("Kit", (TipTrackerConformance,), {"make": make})
-
-
-class Device:
-    """A tracker device: 40 frames a second."""
-
-    status, number, ahead, sensor, position, length = VISIBLE, 1, 0.0, "tip", (1.0, 2.0, 3.0), 1.0
-    reason, takes = "", 0.0
-
-    def __init__(self, clock):
-        self.clock, self.start, self.next = clock, clock.now(), 0
-
-    def read(self):
-        self.clock.wait(self.takes)
-        due = int((self.clock.now() - self.start) * 40.0 + 1e-6) + 1
-        taken, self.next = range(self.next, due), due
-        return tuple(map(self.frame, taken))
-
-    def frame(self, number):
-        status = VISIBLE if self.position else self.reason
-        tip = SensorReading(self.position, (self.length, 0.0, 0.0, 0.0), status=status)
-        return Frame(self.start + number / 40.0 + self.ahead, self.number * number, {self.sensor: tip})
-
-    def close(self):
-        pass
-
-
-class ChangesItsFrames(Device):
-    readings = {}  # noqa: RUF012  this is the fault
-
-    def frame(self, number):
-        tip = SensorReading((float(number), 0.0, 0.0))
-        self.readings["tip"] = tip
-        return Frame(self.start + number / 40.0, number, self.readings)
-
-
-class HidesItsFailure(Device):
-    def read(self):
-        return () if getattr(self, "lost", False) else super().read()
-
-
-def of_device(device):
-    def disconnect(_, made):
-        made.lost = True
-        if device is not HidesItsFailure:
-            made.status = "no connection"
-
-    parts = {"make": lambda _, clock: device(clock), "make_clock": lambda _: ManualClock()}
-    return type("Kit", (TrackerConformance,), parts | {"disconnect": disconnect})
-
-
-class Motors(Stage):
-    """Motors that refuse anything but positions."""
-
-    def follow(self, positions):
-        if not all(map(math.isfinite, positions.values())):
-            raise DriverError(f"{positions}: must be finite")
-        super().follow(positions)
-
-
-class WaitsForTheEnd(Motors):
-    def follow(self, positions):
-        super().follow(positions)
-        while any(state.moving for state in self.read().values()):
-            self.clock.wait(0.01)
-
-
-class RepliesLate(Motors):
-    def read(self):
-        self.clock.wait(0.5)
-        return super().read()
-
-
-class IgnoresFurtherPositions(Motors):
-    def follow(self, positions):
-        if not any(call[0] == "follow" for call in self.calls):
-            super().follow(positions)
-
-
-class MovesWithoutPower(Motors):
-    def follow(self, positions):
-        super().follow(positions)
-        for channel, position in positions.items():
-            self.motors[channel].position = position
-
-
-class MovesToReconnect(Motors):
-    def reconnect(self):
-        self.motors["A"].position = 50.0
-
-
-class ClosesOnce(Motors):
-    closed = False
-
-    def close(self):
-        assert not self.closed
-        self.closed = True
-
-
-class MovesWhenOpened(Motors):
-    def __init__(self, clock):
-        super().__init__(clock)
-        self.motors["A"].target = 50.0
-
-
-class DoesNotStop(Motors):
-    deaf = True
-
-    def __init__(self, clock):
-        super().__init__(clock)
-        self.deaf = True
-
-
-class IgnoresTheSpeed(Motors):
-    def set_speed(self, channel, speed, acceleration):
-        super().set_speed(channel, 3.0 * speed, acceleration)
-
-
-class MovesToDefine(Motors):
-    def define(self, channel, position):
-        self._called("define", channel, position)
-        self.motors[channel].target = position
-
-
-class TakesAnyPosition(Motors):
-    def follow(self, positions):
-        self._called("follow")
-        for channel, position in positions.items():
-            self.motors[channel].target = position
-
-
-class ReadsOneChannel(Motors):
-    def read(self):
-        return {"A": super().read()["A"]}
-
-
-class ReadsTuples(Motors):
-    def read(self):
-        return {name: (state.position, state.moving) for name, state in super().read().items()}
-
-
-class LeapsWhenSwitchedOn(Motors):
-    def power(self, channel, on):
-        super().power(channel, on)
-        self.motors[channel].target = self.motors[channel].position = 100.0 * on
-
-
-class FailsAsOSError(Motors):
-    def _called(self, *call):
-        if self.lost:
-            raise OSError("no such device")
-        super()._called(*call)
-
-
-class AddsToThePosition(Motors):
-    def follow(self, positions):
-        super().follow({name: self.motors[name].position + way for name, way in positions.items()})
-
-
-def of_motors(motors):
-    class Kit(MotorsConformance):
-        channels = ("A", "B", "C")
-
-        def make(self):
-            self.clock = ManualClock()
-            return motors(self.clock)
-
-        def now(self):
-            return self.clock.now()
-
-        def wait(self, seconds):
-            self.clock.wait(seconds)
-
-        def disconnect(self, made):
-            made.lost = True
-
-    return Kit
+from testing.wrong_devices import (
+    AddsToThePosition,
+    ChangesItsFrames,
+    ClosesOnce,
+    Device,
+    DoesNotStop,
+    FailsAsOSError,
+    HidesItsFailure,
+    IgnoresFurtherPositions,
+    IgnoresTheSpeed,
+    LeapsWhenSwitchedOn,
+    Motors,
+    MovesToDefine,
+    MovesToReconnect,
+    MovesWhenOpened,
+    MovesWithoutPower,
+    ReadsOneChannel,
+    ReadsTuples,
+    RepliesLate,
+    TakesAnyPosition,
+    WaitsForTheEnd,
+    of_device,
+    of_motors,
+)
+from testing.wrong_phantoms import (
+    Axes,
+    Camera,
+    ChangesItsRow,
+    DrawsFromTheGlobalGenerator,
+    MovesWhenRead,
+    Repeats,
+    SharesItsState,
+    Unicycle,
+    Waits,
+    of_camera,
+    of_driver,
+    of_plant,
+    reporting,
+    with_values,
+)
 
 
 def straight(task, memory, estimate, rng):
