@@ -1,9 +1,19 @@
 """Contents of a figure: its texts, lines and axes, and the texts that overlap."""
 
+from contextlib import contextmanager
 from itertools import combinations
+from unittest.mock import patch
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.text import Text
+
+
+@contextmanager
+def unarranged():
+    """Make figures without arranging their parts, which takes most of the time: for tests of artists alone."""
+    with patch.object(Figure, "draw_without_rendering"):
+        yield
 
 
 def texts(figure):

@@ -32,7 +32,7 @@ def test_draws_depend_on_the_number_alone_and_stay_in_their_ranges():
     assert all(-1e-9 <= depth <= one.target[0] - 5.0 for depth, one in zip(depths, drawn, strict=True))
 
 
-def test_medians_are_those_of_the_worst_reference_over_the_window():
+def test_medians_are_of_the_worst_reference_over_the_window():
     plan = make_plan()
     periods = list(make_periods(plan))[:10]
     values = np.random.default_rng(0).uniform(0.0, 0.1, (10, 4, 2))

@@ -22,5 +22,5 @@ def test_a_number_out_of_range_is_refused(kind, texts, rule):
             kind(text)
 
 
-def test_other_numbers_are_taken():
+def test_other_numbers_are_accepted():
     assert (seed("0"), finite("-1.5"), positive("1e-9")) == (0, -1.5, 1e-9)

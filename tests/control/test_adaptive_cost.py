@@ -85,7 +85,7 @@ def test_the_blur_is_the_standard_deviation_of_the_linear_model_without_a_miss(q
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))
-def test_what_is_expected_above_zero_is_the_integral(mean, sd):
+def test_the_mean_above_zero_is_the_integral(mean, sd):
     x = np.linspace(0.0, mean + 9.0 * sd, 20001)
     density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
     expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0

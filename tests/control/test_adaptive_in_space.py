@@ -122,7 +122,7 @@ def outlook(state):
     return estimate, Outlook(grid, complexes(count, grid.size), complexes(count, 7)), complexes(7)
 
 
-def test_the_deviations_of_the_shape_are_those_of_needles_drawn_from_the_estimate(outlook):
+def test_the_deviations_of_the_shape_agree_with_needles_drawn_from_the_estimate(outlook):
     """Each drawn needle is 1.4 times as far off as the covariance, and corrects its own miss but for a rest."""
     estimate, derivatives, lever = outlook
     rng, rest = np.random.default_rng(4), 0.3

@@ -262,7 +262,7 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
 
 @pytest.mark.parametrize("axial", [1.5, -1.5])
 def test_the_stroke_is_what_was_commanded_wherever_the_base_began(quick_plan, along, axial):
-    """A base that is estimated further along the axis has not used up its travel, nor has it more."""
+    """An estimate of the base further along the axis neither uses up travel nor adds any."""
     advanced = float(quick_plan.controls[:50, 0].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + 0.4, "target.depth_mm": 10.0})
     state = along(quick_plan, 50, short)

@@ -35,7 +35,7 @@ def estimates(plan, controller, steps):
 
 
 @pytest.mark.parametrize("steps", [0, 15, 26])
-def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
+def test_the_rest_of_a_plan_ends_where_the_plan_ends(plan, steps):
     """Guide, base and rolls are complete; the final shape is the plan's, but for the length of a step at each roll."""
     task, estimate = estimates(plan, "open-loop", steps)
     rows = remaining_controls(task, estimate)

@@ -49,7 +49,7 @@ def followed(pose, curvature, target, step=1e-3):
 
 @pytest.mark.parametrize("curvature", [0.0, 1e-9, 5e-4, -5e-4, 0.01, -0.01, 0.06])
 @pytest.mark.parametrize(("pose", "target"), POSES.values(), ids=POSES)
-def test_closest_approach_is_that_of_the_path_in_small_steps(pose, target, curvature):
+def test_closest_approach_agrees_with_a_path_in_small_steps(pose, target, curvature):
     expected = followed(pose, curvature, target)
     assert nearest(at(*pose), curvature, target) == pytest.approx(expected, abs=2e-3)
 

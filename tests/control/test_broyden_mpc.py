@@ -205,7 +205,7 @@ def test_an_old_reading_updates_nothing():
     assert further.jacobian[1, 0] == pytest.approx(0.65 * 0.05)
 
 
-def test_inputs_are_those_of_when_the_tip_was_there():
+def test_inputs_are_interpolated_and_the_last_eight_are_kept():
     memory = bm.JacobianEstimate(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
     np.testing.assert_allclose(bm.interpolate_inputs(memory, 1.25), [10.25, 0.3])
     np.testing.assert_allclose(bm.interpolate_inputs(memory, 9.0), [11.5, 0.6])

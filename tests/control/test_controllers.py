@@ -79,7 +79,7 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
 
 
 @pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
-def test_towards_a_path_beyond_its_reach_the_guide_moves_to_the_end_of_that_and_no_further(
+def test_towards_a_path_beyond_its_reach_the_guide_moves_to_its_limit_and_no_further(
     quick_plan, estimated, name
 ):
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.8, "target.lateral_mm": 0.0})

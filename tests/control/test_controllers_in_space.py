@@ -161,7 +161,7 @@ def test_half_turns_stay_half_turns():
     assert done.true_error_mm < 0.3
 
 
-def test_a_needle_that_nothing_steers_along_z_is_held():
+def test_where_nothing_steers_along_z_the_needle_is_held():
     """One-axis guide and half turns: the plan names the limit, the controller holds."""
     few = {"plan__max_iterations": 1, "plan__iterations": 1, "control__hold_limit_s": 0.1}
     rig = {"setup__guide_axes": 1, "setup__rotation": "half-turns"}
@@ -174,7 +174,7 @@ def test_a_needle_that_nothing_steers_along_z_is_held():
 
 
 @pytest.mark.parametrize(("miss", "sd"), [(0.3, 0.2), (2.0, 0.4), (0.0, 1.0), (0.9, 0.05)])
-def test_the_probability_of_a_miss_in_space_is_that_of_samples(miss, sd):
+def test_the_probability_of_a_miss_in_space_agrees_with_samples(miss, sd):
     rng = np.random.default_rng(0)
     samples = np.hypot(miss + sd * rng.standard_normal(400_000), sd * rng.standard_normal(400_000))
     expected = np.mean(samples > 1.0)

@@ -29,7 +29,7 @@ def predicting(miss, sd):
 
 
 @given(st.floats(0.0, 10.0), st.floats(-20.0, 20.0), st.floats(1e-3, 10.0))
-def test_the_probability_is_that_of_a_normal_miss_on_either_side(limit, miss, sd):
+def test_the_probability_equals_a_normal_miss_on_either_side(limit, miss, sd):
     expected = norm.cdf(-limit, miss, sd) + norm.sf(limit, miss, sd)
     assert probability_beyond(limit, miss, sd) == pytest.approx(expected, rel=1e-9, abs=1e-15)
 

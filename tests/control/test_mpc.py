@@ -77,7 +77,7 @@ def test_past_the_target_nothing_moves_any_more(plan, along):
     assert (choice.command.db_x, choice.command.dg_y) == (0.0, 0.0)
 
 
-def test_spread_is_that_of_the_first_guide_step(plan, along):
+def test_spread_describes_the_first_guide_step(plan, along):
     """The advance is fixed here; a guide that cannot move has no spread."""
     state = along(plan, 30)
     fixed = PHANTOM.with_values({"plan.advance_sigma_mm": 0.0})
@@ -87,7 +87,7 @@ def test_spread_is_that_of_the_first_guide_step(plan, along):
     assert (choice.spread, choice.command.dg_y) == (0.0, 0.0)
 
 
-def test_cost_is_that_of_the_chosen_steps(plan, along):
+def test_cost_belongs_to_the_chosen_steps(plan, along):
     """With a horizon of one step it can be computed again: pose against the planned one, guide, energy."""
     weights = {
         "control.ce_mpc.horizon": 1, "control.ce_mpc.orientation_weight_mm": 40.0, "control.ce_mpc.guide_weight": 3.0,

@@ -106,8 +106,8 @@ def test_it_is_never_below_the_unexplained_part_and_grows_with_a_miss_that_stays
 
 
 def ahead_of(estimate, steps=12):
-    """Controls (m, 9) with a roll on the way, the tips (m, 5) as the estimated needle goes, by the tracker, and its
-    shape (n, 5) at the end.
+    """Controls (m, 9) with a roll on the way, the tips (m, 5) of the estimated needle as the tracker measures them, and
+    its shape (n, 5) at the end.
     """
     rows = [Control(db_x=2.0, dg_y=0.05, flip=k == 5) for k in range(steps)]
     state, tips = estimate.state, []

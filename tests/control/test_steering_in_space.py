@@ -34,7 +34,7 @@ def normal(theta, psi, bevel):
 
 
 @given(theta=SLOPES, psi=SLOPES, roll=ANGLES, x=AHEAD, y=PLACES, z=PLACES, curvature=st.floats(0.0, 0.02))
-def test_the_closest_approach_is_that_of_the_circle_in_space(theta, psi, roll, x, y, z, curvature):
+def test_the_closest_approach_agrees_with_a_circle_in_space(theta, psi, roll, x, y, z, curvature):
     """It equals the least distance to points of the circle ahead of the tip."""
     bevel, pose = cmath.exp(1j * roll), np.array([0.0, 0.0, 0.0, theta, psi])
     axis, side = tangent(theta, psi), normal(theta, psi, bevel)

@@ -72,7 +72,7 @@ def test_controllers_charge_it_too():
     [None, 3, lambda: 0.0, lambda a, target, other: a + target + other, lambda a, other: a + other],
     ids=["nothing", "a number", "no argument", "three arguments", "an unknown argument"],
 )
-def test_what_is_no_function_of_trajectories_is_refused(module, wrong):
+def test_anything_but_a_function_of_trajectories_is_refused(module, wrong):
     module.wrong = wrong
     with pytest.raises(ScenarioError) as caught:
         with_terms(("own_costs:wrong", 1.0))

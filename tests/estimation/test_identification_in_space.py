@@ -198,7 +198,7 @@ def test_a_variance_of_a_direction_is_the_mean_of_both_axes():
     assert variance(replace(one, direction_covariance=None)) is None
 
 
-def test_reported_variances_become_those_of_the_mean():
+def test_reported_variances_become_the_variance_of_the_mean():
     """The mean of four readings has a quarter of the variance, unknown if one reading reports none."""
     covariance = ((8.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 12.0))
     readings = tuple(Measurement(0.1 * k, 1.0, 2.0, 3.0, covariance=covariance) for k in range(4))

@@ -80,7 +80,7 @@ def test_a_bevel_rolls_before_its_move_and_so_does_the_run_out():
     assert corrected.parameters[AT.run_out] == pytest.approx(-0.15, abs=0.01)
 
 
-def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
+def test_past_tips_are_on_the_side_that_the_bevel_had_then():
     """A roll is made as its move begins."""
     needle = NEEDLES["run-out"]
     estimate, states = followed(needle, 24)
@@ -116,7 +116,7 @@ def test_the_estimate_is_the_fitted_insertion_carried_out_again():
 
 
 @pytest.mark.usefixtures("all_fresh")
-def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
+def test_innovation_and_measured_tip_belong_to_the_newest_reading():
     needle = NEEDLES["run-out"]
     estimate, _ = followed(needle, 45)
     moved = estimate.move(Motion(Control(db_x=1.0), 45.0, 46.0))

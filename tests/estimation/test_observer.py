@@ -245,7 +245,7 @@ def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(n
     ],
     ids=str,
 )
-def test_the_uncertainty_of_the_path_is_that_of_a_needle_on_the_axis(entry):
+def test_the_uncertainty_of_the_path_equals_a_needle_on_the_axis(entry):
     """The bevel bends the needle from its axis by the same amount within a few percent."""
     drift, on_axis = (begun(Simulator(PHANTOM.with_values(each))).drift for each in (entry, {}))
     assert drift == pytest.approx(on_axis, rel=0.03)

@@ -16,7 +16,7 @@ from identified import AT, OWN, PHANTOM, unexplained
 from tasks import begun_with
 
 
-def test_the_prior_is_that_of_the_scenario():
+def test_the_prior_is_taken_from_the_scenario():
     """Standard deviations one by one, and for the cells the inverse of their exponential correlation."""
     sds = {
         "control.start_offset_sd_mm": 0.6, "control.start_angle_sd_mrad": 2.0, "control.adaptive_mpc.bend_sd_mm": 0.7,

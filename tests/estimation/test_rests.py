@@ -74,7 +74,7 @@ def test_after_a_hold_the_estimate_is_where_the_readings_are(estimate):
 
 
 @pytest.mark.parametrize("covariance", [None, tuple(map(tuple, np.diag([0.01, 0.04, 0.04]).tolist()))])
-def test_the_mean_of_many_readings_is_that_of_all(covariance):
+def test_the_mean_of_many_readings_is_kept_when_old_ones_are_merged(covariance):
     """One by one or in batches, whether or not they report variances."""
     rng = np.random.default_rng(0)
     readings = [

@@ -86,7 +86,7 @@ def test_a_roll_that_takes_time_is_a_move_of_its_own():
     ],
     ids=["before the travel", "at once", "spin"],
 )
-def test_what_is_left_to_turn_falls_evenly_in_a_roll_and_in_a_spin(motion, times, left):
+def test_the_remaining_angle_falls_evenly_in_a_roll_and_in_a_spin(motion, times, left):
     moves = Move.parts_of(motion)
     assert [sum(move.left_to_turn(time) for move in moves) for time in times] == pytest.approx(left)
 

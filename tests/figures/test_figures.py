@@ -1,5 +1,6 @@
 """Figures in the plane, checked by their artists, not by their pixels."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -10,7 +11,7 @@ import pytest
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
-from drawn import axes, lines, names, overlapping, texts
+from drawn import axes, lines, names, overlapping, texts, unarranged
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import save
@@ -46,12 +47,14 @@ CASES = {
     ),
     "without rolls": without_rolls,
 }
+ARRANGED = ("reached", "one period", "held from the start", "held on the way", "a long reason")
 
 
 @cache
 def drawn(case="reached"):
     """Return the figure of a case; it is shared by the tests."""
-    return insertion_figure(PHANTOM, CASES[case]())
+    with nullcontext() if case in ARRANGED else unarranged():
+        return insertion_figure(PHANTOM, CASES[case]())
 
 
 @pytest.fixture(scope="module")
@@ -219,6 +222,7 @@ def test_a_panel_without_a_line_gives_the_reason():
     assert names(energy.get_legend()) == ["planned"]
 
 
+@unarranged()
 def test_a_reading_without_a_position_does_not_set_the_depths():
     first = INSERTION.periods[0]
     unknown = replace(first, measurement=replace(first.measurement, x=None, y=None))
@@ -227,6 +231,7 @@ def test_a_reading_without_a_position_does_not_set_the_depths():
     assert one.get_xlim() == other.get_xlim()
 
 
+@unarranged()
 def field(insertion, **changes):
     """Return the panel of the field."""
     (ax,) = axes(insertion_figure(PHANTOM.with_values(changes), insertion), "field")
@@ -261,6 +266,7 @@ def test_without_holds_or_monitor_the_panel_has_neither_shade_nor_resume_limit()
     assert names(off.get_legend())[1:] == ["median over 1 s", "limit, monitor off"]
 
 
+@unarranged()
 def test_without_indicators_of_references_there_is_no_such_panel():
     assert "field" not in {ax.get_label() for ax in drawn().axes}
     assert len(insertion_figure(PHANTOM, without_indicators()).axes) == len(drawn().axes)
@@ -291,9 +297,7 @@ SCENARIOS = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", ["reached", "one period", "held from the start", "held on the way", "a long reason"]
-)
+@pytest.mark.parametrize("case", ARRANGED)
 def test_no_labels_overlap_or_are_cut(case):
     assert overlapping(drawn(case)) == []
 
@@ -325,6 +329,7 @@ def test_a_layer_has_as_much_of_its_name_as_fits():
     assert named == ["wide, μ 1.25 kPa", "narrow\nμ 1.625 kPa", "μ 2 kPa", "last\nμ 2.75 kPa"]
 
 
+@unarranged()
 def test_names_are_no_mathematics_and_never_too_long():
     values = PHANTOM.values() | {"name": "$5_phantom$ 針 " + "long " * 30}
     values["tissue"][0] |= {"name": "$x_1", "thickness_mm": 1.5}
@@ -332,6 +337,7 @@ def test_names_are_no_mathematics_and_never_too_long():
     assert any(text.startswith("$5_phantom$ 針 long") and "…" in text for text in texts(figure))
 
 
+@unarranged()
 def test_without_a_guide_the_base_is_shown():
     bare = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     figure = insertion_figure(bare, INSERTION)

@@ -64,7 +64,7 @@ def shown(figure):
     """Return all texts with their boxes."""
     figure.draw_without_rendering()
     (ax,) = figure.axes
-    for text in ax.texts:  # from here on flat, where it is drawn
+    for text in ax.texts:  # projected, as it is drawn
         x, y, _ = proj3d.proj_transform(*text.get_position_3d(), ax.M)
         text.set(x=x, y=y)
     all_texts = [*ax.texts, *figure.texts, *figure.legends[0].get_texts()]

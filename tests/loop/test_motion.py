@@ -76,14 +76,6 @@ class Stopped(Stage):
         self.stops += 1
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("link lost")])
-def test_motors_are_stopped_after_an_interrupt_or_an_error(plan, error):
-    stage = Stopped(error)
-    with pytest.raises(type(error)):
-        run(plan, stage.rig(), force=True)
-    assert stage.stops == 1
-
-
 def test_motors_are_stopped_at_the_end(plan):
     recorded = RecordedPhantom(plan.roll)
     stops = []

@@ -228,7 +228,7 @@ def test_from_the_usual_number_on_ten_iterations_that_hardly_gain_are_enough(usu
     assert stalling(usual, [0.0999] * 20) == expected
 
 
-def test_while_the_best_cost_falls_the_search_goes_on():
+def test_while_the_best_cost_falls_the_search_continues():
     assert not any(stalling(3, [0.1001] * 30))
 
 

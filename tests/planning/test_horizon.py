@@ -78,7 +78,7 @@ def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
     assert found.search_state.history == by_hand.history
 
 
-def test_a_correlation_is_that_of_the_first_samples():
+def test_a_correlation_applies_to_the_first_samples():
     tape = Taped()
     together = replace(
         VARIABLES, sigma=np.array([0.1, 0.1, 0, 0]), correlation=np.eye(4) + 0.99 * np.eye(4)[[1, 0, 3, 2]]
@@ -99,7 +99,7 @@ def test_it_is_never_worse_than_the_incumbent(seed, z):
     assert found.cost <= before
 
 
-def test_given_samples_are_those_of_the_first_iteration_and_are_kept_in_bounds():
+def test_given_samples_form_the_first_iteration_and_are_kept_in_bounds():
     tape, first = Taped(), np.tile([[0.1], [0.2], [9.0], [0.3], [0.4]], (1, 4))
     search(tape, first=first)
     np.testing.assert_array_equal(tape.rows[0][:, 0], [0.1, 0.2, 1.0, 0.3, 0.4])

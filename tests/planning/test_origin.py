@@ -69,7 +69,7 @@ def test_a_target_that_the_planner_was_given_need_not_be_the_scenarios():
         check_origin(given, PHANTOM.with_values({"target.depth_mm": 20.0}))
 
 
-def test_a_plan_that_carries_no_scenario_is_taken_as_it_is():
+def test_a_plan_without_a_scenario_is_accepted():
     assert check_origin(make_plan(), PHANTOM.with_values(OF_THE_PLAN)) is None
 
 

@@ -184,7 +184,7 @@ def test_a_trace_without_its_beginning_is_removed_and_a_failed_writer_is_closed(
         writer.add(PERIODS[0])
 
 
-def test_save_raises_what_cannot_be_written(tmp_path, monkeypatch):
+def test_save_names_a_file_that_cannot_be_written(tmp_path, monkeypatch):
     def full(*_):
         raise RecordError(f"insertion.png cannot be written: {FULL}")
 

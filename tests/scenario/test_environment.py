@@ -90,7 +90,7 @@ def test_every_leaf_fits_into_a_column_of_a_study():
         ("workspace_center_mm", [0.0, float("nan"), 0.0], "must be a finite number"),
     ],
 )
-def test_what_is_wrong_is_one_line_with_the_key(key, value, message):
+def test_a_wrong_value_is_one_line_with_the_key(key, value, message):
     with pytest.raises(ScenarioError) as caught:
         phantom(**{key: value})
     (line,) = caught.value.problems

@@ -59,7 +59,7 @@ def test_a_warning_begins_half_an_order_of_magnitude_beyond_the_range(value, rat
     assert [f" {ratio} times the largest" in line for line in lines] == [True] * bool(ratio)
 
 
-def test_what_comes_with_the_package_is_beyond_doubt():
+def test_scenarios_of_the_package_raise_no_doubt():
     worlds = [world(number) for number in range(60)]
     guided = [number for number, each in enumerate(worlds) if each.setup.has_guide]
     cases = (*(world(n, PERFECT) for n in range(0, 60, 10)), *(world(n, STRUCTURE) for n in guided))

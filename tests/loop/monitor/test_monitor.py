@@ -140,7 +140,10 @@ def after_a_second(**sensors):
     """The verdict on the field after a second of frames with these sensors."""
     monitor = Monitor(SETTINGS)
     for k in range(40):
-        reported = Frame(k / RATE, k, {"tip": SensorReading((1.0 + 1e-6 * k, 2.0, 3.0)), **sensors})
+        tip = SensorReading(
+            (1.0 + 1e-6 * k, 2.0, 3.0), indicator=0.9
+        )  # an indicator of the tip does not count
+        reported = Frame(k / RATE, k, {"tip": tip, **sensors})
         monitor, _ = checked(monitor, Measurement(k / RATE, 30.0, 1.0, 0.0, reported))
     return str(monitor.check_field()[1])
 

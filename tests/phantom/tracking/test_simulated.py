@@ -156,11 +156,6 @@ def test_readings_before_the_start_have_the_same_noise():
     np.testing.assert_allclose(noise.std(axis=0), 0.1, rtol=0.04)
 
 
-def test_same_seed_same_noise():
-    assert readings(40, seed=3) == readings(40, seed=3)
-    assert readings(40, seed=3) != readings(40, seed=4)
-
-
 def test_in_space_z_is_measured_with_the_same_noise_and_in_the_plane_not_at_all():
     y, z = np.array([(sample.y, sample.z) for sample in readings(4000, axes=2, bias=(0.0, 0.0, 3.0))]).T
     assert z.mean() == pytest.approx(3.0, abs=0.006)
