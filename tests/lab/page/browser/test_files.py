@@ -1,6 +1,5 @@
 """Presets, scenario files, links, recorded runs, rows of studies."""
 
-from base64 import b64decode, b64encode
 from io import BytesIO
 
 import numpy as np
@@ -223,61 +222,13 @@ def test_rows_of_a_study_are_listed_computed_opened_and_compared(files, server):
     page.wait_for_selector("text=No row is finished yet")
 
 
-# Pixels pass as base64: as lists of numbers a picture takes a minute to reach the test.
-CODED = """
-const coded = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
-const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-"""
-DECODED = f"""
-async (gif) => {{
-  {CODED}
-  const decoder = new ImageDecoder({{ data: decoded(gif).buffer, type: "image/gif" }});
-  await decoder.tracks.ready;
-  const frames = [];
-  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {{
-    const {{ image }} = await decoder.decode({{ frameIndex: at }});
-    const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
-    canvas.getContext("2d").drawImage(image, 0, 0);
-    image.close();
-    frames.push(coded(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data));
-  }}
-  return frames;
-}}
-"""
-MADE = f"""
-async ([width, height, frames]) => {{
-  {CODED}
-  const {{ Gif }} = await import("/static/files/gif.js");
-  const gif = new Gif(width, height, 0.1);
-  for (const frame of frames) gif.add(decoded(frame));
-  return coded(gif.bytes());
-}}
-"""
-
-
-def test_a_gif_has_the_pixels_of_its_frames(files):
-    """Also where the codes of a frame need 12 bits and begin again, and end at any of their lengths."""
-    page, rng = files(), np.random.default_rng(3)
-    for size in ((37, 20), (120, 90)):
-        check_gif(page, rng, size)
-
-
-def check_gif(page, rng, size):
-    frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
-    frames[..., 3] = 255
-    frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs
-    made = page.evaluate(MADE, [*size, [b64encode(frame.tobytes()).decode() for frame in frames]])
-    shown = np.array([np.frombuffer(b64decode(frame), np.uint8) for frame in page.evaluate(DECODED, made)])
-    assert np.max(np.abs(shown.reshape(frames.shape).astype(int) - frames)) <= 26
-
-
 @pytest.fixture
 def saved(tmp_path):
-    """A function that returns the bytes of the file that a button saves."""
+    """A function that returns the bytes of a saved picture."""
 
-    def download(page, button):
+    def download(page):
         with page.expect_download() as download:
-            page.click(f"text={button}")
+            page.click("text=Picture")
         path = tmp_path / download.value.suggested_filename
         download.value.save_as(path)
         return path.read_bytes()
@@ -285,40 +236,25 @@ def saved(tmp_path):
     return download
 
 
-def open_four_periods(page, server):
-    frames = [frame for period in range(4) for frame in period_frames(period, FrameSource.FIRST)]
-    server.send(insertion("done", of="first"), rows(0, 4, "first"), *frames)
-    until(page, "flexneedle.store.get('rows first')?.length === 4")
-
-
-def test_pictures_of_the_scene_and_of_an_insertion_are_saved(files, server, saved):
+def test_pictures_are_of_the_scene_in_space_or_of_the_section(files, server, saved):
+    """Without WebGL of the section, even off the screen."""
     page = files(draws=True)
     page.wait_for_selector("[data-panel=space] .legend li")
-    picture = imread(BytesIO(saved(page, "Picture")))
+    picture = imread(BytesIO(saved(page)))
     size = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
     assert list(picture.shape[:2]) == size
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
-    page.click("text=GIF")
-    page.wait_for_selector("text=A GIF needs an insertion")
-    open_four_periods(page, server)
-    frames = page.evaluate(DECODED, b64encode(saved(page, "GIF")).decode())
-    assert len(frames) == 4
-    assert frames[0] != frames[-1]
-    assert page.evaluate("flexneedle.store.get('view period')") is None
-
-
-def test_pictures_without_webgl_are_of_the_section_even_off_the_screen(files, server, saved):
     page = files(width=390, before=NO_WEBGL)
     assert "no WebGL" in page.inner_text("[data-panel=space] [role=note]")
     page.locator("text=Picture").scroll_into_view_if_needed()
     painted(page)
     box = page.locator(SECTION).bounding_box()
     assert box["y"] + box["height"] < -100.0
-    before = saved(page, "Picture")
-    open_four_periods(page, server)
-    assert len(set(page.evaluate(DECODED, b64encode(saved(page, "GIF")).decode()))) == 4
-    picture = saved(page, "Picture")
+    before = saved(page)
+    server.send(insertion("done", of="first"), rows(0, 4, "first"), *period_frames(3, FrameSource.FIRST))
+    until(page, "flexneedle.store.get('rows first')?.length === 4")
+    picture = saved(page)
     assert picture != before
     page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn anyway
     painted(page)
-    assert saved(page, "Picture") == picture
+    assert saved(page) == picture

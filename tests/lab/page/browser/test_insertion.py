@@ -135,9 +135,12 @@ def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_word
         "verdict": "held: no reading",
         "late": True,
         "decide_ms": 312.0,
+        "warning": "the tip is off",
     }
     server.send(some_rows(4, held))
-    page.wait_for_selector("text=hold; measurement held: no reading; decided late, after 312 ms")
+    page.wait_for_selector(
+        "text=hold; measurement held: no reading; decided late, after 312 ms; the tip is off"
+    )
     page.wait_for_selector(f"{PANEL} >> text=The needle is held, for the reason below.")
     server.send(rows(5, 1))
     until(page, f"!document.querySelector('{PANEL} [role=status]').textContent.includes('held')")

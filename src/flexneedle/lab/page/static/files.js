@@ -1,7 +1,7 @@
 // Scenarios and runs: presets, files, recorded runs with downloads, pictures.
 
 import { button, make } from "./dom.js";
-import { saveGif, savePng } from "./files/pictures.js";
+import { savePicture } from "./files/download.js";
 import { showRuns } from "./files/runs.js";
 import { maySteer } from "./shown.js";
 
@@ -18,11 +18,10 @@ export function mount(element, store, link) {
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
   const status = make("span.quiet", { role: "status" });
-  const picture = button("Picture", savePng, { title: "The scene as PNG: in space, or in section where WebGL is missing" });
-  const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
+  const picture = button("Picture", savePicture, { title: "The scene as PNG: in space, or in section where WebGL is missing" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
-  element.append(steered, make("div.tools", {}, save, picture, gif, status), runs);
+  element.append(steered, make("div.tools", {}, save, picture, status), runs);
 
   file.addEventListener("change", () => loadFile(file, store, link, status));
   acceptDrops(element, store, link, status);
@@ -72,19 +71,6 @@ function acceptDrops(element, store, link, status) {
     const [file] = event.dataTransfer.files;
     if (file) send(file, store, link, status);
   });
-}
-
-// A GIF of the insertion that is shown, with its progress.
-async function makeGif(gif, store, status) {
-  gif.disabled = true;
-  try {
-    const made = await saveGif(store, (share) => {
-      status.textContent = `GIF: ${Math.round(100 * share)} %`;
-    });
-    status.textContent = made ? "" : "A GIF needs an insertion or a recorded run";
-  } finally {
-    gif.disabled = false;
-  }
 }
 
 // A name that requests accept (requests.py: FileName).

@@ -2,7 +2,7 @@
 
 import { make } from "../dom.js";
 
-export function download(blob, name) {
+function download(blob, name) {
   const address = URL.createObjectURL(blob);
   make("a", { href: address, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(address), 10_000);
@@ -23,4 +23,16 @@ export async function fetched(address, name, what, status) {
     line.className = "bad";
     line.textContent = `${what}: ${error instanceof TypeError ? "the server does not answer" : error.message}`;
   }
+}
+
+// Save the scene in space, or the section without WebGL, as a PNG on the ground of its stage.
+export async function savePicture() {
+  const [{ spaceView }, { sectionView }] = await Promise.all([import("../space.js"), import("../section.js")]);
+  const canvas = (spaceView() ?? sectionView()).drawn(); // explicitly: a view off the screen is not drawn
+  const picture = make("canvas", { width: canvas.width, height: canvas.height });
+  const pen = picture.getContext("2d");
+  pen.fillStyle = getComputedStyle(canvas.parentElement).backgroundColor;
+  pen.fillRect(0, 0, picture.width, picture.height);
+  pen.drawImage(canvas, 0, 0);
+  picture.toBlob((blob) => download(blob, "flexneedle.png"));
 }
