@@ -36,7 +36,7 @@ FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
 RECOVERY_S = 20.0
 LETTERS = "AB"
-MOVES = re.compile(r"(^|;)\s*(BG|PA|PR|PT|JG)(?![A-H]*\?)")
+MOVES = re.compile(r"(^|;)\s*(BG|PA|PR|PT)(?![A-H]*\?)")
 
 
 # The parser
@@ -74,7 +74,7 @@ def parser_inputs(random: Random) -> Iterator[str]:
 
 # The emulated controller
 
-MOTION = ("SH", "MO", "BG", "ST", "AB", "PR", "PA", "PT", "JG", "DP")
+MOTION = ("SH", "MO", "BG", "ST", "AB", "PR", "PA", "PT", "DP")
 SETTINGS = ("SP", "AC", "DC", "SD", "FL", "BL", "ER", "OE")
 OTHERS = ("TP", "RP", "TE", "TV", "TS", "SC", "TC", "MG", "EO", "XX", "A")
 NAMES = (*MOTION, *MOTION, *SETTINGS, *OTHERS)

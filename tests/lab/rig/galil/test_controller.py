@@ -45,7 +45,6 @@ MOVING = ("SH", "PRA=9999", "BGA")
         ((), "BGA", 20),
         (MOVING, "BGA", 21),
         *((MOVING, line, 7) for line in ("PRA=1", "MOA", "DPA=1", "SHA", "DCA=10240")),
-        (MOVING, "JGA=100", 13),
         (("SH", "FLA=-1", "PRA=10"), "BGA", 22),
         *(((), line, 6) for line in ("SPA=1e12", "SPA=15000002", "ACA=1023", "OEA=0.5", "AB 2")),
         *(((), line, 4) for line in ("PRA=x", "PRA=nan", "BGX")),
@@ -88,7 +87,7 @@ def test_a_relative_and_an_absolute_move_end_at_their_targets():
 
 
 def test_a_stop_slows_down_and_an_abort_does_not():
-    device = switched_on("SP 1000,1000", "DC 10240,10240", "JG 1000,1000", "OEB=1", "BGAB", ms=300)
+    device = switched_on("SP 1000,1000", "DC 10240,10240", "PR 100000,100000", "OEB=1", "BGAB", ms=300)
     at = value(device, "TPA")
     slowed = after(device, "ST", ms=300)
     assert value(slowed, "TPA") - at == pytest.approx(1000**2 / (2 * 10240), abs=2)

@@ -44,7 +44,7 @@ def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
 
 
 def test_the_fuzz_notices_a_motion_that_nothing_began():
-    moving = advance_controller(reply(ControllerState(), "SHA;JGA=5000;BGA")[0], 50)
+    moving = advance_controller(reply(ControllerState(), "SHA;PRA=5000;BGA")[0], 50)
     with pytest.raises(fuzz_galil.Failure, match="began to move"):
         fuzz_galil.check_line(ControllerState(), "SPA=100", 0, answered=lambda *_: (moving, ":"))
 

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 from flexneedle.lab.emulators.galil import motor_axis as one
 from flexneedle.lab.emulators.galil.motor_axis import MotorAxis
-from flexneedle.lab.emulators.galil.profile import slow_to_rest
 
 ERRORS = {
     1: "Unrecognized command",
     4: "Operand error",
     6: "Number out of range",
     7: "Command not valid while running",
-    13: "JG only valid when running in jog mode",
     20: "Begin not valid with motor off",
     21: "Begin not valid while running",
     22: "Begin not possible due to Limit Switch",
@@ -68,18 +66,18 @@ def _set_acceleration(axis: MotorAxis, value: float) -> MotorAxis:
 
 
 def _set_deceleration(axis: MotorAxis, value: float) -> MotorAxis:
-    """Set DC, which may change in a jog and after a stop, but not on the way to a position."""
+    """Set DC, which may change after a stop, but not on the way to a position."""
     stopping = axis.profile.stopping
-    if axis.running and axis.jog is None and not stopping and not axis.profile.at_rest:
+    if axis.running and not stopping and not axis.profile.at_rest:
         raise CommandRefusal(7)
     rate = _round_rate(value)
-    profile = replace(axis.profile, deceleration=rate) if axis.jog is not None or stopping else axis.profile
+    profile = replace(axis.profile, deceleration=rate) if stopping else axis.profile
     return replace(axis, deceleration=rate, profile=profile)
 
 
 def _set_relative(axis: MotorAxis, value: float) -> MotorAxis:
     _require_rest(axis)
-    return replace(axis, relative=_round_counts(value), jog=None)
+    return replace(axis, relative=_round_counts(value))
 
 
 def _round_counts(value: float) -> float:
@@ -93,16 +91,7 @@ def _set_absolute(axis: MotorAxis, value: float) -> MotorAxis:
             raise CommandRefusal(22)
         return one.follow_position(axis, value)
     _require_rest(axis)
-    return replace(axis, absolute=value, relative=None, jog=None)
-
-
-def _set_jog(axis: MotorAxis, value: float) -> MotorAxis:
-    value = math.copysign(_round_down(_require_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP), value)
-    if axis.running and axis.jog is not None:
-        return replace(axis, jog=value, profile=replace(axis.profile, cruise=value))
-    if axis.running:
-        raise CommandRefusal(13)
-    return replace(axis, jog=value, relative=None)
+    return replace(axis, absolute=value, relative=None)
 
 
 def _set_position(axis: MotorAxis, value: float) -> MotorAxis:
@@ -119,10 +108,8 @@ def _set_tracking(axis: MotorAxis, value: float) -> MotorAxis:
         raise CommandRefusal(20)
     if axis.tracking:
         return axis
-    if axis.jog is not None and axis.running:
-        return replace(axis, tracking=True, jog=None, profile=slow_to_rest(axis.profile))
     goal = axis.profile.goal if axis.running else axis.profile.position
-    return replace(axis, tracking=True, jog=None, relative=None, absolute=goal or 0.0)
+    return replace(axis, tracking=True, relative=None, absolute=goal)
 
 
 def _require_whole(value: float, least: float, most: float) -> float:
@@ -141,7 +128,6 @@ SETTINGS: dict[str, tuple[Callable[[MotorAxis], float], Callable[[MotorAxis, flo
     ),
     "PR": (lambda axis: axis.goal - axis.profile.position, _set_relative),
     "PA": (lambda axis: axis.rested, _set_absolute),
-    "JG": (lambda axis: axis.jog or 0.0, _set_jog),
     "DP": (lambda axis: axis.encoder, _set_position),
     "PT": (lambda axis: float(axis.tracking), _set_tracking),
     "FL": (lambda axis: axis.forward, lambda axis, value: replace(axis, forward=_round_counts(value))),
@@ -169,8 +155,7 @@ def _begin(axis: MotorAxis) -> MotorAxis:
         raise CommandRefusal(20)
     if axis.running:
         raise CommandRefusal(21)
-    direction = axis.jog if axis.jog is not None else axis.goal - axis.profile.position
-    if axis.limit_in(direction) is not None:
+    if axis.limit_in(axis.goal - axis.profile.position) is not None:
         raise CommandRefusal(22)
     return one.begin_motion(axis)
 

@@ -1,7 +1,7 @@
 """Replies of the emulated Galil DMC-4143 to lines, as a function of its state. Pure functions, without I/O or time.
 
 It has the commands that drive axes A to D: motor on and off, speeds, relative and absolute moves, position tracking,
-jog, stop, abort, limits, and queries of positions, errors and reasons. A command is two capital letters, axes and
+stop, abort, limits, and queries of positions, errors and reasons. A command is two capital letters, axes and
 values as `PRA=100`, `PR 100,,50` or `BGAC`; a line may have several with `;` between them. Each is answered by its data
 and `:`, or by `?`, after which `TC1` reports why. Facts are from Galil's Command Reference for the DMC-4103, the
 series of the DMC-4143; it was not compared with a controller.

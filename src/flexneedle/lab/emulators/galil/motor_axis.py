@@ -45,7 +45,6 @@ class MotorAxis:
     servo: bool = False
     running: bool = False
     tracking: bool = False
-    jog: float | None = None
     relative: float | None = None
     absolute: float = 0.0
     rested: float = 0.0
@@ -95,8 +94,7 @@ class MotorAxis:
 
 def begin_motion(axis: MotorAxis) -> MotorAxis:
     """Return the axis at the begin of the motion that is set."""
-    goal, cruise = (axis.goal, 0.0) if axis.jog is None else (None, axis.jog)
-    profile = replace(axis.profile, goal=goal, cruise=cruise, stopping=False, deceleration=axis.deceleration)
+    profile = replace(axis.profile, goal=axis.goal, stopping=False, deceleration=axis.deceleration)
     return replace(axis, profile=profile, running=True, stop=RUNNING, relative=None, absolute=axis.goal)
 
 
@@ -111,7 +109,7 @@ def slow_down(axis: MotorAxis, why: int) -> MotorAxis:
     at_limit = why in (FORWARD_LIMIT, REVERSE_LIMIT)
     rate = axis.limit_deceleration if at_limit else axis.deceleration
     profile = replace(slow_to_rest(axis.profile), deceleration=rate)
-    return replace(axis, profile=profile, tracking=False, jog=None, stop=why)
+    return replace(axis, profile=profile, tracking=False, stop=why)
 
 
 def switch_off(axis: MotorAxis, why: int | None = None) -> MotorAxis:
@@ -121,16 +119,8 @@ def switch_off(axis: MotorAxis, why: int | None = None) -> MotorAxis:
     """
     stop = why if why is not None and axis.running else axis.stop
     profile = halt(replace(axis.profile, position=axis.encoder))
-    return replace(
-        axis,
-        profile=profile,
-        servo=False,
-        running=False,
-        tracking=False,
-        jog=None,
-        rested=axis.encoder,
-        stop=stop,
-    )
+    off = replace(axis, profile=profile, servo=False, running=False, tracking=False)
+    return replace(off, rested=axis.encoder, stop=stop)
 
 
 def switch_on(axis: MotorAxis) -> MotorAxis:
@@ -147,9 +137,7 @@ def abort_motion(axis: MotorAxis) -> MotorAxis:
         return switch_off(axis, ABORTED)
     stop = ABORTED if axis.running else axis.stop
     profile = halt(axis.profile)
-    return replace(
-        axis, profile=profile, running=False, tracking=False, jog=None, rested=profile.position, stop=stop
-    )
+    return replace(axis, profile=profile, running=False, tracking=False, rested=profile.position, stop=stop)
 
 
 def define_position(axis: MotorAxis, position: float) -> MotorAxis:
@@ -191,7 +179,7 @@ def _end_motion(axis: MotorAxis) -> MotorAxis:
 def _direction_of(axis: MotorAxis) -> float:
     if axis.profile.velocity:
         return axis.profile.velocity
-    return axis.profile.cruise if axis.profile.goal is None else axis.profile.goal - axis.profile.position
+    return axis.profile.goal - axis.profile.position
 
 
 def _next_encoder(axis: MotorAxis, before: MotionProfile, after: MotionProfile) -> float:

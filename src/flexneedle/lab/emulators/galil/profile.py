@@ -16,14 +16,13 @@ DECELERATION = 256_000.0
 class MotionProfile:
     """Commanded position and speed of an axis, and its goal.
 
-    goal: position at which the motion ends, None for one without end (jog); cruise: signed speed of that; speed,
-    acceleration, deceleration: positive, counts/s and counts/s²; stopping: it slows down to rest wherever that is.
+    goal: position at which the motion ends; speed, acceleration, deceleration: positive, counts/s and counts/s²;
+    stopping: it slows down to rest wherever that is.
     """
 
     position: float = 0.0
     velocity: float = 0.0
-    goal: float | None = 0.0
-    cruise: float = 0.0
+    goal: float = 0.0
     speed: float = 25_000.0
     acceleration: float = 256_000.0
     deceleration: float = DECELERATION
@@ -32,8 +31,7 @@ class MotionProfile:
     @property
     def at_rest(self) -> bool:
         """Whether the motion has ended."""
-        arrived = self.stopping or (self.goal is not None and self.position == self.goal)
-        return self.velocity == 0.0 and (arrived or (self.goal is None and self.cruise == 0.0))
+        return self.velocity == 0.0 and (self.stopping or self.position == self.goal)
 
 
 def slow_to_rest(profile: MotionProfile) -> MotionProfile:
@@ -49,14 +47,13 @@ def halt(profile: MotionProfile) -> MotionProfile:
 def advance_profile(profile: MotionProfile) -> MotionProfile:
     """Return the profile after one sample."""
     if profile.at_rest:
-        return replace(profile, goal=profile.position, cruise=0.0, stopping=False)
+        return replace(profile, goal=profile.position, stopping=False)
     wanted = _wanted_velocity(profile)
     velocity = _next_velocity(profile, wanted)
     position = profile.position + 0.5 * (profile.velocity + velocity) * SAMPLE_S
-    goal = None if profile.stopping else profile.goal
     slow = abs(velocity) <= profile.deceleration * SAMPLE_S
-    if goal is not None and slow and _is_at(goal, profile.position, position):
-        position, velocity = goal, 0.0
+    if not profile.stopping and slow and _is_at(profile.goal, profile.position, position):
+        position, velocity = profile.goal, 0.0
     return replace(profile, position=position, velocity=velocity)
 
 
@@ -64,8 +61,6 @@ def _wanted_velocity(profile: MotionProfile) -> float:
     """Return the signed speed at the end of the sample from which the axis can still stop at its goal."""
     if profile.stopping:
         return 0.0
-    if profile.goal is None:
-        return profile.cruise
     left = profile.goal - profile.position
     # It moves on for the mean of both speeds in this sample, and then slows down: v²/2d + (v₀ + v) h/2 = |left|.
     step = profile.deceleration * SAMPLE_S
