@@ -64,11 +64,7 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, sensors, names):
     [
         (aurora, {}, "port: missing"),
         (aurora, {"port": 3}, "port = 3: must be text in quotes"),
-        (
-            aurora,
-            {"port": "a", "prot": 1},
-            "prot = 1: unknown key; did you mean port? valid keys: port, sensors",
-        ),
+        (aurora, {"port": "a", "prot": 1}, "prot = 1: unknown key; did you mean port?"),
         (aurora, {"port": "a", "sensors": ["tip", "tip"]}, "sensor names must be different identifiers"),
         (aurora, {"port": "a", "sensors": []}, "sensor names must be different identifiers"),
         (replay, {"file": "a", "speed": 0}, "speed = 0: must be above 0"),

@@ -142,10 +142,7 @@ def test_values_that_an_axis_cannot_have_are_refused(values):
     [
         ([(50, MOVING, RUNS), (60, AT_REVERSE, 3), (60, AT_REVERSE, 3)], [True, False, False]),
         ([(50, MOVING, RUNS), (100, AT_FORWARD, ARRIVED)], [True, False]),  # the target is beyond the switch
-        (
-            [(50, MOVING, RUNS), (100, AT_REVERSE, ARRIVED)],
-            [True, True],
-        ),  # the target is away from the switch
+        ([(50, MOVING, RUNS), (100, AT_REVERSE, ARRIVED)], [True, True]),  # the target is away from it
         ([(100, REST, ARRIVED)], [True]),  # the target is still to be sent
     ],
 )

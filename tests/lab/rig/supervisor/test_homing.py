@@ -228,12 +228,7 @@ def change_motor(**values):
     ("at", "change", "state", "why"),
     [
         (SWITCH_MM, stay_active, SupervisorState.IDLE, "guide_y: the reverse-limit switch is still active"),
-        (
-            7.0,
-            stay_active,
-            SupervisorState.IDLE,
-            "guide_y: the reverse-limit switch is still active 0.600 mm",
-        ),
+        (7.0, stay_active, SupervisorState.IDLE, "guide_y: the reverse-limit switch is still active 0.600"),
         (7.0, lose_position, SupervisorState.FAULT, "guide_y: the motor controller reports position nan"),
         (7.0, change_motor(coasts=1e3), SupervisorState.FAULT, "guide_y: "),
         (7.0, change_motor(fault="stall"), SupervisorState.FAULT, "the motors have not"),
