@@ -133,7 +133,7 @@ def _rig(
     rng: np.random.Generator, name: str, scenario: Scenario, guides: int, *, any_angle: bool
 ) -> dict[str, Any]:
     """Return the values of a rig file whose travel suffices for the scenario."""
-    setup, values = scenario.setup, RIGS.shipped("emulated")
+    setup, values = scenario.setup, RIGS.read_shipped("emulated")
     low = -round(float(rng.uniform(0.0, 5.0)), 1)
     across = round(setup.max_guide_travel_mm + float(rng.uniform(0.1, 5.0)), 1)
     ranges = {"insertion": (low, round(setup.stroke_mm + float(rng.uniform(1.0, 10.0)), 1))}

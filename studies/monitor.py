@@ -309,7 +309,7 @@ def print_tables(runs: Runs) -> None:
 def draw_figure(runs: Runs, folder: Path) -> None:
     """Draw time to the hold against the speed of the plate, tip error at the hold, choice of the threshold."""
     speeds, holds = zip(*runs.holds(), strict=True)
-    with style.styled():
+    with style.apply_style():
         figure = style.new_figure(3.65)
         times, errors, choice = figure.subplots(1, 3)
         times.plot(speeds, [hold.after_begin for hold in holds], ".", color=style.ESTIMATE, ms=4)

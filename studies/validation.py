@@ -35,7 +35,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def small(value: float) -> str:
     """Format with two digits, in exponential notation below 0.001."""
     if abs(value) >= 1e-3:
-        return style.signed(value, ".2g")
+        return style.format_signed(value, ".2g")
     mantissa, exponent = f"{value:.1e}".split("e")
     return f"{mantissa}e{int(exponent)}".replace("-", "−")
 
@@ -180,7 +180,7 @@ def bevel(found: results.Found) -> list[str]:
     rows = []
     for length, errors in found.curvature.items():
         expected = closed_forms.steady_curvature(0.01, length, FOUNDATION, EI)
-        shares = (f"{style.signed(100.0 * error, '+.3f')} %" for error in errors)
+        shares = (f"{style.format_signed(100.0 * error, '+.3f')} %" for error in errors)
         rows.append((f"{length:g}", f"{expected:.4e}".replace("e-0", "e−"), *shares))
     return [
         "## Steady curvature of the bevel",

@@ -20,7 +20,7 @@ def draw(found: results.Found, folder: Path) -> list[Path]:
     """Draw the three figures as PNG and SVG."""
     paths = []
     for name, draw_one in (("needle", draw_needle), ("model", draw_model), ("insertion", draw_insertion)):
-        with style.styled():
+        with style.apply_style():
             figure = style.new_figure(3.3)
             draw_one(*figure.subplots(1, 2), found)
             paths += style.save(figure, folder, f"validation-{name}")

@@ -173,19 +173,19 @@ def print_worst(insertions: Sequence[StudyInsertion], endings: Sequence[Ending])
     for insertion, end in zip(insertions, endings, strict=True):
         scenario = insertion.point.scenario
         truth = parameters_of(scenario, insertion.seed)
-        target = f"{scenario.target.depth_mm:g}, {style.signed(scenario.target.lateral_mm)}"
+        target = f"{scenario.target.depth_mm:g}, {style.format_signed(scenario.target.lateral_mm)}"
         parts = (end.depth_error, end.control_error, end.estimate_error)
         rows.append(
             (
                 *(str(insertion.index), target, str(insertion.seed), f"{end.error:.2f}"),
-                *(style.signed(part, ".2f") for part in parts),
-                *(style.signed(end.guide, ".1f"), f"{end.stretch:.2f}"),
+                *(style.format_signed(part, ".2f") for part in parts),
+                *(style.format_signed(end.guide, ".1f"), f"{end.stretch:.2f}"),
                 *(
                     f"{truth.superficial:.2f}, {truth.deep:.2f}",
                     f"{truth.last_ratio:.2f}",
                     f"{truth.bevel:.2f}",
                 ),
-                *(style.signed(value, ".1f") for value in (truth.offset, truth.slope, truth.boundary)),
+                *(style.format_signed(value, ".1f") for value in (truth.offset, truth.slope, truth.boundary)),
             )
         )
     print_table(head, rows)
@@ -237,7 +237,7 @@ def draw_figure(study: ExpandedStudy, index: np.ndarray, error: np.ndarray, fold
         ("boundary above the target, mm", [truth.boundary for truth in truths]),
         (f"modulus, last {LAST_MM:g} mm / above", [truth.last_ratio for truth in truths]),
     )
-    with style.styled():
+    with style.apply_style():
         figure = style.new_figure(5.4)
         tail, *others = figure.subplots(2, 3).flat
         for at, colour in zip(

@@ -6,7 +6,7 @@ from threading import Thread
 
 import pytest
 
-from flexneedle.interrupts import SIGNALS, uninterrupted
+from flexneedle.interrupts import SIGNALS, delay_signals
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def test_an_interrupt_is_raised_after_the_block(number):
     done = []
 
     def block():
-        with uninterrupted():
+        with delay_signals():
             signal.raise_signal(number)
             done.append("block")
 
@@ -37,8 +37,8 @@ def test_in_nested_blocks_it_is_raised_after_the_last():
     done = []
 
     def blocks():
-        with uninterrupted():
-            with uninterrupted():
+        with delay_signals():
+            with delay_signals():
                 signal.raise_signal(signal.SIGINT)
                 done.append("inner")
             done.append("outer")
@@ -60,7 +60,7 @@ def test_after_an_interrupt_while_handlers_are_set_again_none_is_lost(monkeypatc
         return found
 
     monkeypatch.setattr(signal, "signal", interrupted)
-    with pytest.raises(KeyboardInterrupt), uninterrupted():
+    with pytest.raises(KeyboardInterrupt), delay_signals():
         pass
     monkeypatch.undo()
     for each in SIGNALS:
@@ -71,7 +71,7 @@ def test_after_an_interrupt_while_handlers_are_set_again_none_is_lost(monkeypatc
 
 def test_a_signal_without_a_handler_keeps_its_action():
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    with uninterrupted():
+    with delay_signals():
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -81,7 +81,7 @@ def test_other_threads_are_not_interrupted_anyway():
     found = []
 
     def block():
-        with uninterrupted():
+        with delay_signals():
             found.append(signal.getsignal(signal.SIGINT))
 
     thread = Thread(target=block)

@@ -7,7 +7,7 @@ from itertools import count
 from pathlib import Path
 
 from flexneedle.errors import InputError, RecordError
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 
 RUNS = Path("runs")
 _LONGEST_NAME = 60
@@ -19,7 +19,7 @@ def replace_file(path: Path, data: bytes) -> None:
     Ctrl-C is delayed until the file is complete. Raises RecordError if it cannot be written; the old file is kept.
     """
     draft = path.with_name(path.name + ".tmp")
-    with uninterrupted():
+    with delay_signals():
         try:
             with draft.open("wb") as file:
                 file.write(data)

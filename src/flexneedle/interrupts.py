@@ -16,7 +16,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
+def delay_signals() -> Iterator[None]:
     """Delay the handlers of `SIGNALS` until the end of the block. Blocks may be nested."""
     if current_thread() is not main_thread():
         yield  # no KeyboardInterrupt can arise here

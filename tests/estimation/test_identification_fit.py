@@ -121,7 +121,7 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
 
 def misfit(estimate, readings, before):
     """Half of the squares over variances, which the fit minimises; variances from the estimate `before`."""
-    variance = estimate.variances()[0] + readings.bent(before.tips[:, Y]) ** 2
+    variance = estimate.variances()[0] + readings.estimate_sag(before.tips[:, Y]) ** 2
     off = estimate.parameters - estimate.prior.mean
     rows, p = np.array([done.applied for done in estimate.moves]), estimate.parameters
     y = estimate.tips[:, Y]

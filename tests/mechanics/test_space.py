@@ -104,7 +104,7 @@ def random_in_space(seed, steps=60):
 def test_a_turn_by_whole_quarters_is_exact(z, quarters):
     """To the last bit, although the angle as a float is not exactly a quarter."""
     expected = z * (1.0, 1j, -1.0, -1j)[quarters % 4]
-    assert lt.turned(quarters * 0.5 * math.pi, z) == expected
+    assert lt.rotate(quarters * 0.5 * math.pi, z) == expected
 
 
 @given(
@@ -114,9 +114,9 @@ def test_a_stretch_has_two_factors(direction, z, radial, across):
     """The matrix radial·nnᵀ + across·(1 − nnᵀ)."""
     n = np.array([math.cos(direction), math.sin(direction)])
     matrix = radial * np.outer(n, n) + across * (np.eye(2) - np.outer(n, n))
-    found = lt.stretched(complex(*n), z, radial, across)
+    found = lt.stretch(complex(*n), z, radial, across)
     np.testing.assert_allclose([found.real, found.imag], matrix @ [z.real, z.imag], atol=1e-9)
-    assert lt.stretched(1.0, 2.5, radial, across) == radial * 2.5
+    assert lt.stretch(1.0, 2.5, radial, across) == radial * 2.5
 
 
 @given(a=st.complex_numbers(max_magnitude=1e3), b=st.complex_numbers(max_magnitude=1e3))

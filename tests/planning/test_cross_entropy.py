@@ -188,7 +188,7 @@ def test_converged_once_the_elite_costs_spread_by_a_share_of_the_first_iteration
     assert not first.converged
     second = ce.update(first, settings, samples, np.array([-7.0 + 4.0 * spread, 5.0, -7.0]))
     assert second.converged is converged
-    assert second.done(settings) is converged
+    assert second.has_ended(settings) is converged
 
 
 def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():

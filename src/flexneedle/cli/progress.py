@@ -46,7 +46,7 @@ class Progress:
             self._bars.console.print(line, markup=False, highlight=False)
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def pause_display(self) -> Iterator[None]:
         """Leave the terminal to a question."""
         if self._bars is not None:
             self._bars.stop()

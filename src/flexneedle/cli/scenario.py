@@ -97,7 +97,7 @@ def _list(_args: argparse.Namespace) -> int:
 def _show(args: argparse.Namespace) -> int:
     from flexneedle.scenario.files import dump_scenario
 
-    print(dump_scenario(_checked(args)), end="")
+    print(dump_scenario(_load_complete(args)), end="")
     return 0
 
 
@@ -107,7 +107,7 @@ def _check(args: argparse.Namespace) -> int:
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ScenarioWarning)
-        scenario = _checked(args)
+        scenario = _load_complete(args)
         for line in find_doubts(scenario):
             warnings.warn(f"{args.scenario}: {line}", ScenarioWarning, stacklevel=1)
     for warning in caught:
@@ -118,7 +118,7 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def _checked(args: argparse.Namespace) -> Scenario:
+def _load_complete(args: argparse.Namespace) -> Scenario:
     """Return the scenario with all defaults, including the settings of the controllers."""
     from flexneedle.control.controllers import check_tables, find_controller
     from flexneedle.scenario.files import load_scenario

@@ -171,7 +171,7 @@ class Ahead:
     @property
     def constant(self) -> Floats:
         """Controls (4, m, 9) of all combinations of half a turn before the first step and after it (last index)."""
-        rows, _ = self._unrolled(self.current[None, : self.knots], np.tile(self.depth, (4, 1)))
+        rows, _ = self._without_rolls(self.current[None, : self.knots], np.tile(self.depth, (4, 1)))
         rows[2:, 0, ROLL] = np.pi
         if rows.shape[1] > 1:
             rows[1::2, 1, ROLL] = np.pi
@@ -180,11 +180,11 @@ class Ahead:
     def controls(self, z: Floats) -> tuple[Floats, Floats]:
         """Return controls (N, m, 9) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
         depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
-        rows, depth = self._unrolled(z[:, : self.knots], depth)
+        rows, depth = self._without_rolls(z[:, : self.knots], depth)
         rows[:, :, ROLL] = roll
         return rows, depth
 
-    def _unrolled(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
+    def _without_rolls(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
         """Return controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
         rows = controls(len(depth), depth.shape[1] - 1, db_x=np.diff(depth, axis=1))
         for axis, ones in enumerate(np.split(corrections, self.axes, axis=1)):

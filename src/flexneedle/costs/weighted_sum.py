@@ -163,7 +163,7 @@ def _bind_values(value: TermFunction, values: Mapping[str, Any]) -> Callable[[Tr
 def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callable[[Trajectories], Floats]:
     """Return the function of a user, which then raises InputError unless it returns an array (N,)."""
 
-    def checked(trajectories: Trajectories) -> Floats:
+    def evaluate(trajectories: Trajectories) -> Floats:
         try:
             found = np.asarray(value(_lock_arrays(trajectories)), dtype=float)
         except Exception as error:
@@ -174,7 +174,7 @@ def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callabl
             raise InputError(f"cost term {name}: must return numbers, not NaN")
         return found
 
-    return checked
+    return evaluate
 
 
 def _lock_arrays(trajectories: Trajectories) -> Trajectories:

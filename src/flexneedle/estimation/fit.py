@@ -19,10 +19,10 @@ def improve_fit(fitted: Fitted) -> Fitted:
     prior = fitted.prior
     jacobian = jacobian_of(fitted)
     both = zip(fitted.variances(), fitted.readings, fitted.laterals, strict=True)
-    variance = np.concatenate([noise + readings.bent(tips) ** 2 for noise, readings, tips in both])
+    variance = np.concatenate([noise + readings.estimate_sag(tips) ** 2 for noise, readings, tips in both])
     weighted = jacobian.conj().T / variance
     off = fitted.parameters - prior.mean
-    gradient = (weighted @ np.concatenate(fitted.left)).real - prior.precision @ off
+    gradient = (weighted @ np.concatenate(fitted.residuals)).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
     fitted = replace(fitted, precision=precision)
     step = np.linalg.solve(precision, gradient)
@@ -31,7 +31,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     goal = np.clip(fitted.parameters + step, *prior.bounds)
 
     def cost(other: FittedInsertion) -> float:
-        squares = np.abs(np.concatenate(other.left)) ** 2
+        squares = np.abs(np.concatenate(other.residuals)) ** 2
         return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
 
     most, trial = cost(fitted), fitted

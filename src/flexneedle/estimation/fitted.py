@@ -110,10 +110,12 @@ class FittedInsertion:
         return [laterals(self.tips, sensor.column, self.axes) for sensor in self.sensors]
 
     @property
-    def left(self) -> list[Laterals]:
+    def residuals(self) -> list[Laterals]:
         """Lateral residuals (r,) of each sensor: readings minus the model's quantities."""
         return [
-            readings.left(tips, from_components(self.parameters[getattr(self.slots, sensor.offset)]))
+            readings.compute_residuals(
+                tips, from_components(self.parameters[getattr(self.slots, sensor.offset)])
+            )
             for sensor, readings, tips in zip(self.sensors, self.readings, self.laterals, strict=True)
         ]
 

@@ -136,7 +136,7 @@ class Identified(FittedInsertion):
         axial, axial_variance = fit_constant(without, extended.axial_variances(), prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
         fitted = differentiate(improve_fit(extended))
-        left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
+        left, ahead = fitted.residuals[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
         bevel = fitted.state.bevel * cmath.exp(-1j * since)

@@ -61,10 +61,10 @@ class MoveMeans:
         between: Laterals = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
         return between
 
-    def left(self, y: Laterals, offset: complex) -> Laterals:
+    def compute_residuals(self, y: Laterals, offset: complex) -> Laterals:
         """Return lateral residuals (r,): readings minus a model's, with an offset that turns with the bevel."""
-        left: Laterals = self.y - self.between(y) - offset * self.bevel
-        return left
+        residuals: Laterals = self.y - self.between(y) - offset * self.bevel
+        return residuals
 
     def ahead(self, x: Floats) -> Floats:
         """Return axial residuals (r,), mm: readings minus a model's x."""
@@ -87,7 +87,7 @@ class MoveMeans:
         variance: Floats = noise + unexplained**2
         return variance
 
-    def bent(self, y: Laterals) -> Floats:
+    def estimate_sag(self, y: Laterals) -> Floats:
         """Return the possible deviation (r,) of a reading from the chord of its move: in tissue the path bends."""
         change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
         sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])

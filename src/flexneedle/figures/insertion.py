@@ -16,7 +16,7 @@ from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import COLUMNS, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, styled, tone
+from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, apply_style, tone
 from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, X
@@ -30,7 +30,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     """Return the figure of an insertion with at least one period, finished or not."""
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
     shown = _panels(scenario, insertion)
-    with styled():
+    with apply_style():
         figure, axes = _sheet(scenario, insertion, list(shown), field=len(field) > 0)
         sections = scene.sections(scenario)
         scenes = [axes[f"scene{end}"] for end in sections]

@@ -33,9 +33,9 @@ from flexneedle.figures.style import (
     TARGET,
     TRUE,
     WIDTH,
+    apply_style,
+    format_signed,
     new_figure,
-    signed,
-    styled,
 )
 from flexneedle.results import Insertion
 from flexneedle.scenario.model import Scenario
@@ -58,7 +58,7 @@ _RING = 1.5  # mm; radius of the guide
 def perspective_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     """Return the figure of an insertion in space with at least one period, finished or not."""
     low, high = _box(scenario, insertion)
-    with styled(), matplotlib.rc_context({"legend.fontsize": 9.0}):
+    with apply_style(), matplotlib.rc_context({"legend.fontsize": 9.0}):
         figure = new_figure(_HEIGHT)
         figure.set_layout_engine("none")
         figure.suptitle(title_of(scenario, insertion), x=0.01, ha="left", fontsize=11, weight="bold")
@@ -97,14 +97,14 @@ def _box(scenario: Scenario, insertion: Insertion) -> tuple[Floats, Floats]:
     return low, np.array([points[:, X].max() + _BEYOND, *(middle + half)])
 
 
-def _turned(points: Any) -> Floats:
+def _to_view(points: Any) -> Floats:
     """Return columns of points (…, 3) as Matplotlib draws them (3, …): z towards the viewer, y upwards."""
     x, y, z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
     return np.stack([x, -z, y])
 
 
 def _set_up(ax: Any, low: Floats, high: Floats) -> None:
-    ends = np.sort(_turned([low, high]))
+    ends = np.sort(_to_view([low, high]))
     ax.set(**{f"{name}lim": tuple(pair) for name, pair in zip("xyz", ends, strict=True)})
     ax.set_box_aspect(np.ptp(ends, axis=1))
     ax.set_proj_type("persp", focal_length=0.6)
@@ -114,7 +114,7 @@ def _set_up(ax: Any, low: Floats, high: Floats) -> None:
 
 def _fit(figure: Figure, ax: Any, corners: Floats, room: Floats) -> None:
     """Place the axes so that the corners of the box (8, 3) fill `room` (2, 2), corners of a part of the figure."""
-    x, y, _ = proj3d.proj_transform(*_turned(corners), ax.get_proj())
+    x, y, _ = proj3d.proj_transform(*_to_view(corners), ax.get_proj())
     ends = figure.transFigure.inverted().transform(ax.transData.transform(np.column_stack([x, y])))
     scale = float(np.min(np.ptp(room, axis=0) / np.ptp(ends, axis=0)))
     middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
@@ -124,16 +124,16 @@ def _fit(figure: Figure, ax: Any, corners: Floats, room: Floats) -> None:
 
 
 def _face(ax: Any, corners: Any, color: str, alpha: float, **how: Any) -> None:
-    ax.add_collection3d(Poly3DCollection([_turned(corners).T], facecolor=color, alpha=alpha, **how))
+    ax.add_collection3d(Poly3DCollection([_to_view(corners).T], facecolor=color, alpha=alpha, **how))
 
 
 def _line(ax: Any, points: Any, *style: str, **how: Any) -> None:
-    ax.plot(*_turned(points), *style, **how)
+    ax.plot(*_to_view(points), *style, **how)
 
 
 def _name(ax: Any, point: Any, text: str, color: str, above: bool = True, side: str = "center") -> None:
     how: dict[str, Any] = {"fontsize": 10, "zorder": 9, "ha": side, "va": "bottom" if above else "top"}
-    ax.text(*_turned(point), text, color=color, **how)
+    ax.text(*_to_view(point), text, color=color, **how)
 
 
 def _draw_tissue(ax: Any, scenario: Scenario, low: Floats, high: Floats) -> None:
@@ -164,7 +164,7 @@ def _name_depths(ax: Any, low: Floats, high: Floats) -> None:
     _line(ax, [(left, bottom, front), (right, bottom, front)], **how)
     for x in range(_DEPTHS * ceil(left / _DEPTHS), ceil(right), _DEPTHS):
         _line(ax, [(x, bottom, front), (x, bottom, front + 0.8)], **how)
-        _name(ax, (x, bottom, front + 1.2), signed(x), INK, above=False)
+        _name(ax, (x, bottom, front + 1.2), format_signed(x), INK, above=False)
     between = _DEPTHS * (0.5 * (left + right) // _DEPTHS + 0.5)
     _name(ax, (between, bottom, front + 1.2), "depth (mm)", INK, above=False)
 
@@ -235,7 +235,7 @@ def _surface(ax: Any, points: Floats, color: str, alpha: float, *, zorder: float
     """Draw a lit surface (n, m, 3), as an image inside the SVG."""
     how: dict[str, Any] = {"rstride": 1, "cstride": 1, "linewidth": 0.0, "antialiased": alpha < 1.0}
     made = ax.plot_surface(
-        *_turned(points), color=color, alpha=alpha, shade=True, lightsource=_LIGHT, zorder=zorder, **how
+        *_to_view(points), color=color, alpha=alpha, shade=True, lightsource=_LIGHT, zorder=zorder, **how
     )
     made.set(gid=gid, rasterized=True, edgecolor="none")
 
@@ -257,7 +257,7 @@ class _Arrow3D(FancyArrowPatch):
     def do_3d_projection(self) -> float:
         """Place the arrow in the figure; return its distance from the viewer."""
         axes: Any = self.axes
-        x, y, depth = proj3d.proj_transform(*_turned(self.points), axes.M)
+        x, y, depth = proj3d.proj_transform(*_to_view(self.points), axes.M)
         self.set_positions((x[0], y[0]), (x[1], y[1]))
         return float(np.min(depth))
 

@@ -13,7 +13,7 @@ from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, INK, STRATEGIES, TARGET, signed, styled, tone
+from flexneedle.figures.style import BAD, INK, STRATEGIES, TARGET, apply_style, format_signed, tone
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import X, Y
@@ -26,7 +26,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
     roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
     panels = {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}  # from above
-    with styled():
+    with apply_style():
         figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
         scenes: list[Axes] = []
@@ -89,7 +89,7 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
 def _result(scenario: Scenario, plan: Plan) -> str:
     """Return the plan in a line: result, cost, and angles of the tip at the skin, if they are known."""
     angles = [
-        f"{signed(round(degrees(angle), 1) + 0.0, '+.1f')}°"
+        f"{format_signed(round(degrees(angle), 1) + 0.0, '+.1f')}°"
         for angle in plan.entry_angles[: scenario.setup.axes]
     ]
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
-from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, signed
+from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, format_signed
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.types import THETA, Floats, Point, X, Y, Z
@@ -53,7 +53,7 @@ def name_scenes(scenes: Sequence[Axes], title: str, color: str, size: float = 10
 
 def place(scenario: Scenario, target: Point) -> str:
     """Return a target as text."""
-    depth, *lateral = (f"{signed(value)} mm" for value in target[: 1 + scenario.setup.axes])
+    depth, *lateral = (f"{format_signed(value)} mm" for value in target[: 1 + scenario.setup.axes])
     return f"{depth} deep, {' and '.join(lateral)} lateral"
 
 

@@ -13,7 +13,7 @@ from flexneedle.figures import scene
 from flexneedle.figures.curves import Roll, planned_rolls, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
-from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, signed
+from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, format_signed
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Point, X, Y, Z
@@ -66,7 +66,7 @@ def draw_planned(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: f
 
 def prediction_label(period: Period) -> str:
     """Return the name of a period's predicted shape."""
-    return f"final shape ± {SDS:g} sd, predicted at {signed(period.estimate.x, '.0f')} mm"
+    return f"final shape ± {SDS:g} sd, predicted at {format_signed(period.estimate.x, '.0f')} mm"
 
 
 def draw_prediction(ax: Axes, period: Period, view: View) -> None:

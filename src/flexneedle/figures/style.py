@@ -70,13 +70,13 @@ def tone(color: str, axis: int) -> str:
     return _SECOND[color] if axis == Z else color
 
 
-def signed(value: float, form: str = "g") -> str:
+def format_signed(value: float, form: str = "g") -> str:
     """Return a number as text with a true minus sign."""
     return f"{value:{form}}".replace("-", "−")
 
 
 @contextmanager
-def styled() -> Iterator[None]:
+def apply_style() -> Iterator[None]:
     """Use this module's style inside the block, not the user's matplotlibrc."""
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
@@ -106,7 +106,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write `name`.png and `name`.svg into the folder, without date or version; return the paths."""
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
     plain: tuple[dict[str, Any], ...] = ({"Software": None}, {"Date": None, "Creator": "flexneedle"})
-    with styled():
+    with apply_style():
         settle(figure)
         for path, metadata in zip(paths, plain, strict=True):
             sink = BytesIO()

@@ -18,7 +18,7 @@ from threading import Lock
 from time import monotonic
 from typing import IO, Any
 
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 
 _LENGTH = struct.Struct("<I")
 _BUFFER = 1 << 20  # bytes
@@ -79,7 +79,7 @@ class MessageChannel:
         A queue that is full loses its oldest message without `keep`.
         """
         data = self._encode(message)
-        with uninterrupted(), self._lock:
+        with delay_signals(), self._lock:
             self._waiting.append((_LENGTH.pack(len(data)) + data, keep))
             self._pump()
             if len(self._waiting) > self._most_waiting:
@@ -90,7 +90,7 @@ class MessageChannel:
         """Send queued messages; wait at most `seconds` for the other end to read them."""
         until = monotonic() + seconds
         while True:
-            with uninterrupted(), self._lock:
+            with delay_signals(), self._lock:
                 self._pump()
                 left = bool(self._begun or self._waiting)
             if not left or (remaining := until - monotonic()) <= 0.0:

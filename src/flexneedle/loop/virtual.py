@@ -43,16 +43,16 @@ class Seeds:
     @classmethod
     def of(cls, seed: int) -> "Seeds":
         """Return the seeds of the virtual rig for a seed of `insert`; the controller has its own."""
-        phantom, tracker, _, room = _spawned(seed)
+        phantom, tracker, _, room = _spawn_seeds(seed)
         return cls(phantom, tracker, room)
 
     @staticmethod
     def controller(seed: int) -> np.random.Generator:
         """Return the randomness of the controller in `insert` with a seed."""
-        return np.random.default_rng(_spawned(seed)[2])
+        return np.random.default_rng(_spawn_seeds(seed)[2])
 
 
-def _spawned(seed: int) -> list[np.random.SeedSequence]:
+def _spawn_seeds(seed: int) -> list[np.random.SeedSequence]:
     """Return the seeds of phantom, tracker, controller and room."""
     return np.random.SeedSequence(seed).spawn(4)
 

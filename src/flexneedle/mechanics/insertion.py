@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner, kernel
-from flexneedle.mechanics.lateral import Lateral, dot, lateral, size, square, times, turned
+from flexneedle.mechanics.lateral import Lateral, dot, lateral, rotate, size, square, times
 from flexneedle.mechanics.law import stored_energy
 from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
 from flexneedle.mechanics.needle import (
@@ -68,10 +68,10 @@ def outputs(n: int, m: int, *, deflection: bool = False, nodes: int = 0) -> Outp
 
 
 @inner
-def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Boundary:
+def _move_boundary(boundary: Boundary, command: Floats, share: float, roll: float) -> Boundary:
     """Return the boundary after a share of a command; `roll` (rad) includes its spin."""
     base, like = boundary.base, boundary.guide
-    bevel = boundary.bevel if roll == 0.0 else turned(roll, boundary.bevel)
+    bevel = boundary.bevel if roll == 0.0 else rotate(roll, boundary.bevel)
     return Boundary(
         NodePose(
             base.x + share * command[DB_X],
@@ -85,7 +85,7 @@ def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Bo
 
 
 @inner
-def settled(
+def settle_needle(
     model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral
 ) -> NeedleState:
     """Solve with the present base and guide, and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
@@ -107,8 +107,8 @@ def settled(
 
 @kernel
 def settle(model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Plain:
-    """Call `settled` from outside of kernels; return the needle for `from_plain`."""
-    return to_plain(settled(model, needle, rest, u, w, held))
+    """Call `settle_needle` from outside of kernels; return the needle for `from_plain`."""
+    return to_plain(settle_needle(model, needle, rest, u, w, held))
 
 
 @inner
@@ -127,7 +127,7 @@ def _end_of_part(model: Model, needle: NeedleState, advance: float, done: float)
 
 
 @inner
-def _advanced(
+def _advance_needle(
     model: Model, needle: NeedleState, rest: Laterals, u: Laterals, w: Work, command: Floats
 ) -> NeedleState:
     """Return the needle after one step, in its parts."""
@@ -135,9 +135,9 @@ def _advanced(
     while done < 1.0:
         end = _end_of_part(model, needle, command[DB_X], done)
         spin = (end - done) * command[SPIN]
-        boundary = _moved(needle.boundary, command, end - done, roll + spin)
+        boundary = _move_boundary(needle.boundary, command, end - done, roll + spin)
         cut = Cut(needle.solution.tip, needle.channel, spin)
-        needle = settled(
+        needle = settle_needle(
             model,
             NeedleState(boundary, cut, needle.channel, needle.solution),
             rest,
@@ -249,7 +249,7 @@ def rollout(
         for i in range(rest.size):  # not by slices, whose check of shapes takes 2 s to compile
             rest[i], u[i] = rest0[i], u0[i]
         for k in range(commands.shape[1]):
-            needle = _advanced(model, needle, rest, u, w, commands[j, k])
+            needle = _advance_needle(model, needle, rest, u, w, commands[j, k])
             tip = needle.solution.tip
             put(out.tips[j, k], tip.x, tip.y, tip.slope)
             out.energy[j, k] = _strain_energy(model, needle, u)

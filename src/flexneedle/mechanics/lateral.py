@@ -18,17 +18,17 @@ Lateral = complex
 def _by_axes(plane: Callable[..., Any], space: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that is `space` for any complex argument, else `plane`, for the interpreter and for Numba."""
 
-    def chosen(*arguments: Any) -> Any:
+    def choose(*arguments: Any) -> Any:
         return (space if any(isinstance(each, complex) for each in arguments) else plane)(*arguments)
 
-    def typed(*arguments: Any) -> Any:
+    def choose_type(*arguments: Any) -> Any:
         return space if any(isinstance(each, types.Complex) for each in arguments) else plane
 
-    overload(chosen, strict=False)(typed)
-    return chosen
+    overload(choose, strict=False)(choose_type)
+    return choose
 
 
-def _stretched(along: complex, z: complex, radial: float, tangential: float) -> complex:
+def _stretch(along: complex, z: complex, radial: float, tangential: float) -> complex:
     re = radial * (along.real * z.real + along.imag * z.imag)
     im = tangential * (along.real * z.imag - along.imag * z.real)
     return complex(along.real * re - along.imag * im, along.real * im + along.imag * re)
@@ -39,7 +39,7 @@ def _inexact(u: complex, radial: float, tangential: float, weight: float) -> flo
     return max(weight, 1.0 - weight) * abs(radial - tangential) / one
 
 
-def _turned(angle: float, z: complex) -> complex:
+def _rotate(angle: float, z: complex) -> complex:
     quarters = math.floor(angle / (0.5 * math.pi) + 0.5)
     left = angle - quarters * (0.5 * math.pi)
     c, s = math.cos(left), math.sin(left)
@@ -68,7 +68,7 @@ dot = _by_axes(lambda a, b: a * b, lambda a, b: a.real * b.real + a.imag * b.ima
 lateral = _by_axes(lambda like, y, z: y, lambda like, y, z: complex(y, z))
 """y in the plane, y + iz in space, by the type of `like`."""
 
-turned = _by_axes(lambda angle, z: math.cos(angle) * z, _turned)
+rotate = _by_axes(lambda angle, z: math.cos(angle) * z, _rotate)
 """z turned about the axis by an angle (rad), exactly for whole quarters; in the plane, for whole half turns only."""
 
 steady = _by_axes(
@@ -77,7 +77,7 @@ steady = _by_axes(
 )
 """Steady value of a quantity that follows a `goal` turning by `rate` (rad/mm), with relaxation length `length` (mm)."""
 
-stretched = _by_axes(lambda along, z, radial, tangential: radial * z, _stretched)
+stretch = _by_axes(lambda along, z, radial, tangential: radial * z, _stretch)
 """z with its part along the unit vector `along` times `radial`, and the part across it times `tangential`."""
 
 one_stiffness = _by_axes(

@@ -3,7 +3,7 @@
 import math
 
 from flexneedle.mechanics.compile import inner
-from flexneedle.mechanics.lateral import Lateral, dot, lateral, size, stretched, times
+from flexneedle.mechanics.lateral import Lateral, dot, lateral, size, stretch, times
 from flexneedle.mechanics.law import response
 from flexneedle.mechanics.model import CONTACT, GUIDE, Model
 from flexneedle.mechanics.needle import (
@@ -48,7 +48,7 @@ def _overshoot(
     secant, tangent, _, _ = spring_law(model, front, tip_x, spring)
     amount = size(spring)
     along = times(1.0 / amount, spring) if amount > 0.0 else times(1.0, lateral(spring, 1.0, 0.0))
-    linear = times(secant, spring) + stretched(along, change, tangent, secant)
+    linear = times(secant, spring) + stretch(along, change, tangent, secant)
     slope = dot(times(spring_law(model, front, tip_x, here)[0], here) - linear, change)
     for i in range(count):
         node, out = nodes[i], w[i]

@@ -3,7 +3,7 @@
 import math
 
 from flexneedle.mechanics.compile import inner
-from flexneedle.mechanics.lateral import Lateral, size, steady, times, turned
+from flexneedle.mechanics.lateral import Lateral, rotate, size, steady, times
 from flexneedle.mechanics.law import response, stored_energy
 from flexneedle.mechanics.model import Model
 from flexneedle.mechanics.needle import Cut, Path
@@ -21,7 +21,7 @@ def spring_rest(model: Model, bevel: Lateral, cut: Cut, path: Path, tip_x: float
     line = front_y + times(length, cut.tip.slope)
     lag = times(0.0, goal)
     if cut.channel.front > 0.0:
-        before = goal if cut.spin == 0.0 else turned(-rate * length, goal)
+        before = goal if cut.spin == 0.0 else rotate(-rate * length, goal)
         lag = cut.channel.rest - front_y - before
     ratio = length / model.bevel_length
     slope = -math.expm1(-ratio) / ratio

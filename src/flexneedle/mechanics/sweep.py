@@ -27,7 +27,7 @@ from flexneedle.mechanics.lateral import (
     one_stiffness,
     size,
     square,
-    stretched,
+    stretch,
     times,
 )
 from flexneedle.mechanics.law import response
@@ -49,7 +49,7 @@ class Tip(NamedTuple):
 
 
 @inner
-def _prescribed(model: Model, wall: Lateral, rest: Lateral, kind: int) -> Lateral:
+def _prescribe_lateral(model: Model, wall: Lateral, rest: Lateral, kind: int) -> Lateral:
     """Return the lateral position (mm) of an essential node; NaN at a guide with clearance that is not touched."""
     if kind == GUIDE and model.clearance > 0.0:
         rest = rest + times(model.clearance, wall) if size(wall) > 0.0 else times(math.nan, rest)
@@ -111,7 +111,7 @@ def sweep_out(
         node, out = nodes[i], w[i]
         if node.kind != CONTACT:
             out.a1, out.g1, out.b11, out.b12 = a1, g1, b11, b12
-            fixed = _prescribed(model, wall, rest[i], node.kind)
+            fixed = _prescribe_lateral(model, wall, rest[i], node.kind)
             out.fixed = fixed
             if not math.isnan(fixed.real):
                 gain = b12 / b11
@@ -181,21 +181,21 @@ def solve_tip(
     secant, tangent, sharpness, height = spring_law(model, cut.channel.front, tip_x, u)
     amount = size(u)
     along = times(1.0 / amount, u) if amount > 0.0 else times(1.0, lateral(u, 1.0, 0.0))
-    at_zero = boundary.load - times(secant, u) + stretched(along, u + fixed, tangent, secant)
+    at_zero = boundary.load - times(secant, u) + stretch(along, u + fixed, tangent, secant)
     if math.isnan(held.real):
         free = 1.0 - g1
-        y = stretched(
+        y = stretch(
             along,
             a1 + times(b11, at_zero),
             1.0 / (free + b11 * tangent * slope),
             1.0 / (free + b11 * secant * slope),
         )
-        total = at_zero - stretched(along, y, tangent * slope, secant * slope)
+        total = at_zero - stretch(along, y, tangent * slope, secant * slope)
         reaction = times(0.0, y)
     else:
         y = held
         total = times(1.0 / b11, y - a1 - times(g1, y))
-        reaction = total - at_zero + stretched(along, y, tangent * slope, secant * slope)
+        reaction = total - at_zero + stretch(along, y, tangent * slope, secant * slope)
     new_u = times(slope, y) - fixed
     left, fraction = judge(height, sharpness, 0.0, u, new_u) if secant > 0.0 else (0.0, 1.0)
     return Tip(y, a2 + times(g2, y) + times(b12, total), total, new_u, reaction, left, fraction)

@@ -78,7 +78,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     values["contact.spacing_mm"] = settings.contact_spacing_mm
     base_y = float(rng.normal(0.0, settings.start_offset_sd_mm))
     base_turn = float(rng.normal(0.0, settings.start_angle_sd))
-    values |= _displaced(scenario, rng)
+    values |= _displace_boundaries(scenario, rng)
     bend_side, run_out_side = rng.choice([-1.0, 1.0], 2).tolist()
     angle = float(rng.uniform(0.0, 2.0 * math.pi))
     cell = 0.5 * settings.contact_spacing_mm
@@ -125,7 +125,7 @@ def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
     return float(rng.uniform(min(low, most), most))
 
 
-def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+def _displace_boundaries(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
     """Return thicknesses (mm) after an independent displacement of each boundary; no layer vanishes."""
     tops = np.array(scenario.layer_tops[1:])
     bottoms = tops + rng.normal(0.0, scenario.phantom.layer_shift_sd_mm, tops.size)

@@ -17,7 +17,7 @@ from flexneedle.phantom.space import (
     add_dyad,
     add_product,
     after,
-    carried,
+    carry,
     cross,
     dot,
     inverse,
@@ -188,8 +188,8 @@ def new_offset(rod: Rod, s: State, before: Before) -> tuple[Vector, float]:
     mean = plus(t, before.tangent)
     mean = times(1.0 / length(mean), mean)
     advance = dot(moved, mean)
-    drift = carried(minus(moved, times(advance, mean)), mean, t)
-    old = carried(vector(s.offset), before.tangent, t)
+    drift = carry(minus(moved, times(advance, mean)), mean, t)
+    old = carry(vector(s.offset), before.tangent, t)
     cut = cut_length(s)
     if cut <= 0.0:
         return (minus(old, drift) if tip[0] > 0.0 else (0.0, 0.0, 0.0)), 1.0

@@ -95,7 +95,7 @@ class Phantom:
             CommandError: The command exceeds a limit of the setup.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
-        row = self._rounded(command)
+        row = self._round_to_steps(command)
         if self._limits.half_turns:
             row[ROLL] = limit_half_turn(self._rolled, row[ROLL])
         begun, turned = self._time, self._roll(float(row[ROLL]))
@@ -146,7 +146,7 @@ class Phantom:
         self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
         self._path.append((time, *self._tip().tolist()))
 
-    def _rounded(self, command: Control) -> Floats:
+    def _round_to_steps(self, command: Control) -> Floats:
         """Return the command in whole motor steps, within the limits; the rotation of the base is not rounded."""
         row = np.array(command, dtype=float)
         grid = self._truth.scenario.phantom.motor_resolution_mm

@@ -85,7 +85,7 @@ def normal_to(a: Vector) -> Vector:
 
 
 @inner
-def carried(a: Vector, old: Vector, new: Vector) -> Vector:
+def carry(a: Vector, old: Vector, new: Vector) -> Vector:
     """Return a vector across the unit vector `old`, turned by the smallest rotation that turns `old` into `new`."""
     return minus(a, times(dot(a, new) / (1.0 + dot(old, new)), plus(old, new)))
 
@@ -165,7 +165,7 @@ def less(a: Matrix, b: Matrix, c: Matrix) -> Matrix:
 
 
 @inner
-def crossed(a: Vector, m: Matrix) -> Matrix:
+def cross_columns(a: Vector, m: Matrix) -> Matrix:
     """Return the matrix whose columns are a × (columns of M)."""
     return (
         minus(times(a[1], m[2]), times(a[2], m[1])),

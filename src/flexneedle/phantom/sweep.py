@@ -13,7 +13,7 @@ from flexneedle.phantom.space import (
     Symmetric,
     Vector,
     cross,
-    crossed,
+    cross_columns,
     dot,
     full,
     length,
@@ -50,7 +50,7 @@ class _Beyond(NamedTuple):
 
 
 @inner
-def _inverted(m: Symmetric, least: float) -> tuple[bool, Symmetric]:
+def _invert(m: Symmetric, least: float) -> tuple[bool, Symmetric]:
     """Return whether all pivots of a symmetric matrix are above `least`, and its inverse."""
     a, b, c, d, e, f = m
     minor = a * d - b * b
@@ -69,7 +69,7 @@ def _own_rotation(row: Records, arm: Vector, beyond: _Beyond, curved: float) -> 
     The next node moves by δp + δ × arm, up to the second power of δ by ½ δ × (δ × arm).
     """
     pa = (cross(arm, beyond.pp[0]), cross(arm, beyond.pp[1]), cross(arm, beyond.pp[2]))
-    v = crossed(arm, total(pa, total(beyond.pt, beyond.pt)))
+    v = cross_columns(arm, total(pa, total(beyond.pt, beyond.pt)))
     x, y, z = times(0.5 * curved, beyond.force)
     along = 2.0 * (x * arm[0] + y * arm[1] + z * arm[2])
     h, tt = symmetric(row.tt), beyond.tt
@@ -89,7 +89,7 @@ def _stage(rod: Rod, row: Records, beyond: _Beyond, least: float, curved: float)
     arm, moment = times(rod.segment, vector(row.tangent)), vector(row.moment)
     w, s = _own_rotation(row, arm, beyond, curved)
     b = symmetric(row.hinge)
-    definite, m = _inverted(
+    definite, m = _invert(
         (b[0] + s[0], b[1] + s[1], b[2] + s[2], b[3] + s[3], b[4] + s[4], b[5] + s[5]), least
     )
     if not definite:

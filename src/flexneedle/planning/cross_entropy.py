@@ -1,7 +1,7 @@
 """The cross-entropy method with a full Gaussian (paper section III; Kobilarov 2012), on arrays.
 
     search_state = start(mean, sigma)
-    while not search_state.done(settings):
+    while not search_state.has_ended(settings):
         samples = sample(search_state, settings, rng)
         search_state = update(search_state, settings, samples, cost(samples))
 
@@ -71,7 +71,7 @@ class SearchState:
         """Number of iterations done."""
         return len(self.history)
 
-    def done(self, settings: Settings) -> bool:
+    def has_ended(self, settings: Settings) -> bool:
         """Return whether the search has ended."""
         return self.converged or self.iterations >= settings.iterations
 
@@ -128,7 +128,7 @@ def minimize(
 
     cost: maps samples (N, d) to costs (N,); first (n, d): samples of the first iteration (default: drawn).
     """
-    while not search_state.done(settings):
+    while not search_state.has_ended(settings):
         samples = (
             sample(search_state, settings, rng) if first is None or search_state.iterations > 0 else first
         )

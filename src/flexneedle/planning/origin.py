@@ -30,11 +30,11 @@ def check_origin(plan: Plan, scenario: Scenario) -> None:
     own_target = plan.target == scenario.target.position
     sections = [name for name in PLANNER_INPUTS if not (own_target and name == "target")]
     if (key := made.first_difference(scenario, sections)) is not None:
-        was, now = (_shown(each, key) for each in (made, scenario))
+        was, now = (_format_value(each, key) for each in (made, scenario))
         rule = "make a plan for this scenario, or use the scenario of the plan (plan.scenario)"
         raise InputError(f"{key} = {now}: the plan was made with {was}: {rule}")
 
 
-def _shown(scenario: Scenario, key: str) -> str:
+def _format_value(scenario: Scenario, key: str) -> str:
     value = scenario.flat().get(".".join(map(str, split_key(key))))
     return "none" if value is None else str(value)

@@ -92,7 +92,7 @@ def _increments(command: Control) -> tuple[float, ...]:
     return *command[:ROLL], command.roll + command.spin
 
 
-def _measured(period: Period) -> Message | None:
+def _make_measured(period: Period) -> Message | None:
     x, y, z = period.measurement.x, period.measurement.y, period.measurement.z
     if x is None or y is None or not (isfinite(x) and isfinite(y)):
         return None
@@ -143,7 +143,7 @@ FIELDS: dict[str, PeriodField] = {
     "measurement": PeriodField(
         _numbers("measured_time_s", "measured_x_mm", "measured_y_mm", "measured_z_mm"),
         Measurement,
-        (Topic("/tip/measured", _POSE, _measured),),
+        (Topic("/tip/measured", _POSE, _make_measured),),
         ("measured", _measured_point),
     ),
     "verdict": PeriodField((("verdict", parse_verdict),), page=("verdict", str)),

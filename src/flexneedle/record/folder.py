@@ -150,14 +150,14 @@ def read_run(folder: Path) -> RunFile:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}") from None
-    return _checked(path, values)
+    return _check_run(path, values)
 
 
 def _folder_of(file: Path) -> str:
     return f", here {file.parent}" if (file.parent / RUN_FILE).is_file() else ""
 
 
-def _checked(path: Path, values: Any) -> RunFile:
+def _check_run(path: Path, values: Any) -> RunFile:
     if not isinstance(values, dict) or values.get("format") != _FORMAT:
         raise InputError(f"{path}: not a run of this version of flexneedle: format must be {_FORMAT}")
     try:

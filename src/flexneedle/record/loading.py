@@ -19,7 +19,7 @@ def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
     recorded, and of an incomplete trace. Raises InputError if the folder contains no run or is damaged, RunError if the
     run ended before it had a plan.
     """
-    run = _planned(read_run(check_path("run_dir", run_dir)))
+    run = _require_plans(read_run(check_path("run_dir", run_dir)))
     found: Insertion | Plan | dict[str, Plan]
     if run.kind == "insertion":
         found, note = insertion_of(run)
@@ -39,7 +39,7 @@ def load_insertion(folder: Path) -> tuple[Insertion, str]:
     run = read_run(folder)
     if run.kind != "insertion":
         raise InputError(f"{folder}: contains a {run.kind}, not an insertion")
-    return insertion_of(_planned(run))
+    return insertion_of(_require_plans(run))
 
 
 def insertion_of(run: RunFile) -> tuple[Insertion, str]:
@@ -60,7 +60,7 @@ def unfinished_note(run: RunFile) -> str:
     return f"{run.folder}: {_UNFINISHED}" if run.status == "running" else ""
 
 
-def _planned(run: RunFile) -> RunFile:
+def _require_plans(run: RunFile) -> RunFile:
     if not run.plans:
         raise RunError(f"{run.folder}: the run ended before planning finished")
     return run

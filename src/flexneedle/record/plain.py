@@ -57,14 +57,14 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
     deeper = indent + " "
     if isinstance(value, dict) and value:
         opened = [(f"{_dump(key)}: ", item) for key, item in value.items()]
-        yield from _wrapped("{}", opened, indent, deeper)
+        yield from _wrap_items("{}", opened, indent, deeper)
     elif isinstance(value, list) and any(isinstance(item, list | dict) for item in value) and len(indent) < 4:
-        yield from _wrapped("[]", [("", item) for item in value], indent, deeper)
+        yield from _wrap_items("[]", [("", item) for item in value], indent, deeper)
     else:
         yield _dump(value)
 
 
-def _wrapped(brackets: str, items: list[tuple[str, Any]], indent: str, deeper: str) -> Iterator[str]:
+def _wrap_items(brackets: str, items: list[tuple[str, Any]], indent: str, deeper: str) -> Iterator[str]:
     yield brackets[0]
     for number, (opening, item) in enumerate(items):
         yield f"{',' if number else ''}\n{deeper}{opening}"

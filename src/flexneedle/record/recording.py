@@ -99,7 +99,7 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
     periods: list[Period] = []
     parts = {name: folder.values[name] for name in PARTS}
 
-    def ended(outcome: Outcome, reason: str) -> Insertion:
+    def end(outcome: Outcome, reason: str) -> Insertion:
         record = {**choices.parts, **choices.rig.results(), "scenario": scenario}
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, **record)
 
@@ -113,14 +113,14 @@ def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, st
         try:
             return carry_out(scenario, plan, choices, Stream((keep, *stream.listeners), stream.gate))
         except KeyboardInterrupt:
-            insertion = ended(Outcome.INTERRUPTED, BY_USER)
+            insertion = end(Outcome.INTERRUPTED, BY_USER)
         except StoppedError as error:  # before the first motion; later `insert` returns it
-            insertion = ended(Outcome.INTERRUPTED, one_line(error))
+            insertion = end(Outcome.INTERRUPTED, one_line(error))
         except RecordError as error:  # the insertion is no longer recorded: the needle is held
-            insertion = ended(Outcome.HELD, one_line(error))
+            insertion = end(Outcome.HELD, one_line(error))
         except FlexneedleError as error:
             outcome = Outcome.FAILED if periods else Outcome.REFUSED
-            note_result(folder, ended(outcome, one_line(error)))
+            note_result(folder, end(outcome, one_line(error)))
             raise
         stream.send(Ended(insertion))
         return insertion

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Self
 from mcap.writer import CompressionType, Writer
 
 from flexneedle.errors import RecordError
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 from flexneedle.record.messages import STORE
 from flexneedle.record.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
 from flexneedle.results import Period, Plan
@@ -48,7 +48,7 @@ class TraceWriter:
         self, path: Path, plan: Plan, *, about: Mapping[str, str], scenario: Mapping[str, Any]
     ) -> None:
         self._path, self._count = path, 0
-        self._file = _opened(path)
+        self._file = _open_new(path)
         self._writer = Writer(self._file, chunk_size=_CHUNK_SIZE, compression=CompressionType.NONE)
         try:
             with self._writing():
@@ -85,7 +85,7 @@ class TraceWriter:
     def _writing(self) -> Iterator[None]:
         """Delay Ctrl-C until a record is written. If it cannot be, close the file as it is."""
         try:
-            with uninterrupted():
+            with delay_signals():
                 yield
         except OSError as error:
             with suppress(OSError):  # the buffer cannot be written either
@@ -116,7 +116,7 @@ class TraceWriter:
         self._count += 1
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open_new(path: Path) -> BinaryIO:
     try:
         return path.open("xb", buffering=_CHUNK_SIZE)
     except FileExistsError:

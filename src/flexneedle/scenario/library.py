@@ -42,7 +42,7 @@ class Library:
         names = (entry.name for entry in self.folder.iterdir())
         return sorted(name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
 
-    def shipped(self, name: str) -> dict[str, Any]:
+    def read_shipped(self, name: str) -> dict[str, Any]:
         """Return the nested tables of a file that comes with the package."""
         if self.folder is None:
             raise KeyError(name)
@@ -54,8 +54,8 @@ class Library:
         Raises `error` with the file and the problem.
         """
         if isinstance(source, str) and source in self.names():
-            return self.shipped(source)
-        return self._parsed(self._bytes(source), label(source))
+            return self.read_shipped(source)
+        return self._parse(self._bytes(source), label(source))
 
     def load(self, source: str | Path, model: type[Model]) -> Model:
         """Return the checked contents of a file.
@@ -86,7 +86,7 @@ class Library:
             raise self.error(f"{opening}: larger than {_LARGEST_FILE} bytes, not {self.kind}")
         return data
 
-    def _parsed(self, data: bytes, opening: str) -> dict[str, Any]:
+    def _parse(self, data: bytes, opening: str) -> dict[str, Any]:
         try:
             return tomllib.loads(data.decode("utf-8-sig"))
         except UnicodeDecodeError as error:

@@ -109,7 +109,7 @@ class Scenario(Section):
             )
         values = self.values()
         for key, value in changes.items():
-            set_value(values, key, _expanded(key, value))
+            set_value(values, key, _expand_environment(key, value))
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mappin
     return values if sections is None else {name: values[name] for name in sections}
 
 
-def _expanded(key: str, value: Any) -> Any:
+def _expand_environment(key: str, value: Any) -> Any:
     """Return the table of an environment's name, for later changes of its values; any other value unchanged."""
     known = key == _ENVIRONMENT and value in ENVIRONMENTS.names()
     return expand_environment(value) if known else value

@@ -92,7 +92,7 @@ def find_doubts(scenario: Scenario) -> list[str]:
     A value is implausible if it is half an order of magnitude or more outside the usual range, if it has no effect, or
     if it holds the needle from the start.
     """
-    return [*_unusual(scenario), *_unused(scenario), *_stale(scenario)]
+    return [*_unusual(scenario), *_find_unused(scenario), *_stale(scenario)]
 
 
 def _unusual(scenario: Scenario) -> Iterator[str]:
@@ -109,7 +109,7 @@ def _unusual(scenario: Scenario) -> Iterator[str]:
         yield f"{key_path(split_key(key))} = {value:g}: {line}"
 
 
-def _unused(scenario: Scenario) -> Iterator[str]:
+def _find_unused(scenario: Scenario) -> Iterator[str]:
     last = len(scenario.tissue) - 1
     thickness = scenario.tissue[last].thickness_mm
     if thickness is not None:

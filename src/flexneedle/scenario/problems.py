@@ -33,7 +33,7 @@ def refuse(problems: Iterable[Problem]) -> None:
 def to_line(problem: Problem) -> str:
     """Return a problem as `key = value: rule`."""
     path = key_path(_path(problem.key)) or "scenario"
-    shown = "" if problem.value is None else f" = {_shown(problem.value)}"
+    shown = "" if problem.value is None else f" = {_format_value(problem.value)}"
     return make_printable(f"{path}{shown}: {problem.rule}")
 
 
@@ -82,14 +82,16 @@ def _path(key: str | tuple[str | int, ...]) -> Sequence[str | int]:
     return split_key(key) if isinstance(key, str) else key
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     """Return a value in one short line, much as TOML writes it."""
     if isinstance(value, Mapping):
         text = "{…}"
     elif isinstance(value, bool | str):
         text = json.dumps(value, ensure_ascii=False)
     elif isinstance(value, list | tuple):
-        text = "[" + ", ".join(_shown(item) for item in value[:5]) + (", …]" if len(value) > 5 else "]")
+        text = (
+            "[" + ", ".join(_format_value(item) for item in value[:5]) + (", …]" if len(value) > 5 else "]")
+        )
     elif isinstance(value, int) and value.bit_length() > 200:
         text = "a very large number"
     else:

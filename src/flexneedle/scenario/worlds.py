@@ -122,7 +122,10 @@ def _in_space(number: int, scenario: Scenario, name: str) -> Scenario:
         return scenario.with_values(rig.values)
     angle = np.random.default_rng([_DIRECTION_STREAM, number]).uniform(0.0, 2.0 * math.pi)
     offset = cmath.rect(abs(scenario.target.lateral_mm), angle)
-    target = {"target.lateral_mm": _rounded(offset.real), "target.lateral_z_mm": _rounded(offset.imag)}
+    target = {
+        "target.lateral_mm": _round_value(offset.real),
+        "target.lateral_z_mm": _round_value(offset.imag),
+    }
     return scenario.with_values({**rig.values, **target})
 
 
@@ -159,16 +162,16 @@ def structural(number: int, scenario: Scenario) -> dict[str, Any]:
     to the tip.
     """
     rng = np.random.default_rng([_STRUCTURE_STREAM, number])
-    thickness = _rounded(rng.uniform(1.0, 4.0))
-    top = _rounded(rng.uniform(0.0, scenario.target.depth_mm - thickness))
-    factor = _rounded(rng.uniform(3.0, 6.0))
+    thickness = _round_value(rng.uniform(1.0, 4.0))
+    top = _round_value(rng.uniform(0.0, scenario.target.depth_mm - thickness))
+    factor = _round_value(rng.uniform(3.0, 6.0))
     room = 0.5 * ((scenario.setup.guide_to_skin_mm or 0.0) - scenario.setup.tip_to_skin_mm)
     kinds: list[tuple[str, Any]] = [
-        ("alpha", _rounded(rng.uniform(3.0, 20.0))),
-        ("compression_length_factor", _rounded(rng.uniform(0.7, 1.5))),
-        ("bevel_length_factor", _rounded(rng.uniform(0.5, 2.0))),
+        ("alpha", _round_value(rng.uniform(3.0, 20.0))),
+        ("compression_length_factor", _round_value(rng.uniform(0.7, 1.5))),
+        ("bevel_length_factor", _round_value(rng.uniform(0.5, 2.0))),
         ("hidden_layer", {"top_mm": top, "thickness_mm": thickness, "modulus_factor": factor}),
-        ("guide_shift_mm", _rounded(rng.uniform(-3.0, min(3.0, room)))),
+        ("guide_shift_mm", _round_value(rng.uniform(-3.0, min(3.0, room)))),
     ]
     key, value = kinds[int(rng.integers(len(kinds)))]
     return {f"phantom.structure.{key}": value}
@@ -177,12 +180,12 @@ def structural(number: int, scenario: Scenario) -> dict[str, Any]:
 def _real(number: int) -> Scenario:
     rng = np.random.default_rng([_STREAM, number])
     needle = _needle(rng)
-    bevel = _rounded(rng.uniform(1.0, 5.0))
-    depth = _rounded(rng.uniform(25.0, 95.0))
-    lateral = _rounded(rng.uniform(-0.11, 0.11) * depth)
+    bevel = _round_value(rng.uniform(1.0, 5.0))
+    depth = _round_value(rng.uniform(25.0, 95.0))
+    lateral = _round_value(rng.uniform(-0.11, 0.11) * depth)
     tissue = _tissue(rng, depth)
     setup, length = _setup(rng, depth)
-    base = Scenario.from_values(PRESETS.shipped("phantom")).values()
+    base = Scenario.from_values(PRESETS.read_shipped("phantom")).values()
     layer = base["tissue"][0]
     values: dict[str, Any] = {
         "name": f"World {number}",
@@ -196,7 +199,7 @@ def _real(number: int) -> Scenario:
     return Scenario.from_values({**base, **values}, source=f"world {number}")
 
 
-def _rounded(value: float) -> float:
+def _round_value(value: float) -> float:
     """Return three decimals: short, and written to a file without loss."""
     return round(float(value), 3)
 
@@ -205,7 +208,7 @@ def _needle(rng: np.random.Generator) -> dict[str, object]:
     if rng.random() < 0.7:
         gauge = _STEEL_GAUGES[int(rng.integers(len(_STEEL_GAUGES)))]
         return {"gauge": gauge, "stylet": bool(rng.random() < 0.5), "youngs_modulus_gpa": 200.0}
-    return {"outer_diameter_mm": _rounded(rng.uniform(0.5, 1.1)), "youngs_modulus_gpa": 60.0}
+    return {"outer_diameter_mm": _round_value(rng.uniform(0.5, 1.1)), "youngs_modulus_gpa": 60.0}
 
 
 def _tissue(rng: np.random.Generator, depth: float) -> list[dict[str, object]]:
@@ -217,8 +220,8 @@ def _tissue(rng: np.random.Generator, depth: float) -> list[dict[str, object]]:
     return [
         {
             "name": f"layer {k + 1}",
-            "shear_modulus_kpa": _rounded(modulus),
-            **({"thickness_mm": _rounded(thickness[k])} if k < count - 1 else {}),
+            "shear_modulus_kpa": _round_value(modulus),
+            **({"thickness_mm": _round_value(thickness[k])} if k < count - 1 else {}),
         }
         for k, modulus in enumerate(moduli)
     ]
@@ -226,9 +229,9 @@ def _tissue(rng: np.random.Generator, depth: float) -> list[dict[str, object]]:
 
 def _setup(rng: np.random.Generator, depth: float) -> tuple[dict[str, float], float]:
     """Return the apparatus, and a needle long enough for it (mm)."""
-    distance = _rounded(rng.uniform(15.0, 60.0)) if rng.random() < 0.8 else None
-    gap = _rounded(rng.uniform(1.0, 60.0 if distance is None else 0.9 * distance))
-    stroke = _rounded(gap + depth + rng.uniform(5.0, 20.0))
-    length = _rounded(stroke - gap + (distance or 0.0) + rng.uniform(10.0, 40.0))
+    distance = _round_value(rng.uniform(15.0, 60.0)) if rng.random() < 0.8 else None
+    gap = _round_value(rng.uniform(1.0, 60.0 if distance is None else 0.9 * distance))
+    stroke = _round_value(gap + depth + rng.uniform(5.0, 20.0))
+    length = _round_value(stroke - gap + (distance or 0.0) + rng.uniform(10.0, 40.0))
     guide = {} if distance is None else {"guide_to_skin_mm": distance}
     return {**guide, "tip_to_skin_mm": gap, "stroke_mm": stroke}, length

@@ -16,7 +16,7 @@ from flexneedle.arguments import check_instance, check_whole, make_refusal
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.lateral import Lateral, turned
+from flexneedle.mechanics.lateral import Lateral, rotate
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
@@ -101,7 +101,7 @@ class Simulator:
         def across(value: complex) -> Lateral:
             return complex(value) if self.scenario.setup.axes == 2 else value.real
 
-        bevel, none, entry = turned(roll, one), 0.0 * one, self.scenario.entry
+        bevel, none, entry = rotate(roll, one), 0.0 * one, self.scenario.entry
         rest, slope = np.full(self._model.nodes.size, none), across(entry.slope)
         base, tip = (
             nd.NodePose(x, across(entry.lateral(x)), slope)

@@ -67,7 +67,7 @@ class ControllerConformance:
         raise NotImplementedError("make: define it in your class, and return your part")
 
     def _plan(self) -> Plan:
-        return _planned(self.scenario, self.strategy)
+        return _make_plan(self.scenario, self.strategy)
 
     @classmethod
     @cache
@@ -166,14 +166,14 @@ class ControllerConformance:
 
 
 @cache
-def _planned(scenario: Scenario | None, strategy: str) -> Plan:
+def _make_plan(scenario: Scenario | None, strategy: str) -> Plan:
     return plan(scenario or short_scenario(), strategy=strategy, seed=0)
 
 
 def _insert(controller: Controller, scenario: Scenario, planned: Plan, seed: int) -> _Run:
     planned = copy.deepcopy(planned)  # a controller may change it
     arrays = {name: getattr(planned, name).copy() for name in _ARRAYS}
-    with _recorded(controller) as calls:
+    with _record_calls(controller) as calls:
         insertion = insert(
             scenario, planned, seed, controller=controller, rig=VirtualRig("model"), force=True, threads=1
         )
@@ -181,7 +181,7 @@ def _insert(controller: Controller, scenario: Scenario, planned: Plan, seed: int
 
 
 @contextmanager
-def _recorded(controller: Controller) -> Iterator[list[_Call]]:
+def _record_calls(controller: Controller) -> Iterator[list[_Call]]:
     """Record the calls of `decide`, of the object itself: a copy would be another controller of this name."""
     calls: list[_Call] = []
     original = controller.decide

@@ -33,7 +33,7 @@ class PlantConformance:
     def _truth(self) -> Truth:
         return Truth(self.scenario or short_scenario())
 
-    def _inserted(self, roll: float = 0.0, steps: int = 12) -> Plant:
+    def _insert_steps(self, roll: float = 0.0, steps: int = 12) -> Plant:
         """Return a plant after steps of 1 mm."""
         plant = self.make(self._truth(), roll)
         for _ in range(steps):
@@ -46,7 +46,7 @@ class PlantConformance:
 
     def test_tip_is_a_pose(self) -> None:
         """Require a tip of five finite numbers, at the start and in the tissue."""
-        for plant in (self.make(self._truth(), 0.0), self._inserted()):
+        for plant in (self.make(self._truth(), 0.0), self._insert_steps()):
             require(np.shape(plant.tip) == (5,), f"tip must have the shape (5,), not {np.shape(plant.tip)}")
             require_finite("tip", plant.tip)
 
@@ -62,7 +62,7 @@ class PlantConformance:
 
     def test_base_moves_the_tip_in_millimetres(self) -> None:
         """Require that the tip advances as far as the base, within 0.5 mm in 10 mm."""
-        before, after = self._inserted(steps=0).tip[X], self._inserted(steps=10).tip[X]
+        before, after = self._insert_steps(steps=0).tip[X], self._insert_steps(steps=10).tip[X]
         require(
             abs(after - before - 10.0) < _MOST_SLIP, f"10 mm of the base moved the tip by {after - before} mm"
         )
@@ -79,12 +79,12 @@ class PlantConformance:
 
     def test_path_bends_towards_the_bevel(self) -> None:
         """Require that the needle ends further towards +y with roll 0 than with roll π."""
-        up, down = (float(self._inserted(roll).tip[Y]) for roll in (0.0, math.pi))
+        up, down = (float(self._insert_steps(roll).tip[Y]) for roll in (0.0, math.pi))
         require(up > down, f"roll 0 must bend towards +y: y = {up} mm, with roll π {down} mm")
 
     def test_still_command_moves_nothing(self) -> None:
         """Require the same tip after a command of zeros."""
-        plant = self._inserted()
+        plant = self._insert_steps()
         before = np.array(plant.tip)
         plant.step(np.array(STILL))
         require(
@@ -93,7 +93,7 @@ class PlantConformance:
 
     def test_reading_changes_nothing(self) -> None:
         """Require equal values from repeated reads."""
-        plant = self._inserted()
+        plant = self._insert_steps()
         before, after = _read(plant), _read(plant)
         require(before == after, f"reads must not change the plant: {before}, then {after}")
 
@@ -108,7 +108,7 @@ class PlantConformance:
 
     def test_energy_and_stretch_are_physical(self) -> None:
         """Require a finite energy of at least 0 mJ, a stretch above 0, and whether all steps converged."""
-        for plant in (self.make(self._truth(), 0.0), self._inserted()):
+        for plant in (self.make(self._truth(), 0.0), self._insert_steps()):
             require_finite("strain_energy", plant.strain_energy)
             require(
                 plant.strain_energy >= 0.0, f"strain_energy must be at least 0, not {plant.strain_energy}"
@@ -132,7 +132,7 @@ class PlantConformance:
 
     def test_nodes_end_at_the_tip(self) -> None:
         """Require `nodes`, where the plant has them, of shape (N + 1, 3) with the tip last."""
-        plant = self._inserted()
+        plant = self._insert_steps()
         nodes = getattr(plant, "nodes", None)
         if nodes is None:
             return

@@ -37,14 +37,14 @@ class TipTrackerConformance:
         """Return the tracker of a phantom; rng: randomness of its noise."""
         raise NotImplementedError("make: define it in your class, and return your part")
 
-    def _made(self, seed: int = 0) -> tuple[TipTracker, Phantom, Scenario]:
+    def _make_tracker(self, seed: int = 0) -> tuple[TipTracker, Phantom, Scenario]:
         scenario = self.scenario or short_scenario()
         phantom = Phantom(Truth(scenario), 0.0, "model")
         return self.make(scenario, phantom, np.random.default_rng(seed)), phantom, scenario
 
     def _readings(self, seed: int = 0) -> tuple[list[Measurement], Phantom]:
         """Return the readings of ten steps of 1 mm in 0.5 s each, and the phantom."""
-        tracker, phantom, _ = self._made(seed)
+        tracker, phantom, _ = self._make_tracker(seed)
         found = list(tracker.read())
         for _ in range(10):
             phantom.apply(Control(db_x=1.0), _STEP_S)
@@ -53,13 +53,13 @@ class TipTrackerConformance:
 
     def test_has_the_parts_of_the_port(self) -> None:
         """Require `read`, and `status` as text."""
-        tracker, _, _ = self._made()
+        tracker, _, _ = self._make_tracker()
         require_parts("the tracker", tracker, "read", "status")
         require(isinstance(tracker.status, str), f"status must be text, not {tracker.status!r}")
 
     def test_read_returns_measurements(self) -> None:
         """Require a tuple of Measurement."""
-        tracker, _, _ = self._made()
+        tracker, _, _ = self._make_tracker()
         found = tracker.read()
         require(isinstance(found, tuple), f"read must return a tuple, not {type(found).__name__}")
         kinds = {type(one).__name__ for one in found}
@@ -67,7 +67,7 @@ class TipTrackerConformance:
 
     def test_tip_is_measured_before_the_needle_moves(self) -> None:
         """Require a position in the first read, not older than `control.stale_after_s`."""
-        tracker, phantom, scenario = self._made()
+        tracker, phantom, scenario = self._make_tracker()
         known = [one for one in tracker.read() if one.x is not None]
         require(known, "the first read must have a position: the needle does not move without one")
         age, limit = phantom.now() - known[-1].time, scenario.control.stale_after_s
@@ -89,7 +89,7 @@ class TipTrackerConformance:
 
     def test_each_reading_is_returned_once(self) -> None:
         """Require no reading in a second read at the same time."""
-        tracker, phantom, _ = self._made()
+        tracker, phantom, _ = self._make_tracker()
         phantom.wait(1.0)
         tracker.read()
         again = tracker.read()
@@ -97,7 +97,7 @@ class TipTrackerConformance:
 
     def test_read_neither_waits_nor_moves(self) -> None:
         """Require that a read leaves clock and needle as they are."""
-        tracker, phantom, _ = self._made()
+        tracker, phantom, _ = self._make_tracker()
         phantom.wait(0.2)
         before = phantom.now(), phantom.condition().tip.tolist()
         tracker.read()
@@ -106,7 +106,7 @@ class TipTrackerConformance:
 
     def test_readings_arrive_before_they_are_stale(self) -> None:
         """Require readings no further apart than `control.stale_after_s`."""
-        tracker, phantom, scenario = self._made()
+        tracker, phantom, scenario = self._make_tracker()
         times = [one.time for one in tracker.read()]
         for _ in range(20):
             phantom.wait(0.1)

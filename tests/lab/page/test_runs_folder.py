@@ -89,8 +89,8 @@ def test_no_other_name_is_a_run_or_a_study_or_one_to_save_under(runs):
     for file in ("run.json", "study.json"):
         (runs / "no run" / file).symlink_to(runs.parent / "secret" / "run.json")
     assert [entry["name"] for entry in folder.list_runs()] == ["many", "newer", "older"]
-    assert (folder.run("older"), folder.study("many")) == (runs / "older", runs / "many")
-    for find, names in ((folder.run, [*OTHERS, "many"]), (folder.study, [*OTHERS, "older"])):
+    assert (folder.find_run("older"), folder.find_study("many")) == (runs / "older", runs / "many")
+    for find, names in ((folder.find_run, [*OTHERS, "many"]), (folder.find_study, [*OTHERS, "older"])):
         for name in names:
             with pytest.raises(Refusal, match="of this name in the folder of runs"):
                 find(name)

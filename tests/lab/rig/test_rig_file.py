@@ -53,7 +53,7 @@ def test_an_axis_is_in_counts_mm_rad_and_s():
     assert (turned.max_error, turned.tolerance) == pytest.approx((quarter / 18, quarter / 90))
     assert (guide.scale, guide.limits, guide.speed, guide.acceleration) == (-500.0, (-15.0, 15.0), 5.0, 50.0)
     assert (guide.at_home, guide.backlash, guide.max_error, guide.tolerance) == (-3.0, 0.05, 0.2, 0.02)
-    assert (axes.insertion.shown(12.5), turned.shown(math.pi)) == ("12.5", "180")
+    assert (axes.insertion.to_text(12.5), turned.to_text(math.pi)) == ("12.5", "180")
     assert (axes.insertion.unit, turned.unit) == ("mm", "deg")
 
 

@@ -182,7 +182,7 @@ def test_a_profile_without_the_topic_is_refused(tmp_path, key):
         load_checked_profile(RosSettings(profile=str(path), **{key: True}))
 
 
-def test_a_section_of_the_rig_without_a_follower_is_refused():
+def test_a_rig_with_topics_needs_a_bridge_among_the_listeners():
     rig = SupervisedRig(RigFile.model_validate(RIG | {"ros": {"arm": True}}))
     with pytest.raises(RigError, match=r"^ros: "), rig.open(SCENARIO, make_plan(), 0, Stream()):
         pass

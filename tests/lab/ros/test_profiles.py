@@ -41,7 +41,7 @@ def topics_of(name):
 
 def write(path, **changes):
     """Write the neutral profile with `section__key` changed, or left out."""
-    values = PROFILES.shipped("neutral")
+    values = PROFILES.read_shipped("neutral")
     for key, value in changes.items():
         section, _, part = key.partition("__")
         values[section] = {**values[section], part: value}

@@ -45,7 +45,7 @@ def test_a_row_becomes_a_run_in_the_folder_of_the_study(capsys, study):
 @pytest.mark.usefixtures("study")
 def test_a_row_that_was_computed_before_is_drawn_again(capsys, monkeypatch):
     _, figures, _ = run(capsys, "view", "mine", "--row", "1")
-    monkeypatch.setattr(view, "_recomputed", None)
+    monkeypatch.setattr(view, "_recompute_row", None)
     note = "flexneedle: mine/rows/row-000001: computed before: remove it to compute the row again\n"
     assert run(capsys, "view", "mine", "--row", "1") == (0, figures, note)
 

@@ -175,6 +175,6 @@ class _UserGate(Gate):
         rig.take_signals()
         if not self._moves:
             return
-        with self._progress.paused():
+        with self._progress.pause_display():
             lines = [*describe_insertion(rig.rig, self._scenario, rig.positions), ARMS]
             confirm_motions(lines, self._question)

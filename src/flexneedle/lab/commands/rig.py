@@ -181,7 +181,10 @@ def _check(args: argparse.Namespace) -> int:
     from flexneedle.lab.ros.topic_check import check_ros
 
     rig, clock = load_rig(args.rig), WallClock()
-    findings = [*check_rig(rig, clock, args.seconds, _wanted(args)), *check_ros(rig, clock, args.seconds)]
+    findings = [
+        *check_rig(rig, clock, args.seconds, _load_intended(args)),
+        *check_ros(rig, clock, args.seconds),
+    ]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
         lines = [
@@ -196,7 +199,7 @@ def _check(args: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
-def _wanted(args: argparse.Namespace) -> IntendedInsertion | None:
+def _load_intended(args: argparse.Namespace) -> IntendedInsertion | None:
     from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion
     from flexneedle.scenario.files import load_scenario
 
@@ -253,7 +256,7 @@ def _retract(args: argparse.Namespace) -> int:
     position = _read_positions(rig)["insertion"]
     move = plan_retraction(rig, position, args.to, args.speed)
     if move is None:
-        at, end = map(rig.axes.insertion.shown, (position, withdrawn_position(rig)))
+        at, end = map(rig.axes.insertion.to_text, (position, withdrawn_position(rig)))
         print(
             f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
             file=sys.stderr,
@@ -323,11 +326,11 @@ def _arm(operator: SupervisorClient) -> None:
 @contextmanager
 def _stop_on_error(operator: SupervisorClient) -> Iterator[None]:
     """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
-    from flexneedle.interrupts import uninterrupted
+    from flexneedle.interrupts import delay_signals
 
     try:
         yield
     except BaseException:
-        with uninterrupted():
+        with delay_signals():
             operator.stop()
         raise

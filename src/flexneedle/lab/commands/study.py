@@ -127,12 +127,12 @@ class _StudyProgress:
         planning, inserting = _STAGES
         if not self._planned:
             self._planned = advance.plans == advance.all_plans
-            left = self._planning.left(advance.plans, advance.all_plans)
+            left = self._planning.format_remaining(advance.plans, advance.all_plans)
             note = f"{advance.plans} of {advance.all_plans} plans{left}"
             total = max(advance.all_plans, 1)
             self._progress.show(planning, total if self._planned else advance.plans, total, note)
         note = f"{advance.insertions} of {advance.all_insertions}"
-        note += self._inserting.left(advance.insertions, advance.all_insertions)
+        note += self._inserting.format_remaining(advance.insertions, advance.all_insertions)
         note += f", {advance.unfinished} not finished" if advance.unfinished else ""
         self._progress.show(inserting, advance.insertions, advance.all_insertions, note)
 
@@ -144,7 +144,7 @@ class _Pace:
         self._before: int | None = None  # completed by an earlier run of the study
         self._first: tuple[float, int] | None = None  # time and count at the first completion
 
-    def left(self, done: int, total: int) -> str:
+    def format_remaining(self, done: int, total: int) -> str:
         """Return rate and remaining time to append to a note; empty while unknown."""
         rate = self._rate(time.monotonic(), done)
         return f", {rate:.2g}/s, {_duration((total - done) / rate)} left" if rate else ""

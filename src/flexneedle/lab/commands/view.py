@@ -89,11 +89,11 @@ def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
         print_note(f"{folder}: computed before: remove it to compute the row again")
         return folder, []
     compile_first()
-    save(_recomputed(study, index), folder)
+    save(_recompute_row(study, index), folder)
     return folder, sorted(path for path in folder.iterdir() if path.suffix in _FIGURES)
 
 
-def _recomputed(study: Path, index: int) -> Insertion:
+def _recompute_row(study: Path, index: int) -> Insertion:
     from flexneedle.cli.progress import Progress
     from flexneedle.lab.study.recompute import recompute
 

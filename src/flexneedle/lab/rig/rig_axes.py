@@ -118,7 +118,7 @@ class Axis(Section):
         """Direction in which the axis moves to the limit switch of its home, 1 or −1; 0 without one."""
         return self.direction * {"forward-limit": 1, "reverse-limit": -1}.get(self.home, 0)
 
-    def shown(self, value: float) -> str:
+    def to_text(self, value: float) -> str:
         """Return a position, distance or speed (mm or rad, and s) as text in the unit of the file, such as "12.5"."""
         return f"{round(value / self.size, 6) + 0.0:.7g}"  # not -0
 
@@ -184,12 +184,12 @@ class RotaryAxis(Axis):
 
 def _problems_of(axis: Axis) -> Iterator[Problem]:
     """Yield broken rules between the keys of an axis. Keys end in the axis's unit."""
-    unit, shown, (low, high) = axis.unit, axis.shown, axis.limits
+    unit, shown, (low, high) = axis.unit, axis.to_text, axis.limits
     limits = [float(shown(low)), float(shown(high))]
     if low >= high:
         yield Problem(f"range_{unit}", limits, "must be [lowest, highest]")
         return
-    if (rule := _misplaced(axis, low, high)) and axis.home != "absolute":
+    if (rule := _find_home_problem(axis, low, high)) and axis.home != "absolute":
         yield Problem(f"home_{unit}", float(shown(axis.at_home)), rule)
     if axis.backlash >= high - low:
         rule = f"must be below {shown(high - low)}, the width of range_{unit}"
@@ -199,15 +199,15 @@ def _problems_of(axis: Axis) -> Iterator[Problem]:
         yield Problem(f"tolerance_{unit}", float(shown(axis.tolerance)), rule)
 
 
-def _misplaced(axis: Axis, low: float, high: float) -> str:
+def _find_home_problem(axis: Axis, low: float, high: float) -> str:
     """Return the rule that the home of an axis breaks, or "". A limit switch is not between the soft limits."""
     home, end = axis.at_home, axis.to_home
     if end == 0 and not low - _ROUNDING <= home <= high + _ROUNDING:
-        return f"must be within range_{axis.unit}, {axis.shown(low)} to {axis.shown(high)}"
+        return f"must be within range_{axis.unit}, {axis.to_text(low)} to {axis.to_text(high)}"
     if end < 0 and home > low + _ROUNDING:
-        return f"must be at most {axis.shown(low)}: {_SWITCH.format(axis.home, 'low', axis.unit)}"
+        return f"must be at most {axis.to_text(low)}: {_SWITCH.format(axis.home, 'low', axis.unit)}"
     if end > 0 and home < high - _ROUNDING:
-        return f"must be at least {axis.shown(high)}: {_SWITCH.format(axis.home, 'high', axis.unit)}"
+        return f"must be at least {axis.to_text(high)}: {_SWITCH.format(axis.home, 'high', axis.unit)}"
     return ""
 
 

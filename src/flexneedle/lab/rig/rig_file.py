@@ -124,7 +124,7 @@ def _queue_problems(rig: RigFile) -> Iterator[Problem]:
     name, axis = max(linear, key=lambda one: one[1].tolerance)
     least = _LEAST_QUEUE * axis.tolerance
     if rig.loop.queue_mm < least * (1.0 - _ROUNDING):
-        rule = f"must be at least {axis.shown(least)}, twice tolerance_mm of axes.{name}: a motor may rest one away"
+        rule = f"must be at least {axis.to_text(least)}, twice tolerance_mm of axes.{name}: a motor may rest one away"
         yield Problem("loop.queue_mm", rig.loop.queue_mm, rule)
 
 

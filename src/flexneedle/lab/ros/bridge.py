@@ -11,7 +11,7 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import RigError, RunError, StoppedError, describe_error
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 from flexneedle.lab.rig.rig_file import RosSettings
 from flexneedle.lab.rig.supervised import Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
@@ -84,7 +84,7 @@ class Bridge(Gate):
 
     def close(self) -> None:
         """Publish the last state and end the node."""
-        with uninterrupted():  # an interrupt could leave the event's lock locked, and the thread waits for it
+        with delay_signals():  # an interrupt could leave the event's lock locked, and the thread waits for it
             self._ended.set()
         self._thread.join()
         if self._supervisor is None:
@@ -144,7 +144,7 @@ class Bridge(Gate):
         Earlier arms do not count. Raises StoppedError after a stop.
         """
         self._shift = self._now() - rig.now()
-        with uninterrupted(), self._lock:
+        with delay_signals(), self._lock:
             self._supervisor, stopped = rig, self._stopped
         if stopped:
             rig.request_stop(stopped)

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from flexneedle.errors import InputError
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.scenario.problems import Problem, to_line
 
@@ -47,7 +47,7 @@ class StudyJournal:
         """Add rows; returns once they are on disk."""
         added = list(rows)
         text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in added)
-        with uninterrupted():
+        with delay_signals():
             self._file.write(text.encode())
             self._file.flush()
             os.fsync(self._file.fileno())

@@ -46,7 +46,7 @@ def check_not_a_number(measurement: Measurement) -> Verdict:
     """Require finite time, coordinates, direction, points and covariances; the verdict names the others."""
     bad = [
         f"{name} {wrong[0]}"
-        for name, values in _reported(measurement)
+        for name, values in _list_numbers(measurement)
         if (wrong := [value for value in values if value is not None and not math.isfinite(value)])
     ]
     return Verdict(VerdictKind.NOT_A_NUMBER, ", ".join(bad)) if bad else OK
@@ -169,7 +169,7 @@ def _largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, flo
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
 
 
-def _reported(measurement: Measurement) -> Iterator[tuple[str, Iterable[float | None]]]:
+def _list_numbers(measurement: Measurement) -> Iterator[tuple[str, Iterable[float | None]]]:
     """Return the numbers of a reading by name, None if not measured, without the sensors of its frame."""
     yield "time", (measurement.time,)
     yield "x", (measurement.x,)

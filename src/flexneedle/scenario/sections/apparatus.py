@@ -185,14 +185,14 @@ class Entry(Section):
         """Return the nearest permitted change of the slope (rad) that keeps its limit on each axis."""
         most = 1e-3 * self.free_slope_mrad
         free = _within(change, most)
-        y, z = self._kept(free)
+        y, z = self._clip_change(free)
         if y != free.real:  # leaves more of the disc to z
             z = copysign(min(abs(change.imag), sqrt(most**2 - y**2)), change.imag)
         elif z != free.imag:
             y = copysign(min(abs(change.real), sqrt(most**2 - z**2)), change.real)
-        return complex(*self._kept(complex(y, z)))
+        return complex(*self._clip_change(complex(y, z)))
 
-    def _kept(self, change: complex) -> tuple[float, float]:
+    def _clip_change(self, change: complex) -> tuple[float, float]:
         """Return the change of the slope with each coordinate clipped so that the slope keeps its limit."""
         steepest, now = 1e-3 * STEEPEST_MRAD, self.slope
         y = max(-steepest - now.real, min(steepest - now.real, change.real))

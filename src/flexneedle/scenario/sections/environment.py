@@ -125,4 +125,4 @@ def expand_environment(value: Any) -> Any:
     names = ENVIRONMENTS.names()
     if value not in names:
         raise ValueError(f"must be one of {', '.join((NONE, *names))}, or a table")
-    return ENVIRONMENTS.shipped(value)
+    return ENVIRONMENTS.read_shipped(value)

@@ -28,7 +28,7 @@ PHANTOM = load_scenario("phantom")
 
 def rig_with(**parts):
     """The emulated rig of the package with other tables."""
-    return RigFile.model_validate(RIGS.shipped("emulated") | parts)
+    return RigFile.model_validate(RIGS.read_shipped("emulated") | parts)
 
 
 def test_the_rig_of_the_package_fits_both_presets():
@@ -133,11 +133,11 @@ def test_the_sensor_has_the_errors_of_the_draw():
 
 
 def test_without_a_registration_the_frames_are_the_same():
-    values = {key: value for key, value in RIGS.shipped("emulated").items() if key != "registration"}
+    values = {key: value for key, value in RIGS.read_shipped("emulated").items() if key != "registration"}
     job = EmulationJob(RigFile.model_validate(values), PHANTOM)
     x, y, z, *axis = make_sensor(job, draw_phantom(job)).at(np.array([1.0, 2.0, 3.0, 0.0, 0.0]))
     assert ((x, y, z), axis) == ((1.0, 2.0, 3.0), [1.0, 0.0, 0.0])
-    own = Registration.model_validate(RIGS.shipped("emulated")["registration"])
+    own = Registration.model_validate(RIGS.read_shipped("emulated")["registration"])
     of_scenario = PHANTOM.with_values({"tracker.registration": own.model_dump(mode="json")})
     mapped = make_sensor(replace(job, scenario=of_scenario), draw_phantom(job)).at(
         np.array([20.0, 2.0, 3.0, 0.0, 0.0])

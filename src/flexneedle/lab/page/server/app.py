@@ -77,7 +77,7 @@ class Downloads:
         """Return a file of a run."""
         name, file = request.path_params["name"], request.path_params["file"]
         try:
-            folder = self._handler.runs.run(name)
+            folder = self._handler.runs.find_run(name)
             if file == "figure.png":
                 return _figure(folder)
             if file not in _MADE:

@@ -162,7 +162,7 @@ class RequestHandler:
             case ask.OpenRequest():
                 self._open(request)
             case ask.StudyRequest():
-                folder = str(self.runs.study(request.name))
+                folder = str(self.runs.find_study(request.name))
                 order = WorkOrder("study", "study", name=request.name, folder=folder, row=request.index)
                 self._plans.add(order)
             case ask.SaveRequest():
@@ -285,10 +285,10 @@ class RequestHandler:
         order = WorkOrder("read", "recording", name=request.name or "", of=of)
         if request.name is not None and request.row is not None:
             self.require_processor()
-            folder = str(self.runs.study(request.name))
+            folder = str(self.runs.find_study(request.name))
             order = replace(order, action="row", kind="row", row=request.row, folder=folder)
         elif request.name is not None:
-            order = replace(order, folder=str(self.runs.run(request.name)))
+            order = replace(order, folder=str(self.runs.find_run(request.name)))
         self._plans.cancel_slot("recording", of)
         self.hub.forget((f"rows {of}", f"insertion {of}"))
         self.hub.forget_frames(FrameSource[of.upper()])

@@ -44,11 +44,11 @@ class RunsFolder:
             reverse=True,
         )
 
-    def run(self, name: str) -> Path:
+    def find_run(self, name: str) -> Path:
         """Return the folder of a run. Raises Refusal for an unknown name, and for a folder with links."""
         return self._folder(name, RUN_FILE, "run")
 
-    def study(self, name: str) -> Path:
+    def find_study(self, name: str) -> Path:
         """Return the folder of a study. Raises Refusal for an unknown name, and for a folder with links."""
         return self._folder(name, STUDY_FILE, "study")
 

@@ -63,7 +63,7 @@ async def serve_client(socket: WebSocket, handler: RequestHandler) -> None:
 
 
 async def _receive(socket: WebSocket) -> Mapping[str, Any]:
-    with _gone():
+    with _convert_gone():
         message = await socket.receive()
     if message["type"] == "websocket.disconnect":
         raise _Gone
@@ -133,7 +133,7 @@ def _reason(error: ValueError) -> str:
 
 
 @contextmanager
-def _gone() -> Iterator[None]:
+def _convert_gone() -> Iterator[None]:
     """Convert the errors of a socket whose client is gone to _Gone."""
     try:
         yield
@@ -148,7 +148,7 @@ async def _write(socket: WebSocket, outbox: ClientOutbox, limits: PageLimits) ->
         message = await outbox.next()
         try:
             async with asyncio.timeout(limits.send_s):
-                with _gone():
+                with _convert_gone():
                     if isinstance(message, str):
                         await socket.send_text(message)
                     else:
@@ -160,6 +160,6 @@ async def _write(socket: WebSocket, outbox: ClientOutbox, limits: PageLimits) ->
 async def _close(socket: WebSocket, code: int, reason: str, limits: PageLimits) -> None:
     if socket.application_state is WebSocketState.DISCONNECTED:
         return
-    with suppress(TimeoutError, _Gone), _gone():
+    with suppress(TimeoutError, _Gone), _convert_gone():
         async with asyncio.timeout(limits.send_s):
             await socket.close(code, reason[:_LONGEST_REASON])

@@ -36,7 +36,7 @@ def with_metal_plate(scenario: Scenario) -> Scenario:
     environment = scenario.tracker.environment
     if environment is None or environment.plate is not None:
         return scenario
-    return scenario.with_values({"tracker.environment.plate": ENVIRONMENTS.shipped(_METAL)["plate"]})
+    return scenario.with_values({"tracker.environment.plate": ENVIRONMENTS.read_shipped(_METAL)["plate"]})
 
 
 class DisturbedRig(VirtualRig):

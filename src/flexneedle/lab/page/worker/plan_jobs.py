@@ -159,15 +159,15 @@ def shapes_of(plan: Plan, source: FrameSource) -> tuple[ShapeFrame, ShapeFrame]:
 def samples_of(samples: Samples, source: FrameSource, number: int) -> ShapeFrame:
     """Return the frame of at most 64 sampled paths by cost, each with at most 48 points."""
     by_cost = np.argsort(samples.costs, kind="stable")
-    tips = samples.tips[_spread(by_cost, _MOST_PATHS)]
-    tips = tips[:, _spread(np.arange(tips.shape[1]), _MOST_POINTS), :3]
+    tips = samples.tips[_pick_evenly(by_cost, _MOST_PATHS)]
+    tips = tips[:, _pick_evenly(np.arange(tips.shape[1]), _MOST_POINTS), :3]
     values = np.zeros((*tips.shape[:2], 4), dtype=np.float32)
     values[:, :, :3] = tips
-    values[:, -1, 3] = samples.costs[_spread(by_cost, _MOST_PATHS)]
+    values[:, -1, 3] = samples.costs[_pick_evenly(by_cost, _MOST_PATHS)]
     return ShapeFrame(FrameKind.SAMPLES, source, number, values)
 
 
-def _spread(values: Any, most: int) -> Any:
+def _pick_evenly(values: Any, most: int) -> Any:
     """Return at most `most` of the values, evenly spaced, with the first and the last."""
     count = min(most, len(values))
     return values[np.linspace(0, len(values) - 1, count).round().astype(int)]

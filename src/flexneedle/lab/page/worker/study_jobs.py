@@ -22,7 +22,7 @@ _LONGEST_REASON = 300
 def list_rows(task: WorkerTask) -> None:
     """Report rows of a study. Raises InputError for a folder without one."""
     order = task.order
-    with _named(order):
+    with _hide_path(order):
         recorded = read_folder(Path(order.folder))
         found = recorded.rows
         listed = (
@@ -57,7 +57,7 @@ class ShownRows:
             task.control.check()
             task.report_job("running", share, name)
 
-        with _named(order):
+        with _hide_path(order):
             again = recompute(Path(order.folder), order.row or 0, on_share)
         report_recording(task, again.insertion, name, again.note, order.row)
         self._shown[order.of] = again.insertion
@@ -105,7 +105,7 @@ def _row_of(index: int, point: StudyPoint, row: Mapping[str, Any]) -> StudyRow:
 
 
 @contextmanager
-def _named(order: WorkOrder) -> Iterator[None]:
+def _hide_path(order: WorkOrder) -> Iterator[None]:
     """Replace the path of the study by its name in errors, which all clients receive."""
     try:
         yield

@@ -203,7 +203,7 @@ class GuardedDevice:
         if value is _NONE:
             raise AttributeError(part)
         if self._rules.get(part) is text_rule:
-            return self._checked(part, text_rule, value)
+            return self._check_value(part, text_rule, value)
         if callable(value):
             return partial(self._call, part, value)
         if part in self._rules:
@@ -219,9 +219,9 @@ class GuardedDevice:
         except FlexneedleError as error:  # of a function of this package that the device calls
             raise DriverError(make_printable(f"{self._name}: {part}: {one_line(error)}")) from error
         rule = self._rules.get(part)
-        return value if rule is None else self._checked(f"{part}()", rule, value)
+        return value if rule is None else self._check_value(f"{part}()", rule, value)
 
-    def _checked(self, part: str, rule: Rule, value: Any) -> Any:
+    def _check_value(self, part: str, rule: Rule, value: Any) -> Any:
         with convert_exceptions(f"{self._name}: {part}"):
             problem = rule(value)
         if problem:

@@ -68,7 +68,7 @@ def _frames(table: SampleTable, rows: Sequence[_Row]) -> tuple[Frame, ...]:
 
 
 def _reading(row: _Row) -> SensorReading:
-    position, orientation = _known(row, _POSITION), _known(row, _ORIENTATION)
+    position, orientation = _none_if_empty(row, _POSITION), _none_if_empty(row, _ORIENTATION)
     indicator = None if isnan(row["indicator"]) else row["indicator"]
     status = VISIBLE if row["status"].lower() in EMPTY else row["status"]
     if position is None and status == VISIBLE:
@@ -76,7 +76,7 @@ def _reading(row: _Row) -> SensorReading:
     return SensorReading(position if status == VISIBLE else None, orientation, indicator, status)
 
 
-def _known(row: _Row, names: Iterable[str]) -> Any:
+def _none_if_empty(row: _Row, names: Iterable[str]) -> Any:
     """Return the numbers, None if they are empty."""
     numbers = tuple(row[name] for name in names)
     return None if isnan(numbers[0]) else numbers

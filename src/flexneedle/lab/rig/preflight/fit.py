@@ -89,7 +89,7 @@ def start_problems(
     Such an axis is beyond its soft limits (positions: mm or rad), or has no room.
     """
     outside = [
-        (name, f"at {axis.shown(positions[name])} {axis.unit}: {problem}: jog it back")
+        (name, f"at {axis.to_text(positions[name])} {axis.unit}: {problem}: jog it back")
         for name, axis in rig.axes.items()
         if (problem := limits_problem(axis, positions[name]))
     ]
@@ -114,7 +114,7 @@ def limits_problem(axis: Axis, position: float) -> str:
     low, high = axis.limits
     if low - axis.uncertainty <= position <= high + axis.uncertainty:
         return ""
-    return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+    return f"beyond the soft limits, {axis.to_text(low)} to {axis.to_text(high)} {axis.unit}"
 
 
 def describe_queues(rig: RigFile) -> list[tuple[str, str]]:
@@ -125,10 +125,10 @@ def describe_queues(rig: RigFile) -> list[tuple[str, str]]:
 def _describe_queue(axis: Axis, loop: LoopSettings) -> str:
     """Return a text such as `0.375 mm (5 mm/s × 75 ms)`, or `0.5 mm (loop.queue_mm)`."""
     distance, by_time, unit = loop.queue_of(axis, axis.speed), axis.speed * loop.queue, axis.unit
-    why = f"{axis.shown(axis.speed)} {unit}/s × {1e3 * loop.queue:g} ms"
+    why = f"{axis.to_text(axis.speed)} {unit}/s × {1e3 * loop.queue:g} ms"
     if distance != by_time:
         why = "loop.queue_mm" if distance < by_time else f"twice tolerance_{unit}"
-    return f"{axis.shown(distance)} {unit} ({why})"
+    return f"{axis.to_text(distance)} {unit} ({why})"
 
 
 def _insertion_need(scenario: Scenario, advance: float) -> AxisNeed:

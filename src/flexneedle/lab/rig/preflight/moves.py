@@ -35,7 +35,7 @@ class AxisMove:
         return self.goal - self.start
 
     def __str__(self) -> str:
-        at, unit = self.axis.shown, self.axis.unit
+        at, unit = self.axis.to_text, self.axis.unit
         way = f"from {at(self.start)} to {at(self.goal)} {unit} ({at(self.distance)} {unit})"
         slack = f"; the start is {describe_uncertainty(self.axis)}" if self.axis.backlash else ""
         return f"{self.name}: {way}, at most at {at(self.speed)} {unit}/s{slack}"
@@ -79,7 +79,7 @@ def _name_switch(axis: Axis) -> str:
 
 
 def _with_unit(axis: Axis, value: float) -> str:
-    return f"{axis.shown(value)} {axis.unit}"
+    return f"{axis.to_text(value)} {axis.unit}"
 
 
 def describe_uncertainty(axis: Axis) -> str:
@@ -107,7 +107,7 @@ def describe_insertion(rig: RigFile, scenario: Scenario, positions: Mapping[str,
 def describe_power_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
     """Return one line for each axis whose motor is switched off, with its position (mm or rad, by name)."""
     return [
-        f"{name}: at {axis.shown(positions[name])} {axis.unit}, its motor will be switched off"
+        f"{name}: at {axis.to_text(positions[name])} {axis.unit}, its motor will be switched off"
         for name, axis in rig.axes.items()
     ]
 
@@ -173,9 +173,9 @@ def plan_retraction(
     move = _check_move(AxisMove("insertion", axis, position, goal, _parse_speed("insertion", axis, speed)))
     _check_switch(axis, goal)
     if move.distance > -1.0 / abs(axis.scale):
-        at = axis.shown(position)
+        at = axis.to_text(position)
         raise InputError(
-            f"to {axis.shown(goal)} mm: must be below {at} mm, the present position: the axis only retracts"
+            f"to {axis.to_text(goal)} mm: must be below {at} mm, the present position: the axis only retracts"
         )
     return move
 
@@ -184,7 +184,7 @@ def _check_switch(axis: Axis, goal: float) -> None:
     """Raise InputError for a goal (mm) at which an axis may be at the limit switch behind it, its home."""
     least = axis.at_home + axis.max_error
     if axis.to_home < 0 and goal < least - _ROUNDING:
-        at = axis.shown
+        at = axis.to_text
         why = (
             f"the {_name_switch(axis)} is at {at(axis.at_home)} mm, and max_error_mm is {at(axis.max_error)}"
         )
@@ -209,7 +209,7 @@ def _parse_speed(name: str, axis: Axis, given: float | None) -> float:
         return _SHARE * axis.speed
     speed = given * axis.size
     if not 0.0 < speed <= axis.speed * (1.0 + _ROUNDING):
-        rule = f"must be above 0 and at most {axis.shown(axis.speed)}, speed_{axis.unit}_s of {name}"
+        rule = f"must be above 0 and at most {axis.to_text(axis.speed)}, speed_{axis.unit}_s of {name}"
         raise InputError(f"speed {given:g}: {rule}")
     return speed
 
@@ -220,7 +220,7 @@ def _check_move(move: AxisMove) -> AxisMove:
     if not (isfinite(move.start) and isfinite(move.goal)):
         raise InputError(f"{move.name}: its position is not a number")
     if not min(low, move.start) - _ROUNDING <= move.goal <= max(high, move.start) + _ROUNDING:
-        limits = f"{axis.shown(low)} to {axis.shown(high)} {axis.unit}"
-        rule = f"beyond the soft limits, {limits}; it is at {axis.shown(move.start)} {axis.unit}"
-        raise InputError(f"{move.name} to {axis.shown(move.goal)} {axis.unit}: {rule}")
+        limits = f"{axis.to_text(low)} to {axis.to_text(high)} {axis.unit}"
+        rule = f"beyond the soft limits, {limits}; it is at {axis.to_text(move.start)} {axis.unit}"
+        raise InputError(f"{move.name} to {axis.to_text(move.goal)} {axis.unit}: {rule}")
     return move

@@ -143,7 +143,7 @@ def _axis_findings(name: str, axis: Axis, state: MotorState) -> Iterator[Finding
     position = state.position / axis.scale
     problem = limits_problem(axis, position) if isfinite(position) else "is not a number"
     slack = f", {describe_uncertainty(axis)}" if axis.backlash else ""
-    shown = f"{axis.shown(position)} {axis.unit} ({state.position:.10g} counts){slack}"
+    shown = f"{axis.to_text(position)} {axis.unit} ({state.position:.10g} counts){slack}"
     yield Finding(name, "position", shown, problem)
     active = " and ".join(sorted(active_switches(state), reverse=True)) or "none active"
     problem = resting_switch_problem(Drive(name, axis), state).removeprefix(f"{name}: ")
@@ -159,7 +159,7 @@ def _setup_findings(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Findin
     low, high = sorted((setup.lowest / axis.scale, setup.highest / axis.scale))
     narrow = low > axis.limits[0] + axis.tolerance or high < axis.limits[1] - axis.tolerance
     held = ", also while its home is searched" if axis.to_home and (isfinite(low) or isfinite(high)) else ""
-    limits = f"{axis.shown(axis.limits[0])} to {axis.shown(axis.limits[1])} {axis.unit}"
+    limits = f"{axis.to_text(axis.limits[0])} to {axis.to_text(axis.limits[1])} {axis.unit}"
     rule = f"narrower than range_{axis.unit}, {limits}: motions would end there" if narrow else ""
     yield Finding(name, "controller's limits", _format_limits(axis, low, high) + held, rule)
     yield _error_limit_finding(name, axis, setup)
@@ -168,7 +168,7 @@ def _setup_findings(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Findin
 def _format_limits(axis: Axis, low: float, high: float) -> str:
     if not (isfinite(low) or isfinite(high)):
         return "none"
-    ends = (axis.shown(end) if isfinite(end) else "none" for end in (low, high))
+    ends = (axis.to_text(end) if isfinite(end) else "none" for end in (low, high))
     return f"{' to '.join(ends)} {axis.unit}"
 
 
@@ -177,21 +177,21 @@ def _error_limit_finding(name: str, axis: Axis, setup: MotorSetup) -> Finding:
     error = setup.most_error / abs(axis.scale)
     if not (setup.off_on_error and isfinite(error)):
         return Finding(name, "motor off on error", "no")
-    most = axis.shown(axis.max_error)
+    most = axis.to_text(axis.max_error)
     rule = (
         f"below max_error_{axis.unit} ({most}): it would act before the fault"
         if error < axis.max_error
         else ""
     )
-    return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
+    return Finding(name, "motor off on error", f"beyond {axis.to_text(error)} {axis.unit}", rule)
 
 
 def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
     error = abs((state.commanded - state.position) / axis.scale)
     most = axis.max_error
-    limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    limit = f"must be at most max_error_{axis.unit} ({axis.to_text(most)})"
     rule = "" if error <= most else f"{limit}: free the axis; the next motion begins at its position then"
-    return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
+    return Finding(name, "commanded - measured", f"{axis.to_text(error)} {axis.unit}", rule)
 
 
 # Tracker

@@ -41,10 +41,10 @@ def describe_speeds(rig: RigFile) -> list[tuple[str, str]]:
 
 
 def _describe_speed(axis: Axis, speed: float) -> str:
-    unit, most = axis.unit, axis.shown(axis.speed)
+    unit, most = axis.unit, axis.to_text(axis.speed)
     if speed >= axis.speed * (1.0 - _ROUNDING):
         return f"{most} {unit}/s"
-    why = f"acceleration_{unit}_s2 = {axis.shown(axis.acceleration)} cannot brake a faster axis within the queue"
+    why = f"acceleration_{unit}_s2 = {axis.to_text(axis.acceleration)} cannot brake a faster axis within the queue"
     return f"{speed / axis.size:.3g} of {most} {unit}/s: {why}"
 
 
@@ -58,7 +58,7 @@ def _pace_problems(rig: RigFile, paces: MotorPaces) -> Iterator[Problem]:
         for key, per, limits in (("speed", "s", paces.speeds), ("acceleration", "s2", paces.accelerations)):
             value = getattr(axis, key)
             if rule := _pace_rule(axis, value, limits, per.replace("2", "²")):
-                yield Problem(f"axes.{name}.{key}_{axis.unit}_{per}", float(axis.shown(value)), rule)
+                yield Problem(f"axes.{name}.{key}_{axis.unit}_{per}", float(axis.to_text(value)), rule)
 
 
 def _pace_rule(axis: Axis, value: float, limits: tuple[float, float], per: str) -> str:

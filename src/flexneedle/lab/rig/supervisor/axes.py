@@ -148,7 +148,7 @@ class RigAxes:
                 state, before = self.state(drive), self.before.states[drive.axis.channel]
                 if state.on and is_at_rest(drive, state, before) and is_misplaced(drive, state):
                     self._motors.power(drive.axis.channel, False)
-                    off = drive.shown(abs(drive.error_of(state)))
+                    off = drive.to_text(abs(drive.error_of(state)))
                     changed.append(
                         f"{drive.name}: was {off} from its commanded position, now held where it is"
                     )

@@ -29,8 +29,8 @@ def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
     if state.stopped and state.stopped != before.stopped:
         return f"{drive.name}: stopped by the motor controller: {state.stopped}"
     if abs(error) > drive.axis.max_error:
-        limit = drive.shown(drive.axis.max_error)
-        return f"{drive.name}: the motor does not follow: {drive.shown(abs(error))} off, limit {limit}"
+        limit = drive.to_text(drive.axis.max_error)
+        return f"{drive.name}: the motor does not follow: {drive.to_text(abs(error))} off, limit {limit}"
     return ""
 
 
@@ -44,14 +44,14 @@ def position_problem(
     moved = abs((state.position - before.position) / drive.axis.scale)
     most = _HASTE * drive.axis.speed * seconds + drive.axis.max_error
     if moved > most:
-        return f"{drive.name}: the position jumped by {drive.shown(moved)} in {seconds:.3f} s"
+        return f"{drive.name}: the position jumped by {drive.to_text(moved)} in {seconds:.3f} s"
     outside, further = (
         _distance_outside(drive, state),
         _distance_outside(drive, before) + drive.axis.tolerance,
     )
     if not unlimited and outside > drive.axis.max_error and outside > further:
-        low, high = map(drive.shown, drive.axis.limits)
-        return f"{drive.name}: at {drive.shown(drive.to_position(state.position))}, beyond its range {low} to {high}"
+        low, high = map(drive.to_text, drive.axis.limits)
+        return f"{drive.name}: at {drive.to_text(drive.to_position(state.position))}, beyond its range {low} to {high}"
     return ""
 
 
@@ -68,7 +68,7 @@ def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: f
     """
     back = -(state.position - before.position) * (1.0 if way > 0.0 else -1.0) / abs(drive.axis.scale)
     if back > STILL * drive.axis.tolerance:
-        return f"{drive.name}: the position went back by {drive.shown(back)} during a motion"
+        return f"{drive.name}: the position went back by {drive.to_text(back)} during a motion"
     return ""
 
 
@@ -80,9 +80,7 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
     low, high = min(start, sent), max(start, sent)
     off = max(low - state.position, state.position - high) / abs(drive.axis.scale)
     if off > drive.axis.max_error:
-        return (
-            f"{drive.name}: {drive.shown(off)} beyond its target, limit {drive.shown(drive.axis.max_error)}"
-        )
+        return f"{drive.name}: {drive.to_text(off)} beyond its target, limit {drive.to_text(drive.axis.max_error)}"
     return ""
 
 
@@ -115,7 +113,7 @@ def switch_problem(drive: Drive, state: MotorState) -> str:
     way = abs(position_after_homing(drive.axis) - drive.axis.at_home)
     why = "it is stuck, or the home must be further beyond the range"
     return (
-        f"{drive.name}: the {drive.axis.home} switch is still active {drive.shown(way)} away from it: {why}"
+        f"{drive.name}: the {drive.axis.home} switch is still active {drive.to_text(way)} away from it: {why}"
     )
 
 
@@ -133,15 +131,15 @@ def resting_switch_problem(drive: Drive, state: MotorState) -> str:
     is_home = drive.axis.to_home != 0 and is_at_switch(drive, state)
     if not active or (is_home and is_near_switch(drive.axis, at)):
         return ""
-    home = f", but the home is at {drive.shown(drive.axis.at_home)}" if is_home else ""
-    return f"{drive.name}: the {' '.join(active)} limit switch is active at {drive.shown(at)}{home}"
+    home = f", but the home is at {drive.to_text(drive.axis.at_home)}" if is_home else ""
+    return f"{drive.name}: the {' '.join(active)} limit switch is active at {drive.to_text(at)}{home}"
 
 
 def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     """Report a motor that has left its goal (counts) without a command."""
     off = abs((state.position - goal) / drive.axis.scale)
     if off > STILL * drive.axis.tolerance:
-        return f"{drive.name}: moved by {drive.shown(off)} without a command"
+        return f"{drive.name}: moved by {drive.to_text(off)} without a command"
     return ""
 
 

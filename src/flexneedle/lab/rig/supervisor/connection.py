@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Any, Self
 
 from flexneedle.errors import DriverError, StoppedError
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.rig.rig_file import RigFile
@@ -76,7 +76,7 @@ class SupervisorConnection:
                 self._send(protocol.CloseCommand(), lost=True)
             self._process.end(END_S)
             self._thread.join()  # it ends with the supervisor's end of the channel
-            with uninterrupted(), self._sending:
+            with delay_signals(), self._sending:
                 self._process.close()
         finally:
             self._signals.close()
@@ -103,13 +103,13 @@ class SupervisorConnection:
     @property
     def ended(self) -> str | None:
         """Reason why the supervisor has ended, "" at a request; None while it works."""
-        with self._locked():
+        with self._lock_data():
             return self._ended
 
     @property
     def report(self) -> protocol.TickReport:
         """Report of the last tick."""
-        with self._locked():
+        with self._lock_data():
             if self._latest is None:
                 raise DriverError(f"the supervisor has not reported: {self._ended or 'it is starting'}")
             return self._latest
@@ -121,7 +121,7 @@ class SupervisorConnection:
 
     def read(self) -> tuple[Measurement, ...]:
         """Return the measurements since the last call, oldest first."""
-        with self._locked():
+        with self._lock_data():
             found = tuple(self._measurements)
             self._measurements.clear()
         return found
@@ -135,7 +135,7 @@ class SupervisorConnection:
 
     def _send(self, message: Any, *, lost: bool = False) -> int:
         """Send a message; return how many requests were sent with it."""
-        with uninterrupted(), self._sending:
+        with delay_signals(), self._sending:
             open_still = self._process.channel.send(message, keep=not isinstance(message, protocol.Heartbeat))
             self._sent += 1
         if not open_still and not lost:
@@ -172,7 +172,7 @@ class SupervisorConnection:
         self, condition: Callable[[], bool], until: float, *, stopped: bool, every: float
     ) -> bool:
         """Return whether a condition is met; otherwise wait for a report, and send a heartbeat."""
-        with self._locked():
+        with self._lock_data():
             if condition():
                 return True
             if self._ended is not None:
@@ -191,9 +191,9 @@ class SupervisorConnection:
         return False
 
     @contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _lock_data(self) -> Iterator[None]:
         """Lock the data of the receiving thread; an interrupt must not leave them locked."""
-        with uninterrupted(), self._changed:
+        with delay_signals(), self._changed:
             yield
 
     def _await_late_report(self) -> bool:

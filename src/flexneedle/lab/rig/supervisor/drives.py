@@ -41,7 +41,7 @@ class Drive:
         """Return commanded minus measured position (mm or rad), as the controller reports them."""
         return (state.commanded - state.position) / self.axis.scale
 
-    def shown(self, value: float) -> str:
+    def to_text(self, value: float) -> str:
         """Return a position or distance with its unit."""
         text, unit = (f"{math.degrees(value):.2f}", "°") if self.unit == "rad" else (f"{value:.3f}", " mm")
         return (text.removeprefix("-") if float(text) == 0.0 else text) + unit

@@ -56,10 +56,10 @@ class Leg:
         for name, drive in self.drives.items():
             if way := abs(self.way(name) / drive.axis.scale):
                 free = loop.queue_of(drive.axis, speeds[name] / abs(drive.axis.scale))
-                shares.append((self._travelled(name, states) + free) / way)
+                shares.append((self._measure_travel(name, states) + free) / way)
         return min(shares)
 
-    def _travelled(self, channel: str, states: Mapping[str, MotorState]) -> float:
+    def _measure_travel(self, channel: str, states: Mapping[str, MotorState]) -> float:
         """Return the distance that a motor has moved towards its goal (mm or rad)."""
         gone = (states[channel].position - self.trajectory.start[channel]) / abs(
             self.drives[channel].axis.scale
@@ -80,7 +80,7 @@ class Leg:
         The motor with the longest travel measures it.
         """
         gone = sum(
-            self._travelled(name, states) / drive.axis.tolerance for name, drive in self.drives.items()
+            self._measure_travel(name, states) / drive.axis.tolerance for name, drive in self.drives.items()
         )
         if gone > self.marked[0] + 1.0:
             self.marked = gone, now
@@ -120,7 +120,7 @@ class Leg:
         """Return the distance of each motor from its goal, for messages."""
         goal = self.trajectory.goal
         return ", ".join(
-            f"{drive.name} {drive.shown(abs((goal[name] - states[name].position) / drive.axis.scale))}"
+            f"{drive.name} {drive.to_text(abs((goal[name] - states[name].position) / drive.axis.scale))}"
             for name, drive in self.drives.items()
         )
 

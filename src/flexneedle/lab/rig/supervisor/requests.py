@@ -39,10 +39,10 @@ class RequestRules:
         if problem and not self._leads_back(drive, now, go.position):
             return problem
         if go.retract and not (go.axis == "insertion" and go.position <= now):
-            return f"retract to {drive.shown(go.position)}: must withdraw the base, which is at {drive.shown(now)}"
+            return f"retract to {drive.to_text(go.position)}: must withdraw the base, which is at {drive.to_text(now)}"
         if not 0.0 < go.speed <= drive.axis.speed * (1.0 + _ROUNDING):
             speed, fastest = (
-                f"{drive.axis.shown(one)} {drive.axis.unit}/s" for one in (go.speed, drive.axis.speed)
+                f"{drive.axis.to_text(one)} {drive.axis.unit}/s" for one in (go.speed, drive.axis.speed)
             )
             return f"speed of {go.axis} = {speed}: must be above 0, at most {fastest}"
         return ""
@@ -107,7 +107,7 @@ def range_problem(
         axis = drives[name].axis
         (low, high), slack = axis.limits, axis.uncertainty if resting else axis.tolerance
         if not low - slack <= position <= high + slack:
-            shown = drives[name].shown
+            shown = drives[name].to_text
             return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
     return ""
 

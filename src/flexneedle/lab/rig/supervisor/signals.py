@@ -6,7 +6,7 @@ So a signal to the client alone also stops the motors, even while that process i
 import signal
 import socket
 
-from flexneedle.interrupts import SIGNALS, uninterrupted
+from flexneedle.interrupts import SIGNALS, delay_signals
 
 
 class SignalLine:
@@ -25,12 +25,12 @@ class SignalLine:
 
     def take(self) -> None:
         """Write each signal of this process that has a Python handler to the socket. Call it in the main thread."""
-        with uninterrupted():
+        with delay_signals():
             self._before = signal.set_wakeup_fd(self._sent.fileno(), warn_on_full_buffer=False)
 
     def close(self) -> None:
         """Close the socket, and restore the signals. Call it in the thread of `take`."""
-        with uninterrupted():
+        with delay_signals():
             if self._before is not None:
                 signal.set_wakeup_fd(self._before)
                 self._before = None

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import Look, legend, short
-from flexneedle.figures.style import INK, QUIET, signed, styled
+from flexneedle.figures.style import INK, QUIET, apply_style, format_signed
 from flexneedle.lab.study.figures.panels import FAINT, Panel, panels, ticks_of
 
 _SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"
@@ -30,7 +30,7 @@ class DifferenceRow:
 def draw_differences(shown: Sequence[Panel[Sequence[DifferenceRow]]], label: str) -> Figure:
     """Return the figure: one panel each, with rows in the same order, on a common scale with `label`."""
     most = max(len(panel.content) for panel in shown)
-    with styled():
+    with apply_style():
         figure, axes = panels(shown, 0.3 * most + 0.8, label)
         for ax, panel in zip(axes, shown, strict=True):
             _draw(ax, panel.content)
@@ -75,7 +75,7 @@ def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
     pad = 0.06 * (high - low) or 0.05
     ax.set_xlim(low - pad, high + pad)
     ax.locator_params(axis="x", nbins=ticks)
-    ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
+    ax.xaxis.set_major_formatter(lambda value, _: format_signed(round(value, 9)))
 
 
 def _handles() -> list[Line2D]:

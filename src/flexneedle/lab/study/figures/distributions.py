@@ -9,8 +9,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import legend, short
-from flexneedle.figures.style import INK, QUIET, styled
-from flexneedle.lab.study.figures.panels import LIMIT, Panel, decades, limit_line, panels, scattered, ticks_of
+from flexneedle.figures.style import INK, QUIET, apply_style
+from flexneedle.lab.study.figures.panels import (
+    LIMIT,
+    Panel,
+    choose_dots,
+    decades,
+    limit_line,
+    panels,
+    ticks_of,
+)
 from flexneedle.lab.study.figures.samples import LEAST, ErrorSample
 
 _GOLDEN = 0.6180339887
@@ -20,7 +28,7 @@ _HIGH = 0.28  # half height of the scatter of a row
 def draw_errors(shown: Sequence[Panel[Sequence[ErrorSample]]], label: str) -> Figure:
     """Return the figure: one panel each, one row per sample; label: factor of the rows."""
     single, most = len(shown) == 1, max(len(panel.content) for panel in shown)
-    with styled():
+    with apply_style():
         figure, axes = panels(shown, (0.42 if single else 0.31) * most + 0.75, "true error (mm)", label)
         for ax, panel in zip(axes, shown, strict=True):
             errors = [sample.drawn for other in shown for sample in other.content]
@@ -46,7 +54,7 @@ def _draw_rows(ax: Axes, rows: Sequence[ErrorSample]) -> None:
 def _draw_row(ax: Axes, level: int, row: ErrorSample) -> None:
     errors = row.drawn
     spread = level + _HIGH * (2.0 * ((np.arange(len(errors)) * _GOLDEN) % 1.0) - 1.0)
-    dots = scattered(len(errors), 0.5)
+    dots = choose_dots(len(errors), 0.5)
     ax.scatter(errors, spread, color=row.look.color, zorder=2, label="one insertion", **dots)
     first, middle, third, most = np.quantile(errors, (0.25, 0.5, 0.75, 0.95)).tolist()
     thick: dict[str, Any] = {"color": INK, "zorder": 4, "solid_capstyle": "butt"}

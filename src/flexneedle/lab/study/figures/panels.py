@@ -112,7 +112,7 @@ def _ticks(low: float, high: float, most: int) -> list[float]:
     return inside[:: ceil(len(inside) / most)]
 
 
-def scattered(count: int, alpha: float = 0.75) -> dict[str, Any]:
+def choose_dots(count: int, alpha: float = 0.75) -> dict[str, Any]:
     """Return the style of dots with which `count` of them can be distinguished."""
     if count > MANY:
         return {"s": 2.0, "alpha": 0.25, "linewidths": 0.0, "rasterized": True}

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import legend
-from flexneedle.figures.style import styled
+from flexneedle.figures.style import apply_style
 from flexneedle.lab.study.figures.panels import FAINT, LIMIT, Panel, decades, limit_line, panels, ticks_of
 from flexneedle.lab.study.figures.samples import ErrorSample
 
@@ -17,7 +17,7 @@ def draw_shares(shown: Sequence[Panel[Sequence[ErrorSample]]]) -> Figure:
     """Return the figure: one panel each; a line ends below 100 % by the share of unfinished insertions."""
     samples = [sample for panel in shown for sample in panel.content]
     colors = {sample.name: sample.look.color for sample in samples}
-    with styled():
+    with apply_style():
         figure, axes = panels(shown, 5.0 if len(shown) == 1 else 3.2, "true error (mm)", "insertions (%)")
         for ax, panel in zip(axes, shown, strict=True):
             decades(ax.xaxis, [sample.drawn for sample in samples], ticks_of(len(shown)))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.figures.layout import Floats, legend, short
-from flexneedle.figures.style import BAD, INK, styled
+from flexneedle.figures.style import BAD, INK, apply_style
 from flexneedle.lab.study.figures.panels import FAINT, Panel, decades, panels
 from flexneedle.lab.study.figures.samples import ErrorSample
 
@@ -25,7 +25,7 @@ Sweep = Panel[Sequence[ErrorSample]]
 
 def draw_sweep(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
     """Return the figure along an axis with levels at `places` (m,); more than three controllers have no bands."""
-    with styled():
+    with apply_style():
         figure, (ax,) = panels([Panel("", "", INK, ())], 4.0, short(label, 60), "true error (mm)")
         for sweep in sweeps:
             _draw(ax, sweep, places, with_band=len(sweeps) <= _MOST_BANDS)

@@ -15,8 +15,8 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from flexneedle.figures.layout import Floats, legend
-from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
-from flexneedle.lab.study.figures.panels import FAINT, Panel, columns_of, head, panels, scattered, sheet
+from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, apply_style
+from flexneedle.lab.study.figures.panels import FAINT, Panel, choose_dots, columns_of, head, panels, sheet
 
 MAP = ("depth (mm)", "lateral (mm)")
 BEYOND = ("depth beyond the target (mm)", "lateral (mm)")
@@ -56,7 +56,7 @@ def draw_targeting(shown: Sequence[Panel[TipPositions]]) -> Figure:
         targets = np.zeros((1, 2))
     low, high = _find_window(targets, [panel.content.tips for panel in shown])
     ratio = float(high[1] - low[1]) / float(high[0] - low[0])
-    with styled():
+    with apply_style():
         if len(shown) == 1:
             figure, axes = _with_close_up(shown[0], ratio)
         else:
@@ -117,7 +117,7 @@ def _draw_map(ax: Axes, panel: Panel[TipPositions], low: Floats, high: Floats) -
 
 def _draw_tips(ax: Axes, tips: TipPositions, color: str, low: Floats, high: Floats) -> None:
     """Draw the tips inside a window to scale, and write the number of those outside."""
-    style = scattered(len(tips.tips))
+    style = choose_dots(len(tips.tips))
     ax.scatter(*tips.tips[tips.done].T, color=color, zorder=3, label=_TIP, **style)
     if not tips.done.all():
         ax.plot(*tips.tips[~tips.done].T, "x", color=BAD, markersize=4, zorder=4, label=_CROSS)

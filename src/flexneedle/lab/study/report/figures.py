@@ -77,7 +77,7 @@ class _Facts:
         few = [factor for factor in others if len(factor.names) <= MOST_PANELS]
         return controller if controller.varies or not few else few[0]
 
-    def pooled(self, *shown: Factor) -> str:
+    def name_pooled(self, *shown: Factor) -> str:
         """Return as text the factors, besides controller and those shown, whose levels are pooled."""
         labels = [factor.label for factor in self.found.design.besides(self.found.design.controller, *shown)]
         return f", pooled over {_list(labels)}" if labels else ""
@@ -149,7 +149,7 @@ def _list_entries(f: _Facts) -> list[_Entry]:
         ),
         _Entry(
             "errors-by-depth", "True error by target depth",
-            any_known, f"Every finished insertion is a dot{f.pooled(f.panel_factor)}. {_LOGARITHMIC}",
+            any_known, f"Every finished insertion is a dot{f.name_pooled(f.panel_factor)}. {_LOGARITHMIC}",
             partial(_by_depth, f, depth), partial(draw_errors, label=depth.label),
         ),
         *(_make_axis_entry(f, axis, number) for number, axis in enumerate(found.design.axes, 1)),
@@ -188,7 +188,7 @@ def _make_axis_entry(f: _Facts, axis: Factor, number: int) -> _Entry:
         f"error-along-{number}",
         f"True error against {axis.label}",
         bool(f.known.any()) and len(axis.names) <= _MOST_LEVELS,
-        f"Median, interquartile range (25 to 75 %) and mean of the finished insertions{f.pooled(axis)}.{covaried}",
+        f"Median, interquartile range (25 to 75 %) and mean of the finished insertions{f.name_pooled(axis)}.{covaried}",
         panels,
         partial(draw_sweep, label=axis.label, places=axis.positions),
     )

@@ -107,7 +107,7 @@ class _Lines:
     def show(self, snapshot: TrackerSnapshot) -> None:
         """Print a snapshot if it is due."""
         self._last = snapshot
-        if snapshot.time >= self._due or self._changed(snapshot):
+        if snapshot.time >= self._due or self._has_changed(snapshot):
             self._due = snapshot.time + _LINE_EVERY_S
             self._print(snapshot)
 
@@ -116,7 +116,7 @@ class _Lines:
         if self._last is not None and self._last is not self._printed:
             self._print(self._last)
 
-    def _changed(self, snapshot: TrackerSnapshot) -> bool:
+    def _has_changed(self, snapshot: TrackerSnapshot) -> bool:
         from flexneedle.types import VISIBLE
 
         before = self._printed

@@ -125,7 +125,7 @@ def _intervals(error: Floats, measured: Moments) -> dict[str, Interval]:
     scatter, count = measured.scatter.sum(axis=1), measured.count.astype(float)
     return {
         "rmse_mm": bootstrap(_rms, error),
-        "jitter_mm": bootstrap(_pooled, scatter, count) if count.max() > 1 else None,
+        "jitter_mm": bootstrap(_pool_scatter, scatter, count) if count.max() > 1 else None,
         "mean_mm": bootstrap(mean, error),
         "sd_mm": bootstrap(deviation, error),
         "p95_mm": quantile_interval(error, P95),
@@ -137,7 +137,7 @@ def _rms(error: Floats, axis: int) -> Floats:
     return np.sqrt(squares)
 
 
-def _pooled(scatter: Floats, count: Floats, axis: int) -> Floats:
+def _pool_scatter(scatter: Floats, count: Floats, axis: int) -> Floats:
     squares: Floats = scatter.sum(axis=axis) / count.sum(axis=axis)
     return np.sqrt(squares)
 

@@ -24,7 +24,7 @@ def find_notes(grids: Sequence[MeasuredGrid], suggest_registration: bool) -> lis
     return [
         *(note for grid in grids for note in _count_missing(grid)),
         *_misfits(grids),
-        *(_unregistered(grids) if suggest_registration else ()),
+        *(_note_frames(grids) if suggest_registration else ()),
     ]
 
 
@@ -46,7 +46,7 @@ def _misfits(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
             yield f"{grid.title}: {wrong}"
 
 
-def _unregistered(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
+def _note_frames(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
     fits = [(grid, *fit) for grid in grids if (fit := _fit(grid)) is not None]
     if fits:
         grid, raw, residual = max(fits, key=lambda fit: fit[1])

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from flexneedle.figures.style import save, signed
+from flexneedle.figures.style import format_signed, save
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import compute_error_vectors
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, LineFit, average_indicator
@@ -47,7 +47,7 @@ def _indicator(evaluation: Evaluation, found: IndicatorFits) -> IndicatorPanel:
 
 def _line_text(line: LineFit) -> str:
     sign = "+" if line.intercept_mm >= 0.0 else "−"
-    return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
+    return f"{format_signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
 
 
 def _is_of(result: SensorResult, found: IndicatorFits) -> bool:

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from flexneedle.figures.layout import short
-from flexneedle.figures.style import QUIET, WIDTH, new_figure, signed, styled
+from flexneedle.figures.style import QUIET, WIDTH, apply_style, format_signed, new_figure
 
 MOST_ROWS, MOST_SLICES = 6, 5
 MOST_ARROWS = 400
@@ -42,7 +42,7 @@ def draw_field(rows: Sequence[FieldRow]) -> Figure:
     columns = max(map(len, layers))
     across = 2 if columns == 1 and len(shown) > 1 else 1  # two single slices side by side
     down = ceil(len(shown) / across)
-    with styled():
+    with apply_style():
         figure = new_figure(down * (_AROUND + min((WIDTH / across - 1.6) / columns, _WIDEST)))
         parts = figure.subfigures(down, across, squeeze=False).ravel()
         for part, row, slices in zip(parts, shown, layers, strict=False):
@@ -98,8 +98,8 @@ def _slices(height: Floats) -> list[Numbers]:
 def _level(height: Floats) -> str:
     low, high = float(height.min()), float(height.max())
     if high - low < 0.01:
-        return f"z = {signed(low, '.4g')} mm"
-    return f"z = {signed(low, '.3g')} to {signed(high, '.3g')} mm"
+        return f"z = {format_signed(low, '.4g')} mm"
+    return f"z = {format_signed(low, '.3g')} to {format_signed(high, '.3g')} mm"
 
 
 def _factor(row: FieldRow, in_slice: int) -> float:

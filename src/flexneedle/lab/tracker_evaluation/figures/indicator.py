@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from flexneedle.figures.layout import short
-from flexneedle.figures.style import ESTIMATE, INK, QUIET, TARGET, TRUE, new_figure, styled
+from flexneedle.figures.style import ESTIMATE, INK, QUIET, TARGET, TRUE, apply_style, new_figure
 
 FAR, CUT = 2.0, 1.2
 """If the largest indicator exceeds FAR times the 95th percentile, the axis ends at CUT times that percentile and a
@@ -46,7 +46,7 @@ class IndicatorPanel:
 
 def draw_indicator(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
     """Return the figure with a panel for each sensor, side by side; more: number of sensors not shown."""
-    with styled():
+    with apply_style():
         figure = new_figure(_HIGH)
         for ax, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
             _draw(ax, panel)

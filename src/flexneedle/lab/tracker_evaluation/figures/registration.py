@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from flexneedle.figures.style import ESTIMATE, INK, QUIET, new_figure, styled
+from flexneedle.figures.style import ESTIMATE, INK, QUIET, apply_style, new_figure
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def draw_registration(
 
     expected: RMS target registration error (mm) at points (m, 3), drawn as contours in planes through the centroid.
     """
-    with styled():
+    with apply_style():
         figure = new_figure(_HEIGHT)
         low, high = _extent(np.vstack([stage, targets]))
         longest = float(np.linalg.norm(mapped - stage, axis=1).max())

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.interrupts import uninterrupted
+from flexneedle.interrupts import delay_signals
 from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
 from flexneedle.lab.tracker_evaluation.recording.steps import StageVisit, find_mismatch
 from flexneedle.phantom.tracking.measurement_table import COLUMNS
@@ -66,7 +66,7 @@ class RecordingSession:
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Append the rows of a stop and sync them to disk."""
         data = _format_rows(rows) if self.size else _FIRST_LINE + _format_rows(rows)
-        with uninterrupted():
+        with delay_signals():
             self.file.truncate(self.size)
             self.file.write(data)
             self.file.flush()

@@ -35,7 +35,7 @@ class Field:
     weights: Floats
     constant: Floats
 
-    def scaled(self, factor: float) -> "Field":
+    def scale(self, factor: float) -> "Field":
         """Return the field times a number."""
         return Field(factor * self.weights, factor * self.constant)
 
@@ -177,20 +177,22 @@ class _Draws:
     def sensor(self, name: str, rng: Rng, shared: tuple[Field, Field]) -> SensorFields:
         """Return the fields of a sensor. The draws do not depend on the sizes."""
         of_bias, of_plate, of_coils, of_plate_coils = (_weights(rng) for _ in range(4))
-        bias = self._biases(name == TIP, self._mixed(of_bias, shared[0]), of_coils)
+        bias = self._biases(name == TIP, self._mix_fields(of_bias, shared[0]), of_coils)
         plate = self._environment.plate
         if plate is None:
             return SensorFields(bias[0], None, bias[1])
-        distortion = self._distortions(plate, name == TIP, self._mixed(of_plate, shared[1]), of_plate_coils)
+        distortion = self._distortions(
+            plate, name == TIP, self._mix_fields(of_plate, shared[1]), of_plate_coils
+        )
         return SensorFields(bias[0], distortion[0], bias[1], distortion[1])
 
     def _biases(self, is_tip: bool, field: Field, of_coils: Field) -> tuple[Part, Part | None]:
         """Return the error without a plate, and its difference between two coils."""
         environment, envelope = self._environment, growing(self._environment)
         if is_tip:
-            return self._sized(field, environment.tip.bias_mm, envelope), None
-        bias = self._sized(field, environment.reference.bias_mm, envelope)
-        return bias, self._sized(of_coils, environment.reference.coils_mm, envelope)
+            return self._scale_to_size(field, environment.tip.bias_mm, envelope), None
+        bias = self._scale_to_size(field, environment.reference.bias_mm, envelope)
+        return bias, self._scale_to_size(of_coils, environment.reference.coils_mm, envelope)
 
     def _distortions(
         self, plate: Plate, is_tip: bool, field: Field, of_coils: Field
@@ -198,27 +200,27 @@ class _Draws:
         """Return the error due to the plate, and its difference between two coils."""
         envelope = decaying(plate, plate.decay_mm)
         if is_tip:
-            return self._sized(field, plate.tip_mm, envelope), None
+            return self._scale_to_size(field, plate.tip_mm, envelope), None
         difference = self._partly_constant(of_coils, plate)
         return (
-            self._sized(field, plate.reference_mm, envelope),
-            self._sized(difference, plate.coils_mm, decaying(plate, plate.coils_decay_mm)),
+            self._scale_to_size(field, plate.reference_mm, envelope),
+            self._scale_to_size(difference, plate.coils_mm, decaying(plate, plate.coils_decay_mm)),
         )
 
-    def _mixed(self, own: Field, common: Field) -> Field:
+    def _mix_fields(self, own: Field, common: Field) -> Field:
         share = self._environment.shared
-        return own.scaled(sqrt(1.0 - share)).plus(common.scaled(sqrt(share)))
+        return own.scale(sqrt(1.0 - share)).plus(common.scale(sqrt(share)))
 
     def _partly_constant(self, smooth: Field, plate: Plate) -> Field:
         """Return a field with the share `coils_pull` of its square constant along the plate's normal."""
-        varied = smooth.scaled(sqrt(1.0 - plate.coils_pull) / _rms(smooth.at(self._features)))
+        varied = smooth.scale(sqrt(1.0 - plate.coils_pull) / _rms(smooth.at(self._features)))
         normal = np.array(plate.normal) / np.linalg.norm(plate.normal)
         return varied.plus(Field(np.zeros_like(smooth.weights), sqrt(plate.coils_pull) * normal))
 
-    def _sized(self, field: Field, size: float, envelope: Envelope) -> Part:
+    def _scale_to_size(self, field: Field, size: float, envelope: Envelope) -> Part:
         """Return the field scaled to an RMS length of `size` mm on the grid, with the plate at 100 mm."""
         values = field.at(self._features) * envelope(self._grid, SIZES_AT)
-        return Part(field.scaled(size / _rms(values)), envelope)
+        return Part(field.scale(size / _rms(values)), envelope)
 
 
 def _rms(vectors: Floats) -> float:

@@ -50,14 +50,14 @@ def noiseless(
     """
     if sensor == TIP:
         error = room.error(sensor, positions, plate_distance)
-        return Noiseless((positions + error)[:, None], _tilted(room.environment, error, orientations))
+        return Noiseless((positions + error)[:, None], _tilt_sensors(room.environment, error, orientations))
     half = 0.5 * room.environment.reference.spacing_mm * z_axis(orientations)
     ends = np.concatenate((positions - half, positions + half))
     sides = np.repeat((-1.0, 1.0), len(positions))[:, None]
     first, second = np.split(ends + room.coil_errors(sensor, ends, sides, plate_distance), 2)
     coils = np.stack((first, second), axis=1)
     error = coils.mean(axis=1) - positions
-    return Noiseless(coils, _tilted(room.environment, error, orientations))
+    return Noiseless(coils, _tilt_sensors(room.environment, error, orientations))
 
 
 def noisy(environment: Environment, exact: Noiseless, rng: np.random.Generator) -> SensorReadings:
@@ -84,5 +84,5 @@ def indicator(coils: Floats, spacing: float) -> Floats:
     return relative
 
 
-def _tilted(environment: Environment, error: Floats, orientations: Floats) -> Floats:
+def _tilt_sensors(environment: Environment, error: Floats, orientations: Floats) -> Floats:
     return product(from_vector(_PER_MILLI * environment.tilt_mrad_per_mm * error), orientations)

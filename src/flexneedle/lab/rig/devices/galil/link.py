@@ -67,7 +67,7 @@ class Link:
         connection = socket.socket(self._family, socket.SOCK_STREAM)
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection.settimeout(_left(deadline))
+            connection.settimeout(_remaining_time(deadline))
             connection.connect(self._address)
         except OSError as error:
             connection.close()
@@ -88,7 +88,7 @@ class Link:
     def do(self, commands: Sequence[str], deadline: float) -> None:
         """Have commands carried out. Raises DriverError, with the controller's reason if it refuses one."""
         if any(self._data(commands, deadline)):
-            raise self.failed(f"data in the reply to {format_commands(commands)}")
+            raise self.close_in_doubt(f"data in the reply to {format_commands(commands)}")
 
     def numbers(
         self, queries: Sequence[str], counts: Sequence[int], deadline: float
@@ -98,7 +98,7 @@ class Link:
         try:
             return [parse_numbers(data, count) for data, count in zip(found, counts, strict=True)]
         except GarbledError as error:
-            raise self.failed(f"{error} (to {format_commands(queries)})") from None
+            raise self.close_in_doubt(f"{error} (to {format_commands(queries)})") from None
 
     def text(self, query: str, deadline: float) -> str:
         """Return the line of text that answers a query. Raises DriverError, as in `do`."""
@@ -106,7 +106,7 @@ class Link:
         try:
             return parse_text(data)
         except GarbledError as error:
-            raise self.failed(str(error)) from None
+            raise self.close_in_doubt(str(error)) from None
 
     def _data(self, commands: Sequence[str], deadline: float) -> tuple[str, ...]:
         """Return the data in the replies to commands that are all accepted."""
@@ -134,19 +134,19 @@ class Link:
             raise DriverError(f"{self.name}: no time left for {shown}")
         try:
             _require_silence(self._socket)
-            self._socket.settimeout(_left(deadline))
+            self._socket.settimeout(_remaining_time(deadline))
             self._socket.sendall(";".join(line).encode("ascii") + _END)
         except OSError as error:  # perhaps in the middle of a line: nothing may follow
             self.close(_reason(error))
             raise DriverError(f"{self.name}: {shown} not sent: {_reason(error)}; {_REMEDY}") from None
         except GarbledError as error:
-            raise self.failed(f"{error} (before {shown})") from None
+            raise self.close_in_doubt(f"{error} (before {shown})") from None
         try:
-            return self._received(self._socket, len(line), deadline)
+            return self._receive_replies(self._socket, len(line), deadline)
         except (OSError, GarbledError) as error:
-            raise self.failed(f"{_reason(error)} (to {shown})") from None
+            raise self.close_in_doubt(f"{_reason(error)} (to {shown})") from None
 
-    def _received(self, connection: socket.socket, count: int, deadline: float) -> tuple[Reply, ...]:
+    def _receive_replies(self, connection: socket.socket, count: int, deadline: float) -> tuple[Reply, ...]:
         received = b""
         while (replies := parse_replies(received, count)) is None:
             connection.settimeout(max(0.0, deadline - monotonic()))
@@ -158,7 +158,7 @@ class Link:
                 raise GarbledError(f"a reply of more than {_LARGEST_REPLY} bytes")
         return replies
 
-    def failed(self, problem: str) -> DriverError:
+    def close_in_doubt(self, problem: str) -> DriverError:
         """Send the farewell and close a connection whose replies are in doubt; return the error to raise."""
         if self._socket is not None and self.farewell:
             with suppress(OSError):
@@ -190,7 +190,7 @@ def _require_silence(connection: socket.socket) -> None:
         raise GarbledError(f"unsolicited data: {data[:40]!r}")
 
 
-def _left(deadline: float) -> float:
+def _remaining_time(deadline: float) -> float:
     left = deadline - monotonic()
     if left <= 0.0:
         raise TimeoutError

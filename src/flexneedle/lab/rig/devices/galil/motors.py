@@ -162,7 +162,7 @@ class GalilMotors:
         try:
             return make_report(position, commanded, switches, code)
         except GarbledError as error:
-            raise self._link.failed(str(error)) from None
+            raise self._link.close_in_doubt(str(error)) from None
 
     def _find_moving(self, letters: str, deadline: float) -> set[str]:
         """Return the channels that the controller counts as in motion."""

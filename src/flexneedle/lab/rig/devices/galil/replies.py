@@ -68,23 +68,23 @@ def parse_replies(received: bytes, count: int) -> tuple[Reply, ...] | None:
     if len(found) < count:
         return None
     if rest:
-        raise GarbledError(f"more than the replies to {count} commands: {_shown(received)}")
+        raise GarbledError(f"more than the replies to {count} commands: {_quote_data(received)}")
     return tuple(found)
 
 
 def _reply(data: bytes, end: bytes) -> Reply:
     _check(data)
     if end == _REFUSED and data:
-        raise GarbledError(f"data before a refusal: {_shown(data + end)}")
+        raise GarbledError(f"data before a refusal: {_quote_data(data + end)}")
     return Reply(end == _ACCEPTED, data.decode("ascii"))
 
 
 def _check(data: bytes) -> None:
     if not _DATA.fullmatch(data):
-        raise GarbledError(f"not a reply: {_shown(data)}")
+        raise GarbledError(f"not a reply: {_quote_data(data)}")
 
 
-def _shown(data: bytes) -> str:
+def _quote_data(data: bytes) -> str:
     text = repr(data)[1:]
     return text if len(text) <= LONGEST_LINE else text[:LONGEST_LINE] + "…"
 
@@ -94,7 +94,7 @@ def parse_numbers(data: str, count: int) -> tuple[float, ...]:
     body = data.removesuffix("\r\n")
     texts = _SEPARATOR.split(body.strip(" "))
     if body == data or len(texts) != count or not all(_NUMBER.fullmatch(text) for text in texts):
-        raise GarbledError(f"must be {count} numbers in a line: {_shown(data.encode())}")
+        raise GarbledError(f"must be {count} numbers in a line: {_quote_data(data.encode())}")
     return tuple(map(float, texts))
 
 
@@ -107,5 +107,5 @@ def parse_text(data: str) -> str:
     """Return the one line of a reply, such as `1 Unrecognized command` of TC1. Raises GarbledError."""
     body = data.removesuffix("\r\n")
     if body == data or "\r" in body or "\n" in body or not body.strip():
-        raise GarbledError(f"must be a line of text: {_shown(data.encode())}")
+        raise GarbledError(f"must be a line of text: {_quote_data(data.encode())}")
     return " ".join(body.split())
