@@ -122,19 +122,6 @@ class Tracker:
         self.closed = True
 
 
-class Clock:
-    """The port `Clock`, whose time passes only in `wait`."""
-
-    def __init__(self):
-        self.time = 0.0
-
-    def now(self):
-        return self.time
-
-    def wait(self, seconds):
-        self.time += seconds
-
-
 def drivers(_settings, channels):
     """Return motors: a driver of a rig file."""
     return Motors(channels)

@@ -17,6 +17,7 @@ from flexneedle.lab.rig.supervisor.core import Supervisor
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Frame, SensorReading
+from rooms import ManualClock
 
 TICK_S = 0.025
 
@@ -55,19 +56,6 @@ def rig_file(**changes):
     """Return the rig in memory with keys of its axes changed: rig_file(guide_y={"backlash_mm": 0.1})."""
     axes = {name: axis | changes.get(name, {}) for name, axis in RIG["axes"].items()}
     return RigFile.model_validate(RIG | {"axes": axes})
-
-
-class Hand:
-    """A clock that only the test moves."""
-
-    def __init__(self):
-        self.time = 0.0
-
-    def now(self):
-        return self.time
-
-    def wait(self, seconds):
-        self.time += seconds
 
 
 @dataclass
@@ -213,7 +201,7 @@ class Stage:
 class Camera:
     """A tracker in memory: a frame at every reading, with the tip at `tip(time)`; None: no frame."""
 
-    clock: Hand
+    clock: ManualClock
     tip: object = field(default=lambda _: (0.0, 0.0, 0.0))
     status: str = "ok"
     number: int = 0
@@ -232,7 +220,7 @@ class Bench:
     """A supervisor with devices in memory, and the messages that it has sent."""
 
     def __init__(self, rig=None, monitor=None, tracked=True, motors=Stage, **loop):
-        self.clock = Hand()
+        self.clock = ManualClock()
         self.stage, self.camera = motors(self.clock), Camera(self.clock)
         rig = rig or rig_file()
         if loop:

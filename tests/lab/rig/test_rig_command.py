@@ -11,6 +11,7 @@ from bench_rig import Motors, values
 from commands import run
 from flexneedle.errors import DriverError
 from flexneedle.lab.commands import rig as command
+from rooms import ManualClock
 
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
 
@@ -78,7 +79,7 @@ def supervisor(monkeypatch, device):  # noqa: ARG001  the motors are read before
 @pytest.fixture
 def quick(monkeypatch):
     """Use the clock of the tests: the check does not wait."""
-    monkeypatch.setattr("flexneedle.lab.rig.devices.clock.WallClock", bench_rig.Clock)
+    monkeypatch.setattr("flexneedle.lab.rig.devices.clock.WallClock", ManualClock)
 
 
 @pytest.mark.usefixtures("quick")

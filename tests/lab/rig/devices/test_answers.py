@@ -8,12 +8,13 @@ import pytest
 import tomli_w
 
 import bench_rig
-from bench_rig import Clock, Motors, Tracker, rig
+from bench_rig import Motors, Tracker, rig
 from commands import run
 from flexneedle.errors import DriverError
 from flexneedle.lab.rig.devices.opening import open_motors, open_tracker
 from flexneedle.ports import MotorState
 from flexneedle.types import Frame, SensorReading
+from rooms import ManualClock
 
 STATE = MotorState(0.0, 0.0)
 LONG = (0.0, 1.02, 0.0, 0.0)
@@ -51,7 +52,7 @@ def frames(**reading):
 
 
 def opened(device):
-    return open_motors(rig(**FOUND)) if device is Stage else open_tracker(rig(**FOUND), Clock())
+    return open_motors(rig(**FOUND)) if device is Stage else open_tracker(rig(**FOUND), ManualClock())
 
 
 def returning(value):
@@ -118,7 +119,7 @@ def test_numbers_of_numpy_are_numbers(monkeypatch):
 
 @pytest.mark.parametrize("device", [Stage, Camera])
 def test_a_wrong_type_is_a_problem_in_one_line_of_rig_check(capsys, tmp_path, monkeypatch, device):
-    monkeypatch.setattr("flexneedle.lab.rig.devices.clock.WallClock", Clock)
+    monkeypatch.setattr("flexneedle.lab.rig.devices.clock.WallClock", ManualClock)
     monkeypatch.setattr(device, "read", returning(7))
     kinds = {key.replace("__", "."): kind for key, kind in FOUND.items()}
     file = tmp_path / "rig.toml"

@@ -8,11 +8,12 @@ from types import ModuleType
 
 import pytest
 
-from bench_rig import Clock, Motors, Tracker, rig
+from bench_rig import Motors, Tracker, rig
 from flexneedle.errors import DriverError, InputError, RigError, RunError
 from flexneedle.lab.rig.devices.opening import DRIVERS, TRACKERS, open_motors, open_tracker
 from flexneedle.plugins import load_part
 from flexneedle.ports import MotorPaces
+from rooms import ManualClock
 
 PROJECT = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())["project"]
 
@@ -143,7 +144,7 @@ def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
 
 
 def test_a_tracker_is_closed_by_its_close_or_as_a_context_manager():
-    clock = Clock()
+    clock = ManualClock()
     tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), clock)
     tracker.close()
     assert tracker.closed
@@ -175,7 +176,7 @@ def test_other_errors_in_a_device_name_it_and_the_call_and_the_line():
     with pytest.raises(DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_opening"):
         open_motors(found)
     with pytest.raises(DriverError, match=r"^tracker parts:does_not_open: KeyError: 'nothing' "):
-        open_tracker(found, Clock())
+        open_tracker(found, ManualClock())
 
 
 def test_a_name_that_names_no_or_several_installed_parts_is_refused(package):
@@ -211,7 +212,7 @@ def test_a_name_that_names_no_or_several_installed_parts_is_refused(package):
 def test_an_unsuitable_custom_part_is_refused(kind, line):
     found = rig(driver={"kind": kind}, tracker={"kind": kind})
     assert message(open_motors, found).startswith(f'driver.kind = "{kind}": {line}')
-    assert message(open_tracker, found, Clock()).startswith(f'tracker.kind = "{kind}": {line}')
+    assert message(open_tracker, found, ManualClock()).startswith(f'tracker.kind = "{kind}": {line}')
 
 
 def test_a_device_without_all_parts_of_its_port_is_refused_and_closed():
@@ -223,7 +224,7 @@ def test_a_device_without_all_parts_of_its_port_is_refused_and_closed():
         ("managed_lists", "made a list without read, status"),
     ):
         Halves.closed = kind == "lists"
-        line = message(open_tracker, rig(tracker={"kind": f"parts:{kind}"}), Clock())
+        line = message(open_tracker, rig(tracker={"kind": f"parts:{kind}"}), ManualClock())
         assert line.startswith(f'tracker.kind = "parts:{kind}": {words}')
         assert Halves.closed
 
@@ -234,7 +235,7 @@ def test_settings_that_a_device_refuses_are_reported_with_its_kind():
     assert (
         message(open_motors, found) == f"{driver}port = 3: must be text\n{driver}speed = 0: must be above 0"
     )
-    line = message(open_tracker, found, Clock())
+    line = message(open_tracker, found, ManualClock())
     assert line == "tracker parts:refuses_in_one_line: /dev/tty9: no such port"
 
 
@@ -271,4 +272,4 @@ def test_speeds_and_accelerations_beyond_the_controllers_are_refused(changes, ru
 
 def test_a_device_that_does_not_reply_is_no_error_of_the_file():
     with pytest.raises(RunError, match="no reply"):
-        open_tracker(rig(tracker={"kind": "parts:does_not_reply"}), Clock())
+        open_tracker(rig(tracker={"kind": "parts:does_not_reply"}), ManualClock())

@@ -5,18 +5,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from bench_rig import Clock
 from flexneedle.errors import InputError, RigError
 from flexneedle.lab.rig.devices.replay import ENDED, Replay
 from flexneedle.lab.rig.devices.trackers import aurora, read_run_frames, replay
 from flexneedle.types import VISIBLE, CheckedMeasurement, Frame, Measurement, SensorReading
+from rooms import ManualClock
 
 FRAMES = [Frame(100.0 + n / 40, 7 + n, {"tip": SensorReading((float(n), 0.0, 0.0))}) for n in range(5)]
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n5.0,1,tip,1,2,3\n6.0,2,tip,1,2,3\n"
 
 
 def test_recorded_frames_arrive_at_their_time_and_only_once_until_the_end():
-    clock = Clock()
+    clock = ManualClock()
     clock.wait(3.0)
     with Replay(FRAMES, clock) as made:
         assert [frame.number for frame in made.read()] == [7]
@@ -36,7 +36,7 @@ def test_recorded_frames_arrive_at_their_time_and_only_once_until_the_end():
 
 @pytest.mark.parametrize(("speed", "due"), [({"speed": 4}, 0.25), ({"speed": 0.5}, 2.0)])
 def test_a_recording_is_replayed_at_its_speed(tmp_path, speed, due):
-    path, clock = tmp_path / "recorded.csv", Clock()
+    path, clock = tmp_path / "recorded.csv", ManualClock()
     path.write_text(RECORDING)
     clock.wait(3.0)
     tracker = replay({"file": str(path), **speed}, clock)
@@ -55,7 +55,7 @@ def test_a_recording_is_replayed_at_its_speed(tmp_path, speed, due):
 )
 def test_an_aurora_has_a_port_and_names(monkeypatch, sensors, names):
     monkeypatch.setattr("flexneedle.lab.rig.devices.trackers.Aurora", lambda *given: given)
-    clock = Clock()
+    clock = ManualClock()
     assert aurora({"port": "/dev/ttyUSB0", **sensors}, clock) == ("/dev/ttyUSB0", clock, names)
 
 
@@ -74,13 +74,13 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, sensors, names):
 )
 def test_invalid_settings_are_refused(factory, settings, line):
     with pytest.raises(RigError) as caught:
-        factory(settings, Clock())
+        factory(settings, ManualClock())
     assert line in str(caught.value)
 
 
 def test_a_recording_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"gone\.csv: cannot be read"):
-        replay({"file": str(tmp_path / "gone.csv")}, Clock())
+        replay({"file": str(tmp_path / "gone.csv")}, ManualClock())
 
 
 def read_run(monkeypatch, *samples):

@@ -268,20 +268,6 @@ def test_in_motion_neither_position_nor_power_changes(mode, action):
         assert not any(line.startswith("ST") for line in device.lines)
 
 
-def test_a_motor_is_switched_off_and_on_at_its_position():
-    with driven(on=False) as (motors, device):
-        motors.power("A", True)
-        assert device.lines[-1] == "SHA"
-        assert not any(line.startswith("ST") for line in device.lines)
-        motors.follow({"A": 50.0})
-        assert settled(motors)["A"].on
-        motors.power("A", False)
-        assert not motors.read()["A"].on
-        motors.power("A", True)
-        state = motors.read()["A"]
-    assert (state.on, state.position, state.commanded, state.stopped) == (True, 50, 50, "")
-
-
 @pytest.mark.parametrize("on_the_way", [False, True])
 @BOTH_MODES
 def test_a_channel_left_in_motion_by_a_broken_connection_is_stopped_before_its_power_changes(

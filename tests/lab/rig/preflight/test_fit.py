@@ -53,6 +53,7 @@ def keys_of(lines):
         ({"axes__guide_y__range_mm": [-10, 19]}, PLANE, ["axes.guide_y.range_mm = [-10.0, 19.0]"]),
         ({"axes__guide_y__speed_mm_s": 2}, PLANE, ["setup.max_guide_step_mm = 0.5"]),
         ({"axes__rotation__range_deg": [-170, 179.9]}, PLANE, ["axes.rotation.range_deg = [-170.0, 179.9]"]),
+        (FREE_FROM_10, PLANE, ["axes.rotation.range_deg = [10.0, 200.0]"]),
         ({"loop__rate_hz": 20}, PLANE, ["loop.rate_hz = 20.0"]),
         ({}, scenario(setup__axes=2), ["axes.guide_z", "setup.max_rotation_deg"]),
         ({}, MOVING_BASE, ["axes.base_y"]),

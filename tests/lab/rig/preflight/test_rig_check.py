@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 import bench_rig
-from bench_rig import Clock, Motors, Tracker, rig
+from bench_rig import Motors, Tracker, rig
 from flexneedle.errors import RunError
 from flexneedle.lab.emulators.galil.controller import reply
 from flexneedle.lab.rig.devices.galil.motors import factory
@@ -15,6 +15,7 @@ from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_moto
 from flexneedle.scenario.files import load_scenario
 from flexneedle.types import SensorReading
 from galil_peer import peer
+from rooms import ManualClock
 
 PLANE = IntendedInsertion(load_scenario("phantom").with_values({"monitor.references": 0}))
 KINDS = {"driver__kind": "bench_rig:drivers", "tracker__kind": "bench_rig:trackers"}
@@ -39,7 +40,7 @@ def test_a_rig_that_agrees_with_its_file_has_no_problem_and_is_closed(monkeypatc
     motors = Motors()
     motors.identity = "DMC4143 Rev 1.3h"
     monkeypatch.setattr(bench_rig, "drivers", lambda *_: motors)
-    findings = check_rig(rig(**KINDS), Clock(), 2.0, PLANE)
+    findings = check_rig(rig(**KINDS), ManualClock(), 2.0, PLANE)
     assert problems(findings) == {}
     assert (motors.calls, motors.closed) == ([], True)
     assert found_of(findings, "driver", "connection") == "bench_rig:drivers, DMC4143 Rev 1.3h"
@@ -61,7 +62,7 @@ def test_a_failed_device_does_not_hide_the_other(monkeypatch):
         (lambda *_: failing, "reading", "A: no reply to TPA"),
     ):
         monkeypatch.setattr(bench_rig, "drivers", drivers)
-        findings = check_rig(rig(**KINDS), Clock(), 1.0)
+        findings = check_rig(rig(**KINDS), ManualClock(), 1.0)
         ((where, problem),) = problems(findings).items()
         assert where == ("driver", item)
         assert problem.startswith(line)
@@ -72,7 +73,7 @@ def test_a_failed_device_does_not_hide_the_other(monkeypatch):
 def test_a_scenario_that_does_not_fit_and_a_slow_rig_are_findings(monkeypatch):
     monkeypatch.setattr(bench_rig, "drivers", lambda *_: Motors(("A",)))
     slow = rig(**KINDS, axes__guide_y=None, axes__rotation=None, axes__insertion__acceleration_mm_s2=5.0)
-    findings = check_rig(slow, Clock(), 1.0, PLANE)
+    findings = check_rig(slow, ManualClock(), 1.0, PLANE)
     found = [one.problem.split(":")[0] for one in findings if one.part == "scenario"]
     assert found == ["axes.guide_y", "axes.rotation"]
     assert found_of(findings, "insertion", "speed").startswith("2.11 of 10 mm/s")
@@ -86,7 +87,7 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
     device = motors_with("A", position=12345.0, commanded=12345.0)
     device.set("B", position=9000.0, on=False)
     device.set("C", position=-1500.0, commanded=-1500.0)
-    findings = check_motors(rig(axes__guide_y__backlash_mm=0.08), device, Clock())
+    findings = check_motors(rig(axes__guide_y__backlash_mm=0.08), device, ManualClock())
     assert {name: found_of(findings, name, "position") for name in ("insertion", "rotation", "guide_y")} == {
         "insertion": "12.345 mm (12345 counts)",
         "rotation": "90 deg (9000 counts)",
@@ -115,7 +116,7 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
     ],
 )
 def test_a_motor_that_is_not_ready_is_a_problem(changes, state, item, problem):
-    found = problems(check_motors(rig(**changes), motors_with("A", **state), Clock()))
+    found = problems(check_motors(rig(**changes), motors_with("A", **state), ManualClock()))
     if item == "position":
         found.pop(("insertion", "commanded - measured"), None)
     assert set(found) == ({("insertion", item)} if item else set())
@@ -126,7 +127,7 @@ def test_a_reversed_motor_has_the_limits_of_its_axis():
     made = rig(axes__guide_y__range_mm=[-5, 15])
     for counts, expected in ((-7000.0, set()), (7000.0, {("guide_y", "position")})):  # 14 and −14 mm
         device = motors_with("C", position=counts, commanded=counts)
-        assert set(problems(check_motors(made, device, Clock()))) == expected
+        assert set(problems(check_motors(made, device, ManualClock()))) == expected
 
 
 def test_a_missing_channel_and_a_slow_controller_are_problems():
@@ -135,7 +136,7 @@ def test_a_missing_channel_and_a_slow_controller_are_problems():
             clock.wait(0.03)
             return super().read()
 
-    clock = Clock()
+    clock = ManualClock()
     assert problems(check_motors(rig(), Slow(("A", "C", "D")), clock)) == {
         ("rotation", "motor"): "the driver has no channel B; it has A, C, D",
         ("driver", "reply"): "longer than a tick of the loop, 25 ms",
@@ -145,7 +146,7 @@ def test_a_missing_channel_and_a_slow_controller_are_problems():
 def test_an_insertion_that_cannot_start_from_here_is_a_problem():
     for position, expected in ((30_000.0, set()), (50_000.0, {("insertion", "room")})):
         device = motors_with("A", position=position, commanded=position)
-        assert set(problems(check_motors(rig(), device, Clock(), PLANE))) == expected
+        assert set(problems(check_motors(rig(), device, ManualClock(), PLANE))) == expected
 
 
 @pytest.mark.parametrize(
@@ -164,7 +165,7 @@ def test_the_settings_of_a_controller_are_compared_with_the_file(commands, axis,
         device.device, _ = reply(device.device, commands)
         given = {"address": f"127.0.0.1:{device.port}", "reply_timeout_ms": 1000}
         with closing(factory(given, ("A", "B", "C"))) as connected:
-            findings = check_motors(rig(), connected, Clock())
+            findings = check_motors(rig(), connected, ManualClock())
     found = problems(findings)
     assert set(found) == ({(axis, item)} if item else set())
     assert all(line.startswith(problem) for line in found.values())
@@ -185,7 +186,7 @@ class ChangedTracker(Tracker):
     """A tracker whose frames are changed: None leaves a frame out."""
 
     def __init__(self, change, **options):
-        super().__init__(Clock(), **options)
+        super().__init__(ManualClock(), **options)
         self._change = change
 
     def read(self):
@@ -200,11 +201,15 @@ def reading(where, tip):
 @pytest.mark.parametrize(
     ("device", "seconds", "problem"),
     [
-        (Tracker(Clock()), 2.0, ""),
-        (Tracker(Clock(), rate=20.0), 2.0, "frames: tracker.rate_hz of the scenario is 40"),
-        (Tracker(Clock(), rate=0.0, status="no reply"), 1.0, "frames: no frame: no reply"),
-        (Tracker(Clock(), status="no reply"), 2.0, "status: must be ok"),
-        (Tracker(Clock(), sensors=("ref1",)), 1.0, "sensor tip: the needle's sensor must have the name tip"),
+        (Tracker(ManualClock()), 2.0, ""),
+        (Tracker(ManualClock(), rate=20.0), 2.0, "frames: tracker.rate_hz of the scenario is 40"),
+        (Tracker(ManualClock(), rate=0.0, status="no reply"), 1.0, "frames: no frame: no reply"),
+        (Tracker(ManualClock(), status="no reply"), 2.0, "status: must be ok"),
+        (
+            Tracker(ManualClock(), sensors=("ref1",)),
+            1.0,
+            "sensor tip: the needle's sensor must have the name tip",
+        ),
         (ChangedTracker(reading(lambda number: number % 5 == 0, LOST)), 2.0, "sensor tip: measured in"),
         (ChangedTracker(reading(lambda number: number < 1, LOST)), 0.2, ""),  # one frame is allowed
         (ChangedTracker(reading(lambda number: number < 2, LOST)), 0.2, "sensor tip: measured in too few"),
@@ -233,5 +238,5 @@ def test_the_references_that_the_monitor_needs_are_counted():
         (("tip", "ref1"), {("tracker", "reference sensors")}),
         (("tip", "ref1", "ref2", "ref3"), set()),
     ):
-        device = Tracker(Clock(), sensors=sensors)
+        device = Tracker(ManualClock(), sensors=sensors)
         assert set(problems(check_tracker(device, device.clock, 1.0, needs))) == expected

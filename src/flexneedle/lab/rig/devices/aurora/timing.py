@@ -11,23 +11,19 @@ class Timeline:
     Frame n is requested at aₙ = t₀ + n/rate + lag with lag ≥ 0 (except for the transmission time of the command, under
     1 ms), and sometimes with a lag near its minimum. The estimated time is t₀ + n/rate with t₀ = min(a − n/rate) over
     the last 400 frames: its error is only the smallest lag. The time of arrival is not used, since a reply may be
-    delayed. Times increase strictly and are never after the request.
+    delayed. Times increase with the requests, and are never after them.
     """
 
     def __init__(self, rate: float) -> None:
         self._period = 1 / rate
         self._starts: deque[float] = deque(maxlen=_WINDOW)
-        self._last: float | None = None
 
     def stamp(self, number: int, requested: float) -> float:
         """Return the time of measurement (s, on the clock of `requested`) of frame `number`; numbers must increase."""
         self._starts.append(requested - number * self._period)
-        time = min(self._starts) + number * self._period
-        if self._last is not None:  # still increase if the estimate of t₀ became smaller
-            time = max(time, self._last + self._period / 2)
-        time = min(requested, time)  # also where a large number is rounded
-        self._last = time
-        return time
+        return min(
+            requested, min(self._starts) + number * self._period
+        )  # also where a large number is rounded
 
 
 class Numbering:
