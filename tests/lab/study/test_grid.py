@@ -269,7 +269,7 @@ def test_the_shipped_studies_load():
 
 
 def test_shipped_studies_share_the_papers_targets_and_their_phantoms_on_purpose():
-    """As their headers state; the long study has seeds of its own."""
+    """As their headers state; the long study has other seeds."""
     of_phantom = insertions(load_study("phantom"))
     targets = [insertion.point.scenario.target.position[:2] for insertion in of_phantom]
     assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]

@@ -42,11 +42,15 @@ def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
     assert "z = 25 mm" in words(figure)
 
 
-def test_scattered_points_are_divided_into_five_slabs():
+def test_scattered_points_are_divided_into_five_slabs_and_rows_beyond_the_sixth_counted():
     true = np.random.default_rng(1).uniform(-50, 50, (300, 3))
     drawn = [one[0] for one in arrows(draw_field([field_row(true)])) if one]
     assert len(drawn) == 5
     assert sum(len(one.U) for one in drawn) == 300
+    figure = draw_field([field_row(GRID[:1], title=f"coil {k}") for k in range(8)])
+    assert "2 more not shown" in words(figure)
+    assert "coil 5" in words(figure)
+    assert "coil 6" not in words(figure)
 
 
 @pytest.mark.parametrize("true", [GRID[:1], GRID[:2], GRID[GRID[:, 2] == 0.0]])
@@ -65,23 +69,6 @@ def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it():
     assert all(one.get_clip_on() for _, one in drawn)
     lengths = np.concatenate([np.hypot(one.U, one.V) for _, one in drawn])
     assert np.quantile(lengths, 0.95) > 3.0  # mm: long enough to be visible
-
-
-def test_single_slices_are_drawn_in_pairs():
-    plane = GRID[GRID[:, 2] == 0.0]
-    one, two, three = (draw_field([field_row(plane)] * k) for k in (1, 2, 3))
-    assert two.get_figheight() <= one.get_figheight() < three.get_figheight() <= 2 * two.get_figheight()
-    two.draw_without_rendering()
-    left, right = (ax.get_window_extent() for ax in two.axes[::2])
-    assert left.y0 == pytest.approx(right.y0)
-    assert left.x1 < two.bbox.width / 2 < right.x0
-
-
-def test_rows_beyond_the_sixth_are_counted():
-    figure = draw_field([field_row(title=f"coil {k}") for k in range(8)])
-    assert "2 more not shown" in words(figure)
-    assert "coil 5" in words(figure)
-    assert "coil 6" not in words(figure)
 
 
 def panel(**changes):
@@ -109,6 +96,10 @@ def test_all_indicators_are_shown():
     assert figure.axes[0].get_xlim() == pytest.approx((0.0, 1.04 * 0.5))
     assert "not shown" not in words(figure)
     assert "threshold 0.0550" in words(figure)
+    far = draw_indicator([panel(noisy=None, line=None, threshold=0.9)])
+    assert far.axes[0].get_xlim()[1] > 0.9
+    for more, text in ((5, "5 more sensors not shown"), (1, "1 more sensor not shown")):
+        assert text in words(draw_indicator([panel()], more))
 
 
 def test_a_few_indicators_far_out_are_counted_instead():
@@ -119,16 +110,6 @@ def test_a_few_indicators_far_out_are_counted_instead():
     (ax,) = figure.axes
     assert 0.5 < ax.get_xlim()[1] < 0.7
     assert ax.get_ylim()[1] < 5.0
-
-
-def test_omitted_sensors_are_counted():
-    assert "5 more sensors not shown" in words(draw_indicator([panel()] * 3, 5))
-    assert "1 more sensor not shown" in words(draw_indicator([panel()] * 3, 1))
-
-
-def test_a_threshold_beyond_all_indicators_is_shown():
-    figure = draw_indicator([panel(noisy=None, line=None, threshold=0.9)])
-    assert figure.axes[0].get_xlim()[1] > 0.9
 
 
 @pytest.mark.parametrize(

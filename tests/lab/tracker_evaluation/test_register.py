@@ -43,6 +43,12 @@ def test_exact_pairs_give_the_exact_transform(tmp_path):
     np.testing.assert_allclose(found.rigid.translation, TRUE.translation, atol=1e-9)
     assert found.fre < 1e-9
     assert found.pairs.samples.tolist() == [3] * 8
+    in_metres = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
+    other = register(read_pairs(table(tmp_path, in_metres), unit="m"))
+    np.testing.assert_allclose(other.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
+    assert (other.leave_one_out > other.residuals).all()
+    without_ids = table(tmp_path, [row[1:7] for row in rows()], HEAD[9:-7])
+    assert register(read_pairs(without_ids)).values()["points"] == 8
     again = to_stage(found.registration)
     np.testing.assert_allclose(again.apply(STAGE), TRUE.apply(STAGE), atol=1e-9)
 
@@ -76,25 +82,6 @@ def test_rows_of_other_sensors_and_missing_samples_are_not_checked(tmp_path):
     np.testing.assert_array_equal(found.tracker, alone.tracker)
     np.testing.assert_array_equal(found.stage, alone.stage)
     assert (found.names, found.missing) == (alone.names, 1)
-
-
-def test_metres_are_read_with_unit_m(tmp_path):
-    data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
-    in_metres = register(read_pairs(table(tmp_path, data), unit="m"))
-    np.testing.assert_allclose(in_metres.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
-
-
-def test_a_target_with_nan_is_refused_before_writing(tmp_path, capsys):
-    out = tmp_path / "r.toml"
-    with pytest.raises(SystemExit):
-        main(["em", "register", str(table(tmp_path, rows())), "--target", "nan", "0", "0", "--out", str(out)])
-    assert "must be a finite number" in capsys.readouterr().err
-    assert not list(tmp_path.glob("r.*"))
-
-
-def test_without_point_ids_each_row_is_a_point(tmp_path):
-    path = table(tmp_path, [row[1:7] for row in rows()], HEAD[9:-7])
-    assert register(read_pairs(path)).values()["points"] == 8
 
 
 CODE = -3.697314e28  # of a tracker, for a missing position
@@ -134,7 +121,7 @@ def test_what_cannot_be_registered_is_refused(tmp_path, name, capsys):
     assert not (tmp_path / "r.toml").exists()
 
 
-def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp_path, capsys):
+def test_the_command_writes_a_scenario_table_and_reports_errors(tmp_path, capsys):
     data, out = table(tmp_path, [*rows(0.3), *rows(sensor="tip")]), tmp_path / "rig.toml"
     command = ["em", "register", str(data), "--sensor", "ref1", "--target", "40", "5", "0", "--out", str(out)]
     assert main([*command, "--json"]) == 0
@@ -142,7 +129,6 @@ def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp
     found = register(read_pairs(data, sensor="ref1"), [(40.0, 5.0, 0.0)])
     assert printed["fre_mm"] == found.fre
     assert printed["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
-    assert {path.name for path in tmp_path.glob("rig.*")} == {"rig.toml", "rig.png", "rig.svg"}
     assert tomllib.loads(out.read_text())["result"]["points"] == 8
     scenario = load_registration(out, PHANTOM)
     assert scenario.tracker.registration == found.registration
@@ -205,7 +191,7 @@ def test_an_insertion_has_the_error_of_its_registration(tmp_path):
     exact = {**registration, "localisation_mm": 0.0}
     unchanged = off(rig_of(6, **world, **{"tracker.registration": exact}))
     np.testing.assert_allclose(unchanged, off(rig_of(6, **world)), atol=0.3)
-    rigs = (rig_of(seed, **world, **{"tracker.registration": registration}) for seed in range(60))
+    rigs = (rig_of(seed, **world, **{"tracker.registration": registration}) for seed in range(30))
     errors = np.array([off(rig) - unchanged for rig in rigs])
     expected = found.tre[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, with about equal errors
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) == pytest.approx(expected, rel=0.35)

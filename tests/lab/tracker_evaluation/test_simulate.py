@@ -90,11 +90,8 @@ def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
     for name in COLUMNS:
         np.testing.assert_array_equal(both[name][ROWS:], alone[name])
     assert not np.allclose(*(column(table, "y_mm")[:5] for table in (both, alone)))
-
-
-def test_two_sensors_have_independent_noise():
-    both = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
-    table = measure_grid([both], Experiment(points=2, samples=500))
+    noise = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
+    table = measure_grid([noise], Experiment(points=2, samples=500))
     off = [column(table, "x_mm", name) - column(table, "true_x_mm", name) for name in ("tip", "reference")]
     assert abs(np.corrcoef(off)[0, 1]) < 0.05
 
@@ -110,14 +107,8 @@ def test_same_seed_same_bytes(tmp_path, suffix):
     assert one == same != other
 
 
-# ---- what is refused
-
-
-def test_two_environments_with_the_same_name_are_refused():
+def test_two_environments_of_one_name_and_too_many_samples_are_refused():
     with pytest.raises(InputError, match="two environments have the name ideal"):
         measure_grid([load_environment("ideal")] * 2, SMALL)
-
-
-def test_too_many_samples_are_refused():
     with pytest.raises(InputError, match="200000000 samples: must be at most"):
         measure_grid([load_environment("ideal")], Experiment(points=10, samples=100_000, repeats=1))

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed
+from flexneedle.cli.values import port
 
 if TYPE_CHECKING:
     from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
     from flexneedle.lab.emulators.orders import Orders
-
-_LAST_PORT = 65535
 
 
 def add_parser(commands: Commands) -> None:
@@ -79,7 +78,7 @@ def _add_galil(commands: Commands) -> None:
         "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
     )
     galil.add_argument(
-        "--port", type=_port, default=0, metavar="N", help="port to listen on (default: any free port)"
+        "--port", type=port, default=0, metavar="N", help="port to listen on (default: any free port)"
     )
     _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
     add_seed(galil, "seed of corrupted bytes")
@@ -123,12 +122,6 @@ def _add_fault(parser: argparse.ArgumentParser, fault: str, page: str, *, device
         metavar=f"{device}KIND[=DETAIL]@SECONDS[:DURATION]",
         help=f"inject {fault}; repeatable; see {page}",
     )
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= _LAST_PORT):
-        raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (any free port) to {_LAST_PORT}")
-    return int(text)
 
 
 def _emulate_aurora(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.values import port
 from flexneedle.errors import InputError
 from flexneedle.files import RUNS
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from flexneedle.lab.page.server.connected_rig import RigReference
     from flexneedle.lab.page.server.request_handler import PageSetup
 
-_HOST, _PORT, _LAST_PORT = "127.0.0.1", 8472, 65535
+_HOST, _PORT = "127.0.0.1", 8472
 _WORKER = "flexneedle.lab.page.worker"
 
 
@@ -59,7 +60,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--port",
-        type=_port,
+        type=port,
         default=_PORT,
         metavar="N",
         help=f"port to listen on, 0 for any free port (default: {_PORT})",
@@ -70,13 +71,6 @@ def add_parser(commands: Commands) -> None:
         default=None,
         help="open the page in a browser (default: if there is a display)",
     )
-
-
-def _port(text: str) -> int:
-    """Return a port. Raises ArgumentTypeError for anything else."""
-    if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to {_LAST_PORT}")
-    return int(text)
 
 
 def _serve(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import compile_first, print_json
+from flexneedle.cli.values import make_number_type
 
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
@@ -44,7 +45,10 @@ def add_parser(commands: Commands) -> None:
         help="number of the first world and count, for a study of worlds (default: as in the study file)",
     )
     parser.add_argument(
-        "--workers", type=_workers, metavar="N", help="number of local processes (default: one per core)"
+        "--workers",
+        type=make_number_type(int, 1),
+        metavar="N",
+        help="number of local processes (default: one per core)",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="run on the Dask cluster at this scheduler address"
@@ -54,12 +58,6 @@ def add_parser(commands: Commands) -> None:
         "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-
-
-def _workers(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) >= 1):
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, at least 1")
-    return int(text)
 
 
 def _study(args: argparse.Namespace) -> int:

@@ -10,7 +10,6 @@ import tomli_w
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.figures.style import save
 from flexneedle.geometry.quaternion import from_matrix
 from flexneedle.geometry.rigid import (
     Rigid,
@@ -23,7 +22,6 @@ from flexneedle.geometry.rigid import (
 from flexneedle.lab.tables.columns import map_columns
 from flexneedle.lab.tables.row_rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
 from flexneedle.lab.tables.sample_table import SampleTable, open_table
-from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
 from flexneedle.phantom.tracking.measurement_table import REQUIRED
 from flexneedle.scenario.sections.registration import Registration
 
@@ -132,7 +130,7 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
 
 
 def write_registration(registered: RegistrationResult, path: Path) -> None:
-    """Write a TOML file with a table for a scenario and the errors, and its figure as `.png` and `.svg`.
+    """Write a TOML file with a table for a scenario and the errors.
 
     Raises InputError if the file exists.
     """
@@ -140,7 +138,6 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
         raise InputError(f"{path}: already exists: choose another file with --out")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
-    _draw(registered, path)
     values = {
         "tracker": {"registration": registered.registration.model_dump(mode="json")},
         "result": registered.values(),
@@ -152,17 +149,6 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
         raise InputError(f"{path}: already exists: choose another file with --out") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def _draw(registered: RegistrationResult, path: Path) -> None:
-    stage, fle = registered.pairs.stage, registered.fle
-    figure = draw_registration(
-        stage,
-        registered.rigid.apply(registered.pairs.tracker),
-        registered.targets,
-        lambda points: target_error(stage, fle, points),
-    )
-    save(figure, path.parent, path.stem)
 
 
 _POINTS = """

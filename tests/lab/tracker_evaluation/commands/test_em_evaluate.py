@@ -1,7 +1,6 @@
-"""`flexneedle em evaluate` and `em check`: output, files and exit status."""
+"""`flexneedle em evaluate`: output, files and exit status."""
 
 import json
-import re
 import sys
 
 import numpy as np
@@ -87,7 +86,7 @@ def test_the_default_folder_is_new_and_results_are_not_overwritten(capsys, table
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", ["evaluate", "check", "register"])
+@pytest.mark.parametrize("command", ["evaluate", "register"])
 def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, monkeypatch):
     monkeypatch.setitem(sys.modules, "duckdb", None)
     status, out, err = run(capsys, "em", command, table)
@@ -101,64 +100,6 @@ def test_an_invalid_table_gives_one_line_and_status_2(capsys, tmp_path):
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"flexneedle: {path}: no column point_id, true_x_mm")
     assert not (tmp_path / "out").exists()
-
-
-def powered(mean, environment="on", points=27, sensor="reference"):
-    values = mean * np.linspace(0.5, 1.5, points)
-    return rows_of(GRID[:points], GRID[:points, None], sensor, environment, values.tolist())
-
-
-def test_check_compares_two_environments_with_status_1_above_the_threshold(capsys, tmp_path):
-    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.04))
-    status, out, _ = run(capsys, "em", "check", table)
-    assert status == 0
-    assert "power adds 0.0200 (95 % interval" in out
-    assert "mean 0.0400 with power on, not above the threshold of 0.0547 (" in out
-    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.06))
-    status, out, _ = run(capsys, "em", "check", table, "--json")
-    values = json.loads(out)
-    assert (status, values["above"], values["paper_powered"]) == (1, True, 0.04)
-    assert values["results"][0]["difference"] == pytest.approx(0.04)
-    assert values["results"][0]["paired"] is True
-    low, high = values["results"][0]["difference_interval"]
-    assert 0.03 < low <= 0.04 + 1e-12 <= high + 2e-12 < 0.05  # higher with power on
-    assert values["results"][0]["points_above"] == 16
-
-
-def test_the_interval_of_the_difference_resamples_points_in_pairs(capsys, tmp_path):
-    rng = np.random.default_rng(1)
-    off, on = rng.uniform(0.01, 0.03, 27), rng.uniform(0.02, 0.05, 27)
-    rows = [
-        row
-        for name, values in (("off", off), ("on", on))
-        for row in rows_of(GRID, GRID[:, None], "reference", name, values.tolist())
-    ]
-    _, out, _ = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows), "--json")
-    chosen = np.random.default_rng(0).integers(0, 27, (2000, 27))
-    ends = np.quantile((on - off)[chosen].mean(axis=1), (0.025, 0.975))
-    assert json.loads(out)["results"][0]["difference_interval"] == pytest.approx(ends, abs=1e-12)
-
-
-def test_check_finds_both_environments_by_name(capsys, tmp_path):
-    both = write_csv(tmp_path / "both.csv", powered(0.02, "quiet") + powered(0.03))
-    status, out, _ = run(capsys, "em", "check", both, "--off", "quiet", "--threshold", "0.025")
-    assert status == 1
-    assert "above the threshold of 0.025" in out
-    assert re.search(r"paper, power on +0\.0400", out)
-    status, _, err = run(capsys, "em", "check", both)
-    assert status == 2
-    assert "no environment 'off': choose with --off and --on from on, quiet" in err
-
-
-def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
-    rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
-    table = write_csv(tmp_path / "t.csv", rows)
-    status, _, err = run(capsys, "em", "check", table)
-    assert (status, err) == (0, "note: ref2: no indicator with power off\n")
-    assert json.loads(run(capsys, "em", "check", table, "--json")[1])["notes"] == [err[6:-1]]
-    status, _, err = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows[:27] + rows[54:]))
-    assert status == 2
-    assert "no sensor has an indicator both with power off (reference) and on (ref2)" in err
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -34,25 +34,16 @@ def test_fits_and_threshold_are_the_planted_ones(tmp_path):
     assert found["paper"]["threshold"] == 0.0547
 
 
-def test_the_environments_can_have_other_names(tmp_path):
+def test_environments_may_have_other_names_and_one_or_the_indicator_may_be_missing(tmp_path):
     path = planted(tmp_path / "t.csv", names=("clear", "plate"))
-    evaluation = evaluate_table(path, EvaluationOptions())
-    assert evaluation.values()["indicator"] == []
-    (found,) = evaluate_table(path, EvaluationOptions(ideal="clear", noisy="plate")).values()["indicator"]
-    assert found["noisy"]["slope_mm"] == pytest.approx(9.0)
-
-
-def test_one_environment_gives_a_threshold_but_no_line(tmp_path):
+    assert evaluate_table(path, EvaluationOptions()).fits == []
+    (found,) = evaluate_table(path, EvaluationOptions(ideal="clear", noisy="plate")).fits
+    assert found.noisy.slope_mm == pytest.approx(9.0)
     rows = rows_of(GRID, [[p + 0.1] for p in GRID], "reference", "ideal", np.linspace(0.01, 0.06, N).tolist())
-    (found,) = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["indicator"]
-    assert found["threshold"] == pytest.approx(0.0575)
-    assert found["noisy"] is None
-
-
-def test_a_sensor_without_indicator_has_no_analysis(tmp_path):
-    evaluation = evaluate_table(
-        write_csv(tmp_path / "t.csv", rows_of(GRID, [[p] for p in GRID])), EvaluationOptions()
-    )
+    (found,) = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).fits
+    assert (found.threshold, found.noisy) == (pytest.approx(0.0575), None)
+    rows = rows_of(GRID, [[p] for p in GRID])
+    evaluation = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
     assert evaluation.fits == []
     assert evaluation.values()["results"][0]["indicator"] is None
 

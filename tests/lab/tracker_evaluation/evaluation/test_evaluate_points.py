@@ -44,13 +44,6 @@ def test_each_grid_point_of_each_sensor_and_environment_has_a_row(tmp_path):
         assert (row["samples"], row["missing"]) == ("4", "0")
 
 
-def test_the_rmse_is_that_of_the_errors_in_the_table_of_points(tmp_path):
-    rows = random_rows(3, samples=4)
-    result = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).results[0]
-    errors = np.array([float(row["error_mm"]) for row in points(tmp_path, rows)])
-    assert np.sqrt((errors**2).mean()) == result.accuracy.rmse_mm  # all digits
-
-
 def test_a_point_without_samples_has_only_its_true_position(tmp_path):
     rows = random_rows(1, samples=3)
     for row in rows[3:6]:

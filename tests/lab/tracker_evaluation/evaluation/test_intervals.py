@@ -1,38 +1,43 @@
-"""Bootstrap intervals have their nominal coverage of planted values (studies/em_coverage.py: 200 data sets)."""
+"""Intervals over grid points, by independent formulas and coverage (studies/em_coverage.py: 200 data sets)."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from em_tables import one, random_rows, write_csv
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import fit_line
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import bootstrap, quantile_interval
 
 
-def test_the_interval_of_a_root_mean_square_covers_nine_times_of_ten():
-    rng = np.random.default_rng(0)
-    covered = 0
-    for _ in range(60):
-        squares = (rng.normal(0.0, 0.5, (125, 3)) ** 2).sum(axis=1)
-        low, high = bootstrap(lambda s, axis: np.sqrt(s.mean(axis=axis)), squares)
-        covered += low <= np.sqrt(3 * 0.25) <= high
-    assert 52 <= covered <= 60
+def test_intervals_are_quantiles_of_resampled_points(tmp_path):
+    """27 independent points all miss a share s of the volume with probability (1 - s)^27."""
+    rows = random_rows(3, samples=5, bias=0.8)
+    found = one(write_csv(tmp_path / "t.csv", rows))
+    x, true = (
+        np.array([[row[f"{name}{axis}_mm"] for axis in "xyz"] for row in rows]).reshape(27, 5, 3)
+        for name in ("", "true_")
+    )
+    chosen = np.random.default_rng(0).integers(0, 27, (2000, 27))
+    error = np.linalg.norm((x - true).mean(axis=1), axis=1)[chosen]
+    scatter = ((x - x.mean(axis=1, keepdims=True)) ** 2).sum(axis=(1, 2))[chosen]
+    drawn = {
+        "rmse_mm": np.sqrt((error**2).mean(axis=1)),
+        "mean_mm": error.mean(axis=1),
+        "sd_mm": np.sqrt(((error - error.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) / 26),
+        "jitter_mm": np.sqrt(scatter.sum(axis=1) / (27 * 5)),
+    }
+    for name, values in drawn.items():
+        assert found["intervals"][name] == pytest.approx(np.quantile(values, (0.025, 0.975)), abs=1e-9), name
+    assert (1.0 - found["beyond_max"]) ** 27 == pytest.approx(0.05)
 
 
 def test_the_interval_of_a_slope_covers_if_the_scatter_grows_with_the_indicator():
-    rng = np.random.default_rng(1)
-    covered = 0
+    rng, covered = np.random.default_rng(1), 0
     for _ in range(60):
         x = rng.uniform(0.07, 0.45, 125)
-        found = fit_line(x, 9.6 * x + 0.05 + rng.normal(0.0, 4.0 * x))
-        low, high = found.intervals["slope_mm"]
+        low, high = fit_line(x, 9.6 * x + 0.05 + rng.normal(0.0, 4.0 * x)).intervals["slope_mm"]
         covered += low <= 9.6 <= high
     assert 52 <= covered <= 60
-
-
-def test_few_points_have_no_interval_and_the_same_seed_gives_the_same():
-    values = np.arange(30.0)
-    assert bootstrap(np.mean, values[:9]) is None
-    assert bootstrap(np.mean, values) == bootstrap(np.mean, values)
 
 
 @pytest.mark.parametrize("count", [72, 100, 125, 1000])
@@ -43,6 +48,8 @@ def test_the_interval_of_a_percentile_ends_at_the_narrowest_ranks_with_a_fortiet
     assert below.sf(high - 1) <= 0.025 < below.sf(high - 2)
 
 
-def test_a_percentile_of_few_points_has_no_upper_end_or_no_interval():
+def test_few_points_have_no_interval_or_no_upper_end():
+    values = np.arange(30.0)
+    assert bootstrap(np.mean, values[:9]) is quantile_interval(values[:9], 0.95) is None
+    assert bootstrap(np.mean, values) == bootstrap(np.mean, values)
     assert quantile_interval(np.arange(1.0, 72.0), 0.95) == (63.0, np.inf)
-    assert quantile_interval(np.arange(9.0), 0.95) is None

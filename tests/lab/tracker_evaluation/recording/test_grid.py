@@ -32,13 +32,9 @@ def test_a_lattice_varies_z_fastest_and_is_completed_before_it_repeats(read):
     assert grid.points == ((1, 2, 3), (1, 2, 33), (1, 22, 3), (1, 22, 33))
     stops = list(grid.stops())
     assert stops[1] == GridStop(1, 2, (1, 2, 33))
+    listed = read('environment = "ideal"\npoints_mm = [[0, 0, 0], [5.5, 0, 0]]\n')
+    assert (listed.points, listed.file.sensors) == (((0, 0, 0), (5.5, 0, 0)), {"tip": "tip"})
     assert [(stop.repeat, stop.point_id) for stop in stops] == [(r, p) for r in (1, 2) for p in (1, 2, 3, 4)]
-
-
-def test_points_can_be_listed(read):
-    grid = read('environment = "ideal"\npoints_mm = [[0, 0, 0], [5.5, 0, 0]]\n')
-    assert grid.points == ((0, 0, 0), (5.5, 0, 0))
-    assert grid.file.sensors == {"tip": "tip"}
 
 
 def test_the_shipped_example_is_the_papers_grid():
@@ -47,6 +43,8 @@ def test_the_shipped_example_is_the_papers_grid():
     assert len(grid.points) == 125
     assert (grid.points[0], grid.points[-1]) == ((0, 0, 0), (100, 100, 100))
     assert (grid.file.samples, grid.file.repeats) == (100, 5)
+    with pytest.raises(InputError, match=r"nothing\.toml: no such file, and no such grid \(choices: cube\)"):
+        read_grid("nothing.toml")
 
 
 @pytest.mark.parametrize(
@@ -74,8 +72,3 @@ def test_an_invalid_grid_file_is_refused_with_key_and_rule(read, text, message):
     with pytest.raises(InputError, match=r"grid\.toml: ") as refusal:
         read(text)
     assert message in str(refusal.value)
-
-
-def test_a_missing_grid_file_is_refused_with_the_shipped_names():
-    with pytest.raises(InputError, match=r"nothing\.toml: no such file, and no such grid \(choices: cube\)"):
-        read_grid("nothing.toml")

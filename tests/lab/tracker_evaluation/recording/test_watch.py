@@ -48,32 +48,17 @@ def test_each_frame_is_shown_once_with_its_verdict():
     assert set(verdicts[20:]) == {VISIBLE}
 
 
-def test_a_custom_check_receives_the_history():
-    clock, snapshots = Clock(), []
-    watch_tracker(
-        Replay(frames(500), clock),
-        clock,
-        snapshots.append,
-        check=lambda history, _: (str(len(history)), False),
-    )
-    assert [snapshot.verdict for snapshot in snapshots[:3]] == ["1", "2", "3"]
-    assert snapshots[-1].verdict == "400"
-
-
 def test_it_stops_after_the_given_seconds_or_at_the_end_of_a_replay():
     clock = Clock()
     assert watch_tracker(Replay(frames(60), clock), clock, lambda _: None, seconds=0.5) == 20
+    clock, snapshots = Clock(), []
+    assert watch_tracker(Silent(), clock, snapshots.append, seconds=3.0) == 0
+    assert 4 <= len(snapshots) <= 6, "the status, twice a second"
+    assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
     clock, tracker = Clock(), Silent()
     tracker.status = ENDED
     assert watch_tracker(tracker, clock, lambda _: None, seconds=3.0) == 0
     assert clock.time == 0.0
-
-
-def test_without_frames_the_status_is_shown_periodically():
-    clock, snapshots = Clock(), []
-    assert watch_tracker(Silent(), clock, snapshots.append, seconds=3.0) == 0
-    assert 4 <= len(snapshots) <= 6
-    assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
 
 
 def test_what_is_recorded_can_be_replayed(tmp_path):
@@ -164,21 +149,19 @@ def test_the_verdict_follows_the_monitor_of_a_held_insertion():
     ]
 
 
-def sensors(*names, indicator=0.02):
-    return [
-        Frame(n / 40, n, {name: SensorReading((0.0, 0.0, 0.0), None, indicator) for name in names})
-        for n in range(40)
-    ]
-
-
-def test_without_a_given_number_all_present_references_are_used():
-    def check(frames):
-        return make_field_check()(frames, False)[0]
-
-    assert check(sensors("tip", "ref1")) == VISIBLE
-    assert "field distorted" in check(sensors("tip", "ref1", indicator=0.06))
-    assert "field not known" in check(sensors("tip")), "no reference"
-    assert check(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
-    assert check(sensors("tip", "tip2", "ref1")) == VISIBLE, "a second sensor in the needle is no reference"
-    assert "field not known: 1 of 2" in make_field_check(2)(sensors("tip", "ref1"), False)[0]
-    assert make_field_check(0)(sensors("tip"), False) == (VISIBLE, False)
+@pytest.mark.parametrize(
+    ("names", "indicator", "references", "expected"),
+    [
+        (("tip", "ref1"), 0.02, None, VISIBLE),
+        (("tip", "ref1"), 0.06, None, "field distorted"),
+        (("tip",), 0.02, None, "field not known"),
+        (("tip", "ref1", "ref2", "ref3", "ref4"), 0.02, None, VISIBLE),
+        (("tip", "tip2", "ref1"), 0.02, None, VISIBLE),  # a second sensor in the needle is no reference
+        (("tip", "ref1"), 0.02, 2, "field not known: 1 of 2"),
+        (("tip",), 0.02, 0, VISIBLE),
+    ],
+)
+def test_without_a_given_number_all_present_references_are_used(names, indicator, references, expected):
+    readings = {name: SensorReading((0.0, 0.0, 0.0), None, indicator) for name in names}
+    found = make_field_check(references)([Frame(n / 40, n, readings) for n in range(40)], False)[0]
+    assert found.startswith(expected)

@@ -15,8 +15,7 @@ ENDED = "the recording has ended"
 class Replay:
     """Tracker that replays frames on a clock, starting now: a frame recorded after t seconds arrives after t seconds.
 
-    frames: oldest first. Times are on the clock, numbers are from the recording. For another speed use a faster
-    clock, so that ages and windows remain unchanged. Raises InputError if there are no frames.
+    frames: oldest first. Times are on the clock, numbers are from the recording. Raises InputError without frames.
     """
 
     def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:

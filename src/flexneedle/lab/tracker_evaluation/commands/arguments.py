@@ -3,24 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from math import inf, isfinite
-
-
-def make_number_type(
-    minimum: float, maximum: float = inf, kind: type[float] | type[int] = float
-) -> Callable[[str], float]:
-    """Return the argparse type of a finite number from `minimum` to `maximum`."""
-    rule = f"must be at least {minimum:g}" if maximum == inf else f"must be from {minimum:g} to {maximum:g}"
-
-    def number(text: str) -> float:
-        value = kind(text)
-        if not (isfinite(value) and minimum <= value <= maximum):
-            raise argparse.ArgumentTypeError(f"{text}: {rule}")
-        return value
-
-    number.__name__ = kind.__name__  # the name that argparse prints for a value that is not a number
-    return number
 
 
 def parse_name(text: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
-from flexneedle.lab.tracker_evaluation.commands.arguments import make_number_type
+from flexneedle.cli.values import make_number_type
 
 if TYPE_CHECKING:
     from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--dwell",
-        type=make_number_type(0),
+        type=make_number_type(float, 0.0),
         metavar="S",
         help="time for a motorised stage to reach each point (default: prompt for Enter)",
     )
@@ -55,11 +55,12 @@ def add_parser(commands: Commands) -> None:
 
 
 def _record(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.devices.clock import WallClock
     from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
     from flexneedle.lab.tracker_evaluation.recording.grid_recording import open_session, record_grid
-    from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
+    from flexneedle.lab.tracker_evaluation.recording.trackers import open_tracker
 
-    grid, clock = read_grid(args.grid), make_clock(args.tracker)
+    grid, clock = read_grid(args.grid), WallClock()
     with open_session(args.out, grid) as session:
         if session.remaining:
             if session.done:

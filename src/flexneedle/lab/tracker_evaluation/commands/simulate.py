@@ -7,8 +7,7 @@ from pathlib import Path
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import add_seed
-from flexneedle.cli.values import seed
-from flexneedle.lab.tracker_evaluation.commands.arguments import make_number_type
+from flexneedle.cli.values import make_number_type, seed
 
 
 def add_parser(commands: Commands) -> None:
@@ -45,7 +44,7 @@ def add_parser(commands: Commands) -> None:
     for name, minimum, maximum, default, meaning in counts:
         parser.add_argument(
             f"--{name}",
-            type=make_number_type(minimum, maximum, int),
+            type=make_number_type(int, minimum, maximum),
             default=default,
             metavar="N",
             help=f"{meaning} (default: {default})",

@@ -31,14 +31,14 @@ def add_parser(commands: Commands) -> None:
         "show live readings and verdicts of a tracker",
         _watch,
         "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
-        "flexneedle em watch --tracker replay:frames.csv@4 --json",
+        "flexneedle em watch --tracker replay:frames.csv --json",
         about="Print a line each second and at each change of the verdict. Ends with Ctrl-C or the end of a replay.",
     )
     parser.add_argument(
         "--tracker",
         required=True,
         metavar="SPEC",
-        help="tracker, such as aurora:/dev/ttyUSB0 or replay:FILE@2",
+        help="tracker, such as aurora:/dev/ttyUSB0 or replay:FILE",
     )
     parser.add_argument("--record", type=Path, metavar="FILE", help="save all frames to a new CSV file")
     parser.add_argument(
@@ -55,10 +55,11 @@ def add_parser(commands: Commands) -> None:
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from flexneedle.lab.tracker_evaluation.recording.trackers import make_clock, open_tracker
+    from flexneedle.lab.rig.devices.clock import WallClock
+    from flexneedle.lab.tracker_evaluation.recording.trackers import open_tracker
     from flexneedle.lab.tracker_evaluation.recording.watch import make_field_check, watch_tracker
 
-    clock = make_clock(args.tracker)
+    clock = WallClock()
     try:
         with ExitStack() as stack:
             tracker = stack.enter_context(open_tracker(args.tracker, clock))

@@ -128,24 +128,19 @@ def evaluate_table(data: Path, options: EvaluationOptions) -> Evaluation:
     registered = [result.grid for result in results]
     sensors = dict.fromkeys(grid.sensor for grid in registered)
     fits = [fit_indicator(sensor, *_environments(registered, sensor, options)) for sensor in sensors]
-    notes = find_notes(registered, suggest_registration=not options.register)
+    notes = find_notes(registered)
     return Evaluation(data, options, rows, results, [fit for fit in fits if fit is not None], notes)
 
 
-def read_table(
-    data: Path, options: EvaluationOptions, threshold: float = published.THRESHOLD
-) -> tuple[list[MeasuredGrid], int]:
-    """Return the grids of a table and its number of rows; threshold: of the indicator of single samples.
-
-    Raises InputError for an invalid table.
-    """
+def read_table(data: Path, options: EvaluationOptions) -> tuple[list[MeasuredGrid], int]:
+    """Return the grids of a table and its number of rows. Raises InputError for an invalid table."""
     mapping = map_columns(options.columns)
     labels = {"sensor": options.sensor, "environment": options.environment}
     names = {column: name for column, name in labels.items() if name is not None}
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
     with open_table(data, required, optional, mapping=mapping, labels=names, unit=options.unit) as table:
-        return read_grids(table, threshold)
+        return read_grids(table)
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from flexneedle.lab.tables.row_rules import (
     require_text,
 )
 from flexneedle.lab.tables.sample_table import EMPTY, Rule, SampleTable, first_violation
+from flexneedle.lab.tracker_evaluation.evaluation.published import THRESHOLD
 from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
 
 Floats = NDArray[np.float64]
@@ -41,10 +42,10 @@ _POSITIONS = ", ".join(
 _ORIENTATIONS = ", ".join(f"favg(q{a} * q{b} / norm) AS p_{a}{b}" for a, b in _PAIRS)
 _NO_ORIENTATIONS = ", ".join(f"NULL::DOUBLE AS p_{a}{b}" for a, b in _PAIRS)
 _NUMBER = "-?[0-9]+"
-_INDICATORS = """
+_INDICATORS = f"""
     SELECT sensor, environment, count(indicator) AS n, favg(indicator) AS mean, min(indicator) AS min,
         max(indicator) AS max, quantile_cont(indicator, 0.95) AS p95,
-        count(*) FILTER (indicator > $threshold) / count(indicator) AS above
+        count(*) FILTER (indicator > {THRESHOLD}) / count(indicator) AS above
     FROM samples WHERE indicator IS NOT NULL AND x_mm IS NOT NULL GROUP BY ALL
 """
 
@@ -78,7 +79,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class IndicatorSamples:
-    """Statistics of single samples of the indicator; above: share above a threshold."""
+    """Statistics of single samples of the indicator; above: share above the paper's threshold."""
 
     n_samples: int
     mean: float
@@ -132,10 +133,10 @@ class MeasuredGrid:
 _Arrays = dict[str, NDArray[Any]]
 
 
-def read_grids(table: SampleTable, threshold: float) -> tuple[list[MeasuredGrid], int]:
+def read_grids(table: SampleTable) -> tuple[list[MeasuredGrid], int]:
     """Return a grid for each sensor and environment, and the number of rows.
 
-    threshold: of the indicator. Raises InputError for rows that violate a rule, or if there are no rows.
+    Raises InputError for rows that violate a rule, or if there are no rows.
     """
     if 0 < len(table.fields.keys() & {*_QUATERNION}) < len(_QUATERNION):
         raise InputError("qw, qx, qy, qz: the table must have all four columns or none")
@@ -147,7 +148,7 @@ def read_grids(table: SampleTable, threshold: float) -> tuple[list[MeasuredGrid]
     if points["n_invalid"].any() or not labels.isdisjoint(EMPTY):
         table.refuse([*require_text(*_LABELS), *rules])
     _refuse_moved(table, points)
-    indicators = table.arrays(_INDICATORS, threshold=threshold) if points["n_indicator"].any() else {}
+    indicators = table.arrays(_INDICATORS) if points["n_indicator"].any() else {}
     pairs = sorted(
         {*zip(points["sensor"], points["environment"], strict=True)}, key=lambda p: [*map(_rank, p)]
     )

@@ -2,15 +2,12 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from math import isfinite
-from pathlib import Path
 
 from flexneedle.errors import InputError, RigError, one_line
 from flexneedle.lab.rig.devices import trackers
-from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.ports import Clock, Tracker
 
-FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording or a run folder)"
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE (a recording or a run folder)"
 """Syntax of a tracker on the command line."""
 
 
@@ -18,22 +15,14 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
     """Return the tracker given by `spec`, started; leaving the context stops it.
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip` names
-    those at ports 1 and 2. `replay:FILE` plays back a recording or the readings in a run folder, at the speed of the
-    clock (`make_clock`). Raises InputError for any other `spec`, RunError if the tracker does not respond.
+    those at ports 1 and 2. `replay:FILE` plays back a recording or the readings in a run folder.
+
+    Raises InputError for any other `spec`, RunError if the tracker does not respond.
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("aurora", "replay"):
         raise InputError(f"tracker {spec}: must be {FORMS}")
     return _open(spec, _open_aurora if kind == "aurora" else _open_replay, rest, clock)
-
-
-def make_clock(spec: str) -> WallClock:
-    """Return the clock for the tracker given by `spec`; for `replay:FILE@2` it runs at twice the speed.
-
-    Raises InputError for an invalid speed.
-    """
-    kind, _, rest = spec.partition(":")
-    return WallClock(_split_speed(rest)[1] if kind == "replay" else 1.0)
 
 
 def _open(
@@ -52,23 +41,4 @@ def _open_aurora(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
 
 
 def _open_replay(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
-    return trackers.replay({"file": _split_speed(rest)[0]}, clock)
-
-
-def _split_speed(rest: str) -> tuple[str, float]:
-    """Return file and speed of FILE@SPEED; the name of an existing file may contain @.
-
-    Raises InputError for an invalid speed.
-    """
-    if "@" not in rest or Path(rest).exists():
-        return rest, 1.0
-    file, _, text = rest.rpartition("@")
-    try:
-        speed = float(text)
-    except ValueError:
-        raise InputError(
-            f"tracker replay:{rest}: {text} is not a speed, and the file {rest} does not exist"
-        ) from None
-    if not (isfinite(speed) and speed > 0.0):
-        raise InputError(f"tracker replay:{rest}: the speed must be finite and above 0")
-    return file, speed
+    return trackers.replay({"file": rest}, clock)
