@@ -153,6 +153,8 @@ def _toml(value: Any) -> str:
 def allowed(node: dict[str, Any]) -> str:
     """Return the allowed values of a schema, in symbols."""
     node = next((one for one in node.get("anyOf", [node]) if one.get("type") != "null"), node)
+    if "allowed" in node:
+        return str(node["allowed"])
     if "enum" in node:
         return ", ".join(f"`{name}`" for name in node["enum"])
     match node.get("type"):

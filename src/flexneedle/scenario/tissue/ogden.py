@@ -22,7 +22,11 @@ def _usable_alpha(alpha: float) -> float:
     return alpha
 
 
-Alpha = Annotated[float, AfterValidator(_usable_alpha)]
+Alpha = Annotated[
+    float,
+    Field(json_schema_extra={"allowed": f"±{_ALPHA_SMALLEST:g}…{_ALPHA_LARGEST:g}"}),
+    AfterValidator(_usable_alpha),
+]
 
 
 class Ogden(Layer):

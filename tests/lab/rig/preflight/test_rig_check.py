@@ -58,7 +58,7 @@ def test_a_failed_device_does_not_hide_the_other(monkeypatch):
     failing = Motors(fails="A: no reply to TPA")
     for drivers, item, line in (
         (disconnected, "connection", "192.168.1.2: no connection: timed out"),
-        (broken, "connection", "driver bench_rig:drivers: ValueError: bad byte (test_rig_check.py, line "),
+        (broken, "connection", "ValueError: bad byte (test_rig_check.py, line "),
         (lambda *_: failing, "reading", "A: no reply to TPA"),
     ):
         monkeypatch.setattr(bench_rig, "drivers", drivers)

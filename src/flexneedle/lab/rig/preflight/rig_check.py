@@ -80,7 +80,10 @@ def check_device(
             connected = [Finding(part, "connection", ", ".join(filter(None, (kind, identity))))]
             return connected + read(device)
     except FlexneedleError as error:
-        return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
+        problem = one_line(error)
+        for label in (f"{part} {kind}: ", f'{part}.kind = "{kind}": '):  # in each line of the error
+            problem = problem.replace(label, "")
+        return [*connected, Finding(part, "reading" if connected else "connection", kind, problem)]
 
 
 def _scenario_findings(rig: RigFile, wanted: IntendedInsertion) -> list[Finding]:
