@@ -51,7 +51,7 @@ def draw_nothing(setattr_):
     from flexneedle.figures.style import new_figure
     from flexneedle.record import figures
 
-    for name in ("insertion_figure", "plan_figure"):
+    for name in ("insertion_figure", "perspective_figure", "plan_figure"):
         setattr_(figures, name, lambda *_: new_figure(1.0))
 
 

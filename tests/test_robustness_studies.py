@@ -35,12 +35,12 @@ def test_random_sequences_run_without_failure(capsys, options):
 
 
 def test_random_insertions_of_the_plant_run_without_failure(capsys):
-    status, summary, progress = run(PLANT, capsys, "--insertions", 10, "--seed", 20)
+    status, summary, progress = run(PLANT, capsys, "--insertions", 5, "--seed", 20)
     assert (status, summary["passed"]) == (0, True)
-    assert summary["steps"] > 10 * plant_robustness.STEPS
+    assert summary["steps"] > 5 * plant_robustness.STEPS
     assert summary["mean_iterations"] < 6.0
     assert summary["deepest_mm"] > 20.0
-    assert "insertion 10/10" in progress
+    assert "insertion 5/5" in progress
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_failure_is_counted_and_can_be_reproduced(of, monkeypatch, capsys, how
 
     monkeypatch.setattr(robustness.Simulator, "rollout", rollout)
     monkeypatch.setattr(plants, "step", step)
-    status, summary, progress = run(of, capsys, of.count, 3 if of is PLANT else 20, "--seed", 4)
+    status, summary, progress = run(of, capsys, of.count, 1 if of is PLANT else 20, "--seed", 4)
     assert (status, summary["passed"]) == (1, False)
     assert summary[how] > 0
     name = Path(of.study.__file__).name

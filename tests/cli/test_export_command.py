@@ -7,7 +7,6 @@ import pytest
 
 import fake_engine
 from commands import run
-from flexneedle.cli import main as cli
 from flexneedle.record.fields import COLUMNS
 from flexneedle.record.reader import read_trace
 from flexneedle.types import CheckedMeasurement
@@ -101,15 +100,6 @@ def test_a_tracker_without_frames_exports_the_tip_alone_and_a_missing_folder_is_
         status, out, err = run(capsys, "export", "here", what, "nodir/foo.csv")
         assert (status, out) == (2, "")
         assert err.startswith("flexneedle: nodir/foo.csv: cannot be written: ")
-
-
-def test_the_help_of_export_names_the_columns_of_readings(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["export", "--help"])
-    message = capsys.readouterr().out
-    columns = ("time_s", "period", "frame_number", "verdict", "x_mm", "NAME.qw", "NAME.indicator")
-    columns += ("direction_theta_rad", "points_mm", "covariance_mm2", "direction_covariance_rad2")
-    assert [name for name in columns if name not in message] == []
 
 
 def test_a_plan_cannot_be_exported(engine, capsys):

@@ -15,7 +15,6 @@ from commands import names, run
 from flexneedle.cli import main as cli
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.errors import RunError
-from flexneedle.phantom.plants import PLANTS
 from flexneedle.record.reader import read_trace
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -283,11 +282,3 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
         cli.main(argv)
     assert caught.value.code == 2
     assert capsys.readouterr().out == ""
-
-
-def test_the_help_names_the_defaults(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["insert", "--help"])
-    message = " ".join(capsys.readouterr().out.split())
-    assert f"(default: {DEFAULT})" in message
-    assert all(f"{kind} (" in message for kind in PLANTS)

@@ -100,12 +100,6 @@ def test_the_needle_does_not_advance_while_it_rolls():
     assert np.subtract(x, x[0]) == pytest.approx([0.0, 0.0, 0.0, 0.5, 1.0], abs=1e-6)
 
 
-def test_without_a_roll_the_travel_begins_at_once():
-    motion = make_phantom().apply(STRAIGHT, 0.2)
-    assert motion.turned is None
-    assert motion.travel_begun == motion.begun == 0.0
-
-
 def test_two_half_turns_of_a_driver_of_half_turns_take_no_time():
     motion = make_phantom().apply(Control(db_x=1.0, roll=2.0 * math.pi), 0.2)
     assert (motion.turned, motion.ended) == (None, 0.2)

@@ -71,8 +71,13 @@ def test_a_driver_of_half_turns_has_no_other_rolls():
 # ---- the entry
 
 
-@pytest.mark.parametrize("strategy", ["manipulation", "steering"])
-@pytest.mark.parametrize("axes", [1, 2])
+@pytest.mark.parametrize(
+    ("strategy", "axes"),
+    [
+        *(("manipulation", 1), ("steering", 2)),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (("manipulation", 2), ("steering", 1))),
+    ],
+)
 def test_a_free_entry_is_chosen_within_its_bounds(strategy, axes):
     """The plan's scenario has the chosen entry, and the needle starts on it."""
     values = {"entry__free_radius_mm": 4.0, "entry__free_slope_mrad": 40.0, "setup__axes": axes}

@@ -6,6 +6,7 @@ import tomllib
 
 import pytest
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -154,6 +155,7 @@ def test_the_first_difference_is_named_as_in_the_file():
     nodes=st.integers(2, 10_000),
     factors=st.tuples(st.floats(0.1, 1), st.floats(1, 10)),
 )
+@hypothesis_settings(max_examples=30)
 def test_text_loads_back_equal(name, offset, mu, alpha, guide, nodes, factors):
     scenario = PHANTOM.with_values(
         {

@@ -77,35 +77,6 @@ def test_retraction_and_reinsertion_return_to_the_same_shape(pull):
     assert_same_curve(one, other, 2e-3)
 
 
-def test_points_ahead_of_a_retracted_tip_rest():
-    """They stay in the list, are not active, carry no energy and keep the path."""
-    state = insert_to(SIMULATOR, 30.0)
-    out = repeat(SIMULATOR, state, Control(db_x=-1.0), 10)[-1]
-    contacts = out.contacts
-    assert contacts.x.size == state.contacts.x.size == 35
-    np.testing.assert_array_equal(contacts.active, contacts.x < out.tip[0])
-    ahead = ~contacts.active
-    assert ahead.sum() == 10
-    np.testing.assert_array_equal(contacts.rest, state.contacts.rest)
-    np.testing.assert_array_equal(contacts.position[ahead], contacts.rest[ahead])
-    assert np.all(contacts.stretch[ahead] == 1.0)
-
-
-def test_channel_closes_when_the_tip_leaves_the_skin():
-    """The next entry cuts a new one where the tip then is."""
-    state = insert_to(SIMULATOR, 8.0)
-    out = repeat(SIMULATOR, state, Control(db_x=-1.0), 10)[-1]
-    assert out.tip[0] < 0.0
-    assert out.contacts.x.size == 0
-    assert out.strain_energy == 0.0
-    again = repeat(SIMULATOR, out, Control(dg_y=0.5), 6)[-1]
-    fresh = repeat(SIMULATOR, insert_to(SIMULATOR, -2.0), Control(dg_y=0.5), 6)[-1]
-    one, other = (repeat(SIMULATOR, state, Control(db_x=1.0), 8)[-1] for state in (again, fresh))
-    assert one.contacts.x.size == other.contacts.x.size == 11
-    np.testing.assert_allclose(one.contacts.rest, other.contacts.rest, atol=1e-5)
-    assert_same_curve(one, other, 1e-5)
-
-
 ROWS = st.tuples(
     st.floats(-0.3, 1.0),
     st.floats(-0.3, 0.3),
@@ -139,18 +110,3 @@ def test_one_layer_or_two_of_the_same_tissue_are_the_same():
     tips = [insert_to(Simulator(PHANTOM.with_values({"tissue": tissue})), 30.0).tip for tissue in tissues]
     np.testing.assert_allclose(tips[1], tips[0], atol=1e-12)
     np.testing.assert_allclose(tips[2], tips[0], atol=2e-3)
-
-
-def test_strain_energy_weighs_the_layers_and_energy_does_not():
-    """w_c of each layer on its contacts; no weight changes the motion."""
-    states = []
-    for weights in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (2.0, 3.0)):
-        weighted = {f"tissue.{i}.energy_weight": weight for i, weight in enumerate(weights)}
-        states.append(insert_to(Simulator(PHANTOM.with_values(weighted)), 35.0))
-    both, first, second, mixed = (state.strain_energy for state in states)
-    assert min(first, second) > 0.005 * both
-    assert first + second == pytest.approx(both, rel=1e-12)
-    assert 2 * first + 3 * second == pytest.approx(mixed, rel=1e-12)
-    assert len({state.energy for state in states}) == 1
-    assert len({state.nodes.tobytes() for state in states}) == 1
-    assert states[0].energy > both
