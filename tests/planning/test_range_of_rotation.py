@@ -2,6 +2,7 @@
 
 import cmath
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,8 +24,13 @@ SPACE = flexneedle.load_scenario("phantom3d").with_values(
         "needle.nodes": 31, "setup.tip_to_skin_mm": 6.0,
     }
 )  # fmt: skip
-REACH = bevel_reach(SPACE, DEPTH, threads=1)[1]
 STEER, MOVE = "steering", "manipulation"
+
+
+@cache
+def reach():
+    """Distance (mm) from the axis that the bevel reaches at the target's depth."""
+    return bevel_reach(SPACE, DEPTH, threads=1)[1]
 
 
 def planned(off, strategy=STEER, seed=0, **changes):
@@ -49,7 +55,7 @@ def inside(most, direction, share):
     sizes = np.linspace(0.0, 2.0, 4001)
     at = middle + sizes * way
     edge = sizes[(np.abs(at) <= 1.0) & (at.real >= chord)].max()
-    return REACH * (middle + share * edge * way)
+    return reach() * (middle + share * edge * way)
 
 
 @pytest.mark.parametrize(
@@ -85,17 +91,17 @@ def test_where_half_a_turn_is_in_the_range_a_free_driver_has_the_same_plan():
 
 
 def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
-    """The messages state REACH, and REACH cos 60°, the least towards angle 0."""
+    """The messages state the reach, and the reach times cos 60°, the least towards angle 0."""
     near, side, far = (
         planned(off, setup__max_rotation_deg=60.0, plan__iterations=2, plan__max_iterations=2).limit
-        for off in (0.3 * REACH + 0j, 0.8j * REACH, 2.0 * REACH + 0j)
+        for off in (0.3 * reach() + 0j, 0.8j * reach(), 2.0 * reach() + 0j)
     )
     assert near.startswith("setup.max_rotation_deg = 60")
-    assert f"{0.5 * REACH:.2f} to {REACH:.2f} mm" in near
+    assert f"{0.5 * reach():.2f} to {reach():.2f} mm" in near
     assert side.startswith("setup.max_rotation_deg = 60")
     assert "nothing" in side
     assert far.startswith(f"needle.bevel.offset_mm = {SPACE.needle.bevel.offset_mm:g}")
-    assert f"at most {REACH:.2f} mm" in far
+    assert f"at most {reach():.2f} mm" in far
 
 
 @pytest.mark.parametrize(
@@ -114,7 +120,7 @@ def test_reach_in_a_direction_is_what_the_hull_of_the_arc_leaves_of_a_line(most,
     goal = scenario.entry.lateral(DEPTH) + cmath.rect(1.0, math.radians(angle))
     problem = make_problem(scenario, (DEPTH, goal.real, goal.imag), STEER)
     rollout = planner._make_rollout(Simulator(scenario, threads=1))
-    expected = [REACH * least, REACH * greatest]
+    expected = [reach() * least, reach() * greatest]
     np.testing.assert_allclose(steering.reach(rollout, problem), expected, rtol=0.02, atol=1e-6)
     assert problem.lateral == pytest.approx(1.0)
 
@@ -155,7 +161,7 @@ def test_reach_is_about_the_axis_of_the_entry(axes):
     entry = {"setup.axes": axes, "entry.lateral_mm": 3.0, "entry.slope_mrad": 50.0}
     least, greatest = bevel_reach(SPACE.with_values({**entry, "target.lateral_z_mm": 0.0}), DEPTH, threads=1)
     middle = 3.0 + 0.05 * DEPTH
-    assert (least, greatest) == pytest.approx((middle - REACH, middle + REACH), abs=0.02)
+    assert (least, greatest) == pytest.approx((middle - reach(), middle + reach()), abs=0.02)
 
 
 @pytest.mark.parametrize("off", [-3.0 + 0.0j, 2.0 - 4.0j])
@@ -166,8 +172,8 @@ def test_beyond_the_bevel_the_distance_from_the_axis_is_reported(off):
     opening, rest = plan.limit.split(" (")
     assert opening.startswith("needle.bevel.offset_mm")
     numbers = [float(word) for word in rest.split() if word.lstrip("-").replace(".", "").isdigit()]
-    assert numbers == pytest.approx([-REACH, REACH, abs(off)], abs=0.03)
-    assert plan.error_mm == pytest.approx(abs(off) - REACH, abs=0.05)
+    assert numbers == pytest.approx([-reach(), reach(), abs(off)], abs=0.03)
+    assert plan.error_mm == pytest.approx(abs(off) - reach(), abs=0.05)
 
 
 @pytest.mark.parametrize(
