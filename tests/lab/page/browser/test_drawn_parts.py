@@ -103,13 +103,12 @@ def test_each_part_is_drawn_in_its_tone(views, server, pictures, size, scheme, s
     pictures(page, f"section-{state}-{size[0]}-{scheme}")
 
 
-LINES = "view.shapes.group.children.find((each) => each.isLineSegments)"
-HORIZON = f"""async () => {{
+HORIZON = """async () => {
   const view = (await import("/static/space.js")).spaceView();
-  const {{ visible, geometry }} = {LINES};
-  const {{ position }} = geometry.attributes;
+  const { visible, geometry } = view.scene.getObjectByName("samples");
+  const { position } = geometry.attributes;
   return visible ? [...position.array.slice(0, 3 * geometry.drawRange.count)] : [];
-}}"""
+}"""
 """Corners of the sampled paths in space."""
 
 

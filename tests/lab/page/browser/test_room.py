@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_blends import PAINTED, arrived
+from browser_blends import arrived
 from recorded_page import opening, scene
 
 pytestmark = pytest.mark.page
@@ -18,8 +18,8 @@ OBJECTS = f"""async () => {{
   {VIEW}
   const {{ paint }} = await import("/static/space/room.js");
   const tones = ["--tissue", "--skin", "--grid"].map((name) => [name, paint(name).getHex()]);
-  return view.room.group.children.map(({{ type, geometry, material, position }}) => ({{
-    type: `${{type}} ${{geometry.type}}`,
+  return view.room.group.children.map(({{ name, geometry, material, position }}) => ({{
+    name,
     tone: tones.find(([, hex]) => hex === material.color.getHex())?.[0],
     opacity: material.opacity,
     at: position.x,
@@ -27,19 +27,10 @@ OBJECTS = f"""async () => {{
     corners: [...geometry.attributes.position.array],
   }}));
 }}"""
-LISTEN = f"""async () => {{
+LABELS = f"""async () => {{
   {VIEW}
-  const add = (window.addLabel ??= view.labels.add);
-  window.labels = [];
-  view.labels.add = (...given) => {{
-    window.labels.push(given.slice(0, 3));
-    add.apply(view.labels, given);
-  }};
+  return view.labels.group.children.map(({{ userData, position }}) => [userData.text, position.toArray()]);
 }}"""
-"""Note the labels that are made from now on: text, place, colour."""
-SPRITES = (
-    f"async () => {{ {VIEW} return view.labels.group.children.map(({{ position }}) => position.toArray()); }}"
-)
 
 
 @pytest.fixture
@@ -49,13 +40,8 @@ def space(visit):
 
 def labels(page):
     """Places of the labels by their texts."""
-    page.evaluate(LISTEN)
-    page.click("#theme")  # all are made anew
-    page.evaluate(PAINTED)
-    made = page.evaluate("window.labels")
-    np.testing.assert_allclose(page.evaluate(SPRITES), [place for _, place, _ in made])
     places = {}
-    for text, place, _ in made:
+    for text, place in page.evaluate(LABELS):
         places.setdefault(text, []).append(tuple(place))
     return places
 
@@ -64,17 +50,16 @@ def test_layers_and_grid_are_to_scale_and_labelled(space, server):
     """The stiffer a layer, the denser; lines each 5 mm on floor and back wall; without a guide none is named."""
     page, (left, right, half) = space(opening()), BOX
     objects = page.evaluate(OBJECTS)
-    layers = [each for each in objects if each["type"] == "Mesh BoxGeometry"]
+    layers = [each for each in objects if each["name"] == "layer"]
     for layer, (top, bottom) in zip(layers, [(0.0, 20.0), (20.0, right)], strict=True):
         size = layer["size"]
         assert (layer["at"], size["width"]) == ((top + bottom) / 2.0, bottom - top)
         assert (size["height"], size["depth"], layer["tone"]) == (2 * half, 2 * half, "--tissue")
     assert layers[0]["opacity"] < layers[1]["opacity"] < 0.5
-    surfaces = [
-        (one["at"], one["tone"]) for one in objects if "Plane" in one["type"] or "Edges" in one["type"]
-    ]
+    surfaces = [(one["at"], one["tone"]) for one in objects if one["name"] in ("surface", "edge")]
     assert surfaces == [(0.0, "--skin")] * 2 + [(20.0, "--tissue")] * 2
-    (grid,) = (each for each in objects if each["tone"] == "--grid")
+    (grid,) = (each for each in objects if each["name"] == "grid")
+    assert grid["tone"] == "--grid"
     lines = np.reshape(grid["corners"], (-1, 2, 3))
     along = np.abs(lines[:, 1, 0] - lines[:, 0, 0]) == right - left
     np.testing.assert_array_equal(np.unique(lines[~along, 0, 0]), np.arange(left, right + 5.0, 5.0))

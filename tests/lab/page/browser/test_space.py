@@ -67,25 +67,16 @@ DRAWN = [
 ALONE = f"""async (parts) => {{
   {BLENDS}
   {VIEW}
-  const [
-    needle, , path, other, estimated, truth, , trueNeedle, foreseen, channel, predicted, guide, bevel, measured,
-    samples, reach,
-  ] = view.shapes.group.children;
-  const [grid, layer, surface, edge] = view.room.group.children;
-  const [labels, target] = [view.labels.group, view.target.ball];
-  const objects = {{
-    needle, path, other, estimated, truth, trueNeedle, foreseen, channel, predicted, guide, bevel, measured, samples,
-    reach, grid, layer, surface, edge, labels, target,
-  }};
-  const all = [...view.shapes.group.children, ...view.room.group.children, labels, target];
+  const all = [...view.shapes.group.children, ...view.room.group.children, view.labels.group, view.target.ball];
   const shown = all.filter((each) => each.visible);
   for (const each of shown) each.visible = false;
   const nothing = composed(view.drawn());
   const changed = (picture) => picture.filter((value, at) => at % 4 === 0 && Math.abs(value - nothing[at]) > 8).length;
   return parts.map(([name, tone]) => {{
-    objects[name].visible = shown.includes(objects[name]);
+    const part = view.scene.getObjectByName(name);
+    part.visible = shown.includes(part);
     const picture = composed(view.drawn());
-    objects[name].visible = false;
+    part.visible = false;
     return [name, tone ? blended(nothing, picture, toneOf(tone)) : changed(picture)];
   }});
 }}"""
@@ -98,7 +89,7 @@ PARTS = {
         "reach": "--reach",
     },
     "inserting": {
-        "needle": None, "trueNeedle": "--true", "estimated": "--estimate", "truth": "--true", "path": "--manipulation",
+        "needle": None, "true": "--true", "estimated": "--estimate", "truth": "--true", "path": "--manipulation",
         "foreseen": "--predicted", "predicted": "--predicted", "channel": None, "measured": "--measured",
         "samples": "--estimate",
     },
@@ -119,10 +110,21 @@ def test_each_part_of_the_scene_is_drawn_at_each_size(space, pictures, state, si
     assert [each for each in counts if each[1] < LEAST] == []
 
 
+SIDES = 10
+
+
+def tube(page, name, points):
+    """Rings (points, sides, 3) of a tube, and their colours."""
+    attributes = f"const {{ position, color }} = view.scene.getObjectByName('{name}').geometry.attributes;"
+    parts = on_view(
+        page, attributes + "return [position, color].map((each) => (each ? [...each.array] : []));"
+    )
+    return [np.reshape(part, (-1, SIDES, 3))[1 : points + 1] for part in parts]  # ring 0 closes the end
+
+
 def test_lengths_are_to_scale_the_legend_follows_and_only_a_change_is_drawn(space, server):
     page = space()
-    position = on_view(page, "return [...view.shapes.group.children[0].geometry.attributes.position.array]")
-    ring = np.reshape(position, (-1, 10, 3))[1]  # ring 0 closes the end
+    (ring, *_), _ = tube(page, "needle", 1)
     start = needle(-28.5)[0]
     np.testing.assert_allclose(ring.mean(axis=0), start, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(ring - start, axis=1), 0.41, atol=1e-4)
@@ -168,7 +170,8 @@ def test_lengths_are_to_scale_the_legend_follows_and_only_a_change_is_drawn(spac
     assert on_view(page, count) == before
     server.send(rows(11, 1), *period_frames(11))
     until(page, "flexneedle.store.get('rows live')?.length === 12")
-    painted(page)
+    for _ in range(5):
+        painted(page)
     assert before < on_view(page, count) <= before + 4
     color = "return view.shapes.group.children[0].material.color.getHex()"
     before = on_view(page, color)
@@ -204,32 +207,17 @@ def test_the_bevel_has_the_direction_of_the_plan_and_then_of_the_period(space, s
         np.testing.assert_allclose(on_view(page, BEVEL), direction, atol=1e-6)
 
 
-TUBE = """
-const tube = view.shapes.group.children.find((each) => each.isMesh && each.visible && each.renderOrder === ORDER);
-const { position, color } = tube.geometry.attributes;
-return [position, color].map((each) => (each ? [...each.array] : []));
-"""
-SIDES = 10
-CHANNEL, PREDICTED = 4, 5
-
-
-def tube(page, order, points):
-    """Rings (points, sides, 3) of a tube that is drawn in an order, and their colours."""
-    parts = on_view(page, TUBE.replace("ORDER", str(order)))
-    return [np.reshape(part, (-1, SIDES, 3))[1 : points + 1] for part in parts]  # ring 0 closes the end
-
-
 def test_the_predicted_needle_shows_its_uncertainty_and_the_channel_its_stretch(space):
     """Two standard deviations around the needle's radius; the darker, the more stretched."""
     page = space(inserting(60))
     painted(page)
-    rings, _ = tube(page, PREDICTED, NODES)
+    rings, _ = tube(page, "predicted", NODES)
     sd = 0.2 + 1.2 * np.linspace(0.0, 1.0, NODES) * (1 - 60 / PERIODS)
     middle = rings.mean(axis=1, keepdims=True)
     radius = np.linalg.norm(rings - middle, axis=2)
     np.testing.assert_allclose(radius, np.tile(0.41 + 2.0 * sd, (SIDES, 1)).T, atol=1e-3)
     np.testing.assert_allclose(middle[:, 0], needle(TARGET[0], sway=0.1), atol=1e-3)
-    _, colors = tube(page, CHANNEL, 24)
+    _, colors = tube(page, "channel", 24)
     cut = np.linspace(0.0, -28.5 + 68.5 * 61 / PERIODS, 24)
     stretch = np.sin(np.pi * cut / (TARGET[0] + 5.0))
     green = colors[:, 0, 1]

@@ -11,6 +11,7 @@ export class Labels {
 
   constructor() {
     this.group = new Group();
+    this.group.name = "labels";
   }
 
   // Add a label at a point [x, y, z]. anchor: the part of the text at that point, [0, 0] is its lower left corner.
@@ -23,7 +24,7 @@ export class Labels {
     sprite.position.set(...point);
     sprite.center.set(...anchor);
     sprite.renderOrder = 20;
-    sprite.userData = { width, height };
+    sprite.userData = { text, width, height };
     this.group.add(sprite);
     this.#size(sprite);
   }

@@ -37,6 +37,7 @@ export class Room {
     const solid = new BoxGeometry(end - top, 2 * half, 2 * half);
     const layer = new Mesh(solid, walls);
     layer.position.x = (top + end) / 2;
+    layer.name = "layer";
     layer.renderOrder = -2;
     this.group.add(layer);
     this.#addBoundary(top, half, top === 0 ? "--skin" : "--tissue");
@@ -48,6 +49,7 @@ export class Room {
     const paint = { color: color(tone), transparent: true, depthWrite: false };
     const plane = new Mesh(new PlaneGeometry(2 * half, 2 * half), new MeshBasicMaterial({ ...paint, opacity: 0.16, side: DoubleSide }));
     const edges = new LineSegments(new EdgesGeometry(plane.geometry), new LineBasicMaterial({ ...paint, opacity: 0.6 }));
+    [plane.name, edges.name] = ["surface", "edge"];
     for (const each of [plane, edges]) {
       each.position.x = x;
       each.rotation.y = Math.PI / 2;
@@ -64,6 +66,7 @@ export class Room {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(new Float32Array(points), 3));
     const grid = new LineSegments(geometry, new LineBasicMaterial({ color: color("--grid"), transparent: true, opacity: 0.7 }));
+    grid.name = "grid";
     grid.renderOrder = -3;
     this.group.add(grid);
 

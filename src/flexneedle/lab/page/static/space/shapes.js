@@ -42,6 +42,8 @@ export class Shapes {
     this.#addBevel();
     this.#addMeasured();
     this.#paths.object.renderOrder = 2;
+    const named = { guide: this.guide, bevel: this.bevel, measured: this.measured, samples: this.#paths.object, reach: this.#outlines.group };
+    for (const [name, object] of Object.entries(named)) object.name = name;
     this.group.add(this.#paths.object, this.#outlines.group);
   }
 
@@ -70,9 +72,10 @@ export class Shapes {
 
   #addTube(name, material, tone, order) {
     const tube = new Tube(material);
+    tube.mesh.name = name;
     tube.mesh.renderOrder = order;
+    tube.tone = tone;
     this.#tubes[name] = tube;
-    this.#tubes[name].tone = tone;
     this.group.add(tube.mesh);
   }
 

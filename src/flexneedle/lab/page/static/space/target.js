@@ -17,6 +17,7 @@ export class Target {
   constructor(camera, canvas, store, link, changed) {
     this.#store = store;
     this.ball = new Mesh(new SphereGeometry(RADIUS, 32, 16), new MeshLambertMaterial({ transparent: true, opacity: 0.75 }));
+    this.ball.name = "target";
     this.ball.renderOrder = 7;
     this.#gizmo = new TransformControls(camera.camera, canvas);
     this.#gizmo.setSize(SIZE);
