@@ -18,6 +18,8 @@ from flexneedle.lab.page.protocol import (
     RunsMessage,
     SceneMessage,
     SessionMessage,
+    StudyRow,
+    StudyRowsMessage,
     WelcomeMessage,
 )
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
@@ -221,6 +223,27 @@ def period_frames(period, source=FrameSource.LIVE):
             shape(FrameKind.CHANNEL, source, period, np.column_stack([curve(cut, sway=0.3), stretch]))
         )
     return frames
+
+
+MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
+
+
+def study_rows(request):
+    """Return the server's message about rows of a study: the worst, or one from an index on."""
+
+    def row(index, **changes):
+        given = {
+            "settings": "base", "controller": "adaptive-mpc", "target": (40.0, 5.0, 0.0), "error_mm": 0.2214,
+            "outcome": "done", "reason": "", "opens": True, **changes,
+        }  # fmt: skip
+        return StudyRow(index=index, **given)
+
+    refused = {"error_mm": None, "outcome": "refused", "reason": "plan misses", "opens": False}
+    worst = [row(17), row(3, error_mm=0.02), row(9, target=(40.0, 5.0, 3.0), **refused)]
+    index = request.get("index")
+    about = {"title": "Many targets", "insertions": 150, "finished": 149}
+    found = worst if index is None else [row(index)]
+    return [StudyRowsMessage(name=request["name"], index=index, rows=found, **about)]
 
 
 def opening(**changes):

@@ -15,7 +15,7 @@ STATUS = "[data-panel=status]"
 FOCUSED = "document.activeElement.textContent"
 
 
-def test_control_is_taken_shared_and_released(visit, server):
+def test_control_is_taken_shared_released_and_taken_by_edits_which_are_merged(visit, server):
     page = visit()
     page.wait_for_selector("text=Connected")
     assert "Two-layer tissue phantom in space · seed 0" in page.inner_text("#title")
@@ -36,10 +36,8 @@ def test_control_is_taken_shared_and_released(visit, server):
     page.wait_for_selector("text=Person 2 is in control", state="detached")
     server.send(clients(3, steering=2))
     page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
-
-
-def test_edits_take_control_are_merged_and_a_refusal_ends_with_the_next_accepted_value(visit, server):
-    page = visit()
+    del server.answers["steer"]
+    server.send(clients())
     page.wait_for_selector("text=nobody is in control")
     seconds = page.evaluate(
         """async () => {

@@ -9,9 +9,9 @@ from matplotlib.image import imread
 from browser_blends import painted
 from chromium import NO_WEBGL
 from fake_page import until
-from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRow, StudyRowsMessage
+from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRowsMessage
 from flexneedle.lab.page.shape_frames import FrameSource
-from recorded_page import insertion, period_frames, rows, session
+from recorded_page import MANY, insertion, period_frames, rows, session, study_rows
 
 pytestmark = pytest.mark.page
 
@@ -88,9 +88,6 @@ def test_a_scenario_is_begun_from_preset_world_and_file_and_saved_and_changes_ar
         server.wait_for(kind, asked + 1)
 
 
-MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
-
-
 def download_two_files(page, errors):
     """Download a file that the server refuses, and another one."""
     held = []
@@ -164,30 +161,9 @@ def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, vis
     ]
 
 
-def study_row(index, **changes):
-    given = {
-        "settings": "base", "controller": "adaptive-mpc", "target": (40.0, 5.0, 0.0), "error_mm": 0.2214,
-        "outcome": "done", "reason": "", "opens": True, **changes,
-    }  # fmt: skip
-    return StudyRow(index=index, **given)
-
-
-REFUSED = study_row(
-    9, target=(40.0, 5.0, 3.0), error_mm=None, outcome="refused", reason="plan misses", opens=False
-)
-
-
-def listing(request):
-    """Return the server's message about rows of a study."""
-    index = request.get("index")
-    found = [study_row(17), study_row(3, error_mm=0.02), REFUSED] if index is None else [study_row(120)]
-    about = {"title": "Many targets", "insertions": 150, "finished": 149}
-    return [StudyRowsMessage(name=request["name"], index=index, rows=found, **about)]
-
-
 def test_rows_of_a_study_are_listed_computed_opened_and_compared(files, server):
     server.news[-1] = RunsMessage(runs=[MANY])
-    server.answers["study"] = listing
+    server.answers["study"] = study_rows
     page = files()
     assert not page.is_visible("text=Worst first")
     page.click("[aria-label='Rows of many']")

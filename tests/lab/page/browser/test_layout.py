@@ -1,17 +1,63 @@
-"""Layout and colours: each state of the page at two widths, light and dark; motion of a telephone's page."""
+"""Each state of the page at two widths, light and dark: layout, names of controls, colours."""
 
 import pytest
 
+from browser_blends import arrived, painted
 from browser_layout import too_wide
-from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage, StudyRow, StudyRowsMessage
+from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage
 from flexneedle.scenario.files import load_scenario
-from recorded_page import REACH, WELCOME, clients, inserting, insertion, planned, rows, session
+from recorded_page import (
+    MANY,
+    REACH,
+    WELCOME,
+    clients,
+    inserting,
+    insertion,
+    planned,
+    rows,
+    session,
+    study_rows,
+)
 
 pytestmark = pytest.mark.page
 
 PANELS = ("section", "plans", "insertion", "player", "plots", "files", "form")
-MANY = {"name": "many", "kind": "study", "summary": "Many targets: 150 insertions", "made": 1.7e9}
 GROUND = "getComputedStyle(document.body).backgroundColor"
+
+
+NAMED = {
+    *("button", "link", "textbox", "searchbox", "spinbutton", "combobox", "checkbox", "radio", "slider"),
+    *("DisclosureTriangle", "image", "Canvas", "application", "dialog", "toolbar", "progressbar", "meter"),
+    "region",
+}
+"""Roles, as Chromium has them, that have a name."""
+FOUND = {
+    "button": "button:visible, input[type=file]",
+    "slider": "input[type=range]:visible",
+    "combobox": "select:visible",
+}
+"""Elements by role, so that none is missed."""
+
+
+def named(page):
+    """(role, name) of all that Chromium hands to a screen reader; what is in an image is a part of it."""
+    nodes = page.context.new_cdp_session(page).send("Accessibility.getFullAXTree")["nodes"]
+    by_id = {node["nodeId"]: node for node in nodes}
+
+    def in_image(node):
+        parent = by_id.get(node.get("parentId"))
+        return parent is not None and (parent["role"]["value"] == "image" or in_image(parent))
+
+    given = [node for node in nodes if not node["ignored"] and not in_image(node)]
+    return [(node["role"]["value"], node.get("name", {}).get("value", "")) for node in given]
+
+
+def check_names(page):
+    """Check that each control has a name for a screen reader."""
+    found = [(role, name) for role, name in named(page) if role in NAMED]
+    assert [role for role, name in found if not name.strip()] == []
+    for role, selector in FOUND.items():
+        assert [each for each, _ in found].count(role) == page.locator(selector).count()
 
 
 def whole_session():
@@ -19,22 +65,12 @@ def whole_session():
     return session().model_copy(update={"values": load_scenario("phantom3d").flat()})
 
 
-def study(request):
-    row = StudyRow(
-        index=17, settings="base", controller="adaptive-mpc", target=(40.0, 5.0, 0.0), error_mm=0.22, outcome="done",
-        reason="", opens=True,
-    )  # fmt: skip
-    return [
-        StudyRowsMessage(
-            name=request["name"], title="Many targets", insertions=9, finished=1, index=None, rows=[row]
-        )
-    ]
-
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
-def test_each_state_fits_its_width_and_the_switch_changes_the_colours(visit, server, pictures, size, scheme):
-    server.answers["study"] = study
+def test_each_state_fits_its_width_with_named_controls_and_both_colours(
+    visit, server, pictures, size, scheme
+):
+    server.answers["study"] = study_rows
     server.news = [*planned(), REACH, whole_session(), RunsMessage(runs=[MANY])]
     page = visit(width=size[0], height=size[1], scheme=scheme, ready="[data-panel=form] details")
     page.click("[aria-label='Rows of many']")
@@ -60,8 +96,12 @@ def test_each_state_fits_its_width_and_the_switch_changes_the_colours(visit, ser
         server.send(*news)
         for panel in PANELS:
             page.locator(f"[data-panel={panel}]").scroll_into_view_if_needed()
-        page.wait_for_timeout(200)
+            painted(page)
+        arrived(page)
+        if state in ("inserting", "recorded"):
+            page.wait_for_selector("[data-panel=plots] canvas >> nth=5")
         assert too_wide(page) == [], state
+        check_names(page)
         pictures(page, f"{state}-{size[0]}-{scheme}")
     before = page.evaluate(GROUND)
     page.click("#theme")
