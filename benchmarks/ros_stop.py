@@ -120,7 +120,7 @@ def _planning() -> Iterator[None]:
 
     def plan() -> None:
         while not ended.is_set():
-            flexneedle.plan(scenario, progress=lambda _: None)
+            flexneedle.plan(scenario)
 
     thread = Thread(target=plan)
     thread.start()

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.lab.tables.columns import REFERENCE
 from flexneedle.lab.tracker_evaluation.simulate import Columns, Experiment, measure_grid
-from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
+from flexneedle.types import TIP
 
 Floats = NDArray[np.float64]
 IDEAL, NOISY = "ideal", "noisy"

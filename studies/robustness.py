@@ -164,7 +164,8 @@ def run_batch(
     try:
         simulator = Simulator(scenario.with_values({"setup.axes": 2}) if space else scenario)
         simulator = bent(simulator, rng) if adapted else simulator
-        tips, energy, converged, *_ = simulator.rollout(simulator.start(roll), controls)
+        found = simulator.rollout(simulator.start(roll), controls)
+        tips, energy, converged = found.tips, found.energy, found.converged
         _repeat_by_step(simulator, controls[batch % count], roll, tally)
     except Exception as error:  # noqa: BLE001  the study counts exceptions
         tally.exceptions += 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.estimation import derivatives
+from flexneedle.estimation import fit
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_THETA, DB_Y, DG_Y, Control, X
@@ -90,7 +90,7 @@ def estimated():
 @pytest.fixture
 def all_fresh(monkeypatch):
     """Every derivative simulated in every period."""
-    monkeypatch.setattr(derivatives, "due_parameters", lambda fitted: iter(range(fitted.parameters.size)))
+    monkeypatch.setattr(fit, "due_parameters", lambda fitted: iter(range(fitted.parameters.size)))
 
 
 def assert_predicted_shapes(done, target):

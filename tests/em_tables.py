@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError
+from flexneedle.lab.tables.columns import REQUIRED
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
-from flexneedle.phantom.tracking.measurement_table import REQUIRED
 
 GRID = np.stack(np.meshgrid(*[np.arange(3) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 

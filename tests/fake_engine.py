@@ -10,15 +10,16 @@ import numpy as np
 
 from flexneedle.errors import RunError
 from flexneedle.loop.events import PeriodEnded
+from flexneedle.planning.events import Iterated, send_event
 from flexneedle.results import Insertion, Outcome
 from synthetic import make_periods, make_plan
 
 
-def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, *, miss=0.0):
+def plan(scenario, target=None, strategy="manipulation", seed=0, *, listeners=(), miss=0.0):
     """Plan as `flexneedle.plan` does; `miss` displaces the end of the plan."""
     made = make_plan(strategy, target or scenario.target.position, seed, step=3.0)
     for iteration in range(1, 6):
-        progress({"iteration": iteration, "iterations": 5, "best": 9.0, "cost_mean": 9.0})
+        send_event(Iterated(strategy, {"iteration": iteration, "iterations": 5, "best": 9.0}), listeners)
     limit = "setup.max_guide_travel_mm = 15" if miss > 1.0 else ""
     return replace(made, tips=made.tips + np.array([0.0, miss, 0.0, 0.0, 0.0]), limit=limit)
 
@@ -51,7 +52,7 @@ def draw_nothing(setattr_):
     from flexneedle.figures.style import new_figure
     from flexneedle.record import figures
 
-    for name in ("insertion_figure", "perspective_figure", "plan_figure"):
+    for name in ("insertion_figure", "plan_figure"):
         setattr_(figures, name, lambda *_: new_figure(1.0))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import flexneedle
 from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
-from flexneedle.estimation.derivatives import differentiate
+from flexneedle.estimation.fit import differentiate
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import POSITION, SENSORS

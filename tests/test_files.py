@@ -4,7 +4,6 @@ import os
 
 import pytest
 
-import flexneedle
 from flexneedle.errors import RecordError
 from flexneedle.figures.style import new_figure, save
 from flexneedle.files import replace_file
@@ -18,11 +17,7 @@ def write_figure(folder):
     save(new_figure(1.0), folder, "figure")
 
 
-def write_state(folder):
-    flexneedle.Simulator("phantom").start().save(folder / "state.npz")
-
-
-@pytest.mark.parametrize("write", [write_bytes, write_figure, write_state])
+@pytest.mark.parametrize("write", [write_bytes, write_figure])
 def test_a_file_is_the_old_one_until_the_new_one_is_complete(tmp_path, monkeypatch, write):
     write(tmp_path)
     written = {path: path.stat().st_size for path in tmp_path.iterdir()}

@@ -9,11 +9,10 @@ import flexneedle
 from flexneedle.cli import main as cli
 from flexneedle.control.controllers import CONTROLLERS, find_controller
 from flexneedle.errors import InputError
-from flexneedle.loop.virtual import Seeds, virtual_rig
+from flexneedle.loop.virtual import Seeds, find_tracker, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS, find_plant
-from flexneedle.phantom.tracking.factory import find_tracker
 from flexneedle.types import STILL
 from synthetic import make_plan
 

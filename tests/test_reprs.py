@@ -7,7 +7,6 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
-from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.phantom.draw import draw
@@ -34,9 +33,8 @@ RECORDS = {
     "state": STATE,
     "start": SIMULATOR.start(),
     "contacts": STATE.contacts,
-    "rollout": ROLLOUT,
     "assimilation": SIMULATOR.assimilate(STATE, STATE.tip[:2]),
-    "trajectories": Trajectories(np.zeros((2, 3, 9)), *ROLLOUT[:3]),
+    "trajectories": ROLLOUT,
     "task": task_of(SIMULATOR, make_plan()),
     "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
     "identification": Identification().begin(begun_with(SIMULATOR)),

@@ -9,9 +9,9 @@ import pytest
 
 import plant_robustness
 import robustness
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.phantom import plants
 from flexneedle.phantom.equilibrium import MAX_ITERATIONS
-from flexneedle.simulator.simulator import Rollout
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 MODEL = SimpleNamespace(study=robustness, count="--sequences", number="--batch", work="run_batch")
@@ -86,7 +86,7 @@ def test_a_failure_is_counted_and_can_be_reproduced(of, monkeypatch, capsys, how
             raise ZeroDivisionError("a bug")
         tips[3, 7, 1] = np.nan if how == "not_finite" else 0.0
         converged[3, 7] = how != "unconverged"
-        return Rollout(tips, np.zeros((n, m)), converged, np.zeros((0, 0)), np.zeros((0,) * 4))
+        return Trajectories(controls, tips, np.zeros((n, m)), converged)
 
     def step(rod, s, *arguments, whole=plants.step):
         count = whole(rod, s, *arguments)

@@ -23,25 +23,18 @@ if TYPE_CHECKING:
     )
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
-    from flexneedle.figures.record import plot
     from flexneedle.lab.study.runner import run_study
-    from flexneedle.loop.events import (
-        Decided,
-        Ended,
-        Event,
-        Gate,
-        Iterated,
-        PeriodEnded,
-        Planned,
-    )
+    from flexneedle.loop.events import Decided, Ended, Gate, PeriodEnded, Planned
     from flexneedle.loop.insertions import insert
     from flexneedle.loop.rig import Rig
     from flexneedle.loop.virtual import VirtualRig
     from flexneedle.phantom.draw import Truth
     from flexneedle.phantom.plants import Plant
+    from flexneedle.planning.events import Event, Iterated
     from flexneedle.planning.planner import plan
     from flexneedle.ports import Clock, Driver, TipTracker
     from flexneedle.record.export import to_dataframe
+    from flexneedle.record.figures import plot
     from flexneedle.record.loading import load
     from flexneedle.record.saving import save
     from flexneedle.results import Insertion, Plan
@@ -50,7 +43,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.sections.fields import Section
     from flexneedle.scenario.tissue.layer import Layer
     from flexneedle.simulator.control import controls
-    from flexneedle.simulator.simulator import Rollout, Simulator
+    from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
     from flexneedle.types import (
         DB_PSI,
@@ -113,7 +106,6 @@ __all__ = [
     "Pose",
     "Rig",
     "RigError",
-    "Rollout",
     "RunError",
     "Scenario",
     "ScenarioError",
@@ -151,17 +143,18 @@ _HOMES = {
     "StateError StoppedError",
     "estimation.estimate": "Estimate",
     "estimation.task": "Task",
-    "figures.record": "plot",
     "lab.study.runner": "run_study",
-    "loop.events": "Decided Ended Event Gate Iterated PeriodEnded Planned",
+    "loop.events": "Decided Ended Gate PeriodEnded Planned",
     "loop.insertions": "insert",
     "loop.rig": "Rig",
     "loop.virtual": "VirtualRig",
     "phantom.draw": "Truth",
     "phantom.plants": "Plant",
+    "planning.events": "Event Iterated",
     "planning.planner": "plan",
     "ports": "Clock Driver TipTracker",
     "record.export": "to_dataframe",
+    "record.figures": "plot",
     "record.loading": "load",
     "record.saving": "save",
     "results": "Insertion Plan",
@@ -170,7 +163,7 @@ _HOMES = {
     "scenario.sections.fields": "Section",
     "scenario.tissue.layer": "Layer",
     "simulator.control": "controls",
-    "simulator.simulator": "Rollout Simulator",
+    "simulator.simulator": "Simulator",
     "simulator.state": "State",
     "types": "DB_PSI DB_THETA DB_X DB_Y DB_Z DG_Y DG_Z PSI ROLL SPIN THETA X Y Z Control Measurement Motion Pose",
 }

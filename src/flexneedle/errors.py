@@ -50,7 +50,7 @@ class CommandError(InputError, ValueError):
 
 
 class StateError(InputError):
-    """A saved state does not belong to this scenario, or its file is damaged."""
+    """A state belongs to another scenario."""
 
 
 class RunError(FlexneedleError):

@@ -85,15 +85,10 @@ class Pose(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """A predicted shape.
+    """A predicted shape."""
 
-    Attributes:
-        nodes: Poses (n, 5) at the nodes of the needle.
-        sd: Standard deviations (n, 2) of their y and z (mm).
-    """
-
-    nodes: Floats
-    sd: Floats
+    nodes: Floats  # poses (n, 5) at the nodes of the needle
+    sd: Floats  # standard deviations (n, 2) of their y and z (mm)
 
 
 class _Columns(NamedTuple):
@@ -200,6 +195,8 @@ class Motion(NamedTuple):
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z from the sensor's to the tracker's frame; the sensor's z axis is the needle's."""
 
+TIP = "tip"
+"""Name of the needle's sensor in frames."""
 VISIBLE = "ok"
 """Status of a sensor that the tracker measures, and of a tracker that sends frames."""
 

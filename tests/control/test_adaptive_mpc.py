@@ -108,7 +108,7 @@ def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, al
     def rest(state, sd, command=FORWARD, measured=0.9):
         estimate = estimate_of(state)
         off = sd * np.sqrt(estimate.reading_variance)
-        move = Move(0.0, 1.0, command, (Measurement(measured, *state.tip[:2].tolist()),))
+        move = Move(Motion(command, 0.0, 1.0), (Measurement(measured, *state.tip[:2].tolist()),))
         estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(move,))
         return decide(quick_plan, estimate).rest
 

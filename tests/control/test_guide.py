@@ -6,7 +6,7 @@ import pytest
 import flexneedle
 from flexneedle.control import mpc
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.control.guide import check_guide, guide_may_move, largest_guide_step
+from flexneedle.control.limits import check_guide, guide_may_move, largest_guide_step
 from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
 from flexneedle.loop.choices import Choices

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.control.bang_bang import choose_roll, closest_approach, target_from_tip
-from flexneedle.control.rotation import limit_roll
+from flexneedle.control.limits import limit_roll
 from flexneedle.scenario.files import load_scenario
 
 SLOPES = st.floats(-0.4, 0.4)

@@ -252,7 +252,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
             longer = longer.move(Motion(STILL, 31.0 + k, 32.0 + k))
     assert longer.state is resting.state
     assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
-    assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
+    assert (longer.moves[-1].motion.begun, longer.moves[-1].motion.ended) == (30.0, 51.0)
     updated = longer.observe([Measurement(50.0, *needle.measured(states[-1]).tolist())])
     assert len(updated.moves[-1].measurements) == 2
     assert updated.tip_at(40.5) == pytest.approx(tuple(updated.tip[:3]), abs=1e-6)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.estimation import derivatives, fit
+from flexneedle.estimation import fit
 from flexneedle.estimation import identification as idn
-from flexneedle.estimation.derivatives import differentiate
+from flexneedle.estimation.fit import differentiate
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import ROLL, Control, Measurement, Motion, X, Y
@@ -72,8 +72,8 @@ def test_no_derivative_is_older_than_a_round():
         last |= {one.parameter: k for one in estimate.perturbed}
     everyone = set(range(estimate.parameters.size)) - {AT.run_out}
     assert set(last) == everyone
-    assert min(last.values()) > len(rows) - 1 - derivatives.ROUND
-    assert min(last[k] for k in leading) > len(rows) - 1 - derivatives.LEADING_ROUND
+    assert min(last.values()) > len(rows) - 1 - fit.ROUND
+    assert min(last[k] for k in leading) > len(rows) - 1 - fit.LEADING_ROUND
     assert len(estimate.perturbed) < 0.5 * len(everyone)
 
 

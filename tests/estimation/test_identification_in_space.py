@@ -120,7 +120,7 @@ def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted)
     """Before the last quarter turn the tip is off the axis in the bevel's former direction."""
     estimate, _ = fitted
     estimate = replace(estimate, residual=0.0)
-    end = estimate.moves[-1].ended
+    end = estimate.moves[-1].motion.ended
     rolled = estimate.move(Motion(Control(roll=math.pi / 2), end, end + 0.2))
     _, y, z = rolled.tip_at(end)
     off = estimate.run_out * estimate.state.bevel

@@ -106,7 +106,10 @@ def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
     at = {time: Measurement(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
     updated = estimate.observe([at[-0.5], at[0.4]])
     assert [done.measurements for done in updated.moves] == [(at[-0.5], at[0.4]), (), ()]
-    assert [done.ended for done in updated.observe([at[1.0]]).moves] == [2.0, 3.0]  # the first move is closed
+    assert [done.motion.ended for done in updated.observe([at[1.0]]).moves] == [
+        2.0,
+        3.0,
+    ]  # the first move is closed
     late = Measurement(7.0, -25.5, 0.0)
     assert estimate.observe([late]).moves == ()
 

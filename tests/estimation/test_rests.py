@@ -56,7 +56,7 @@ def test_without_readings_a_hold_is_one_move_and_no_work(estimate, monkeypatch):
     long = held(first, HELD, lambda *_: [], READING_S)
     assert kept(long) == kept(first)
     assert long.state is first.state
-    assert long.moves[-1].ended == pytest.approx((HELD + 1) * READING_S)
+    assert long.moves[-1].motion.ended == pytest.approx((HELD + 1) * READING_S)
 
 
 def test_a_long_hold_keeps_no_more_readings_than_a_short_one(estimate):

@@ -69,12 +69,12 @@ def test_without_a_run_out_readings_of_a_roll_correct_nothing():
 
 def test_a_roll_that_takes_time_is_a_move_of_its_own():
     roll, travel = Move.parts_of(ROLLED)
-    assert (roll.begun, roll.ended, roll.applied) == (1.0, 1.6, Control(flip=True))
-    assert (travel.begun, travel.ended, travel.applied) == (1.6, 2.0, AHEAD)
+    assert (roll.motion.begun, roll.motion.ended, roll.applied) == (1.0, 1.6, Control(flip=True))
+    assert (travel.motion.begun, travel.motion.ended, travel.applied) == (1.6, 2.0, AHEAD)
     assert roll.is_roll
     assert not travel.is_roll
     for whole in (Motion(TURN, 1.0, 2.0), Motion(AHEAD, 1.0, 2.0, turned=1.0)):
-        assert Move.parts_of(whole) == (Move.of(whole),) == (Move(1.0, 2.0, whole.control),)
+        assert Move.parts_of(whole) == (Move.of(whole),) == (Move(Motion(whole.control, 1.0, 2.0)),)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_with_rolls_that_take_time_the_run_out_is_found(used):
 def test_in_a_roll_the_predicted_tip_goes_round_the_axis():
     needle = Needle(run_out=-0.15)
     estimate, _ = rolled(needle, (34,), 36)
-    end, estimate = estimate.moves[-1].ended, replace(estimate, residual=0.0)
+    end, estimate = estimate.moves[-1].motion.ended, replace(estimate, residual=0.0)
     moved = estimate.move(Motion(TURN, end, end + 0.6, end + 0.4))
     (before, after), side = moved.tips[-3:-1, 1], estimate.off_axis(estimate.state.bevel).real
     for part in (0.0, 0.25, 0.5, 1.0):
@@ -157,7 +157,7 @@ def test_the_measured_tip_after_a_roll_is_on_the_side_of_the_bevel():
     """The newest reading is from the middle of the roll."""
     needle = Needle(run_out=-0.15)
     estimate, _ = rolled(needle, (34,), 36)
-    end = estimate.moves[-1].ended
+    end = estimate.moves[-1].motion.ended
     moved = estimate.move(Motion(TURN, end, end + 0.6, end + 0.4))
     x, y, _ = moved.tip_at(end + 0.2)
     observed = moved.observe([Measurement(end + 0.2, x, y)])

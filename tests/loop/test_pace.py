@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexneedle.control.interface import Controller, Decision
-from flexneedle.simulator.control import Limits
-from flexneedle.simulator.pace import roll_time, travel_time
+from flexneedle.simulator.control import Limits, roll_time, travel_time
 from flexneedle.types import COLUMNS, Control
 from insertions import PHANTOM, READING, RecordedPhantom, first_periods
 from phantoms import STRAIGHT, TURN, make_phantom, tip

@@ -8,10 +8,9 @@ import pytest
 import flexneedle
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig, virtual_room
-from flexneedle.phantom.tracking.field.poses import reference_poses
+from flexneedle.phantom.tracking.field.poses import placed_references, reference_poses
 from flexneedle.phantom.tracking.field.room import Room
 from flexneedle.phantom.tracking.field.sensors import indicator, noiseless
-from flexneedle.phantom.tracking.placement import placed_references
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import STILL as AT_REST
 from flexneedle.types import Control, Frame, SensorReading

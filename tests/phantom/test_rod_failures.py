@@ -58,7 +58,7 @@ def test_invalid_numbers_are_reported_and_the_solve_ends(where, bad):
 
 def test_the_exact_rod_shares_no_solver_with_the_controllers_model():
     """Only the decorators for compilation, the tables of the tissue's laws, and the columns of a control."""
-    kernels = ("space", "rod", "hinges", "loads", "sweep", "equilibrium")
+    kernels = ("space", "rod", "loads", "sweep", "equilibrium")
     ours = {f"flexneedle.phantom.{name}" for name in kernels}
     for name in (*kernels, "plants"):
         tree = ast.parse(

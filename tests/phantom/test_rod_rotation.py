@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flexneedle import Control
-from flexneedle.phantom.hinges import clamp
+from flexneedle.phantom.loads import clamp
 from flexneedle.types import PSI, THETA, Z
 from reference import kirchhoff
 from reference.rods import IDEAL, plant

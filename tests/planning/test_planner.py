@@ -278,7 +278,7 @@ def test_a_target_near_the_skin_that_one_search_misses_is_reached(where, monkeyp
     scenario, target = NEAR_THE_SKIN[where]
     calls, found, carry_out = [], [], planner._carry_out
     monkeypatch.setattr(planner, "_carry_out", lambda *args: found.append(carry_out(*args)) or found[-1])
-    plan = flexneedle.plan(scenario, target, progress=calls.append)
+    plan = flexneedle.plan(scenario, target, listeners=[lambda event: calls.append(event.info)])
     assert plan.error_mm <= 0.5
     assert plan.limit == ""
     assert plan.cost == plan.history[-1]["best"]

@@ -51,7 +51,7 @@ def test_a_plan_in_the_plane_is_one_in_space():
     replayed = simulator.rollout(simulator.start(plane.roll), plane.controls[None])
     np.testing.assert_allclose(replayed.tips[0], plane.tips[1:], atol=3e-6)
     assert (replayed.tips[0][:, [2, 4]] == 0.0).all()
-    np.testing.assert_allclose(replayed.strain_energy[0], plane.strain_energy[1:], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(replayed.energy[0], plane.strain_energy[1:], rtol=1e-5, atol=1e-9)
 
 
 def test_a_guide_on_one_axis_leaves_the_other_to_the_bevel():

@@ -13,6 +13,7 @@ from matplotlib.text import Text
 import flexneedle
 from flexneedle.cli import main as cli
 from flexneedle.errors import InputError, RunError
+from flexneedle.figures.insertion import insertion_figure
 from flexneedle.record.fields import COLUMNS
 from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE
@@ -64,7 +65,7 @@ def same(one, other):
 def test_plot_returns_the_figure_that_the_commands_draw(record, kind, shown, monkeypatch):
     for name in ("plan", "insertion"):
         monkeypatch.setattr(
-            f"flexneedle.figures.record.{name}_figure", lambda *given, name=name: (name, *given)
+            f"flexneedle.record.figures.{name}_figure", lambda *given, name=name: (name, *given)
         )
     assert flexneedle.plot(record) == (kind, PHANTOM, shown)
 
@@ -96,7 +97,9 @@ def test_each_record_of_a_dry_run_is_marked_as_one(tmp_path, capsys):
     assert (stored["dry_run"], stored["result"]["dry_run"]) == (True, True)
     loaded = flexneedle.load(folder)
     assert loaded.dry_run
-    assert dry.summary in {text.get_text() for text in flexneedle.plot(loaded).findobj(Text)}
+    assert dry.summary in {
+        text.get_text() for text in insertion_figure(loaded.scenario, loaded).findobj(Text)
+    }
     assert cli.main(["export", str(folder), "--csv", "-"]) == 0
     table = pd.read_csv(StringIO(capsys.readouterr().out))
     assert table["dry_run"].all()

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexneedle.mechanics import law
-from flexneedle.phantom import equilibrium, hinges, loads, rod, space, sweep
+from flexneedle.phantom import equilibrium, loads, rod, space, sweep
 from flexneedle.scenario.tissue.ogden import Ogden
 from reference.interpreted import Record, interpreted
 from reference.rods import Bench
 
-PLAIN = interpreted(law, space, rod, hinges, loads, sweep, equilibrium)
+PLAIN = interpreted(law, space, rod, loads, sweep, equilibrium)
 
 
 def parts(bench):

@@ -14,8 +14,8 @@ from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.controllers import check_tables
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.library import PRESETS
 from flexneedle.scenario.model import Scenario, check_target
-from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.sections.needle import GAUGES
 
 PHANTOM = load_scenario("phantom")
@@ -136,12 +136,12 @@ def test_flat_values_round_trip_through_changes():
 
 
 def test_the_first_difference_is_named_as_in_the_file():
-    assert PHANTOM.first_difference(load_scenario("phantom")) is None
+    assert PHANTOM.first_difference(load_scenario("phantom"), ("tissue", "plan")) is None
     changed = PHANTOM.with_values({"tissue.1.alpha": 2.0, "plan.samples": 10, "plan.elite_fraction": 0.5})
-    assert PHANTOM.first_difference(changed) == "tissue[1].alpha"
-    no_guide = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-    assert PHANTOM.first_difference(no_guide) == "setup.guide_to_skin_mm"
-    assert no_guide.first_difference(PHANTOM) == "setup.guide_to_skin_mm"
+    assert PHANTOM.first_difference(changed, ("plan", "tissue")) == ("tissue[1].alpha", 8.74, 2.0)
+    no_guide, guide = PHANTOM.with_values({"setup.guide_to_skin_mm": None}), PHANTOM.setup.guide_to_skin_mm
+    assert PHANTOM.first_difference(no_guide, ["setup"]) == ("setup.guide_to_skin_mm", guide, "none")
+    assert no_guide.first_difference(PHANTOM, ["setup"]) == ("setup.guide_to_skin_mm", "none", guide)
 
 
 @given(

@@ -3,8 +3,8 @@
 import pytest
 
 from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.library import PRESETS
 from flexneedle.scenario.plausible import USUAL, find_doubts
-from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.scenario.worlds import PERFECT, STRUCTURE, world
 

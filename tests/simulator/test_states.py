@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.errors import CommandError, InputError, StateError
 from flexneedle.mechanics import insertion
+from flexneedle.scenario.dotted import split_key
+from flexneedle.scenario.problems import key_path
 from reference.cases import insert_to, numbers, repeat, with_number
 
 PHANTOM = load_scenario("phantom")
@@ -87,56 +89,33 @@ def test_states_are_equal_if_and_only_if_their_bits_are_and_then_hash_equally(pl
     assert len({a, b}) == 2 - (a == b)
 
 
-# ---- files and other scenarios
-
-
-@pytest.fixture
-def saved(state, tmp_path):
-    path = tmp_path / "needle.npz"
-    state.save(path)
-    return path
-
-
-def test_a_saved_state_loads_equal(state, saved):
-    loaded = SIMULATOR.load(str(saved))
-    assert loaded == state
-    assert same_future(loaded, state)
-    assert not loaded.rest.flags.writeable
+# ---- other scenarios
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
     [("tissue.1.alpha", 9.0), ("needle.bevel.offset_mm", 3.5), ("setup.guide_to_skin_mm", None)],
 )
-def test_a_state_of_other_mechanics_is_refused_with_the_key(state, saved, key, value):
-    """In a step, a rollout, an assimilation and a file, with both values."""
+def test_a_state_of_other_mechanics_is_refused_with_the_key(state, key, value):
+    """In a step, a rollout and an assimilation, with both values."""
     other = Simulator(PHANTOM.with_values({key: value}))
     uses = (
         lambda: other.step(state, ON),
         lambda: other.rollout(state, [[ON]]),
         lambda: other.assimilate(state, state.tip[:2]),
-        lambda: other.load(saved),
     )
     for use in uses:
         with pytest.raises(StateError) as caught:
             use()
-        assert all(part in str(caught.value) for part in (key, str(PHANTOM.flat()[key]), str(value)))
+        assert all(
+            part in str(caught.value)
+            for part in (key_path(split_key(key)), str(PHANTOM.flat()[key]), str(value or "none"))
+        )
 
 
-def test_planner_controller_and_target_are_no_part_of_the_mechanics(state, saved):
+def test_planner_controller_and_target_are_no_part_of_the_mechanics(state):
     other = Simulator(PHANTOM.with_values({"plan.samples": 77, "target.depth_mm": 30.0, "name": "Other"}))
-    assert other.step(other.load(saved), ON).nodes.tobytes() == SIMULATOR.step(state, ON).nodes.tobytes()
-
-
-def test_a_file_that_is_no_state_is_refused(tmp_path):
-    path = tmp_path / "needle.npz"
-    np.savez(path, x=np.zeros(3))
-    for content in (path.read_bytes(), b"plain text", b"", b"PK\x03\x04 no"):
-        path.write_bytes(content)
-        with pytest.raises(StateError, match=r"needle\.npz"):
-            SIMULATOR.load(path)
-    with pytest.raises(StateError, match="absent"):
-        SIMULATOR.load(tmp_path / "absent")
+    assert other.step(state, ON).nodes.tobytes() == SIMULATOR.step(state, ON).nodes.tobytes()
 
 
 # ---- values that nobody changes

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import seed
-from flexneedle.errors import InputError, RunError
+from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Controller
@@ -18,17 +18,7 @@ if TYPE_CHECKING:
     from flexneedle.results import Plan
     from flexneedle.scenario.model import Scenario
 
-SWITCHED_ON = (
-    "The motors of all axes are switched on first. A motor that rests away from its commanded position is switched "
-    "off and on again at its present position: support a vertical axis."
-)
-"""Notice before any motion of a rig."""
-ARMS = f"{SWITCHED_ON} Ctrl-C stops."
-"""Printed before any motion of a rig."""
-STILL_IN = "the needle stays in place: withdraw it with flexneedle rig retract {rig}"
-"""Notice of a needle that is left in; rig: as the user gave it."""
-STRATEGIES = ("manipulation", "steering")
-"""Strategies of planning, the default first."""
+_TABLE_WIDTH = 200  # characters: a line that is wrapped in a table would split numbers
 
 
 class _Target(argparse.Action):
@@ -150,21 +140,24 @@ def print_json(values: Mapping[str, Any]) -> None:
     print(to_text(values), end="")
 
 
-def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: Sequence[str] = ()) -> None:
-    """Print a short table and the folder of the record on stdout; heads: names of the value columns."""
+def print_table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table on stdout; its first column has names, and a name that begins with a space is of the row above."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     console = Console(soft_wrap=True, highlight=False)
-    table = Table(box=box.SIMPLE, show_header=bool(heads), show_edge=False)
-    for number, head in enumerate(("", *(heads or ("",)))):
-        table.add_column(head, justify="right" if number else "left", style="" if number else "dim")
+    console.width = max(console.width, _TABLE_WIDTH)
+    table = Table(box=box.SIMPLE, show_header=any(heads), show_edge=False)
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="right" if number else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*map(Text, row))
-    console.print(Text(title, style="bold"), table, sep="\n\n")
-    console.print(Text(f"\nRecord and figures: {folder}"))
+        style = "dim" if row[0].startswith(" ") else ""
+        table.add_row(*(Text(cell, style=style) for cell in row))
+    console.print(Text(title, style="bold"), end="\n\n")
+    console.print(table)
+    console.print()
 
 
 @contextmanager
@@ -176,28 +169,8 @@ def print_problems(folder: Folder) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        print(f"flexneedle: incomplete record: {folder.path}", file=sys.stderr)
+        print_note(f"incomplete record: {folder.path}")
         raise
     finally:
         for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
-            print(f"flexneedle: {line}", file=sys.stderr)
-
-
-def require_terminal() -> None:
-    """Raise InputError if there is no terminal on which motions could be confirmed."""
-    if not sys.stdin.isatty():
-        raise InputError("no terminal to confirm the motion: use --yes to move without asking")
-
-
-def confirm_motions(lines: Iterable[str], question: str) -> None:
-    """Print the motions, and ask on stderr; question "": do not ask.
-
-    Raises RunError for any answer but yes, InputError without a terminal.
-    """
-    print("\n".join(lines), file=sys.stderr)
-    if not question:
-        return
-    require_terminal()
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise RunError("not confirmed: nothing was moved")
+            print_note(line)

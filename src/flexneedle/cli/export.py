@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.progress import print_note
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
@@ -67,7 +68,7 @@ def _export(args: argparse.Namespace) -> int:
         write, name, default = write_readings, args.readings, _READINGS
     insertion, note = load_insertion(args.run)
     if note:
-        print(f"flexneedle: {note}", file=sys.stderr)
+        print_note(note)
     if name == _STDOUT:
         write(sys.stdout, insertion)
         return 0

@@ -25,8 +25,9 @@ from flexneedle.errors import FlexneedleError, StoppedError, one_line
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
     from flexneedle.loop.choices import Choices
-    from flexneedle.loop.events import Event, Gate, Listener
+    from flexneedle.loop.events import Gate
     from flexneedle.loop.rig import RigSource
+    from flexneedle.planning.events import Event, Listener
     from flexneedle.record.folder import Folder
     from flexneedle.results import Insertion, Period
     from flexneedle.scenario.model import Scenario
@@ -39,9 +40,8 @@ class Connection:
     """
 
     def __init__(self, args: argparse.Namespace) -> None:
-        from flexneedle.loop.virtual import VirtualRig
+        from flexneedle.loop.virtual import SCENARIO_TRACKER, VirtualRig
         from flexneedle.phantom.plants import DEFAULT_PLANT
-        from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER
 
         self.args = args
         self.source: RigSource = VirtualRig(args.phantom or DEFAULT_PLANT, args.tracker or SCENARIO_TRACKER)
@@ -238,7 +238,8 @@ class _InsertProgress:
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
-        from flexneedle.loop.events import Iterated, PeriodEnded
+        from flexneedle.loop.events import PeriodEnded
+        from flexneedle.planning.events import Iterated
 
         match event:
             case Iterated(info=info):

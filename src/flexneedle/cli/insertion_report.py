@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.common import entry_rows, print_json, print_table, target_row
+from flexneedle.cli.progress import print_note
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,14 +22,14 @@ def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path
 
     if insertion.outcome is Outcome.INTERRUPTED:
         why = "" if insertion.reason == BY_USER else f": {insertion.reason}"
-        print(f"flexneedle: interrupted{why}; record: {folder}", file=sys.stderr)
+        print_note(f"interrupted{why}; record: {folder}")
         return 130
     if as_json:
         result, timing = insertion_result(insertion), insertion_timing(insertion)
         print_json({**result, "run_dir": str(folder), "timing": timing})
     else:
         if not insertion.plan.reached:
-            print(f"flexneedle: warning: the plan {insertion.plan.summary}", file=sys.stderr)
+            print_note(f"warning: the plan {insertion.plan.summary}")
         _table(scenario, insertion, folder)
     return 0 if insertion.reached else 1
 
@@ -58,7 +58,8 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("median period time", _number(timing["period_ms"]["p50"], "ms")),
         *_ticks(insertion),
     ]
-    print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
+    print_table(insertion.summary[:1].upper() + insertion.summary[1:], ("", ""), rows)
+    print(f"Record and figures: {folder}")
 
 
 def _needle(insertion: Insertion) -> tuple[str, str]:

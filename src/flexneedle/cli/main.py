@@ -16,6 +16,7 @@ from typing import Any
 from flexneedle import __version__
 from flexneedle.cli import export, insert, plan, scenario, view
 from flexneedle.cli.commands import Commands, help_texts
+from flexneedle.cli.progress import print_note
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError, describe_error
 
 _CORE = {"plan": plan, "insert": insert, "view": view, "export": export, "scenario": scenario}
@@ -65,10 +66,7 @@ def _load(point: EntryPoint) -> Callable[[Commands], None] | None:
     try:
         add: Callable[[Commands], None] = point.load()
     except Exception as error:  # noqa: BLE001  whatever an installed package raises
-        print(
-            f"flexneedle: command {point.name} ({point.value}) not loaded: {describe_error(error)}",
-            file=sys.stderr,
-        )
+        print_note(f"command {point.name} ({point.value}) not loaded: {describe_error(error)}")
         return None
     return add
 
@@ -85,9 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="backslashreplace"
-        )  # a name that the terminal cannot print is not an error
+        # A name that the terminal cannot print is no error.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = build_parser().parse_args(argv)
         with _print_warnings():
@@ -108,7 +105,7 @@ def _print_warnings() -> Iterator[None]:
             show(message, category, *about, **more)
         elif str(message) not in printed:
             printed.add(str(message))
-            _print_error(str(message))
+            _print_lines(message)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", ScenarioWarning)
@@ -121,20 +118,20 @@ def _report_errors(command: Callable[[], int]) -> int:
     try:
         return command()
     except FlexneedleError as error:
-        _print_error(str(error))
+        _print_lines(error)
         return 2 if isinstance(error, InputError) else 130 if isinstance(error, StoppedError) else 1
     except KeyboardInterrupt:
-        _print_error("interrupted")
+        print_note("interrupted")
         return 130
     except BrokenPipeError:
         # prevents a second error about the closed pipe at interpreter exit (Python docs, signal)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        _print_error(str(error))
+        _print_lines(error)
         return 1
 
 
-def _print_error(message: str) -> None:
-    for line in message.splitlines():
-        print(f"flexneedle: {line}", file=sys.stderr)
+def _print_lines(message: object) -> None:
+    for line in str(message).splitlines():
+        print_note(line)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import (
-    STRATEGIES,
     add_run_arguments,
     add_strategy,
     choose_scenario,
@@ -20,6 +19,7 @@ from flexneedle.cli.common import (
     run_name,
     target_row,
 )
+from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,7 +44,7 @@ def add_parser(commands: Commands) -> None:
 
 def _plan(args: argparse.Namespace) -> int:
     from flexneedle.cli.progress import Progress
-    from flexneedle.loop.events import Event, Iterated
+    from flexneedle.planning.events import Event, Iterated
     from flexneedle.record.folder import Folder
     from flexneedle.record.recording import record_plans
 
@@ -75,7 +75,8 @@ def _report(scenario: Scenario, plans: dict[str, Plan], as_json: bool, folder: P
     columns = [_rows(scenario, plan) for plan in plans.values()]
     names = dict.fromkeys(name for column in columns for name in column)
     rows = [(name, *(column.get(name, "") for column in columns)) for name in names]
-    print_table(title, rows, folder, heads=list(plans) if len(plans) > 1 else ())
+    print_table(title, ("", *(plans if len(plans) > 1 else ("",))), rows)
+    print(f"Record and figures: {folder}")
 
 
 def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar in a terminal, occasional lines otherwise."""
+"""Lines and progress on stderr: a bar in a terminal, occasional lines otherwise."""
 
 from __future__ import annotations
 
@@ -16,6 +16,16 @@ if TYPE_CHECKING:
 
 _LINES = 5  # per stage, without a terminal
 _MAX_SILENCE_S = 60.0  # between two lines, without a terminal
+
+
+def print_line(line: str) -> None:
+    """Print a line on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def print_note(line: str) -> None:
+    """Print a line on stderr that begins with the name of the program."""
+    print_line(f"flexneedle: {line}")
 
 
 class Progress:
@@ -41,7 +51,7 @@ class Progress:
     def print_line(self, line: str) -> None:
         """Print a line that belongs to no stage."""
         if self._bars is None:
-            _print_stderr(line)
+            print_line(line)
         else:
             self._bars.console.print(line, markup=False, highlight=False)
 
@@ -59,7 +69,7 @@ class Progress:
     def begin(self, stage: str) -> None:
         """Show a stage at its start."""
         if self._bars is None:
-            _print_stderr(f"{stage} …")
+            print_line(f"{stage} …")
         else:
             self._tasks[stage] = self._bars.add_task(stage, total=None, note="")
         self._printed[stage] = 0
@@ -73,7 +83,7 @@ class Progress:
         elif (lines := int(_LINES * done / total + 1e-9)) > self._printed[stage] or self._is_overdue():
             self._printed[stage] = lines
             self._last = monotonic()
-            _print_stderr(f"{stage} {done / total:.0%}: {note}")
+            print_line(f"{stage} {done / total:.0%}: {note}")
 
     def _is_overdue(self) -> bool:
         return monotonic() > self._last + _MAX_SILENCE_S
@@ -83,10 +93,6 @@ class Progress:
         if self._bars is not None and stage in self._tasks:
             task = next(task for task in self._bars.tasks if task.id == self._tasks[stage])
             self._bars.update(task.id, total=task.total or 1.0, completed=task.total or 1.0)
-
-
-def _print_stderr(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def _bars() -> Bars:

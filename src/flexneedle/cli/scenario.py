@@ -87,7 +87,7 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
 
 def _list(_args: argparse.Namespace) -> int:
     from flexneedle.scenario.files import load_scenario
-    from flexneedle.scenario.preset import PRESETS
+    from flexneedle.scenario.library import PRESETS
 
     for name in PRESETS.names():
         print(f"{name:12} {load_scenario(name).name}")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.progress import print_note
 
 
 def add_parser(commands: Commands) -> None:
@@ -29,8 +29,3 @@ def draw(args: argparse.Namespace) -> int:
     for path in draw_run(args.run, print_note):
         print(path)
     return 0
-
-
-def print_note(line: str) -> None:
-    """Print a line on stderr."""
-    print(f"flexneedle: {line}", file=sys.stderr)

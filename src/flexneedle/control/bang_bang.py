@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from flexneedle.control.rotation import limit_roll
+from flexneedle.control.limits import limit_roll
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.planning.primitives import LEAST_ROLL

@@ -1,16 +1,15 @@
 """Cross-entropy model predictive control of advance and guide (paper eq. 13)."""
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from flexneedle.control.bang_bang import BevelRule
-from flexneedle.control.guide import guide_reach, largest_guide_step
-from flexneedle.control.interface import travel_left
+from flexneedle.control.interface import Decision, travel_left
+from flexneedle.control.limits import guide_reach, largest_guide_step
 from flexneedle.costs.terms import CE_MPC
-from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.horizon import Samples, Variables, find_best
+from flexneedle.planning.horizon import Variables, find_best
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
@@ -42,16 +41,6 @@ class CeMpc(BevelRule):
     """As `control.bevel_only.flip_dead_band`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The command of a period, its cost, the standard deviation left in dg_y (mm), and the last samples."""
-
-    command: Control
-    cost: float
-    spread: float
-    samples: Samples
-
-
 def choose_step(
     simulator: Simulator,
     plan: Plan,
@@ -60,10 +49,11 @@ def choose_step(
     *,
     roll: float,
     rng: np.random.Generator,
-) -> Choice:
-    """Search the next steps of advance and guide for the least deviation from the planned tip poses.
+    why: str = "",
+) -> Decision:
+    """Return the first of the next steps of advance and guide with the least deviation from the planned tip poses.
 
-    roll: roll in the first step (rad).
+    roll: roll in the first step (rad); why: its reason.
     """
     scenario = simulator.scenario
     steps, travel = control.horizon, travel_left(scenario, plan, state)
@@ -78,18 +68,15 @@ def choose_step(
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
     )
-
-    def rollout(rows: Floats) -> Trajectories:
-        return Trajectories(rows, *simulator.rollout(state, rows)[:3])
-
     steps_of_guide = nominal[:, DG_Y : DG_Y + 2]
     weight = control.orientation_weight_mm
     charged = CE_MPC.terms(
         control, target=plan.target, reference=reference, orientation=weight, nominal=steps_of_guide
     )
-    found = find_best(variables, rollout, charged, search, rng)
+    found = find_best(variables, partial(simulator.rollout, state), charged, search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
-    return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread, found.samples)
+    command = Control.of(found.trajectories.controls[0, 0].tolist())
+    return Decision(command, why, found.cost, spread, samples=found.samples)
 
 
 def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:

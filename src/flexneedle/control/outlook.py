@@ -37,16 +37,11 @@ class Outlook:
     """Derivatives of the tip's lateral position ahead, and of the needle's shape, with respect to the parameters.
 
     A few of them are simulated again each period, along the current path (`Identified.perturbed`).
-
-    Attributes:
-        grid: Depths (g,), mm.
-        curves: Derivatives (K, g) of the lateral position over the depths.
-        bent: Derivatives (K, n) of the shape at the target.
     """
 
-    grid: Floats
-    curves: Laterals
-    bent: Laterals
+    grid: Floats  # depths (g,), mm
+    curves: Laterals  # derivatives (K, g) of the lateral position over the depths
+    bent: Laterals  # derivatives (K, n) of the shape at the target
 
     @staticmethod
     def of(estimate: Identified) -> "Outlook":
@@ -62,16 +57,14 @@ class Outlook:
         """
         curves, bent = self.curves.copy(), self.bent.copy()
         bevel = bevel_directions(estimate.state.bevel, controls, estimate.axes)
-        lateral = (
-            laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
-        )  # of the axis
+        axis = laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
         depth = np.maximum.accumulate(tips[:, X])
         for one in estimate.perturbed:
             ended = one.simulator.rollout(one.state, controls[None], limits=False, rough=True, shapes=True)
             moved = ended.tips[0]
             bent[one.parameter] = laterals(ended.shapes[0, -1] - shape, Y, estimate.axes) / one.step
             curves[one.parameter] = np.interp(
-                self.grid, depth, (laterals(moved, Y, estimate.axes) - lateral) / one.step
+                self.grid, depth, (laterals(moved, Y, estimate.axes) - axis) / one.step
             )
         for k, direction in zip(
             range(*estimate.slots.run_out.indices(len(curves))), directions(1.0, estimate.axes), strict=True

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.guide import guide_axes, guide_reach, largest_guide_step
 from flexneedle.control.interface import travel_left
+from flexneedle.control.limits import guide_axes, guide_reach, largest_guide_step, limit_roll, shorten_roll
 from flexneedle.control.mpc import steps_to_planned_base
-from flexneedle.control.rotation import limit_roll, shorten_roll
 from flexneedle.estimation.task import Task
 from flexneedle.planning.primitives import LEAST_ROLL
 from flexneedle.results import Plan
@@ -40,17 +39,11 @@ _TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an ang
 
 @dataclass(frozen=True, eq=False)
 class GuidePath:
-    """A path of the guide, with the rolls of the needle.
+    """A path of the guide, with the rolls of the needle."""
 
-    Attributes:
-        depth: Depths (r,) of the tip, mm.
-        guide: Position y, z (r, 2) of the guide at these depths, mm.
-        rolls: Depths (mm), ascending, of the rolls, and the needle's angle (rad) after each, (k, 2).
-    """
-
-    depth: Floats
-    guide: Floats
-    rolls: Floats
+    depth: Floats  # depths (r,) of the tip, mm
+    guide: Floats  # position y, z (r, 2) of the guide at these depths, mm
+    rolls: Floats  # depths (mm), ascending, of the rolls, and the needle's angle (rad) after each, (k, 2)
 
 
 def path_of_plan(plan: Plan) -> GuidePath:
@@ -64,25 +57,15 @@ def path_of_plan(plan: Plan) -> GuidePath:
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """The path from the tip to the target in m steps.
+    """The path from the tip to the target in m steps."""
 
-    Attributes:
-        depth: Depths (m + 1,) of the ends of the steps, mm.
-        base: Motion of the base (m, 4) in each step, mm and rad.
-        state: The estimated needle.
-        path: The current path.
-        setup: Limits of the needle.
-        step: Largest step of the guide (mm).
-        axes: Number of axes on which the guide moves.
-    """
-
-    depth: Floats
-    base: Floats
-    state: State
-    path: GuidePath
-    setup: Setup
-    step: float
-    axes: int
+    depth: Floats  # depths (m + 1,) of the ends of the steps, mm
+    base: Floats  # motion of the base (m, 4) in each step, mm and rad
+    state: State  # the estimated needle
+    path: GuidePath  # the current path
+    setup: Setup  # limits of the needle
+    step: float  # largest step of the guide (mm)
+    axes: int  # number of axes on which the guide moves
 
     @staticmethod
     def of(task: Task, state: State, path: GuidePath) -> "Ahead":

@@ -1,7 +1,8 @@
 """The terms of all costs: each with its function, its unit, and its weight in the settings of every user.
 
-The users are the planner (`plan`) and two controllers (`ce_mpc`, `adaptive_mpc`). A cost is the weighted sum of its
-terms, in the order of this file. A term is added by one decorated function:
+The users are the planner (`plan`) and two controllers (`ce_mpc`, `adaptive_mpc`); `broyden-mpc` solves a least-squares
+problem instead. A cost is the weighted sum of its terms, in the order of this file. A term is added by one decorated
+function:
 
     @cost_term("mJ", plan=Weight("energy", "energy_weight_per_mj", "1/mJ", 5.0, "Weight of …", "raise it to …"))
     def energy_at_end(trajectories):

@@ -18,8 +18,8 @@ class Trajectories:
     """N sequences of m control steps, and their simulation.
 
     controls (N, m, 9): columns of `Control`; tips (N, m, 5): poses after each step, mm and rad; energy (N, m): strain
-    energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the needle's lateral deflection, mm²,
-    in the planner only.
+    energy of the tissue, mJ; converged (N, m). On demand, else of size 0: deflection (N, m): mean square of the
+    needle's lateral deflection, mm², as in the planner; shapes (N, m, n, 5): poses at the needle's nodes, mm and rad.
     """
 
     controls: Floats
@@ -27,6 +27,7 @@ class Trajectories:
     energy: Floats
     converged: NDArray[np.bool_]
     deflection: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    shapes: Floats = field(default_factory=lambda: np.empty((0, 0, 0, 0)))
 
     @property
     def inside(self) -> NDArray[np.bool_]:

@@ -34,39 +34,22 @@ class Perturbed:
 
 @dataclass(frozen=True, eq=False)
 class FittedInsertion:
-    """An insertion that is simulated with fitted parameters, its readings, and its derivatives to the parameters.
+    """An insertion that is simulated with fitted parameters, its readings, and its derivatives to the parameters."""
 
-    Attributes:
-        nominal: The scenario's model, to which the prior refers.
-        settings: Settings of the observer.
-        prior: Prior of the parameters.
-        simulator: The model with the parameters.
-        parameters: Posterior means (K,).
-        state: Present state of the model.
-        tips: Tip poses (m + 1, 5) at the ends of the m moves, the start first.
-        stops: State before some of the moves.
-        grid: Depths of the tip (g,), mm.
-        curves: Derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first.
-        precision: Inverse covariance (K, K) of the parameters.
-        axial: Start error along the axis (mm).
-        period: Number of the period.
-        perturbed: The present needle with one parameter changed, for some parameters.
-        moves: All moves.
-    """
-
-    nominal: Simulator
+    nominal: Simulator  # the scenario's model, to which the prior refers
     settings: Priors
     prior: Prior
-    simulator: Simulator
-    parameters: Floats
+    simulator: Simulator  # the model with the parameters
+    parameters: Floats  # posterior means (K,)
     state: State
-    tips: Floats
-    stops: tuple[tuple[int, State], ...]
-    grid: Floats
-    curves: Laterals
-    precision: Floats
-    axial: float = 0.0
+    tips: Floats  # tip poses (m + 1, 5) at the ends of the m moves, the start first
+    stops: tuple[tuple[int, State], ...]  # state before some of the moves
+    grid: Floats  # depths of the tip (g,), mm
+    curves: Laterals  # derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first
+    precision: Floats  # inverse covariance (K, K) of the parameters
+    axial: float = 0.0  # start error along the axis (mm)
     period: int = 0
+    # the present needle with one parameter changed, for some parameters
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
 

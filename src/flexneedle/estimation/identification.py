@@ -19,9 +19,8 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.derivatives import ROUND, differentiate
 from flexneedle.estimation.estimate import describe_estimate
-from flexneedle.estimation.fit import improve_fit
+from flexneedle.estimation.fit import ROUND, differentiate, improve_fit
 from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import directions, from_components, variance_of
 from flexneedle.estimation.move_means import fit_constant
@@ -69,18 +68,12 @@ class Identification:
 
 @dataclass(frozen=True, eq=False)
 class Identified(FittedInsertion):
-    """An `Estimate` with fitted parameters.
+    """An `Estimate` with fitted parameters."""
 
-    Attributes:
-        axial_variance: Variance (mm²) of the start error along the axis.
-        residual: Low-passed residual (mm).
-        innovation: The last reading minus its prediction (mm).
-        measured: Tip measured at the end of the last move with a reading (mm), None before the first.
-    """
-
-    axial_variance: float = 0.0
-    residual: complex = 0.0
-    innovation: Point = (0.0, 0.0, 0.0)
+    axial_variance: float = 0.0  # variance (mm²) of the start error along the axis
+    residual: complex = 0.0  # low-passed residual (mm)
+    innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
+    # tip measured at the end of the last move with a reading (mm), None before the first
     measured: Point | None = None
 
     def __repr__(self) -> str:
@@ -106,7 +99,7 @@ class Identified(FittedInsertion):
     def tip_at(self, time: float) -> Point:
         """Return the estimated position of the tip (mm) at `time`."""
         x, y, z = position_along(self.moves, self.tips, time)
-        left = sum(done.left_to_turn(time) for done in self.moves if time < done.ended)
+        left = sum(done.left_to_turn(time) for done in self.moves if time < done.motion.ended)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
         return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
@@ -118,8 +111,7 @@ class Identified(FittedInsertion):
         """Move the estimated needle as the driver did."""
         rested = self.moves and self.moves[-1].applied == STILL
         if motion.control == STILL and rested:  # one move, however long
-            last = replace(self.moves[-1], ended=motion.ended)
-            return replace(self, moves=(*self.moves[:-1], last), perturbed=())
+            return replace(self, moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)), perturbed=())
         new = Move.parts_of(motion)
         state, tips = self.simulator.replay(self.state, np.array([done.applied for done in new]))
         tips = np.concatenate([self.tips, tips])
@@ -185,7 +177,7 @@ class Identified(FittedInsertion):
     def lag(self) -> float:
         """Time (s) from the newest reading to the end of the last move."""
         times = (one.time for done in reversed(self.moves) for one in reversed(done.measurements))
-        return self.moves[-1].ended - next(times, 0.0) if self.moves else 0.0
+        return self.moves[-1].motion.ended - next(times, 0.0) if self.moves else 0.0
 
     @property
     def roll_sd(self) -> float:

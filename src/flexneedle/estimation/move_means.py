@@ -16,28 +16,17 @@ class MoveMeans:
 
     Lateral quantities are complex in space. Quantities of a model are given at the ends of all m moves, the start
     first: (m + 1,).
-
-    Attributes:
-        index: Index of the move.
-        part: Share of the move that is done.
-        x: x of the tip (mm).
-        y: Measured quantity.
-        count: Number of readings.
-        reported: Reported variance of y on an axis (NaN: not reported).
-        reported_x: Reported variance of x (NaN: not reported).
-        bevel: Mean of the bevel's direction.
-        turns: Whether the move is a roll.
     """
 
-    index: NDArray[np.intp]
-    part: Floats
-    x: Floats
-    y: Laterals
+    index: NDArray[np.intp]  # index of the move
+    part: Floats  # share of the move that is done
+    x: Floats  # x of the tip (mm)
+    y: Laterals  # measured quantity
     count: Floats
-    reported: Floats
-    reported_x: Floats
-    bevel: Laterals
-    turns: NDArray[np.bool_]
+    reported: Floats  # reported variance of y on an axis (NaN: not reported)
+    reported_x: Floats  # reported variance of x (NaN: not reported)
+    bevel: Laterals  # mean of the bevel's direction
+    turns: NDArray[np.bool_]  # whether the move is a roll
 
     @staticmethod
     def of(moves: Sequence[Move], sensor: str, bevel: complex, axes: int) -> "MoveMeans":

@@ -19,29 +19,17 @@ _ROUNDING_S = 1e-9
 
 
 class Means(NamedTuple):
-    """Means over the readings of a move.
+    """Means over the readings of a move."""
 
-    Attributes:
-        part: Share of the move that is done.
-        x: x of the tip (mm).
-        y: y of the measured quantity.
-        z: z of the measured quantity.
-        facing_y: y of the bevel's direction, relative to its direction after the move.
-        facing_z: z of the bevel's direction.
-        number: Number of readings.
-        across: Variance of the mean of y or z where all readings report it, else NaN.
-        ahead: Variance of the mean of x where all readings report it, else NaN.
-    """
-
-    part: float
-    x: float
-    y: float
-    z: float
-    facing_y: float
-    facing_z: float
+    part: float  # share of the move that is done
+    x: float  # x of the tip (mm)
+    y: float  # y of the measured quantity
+    z: float  # z of the measured quantity
+    facing_y: float  # y of the bevel's direction, relative to its direction after the move
+    facing_z: float  # z of the bevel's direction
     number: float
-    across: float
-    ahead: float
+    across: float  # variance of the mean of y or z where all readings report it, else NaN
+    ahead: float  # variance of the mean of x where all readings report it, else NaN
 
     def join(self, other: "Means") -> "Means":
         """Return the means over the readings of both."""
@@ -57,18 +45,11 @@ class Means(NamedTuple):
 
 @dataclass(frozen=True)
 class Move:
-    """A motion from `begun` to `ended` (s) as applied by the driver, and the good readings taken during it.
+    """A motion as applied by the driver, and the good readings taken during it."""
 
-    Attributes:
-        turned: End of the roll before the travel (s); None: it took no time, or there was none.
-        earlier: Means over readings of a needle at rest that are no longer kept one by one.
-    """
-
-    begun: float
-    ended: float
-    applied: Control
+    motion: Motion  # the motion; `turned` is None if the roll took no time, or there was none
     measurements: tuple[Measurement, ...] = ()
-    turned: float | None = None
+    # means over readings of a needle at rest that are no longer kept one by one
     earlier: Mapping[str, Means] = field(default_factory=dict)
 
     @cached_property
@@ -97,23 +78,26 @@ class Move:
         """Whether it is a roll alone, which turns evenly."""
         return self.applied.roll != 0.0 and self.applied._replace(roll=0.0) == STILL
 
+    @property
+    def applied(self) -> Control:
+        """The control."""
+        return self.motion.control
+
+    def extend(self, ended: float) -> "Move":
+        """Return the move with a later end (s)."""
+        return replace(self, motion=self.motion._replace(ended=ended))
+
     def left_to_turn(self, time: float) -> float:
         """Return the angle (rad) left to turn at `time`; a roll before a travel is done at its start."""
         if self.is_roll:
             return self.applied.roll * (1.0 - self.part(time))
-        before = self.applied.roll if time <= self.travel_begun else 0.0
+        before = self.applied.roll if time <= self.motion.travel_begun else 0.0
         return before + self.applied.spin * (1.0 - self.part(time))
 
     def part(self, time: float) -> float:
         """Return the share of the travel that is done at `time`."""
-        if self.ended <= self.travel_begun:
-            return 1.0
-        return min(1.0, max(0.0, (time - self.travel_begun) / (self.ended - self.travel_begun)))
-
-    @property
-    def travel_begun(self) -> float:
-        """Start of the travel (s), after the roll."""
-        return self.begun if self.turned is None else self.turned
+        begun, ended = self.motion.travel_begun, self.motion.ended
+        return 1.0 if ended <= begun else min(1.0, max(0.0, (time - begun) / (ended - begun)))
 
     def with_readings(self, new: tuple[Measurement, ...]) -> "Move":
         """Return the move with further readings; at rest the newest are kept, and the means of the others."""
@@ -127,8 +111,7 @@ class Move:
     @staticmethod
     def of(motion: Motion) -> "Move":
         """Return a motion without readings."""
-        turned = motion.turned if motion.control.roll != 0.0 else None
-        return Move(motion.begun, motion.ended, motion.control, turned=turned)
+        return Move(motion if motion.control.roll != 0.0 else motion._replace(turned=None))
 
     @staticmethod
     def parts_of(motion: Motion) -> "tuple[Move, ...]":
@@ -136,7 +119,8 @@ class Move:
         if motion.turned is None or motion.control.roll == 0.0:
             return (Move.of(motion),)
         roll, travel = Control(roll=motion.control.roll), motion.control._replace(roll=0.0)
-        return Move(motion.begun, motion.turned, roll), Move(motion.turned, motion.ended, travel)
+        parts = Motion(roll, motion.begun, motion.turned), Motion(travel, motion.turned, motion.ended)
+        return Move(parts[0]), Move(parts[1])
 
 
 def assign_readings(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
@@ -159,13 +143,15 @@ def drop_roll_readings(moves: tuple[Move, ...], measurements: Sequence[Measureme
         return list(measurements)
     owned = zip(measurements, _owners(moves, measurements), strict=True)
     return [
-        one for one, k in owned if moves[k].turned is None or one.time > moves[k].travel_begun - _ROUNDING_S
+        one
+        for one, k in owned
+        if moves[k].motion.turned is None or one.time > moves[k].motion.travel_begun - _ROUNDING_S
     ]
 
 
 def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> NDArray[np.intp]:
     """Return the number of the last move that had begun before each measurement, 0 for earlier ones."""
-    starts = np.array([done.begun for done in moves[1:]])
+    starts = np.array([done.motion.begun for done in moves[1:]])
     owners: NDArray[np.intp] = np.searchsorted(starts, [one.time - _ROUNDING_S for one in measurements])
     return owners
 
@@ -177,7 +163,7 @@ def position_along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
     """
     if not moves:
         return Pose.of(tips[-1]).point
-    times = [limit for done in moves for limit in (done.travel_begun, done.ended)]
+    times = [limit for done in moves for limit in (done.motion.travel_begun, done.motion.ended)]
     at = [end for k in range(len(moves)) for end in (k, k + 1)]
     x, y, z = (float(np.interp(time, times, tips[at, column])) for column in (X, Y, Z))
     return x, y, z

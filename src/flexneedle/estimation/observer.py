@@ -48,32 +48,19 @@ class StateCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """An `Estimate`.
-
-    Attributes:
-        simulator: The model.
-        correction: Quantities that are estimated.
-        state: Present state.
-        past: State before the first of `moves`.
-        covariance: Covariance (2, 2) of base y (mm) and θ (rad) before `moves`.
-        axial: Variance of the start along the axis (mm²) before `moves`.
-        tips: Estimated tip poses (k + 1, 5) at the ends of the moves, the start first.
-        drift: Standard deviation of the path's curvature (1/mm).
-        moves: Moves whose readings may still arrive.
-        innovation: The last reading minus its prediction (mm).
-        measured: Tip measured at the end of the last move with a reading (mm), None before the first.
-    """
+    """An `Estimate`."""
 
     simulator: Simulator
-    correction: StateCorrection
-    state: State
-    past: State
-    covariance: Floats
-    axial: float
-    tips: Floats
-    drift: float
-    moves: tuple[Move, ...] = ()
-    innovation: Point = (0.0, 0.0, 0.0)
+    correction: StateCorrection  # quantities that are estimated
+    state: State  # present state
+    past: State  # state before the first of `moves`
+    covariance: Floats  # covariance (2, 2) of base y (mm) and θ (rad) before `moves`
+    axial: float  # variance of the start along the axis (mm²) before `moves`
+    tips: Floats  # estimated tip poses (k + 1, 5) at the ends of the moves, the start first
+    drift: float  # standard deviation of the path's curvature (1/mm)
+    moves: tuple[Move, ...] = ()  # moves whose readings may still arrive
+    innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
+    # tip measured at the end of the last move with a reading (mm), None before the first
     measured: Point | None = None
 
     def __repr__(self) -> str:
@@ -118,8 +105,7 @@ class Corrected:
     def move(self, motion: Motion) -> "Corrected":
         """Move the estimated needle as the driver did."""
         if motion.control == STILL and self._rests_unread:  # one move, however long
-            last = replace(self.moves[-1], ended=motion.ended)
-            return replace(self, moves=(*self.moves[:-1], last))
+            return replace(self, moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)))
         state = carry_out(self.simulator, self.state, motion.control)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)))
@@ -139,7 +125,7 @@ class Corrected:
         for k, done in enumerate(moves):
             at = _follow(at, done)
             tips.append(at.tip)
-            if closed == k and newest >= done.ended - 1e-9:
+            if closed == k and newest >= done.motion.ended - 1e-9:
                 past, closed = at, k + 1
         return replace(
             at,

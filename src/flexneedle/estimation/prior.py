@@ -95,21 +95,13 @@ class Priors(Section):
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Normal prior of the parameters.
+    """Normal prior of the parameters."""
 
-    Attributes:
-        mean: Means (K,).
-        precision: Inverse covariance (K, K).
-        bounds: Lower and upper bounds (2, K).
-        steps: Steps for differences (K,).
-        begins: Depth of the tip (mm) from which each parameter affects it (K,).
-    """
-
-    mean: Floats
-    precision: Floats
-    bounds: Floats
-    steps: Floats
-    begins: Floats
+    mean: Floats  # means (K,)
+    precision: Floats  # inverse covariance (K, K)
+    bounds: Floats  # lower and upper bounds (2, K)
+    steps: Floats  # steps for differences (K,)
+    begins: Floats  # depth of the tip (mm) from which each parameter affects it (K,)
 
     @staticmethod
     def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":

@@ -12,24 +12,17 @@ POSITION = "tip position"
 
 @dataclass(frozen=True)
 class Sensor:
-    """A lateral quantity of the tip that a tracker measures.
-
-    Attributes:
-        name: Name.
-        column: Column of y in the tip's pose; z is the next.
-        offset: Name of the slot of its constant offset, which turns with the bevel.
-        read: Returns y and z of a measurement, None if it has none.
-        variance: Returns the variance of y or z that a measurement reports, else None.
-        sd: Returns the standard deviation of y or z by the scenario, None if the quantity is not measured.
-        unexplained: Returns the standard deviation of the mean of a move's readings which no parameter explains.
-    """
+    """A lateral quantity of the tip that a tracker measures."""
 
     name: str
-    column: int
-    offset: str
-    read: Callable[[Measurement], Lateral | None]
+    column: int  # column of y in the tip's pose; z is the next
+    offset: str  # name of the slot of its constant offset, which turns with the bevel
+    read: Callable[[Measurement], Lateral | None]  # returns y and z of a measurement, None if it has none
+    # returns the variance of y or z that a measurement reports, else None
     variance: Callable[[Measurement], float | None]
+    # returns the standard deviation of y or z by the scenario, None if the quantity is not measured
     sd: Callable[[Scenario], float | None]
+    # returns the standard deviation of the mean of a move's readings which no parameter explains
     unexplained: Callable[[Scenario, Priors], float]
 
 

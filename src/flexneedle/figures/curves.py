@@ -13,9 +13,8 @@ from statistics import median
 import numpy as np
 
 from flexneedle.results import Action, Insertion, Period, Plan
-from flexneedle.types import ROLL, SPIN, Floats, Frame, Pose, VerdictKind, X, Y
+from flexneedle.types import ROLL, SPIN, TIP, Floats, Frame, Pose, VerdictKind, X, Y
 
-_TIP = "tip"  # the sensor in the needle; all others of a frame are references
 # Verdicts of readings that the monitor excludes from its window.
 _EXCLUDED = (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER)
 _MARKED = math.radians(5.0)  # smaller rolls have no mark
@@ -186,7 +185,7 @@ def _indicators(frame: Frame) -> dict[str, float]:
     return {
         name: reading.indicator
         for name, reading in frame.readings.items()
-        if name != _TIP and reading.indicator is not None
+        if name != TIP and reading.indicator is not None
     }
 
 

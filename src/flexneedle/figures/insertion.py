@@ -74,13 +74,9 @@ def _sheet(
         heights, widths, tall = [1.6, 1.6], space.COLUMNS, 2.8
     rows = [*scenes, *below, *([["field", *["."] * (len(widths) - 1)]] if field else [])]
     heights = heights + [1.0] * (len(rows) - len(scenes))
-    return mosaic(title_of(scenario, insertion), tall + 1.15 * len(rows), rows, heights, widths)
-
-
-def title_of(scenario: Scenario, insertion: Insertion) -> str:
-    """Return the title of a figure of an insertion."""
     target = f"target {scene.place(scenario, insertion.target)}"
-    return f"{short(scenario.name, 60)}: {target} (seed {insertion.seed})"
+    title = f"{short(scenario.name, 60)}: {target} (seed {insertion.seed})"
+    return mosaic(title, tall + 1.15 * len(rows), rows, heights, widths)
 
 
 def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
@@ -107,7 +103,8 @@ def _rolls(ax: Axes, scenario: Scenario, insertion: Insertion, view: View, lengt
     if scenario.setup.axes == 1:
         scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel flip, applied")
     else:
-        space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=space.APPLIED)
+        label = "bevel after a roll, applied"
+        space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=label)
 
 
 def _guide_travel(insertion: Insertion) -> Floats:

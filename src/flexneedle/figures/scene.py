@@ -25,7 +25,7 @@ ALONG: View = (Z, Y)
 """Along the axis, in the direction of insertion."""
 
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
-SKIN, BORDER, NAME = "#8c5a36", "#c9a27f", "#6d4526"
+_SKIN, _BORDER, _NAME = "#8c5a36", "#c9a27f", "#6d4526"
 _SHAPE = 0.2  # height of a scene by its width
 _OPENING, _BLOCK, _WIDE = 0.7, 2.2, 1.1  # half opening, length and half width of the guide's jaws (mm)
 _SMALL: Any = {"textcoords": "offset points", "fontsize": 8}
@@ -64,10 +64,10 @@ def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats], view: Vie
     """
     _frame(ax, scenario, np.concatenate([path[:, : 1 + scenario.setup.axes] for path in paths]), view)
     tint_layers(ax, scenario)
-    ax.axvline(0.0, color=SKIN, linewidth=1.6, zorder=1)
+    ax.axvline(0.0, color=_SKIN, linewidth=1.6, zorder=1)
     ax.annotate("air", (0, 0), (4, 4), "axes fraction", color=QUIET, **_SMALL)
     above: dict[str, Any] = {"xycoords": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-    ax.annotate("skin", (0, 1), (-4, -3), color=SKIN, **above, **_SMALL)
+    ax.annotate("skin", (0, 1), (-4, -3), color=_SKIN, **above, **_SMALL)
     ax.set(xlabel="depth (mm)", ylabel=lateral_label(scenario, view[1]))
 
 
@@ -92,17 +92,13 @@ def _frame(ax: Axes, scenario: Scenario, points: Floats, view: View) -> None:
 
 def tint_layers(ax: Axes, scenario: Scenario) -> None:
     """Colour the layers as far as the axes reach, the stiffer the darker."""
-    for layer, top, bottom in _layers(ax, scenario):
-        ax.axvspan(top, bottom, facecolor=tissue_color(scenario, layer), edgecolor="none", zorder=0)
-        if top > 0.0:
-            ax.axvline(top, color=BORDER, linewidth=0.8, zorder=0.5)
-
-
-def tissue_color(scenario: Scenario, layer: Layer) -> str:
-    """Return the colour of a layer, the stiffer the darker."""
     stiffness = sorted({layer.shear_modulus_kpa for layer in scenario.tissue})
-    rank = stiffness.index(layer.shear_modulus_kpa) / max(1, len(stiffness) - 1)
-    return _TISSUES[round(rank * (min(len(stiffness), len(_TISSUES)) - 1))]
+    for layer, top, bottom in _layers(ax, scenario):
+        rank = stiffness.index(layer.shear_modulus_kpa) / max(1, len(stiffness) - 1)
+        color = _TISSUES[round(rank * (min(len(stiffness), len(_TISSUES)) - 1))]
+        ax.axvspan(top, bottom, facecolor=color, edgecolor="none", zorder=0)
+        if top > 0.0:
+            ax.axvline(top, color=_BORDER, linewidth=0.8, zorder=0.5)
 
 
 def _layers(ax: Axes, scenario: Scenario) -> Iterator[tuple[Layer, float, float]]:
@@ -118,7 +114,7 @@ def name_layers(ax: Axes, scenario: Scenario) -> None:
     for layer, top, bottom in _layers(ax, scenario):
         right = ax.transData.transform((bottom, 0.0))[0]
         modulus = f"μ {layer.shear_modulus_kpa:g} kPa"
-        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), color=NAME, **_SMALL)
+        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), color=_NAME, **_SMALL)
         for text in (f"{layer.name}, {modulus}", f"{layer.name}\n{modulus}", modulus, ""):
             name.set_text(text)
             if name.get_window_extent().x1 < right or not text:

@@ -20,12 +20,11 @@ from flexneedle.types import Floats, Point, X, Y, Z
 
 COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
 """Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""
-APPLIED = "bevel after a roll, applied"
-SDS = 2.0
-"""Half width of the band about a predicted shape, in standard deviations."""
-DEPTHS = LinearSegmentedColormap.from_list("depth", ("#f8c9a4", TRUE, "#5c2600"))
-"""Colours of the true path from the start to the end."""
 
+_SDS = 2.0  # half width of the band about a predicted shape, in standard deviations
+_DEPTHS = LinearSegmentedColormap.from_list(
+    "depth", ("#f8c9a4", TRUE, "#5c2600")
+)  # from the start to the end
 _RING = 0.9  # mm; radius of the guide along the axis
 _SCALE = (0.1, -0.33, 0.8, 0.035)  # the scale of depths, in shares of the axes
 _ROOM = 1.4  # mm around all that is drawn in the view along the axis
@@ -64,17 +63,13 @@ def draw_planned(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: f
         draw_bevels(ax, planned, view, length, PLAN, solid=False, label="bevel after a roll, planned")
 
 
-def prediction_label(period: Period) -> str:
-    """Return the name of a period's predicted shape."""
-    return f"final shape ± {SDS:g} sd, predicted at {format_signed(period.estimate.x, '.0f')} mm"
-
-
 def draw_prediction(ax: Axes, period: Period, view: View) -> None:
     """Draw the band about the predicted shape of a period, in the view from the side."""
     if period.predicted is not None:
-        (x, y), half = period.predicted.nodes[:, view].T, SDS * period.predicted.sd[:, view[1] - Y]
+        (x, y), half = period.predicted.nodes[:, view].T, _SDS * period.predicted.sd[:, view[1] - Y]
+        label = f"final shape ± {_SDS:g} sd, predicted at {format_signed(period.estimate.x, '.0f')} mm"
         how: dict[str, Any] = {"color": ESTIMATE, "alpha": 0.2, "linewidth": 0.0, "zorder": 2.2}
-        ax.fill_between(x, y - half, y + half, label=prediction_label(period), **how)
+        ax.fill_between(x, y - half, y + half, label=label, **how)
 
 
 def set_up_along(ax: Axes, scenario: Scenario, paths: Sequence[Floats]) -> None:
@@ -109,7 +104,7 @@ def draw_along(ax: Axes, path: Floats, planned: Floats | None = None) -> None:
 
 def _draw_depths(ax: Axes, path: Floats) -> None:
     points = path[:, ALONG]
-    how: dict[str, Any] = {"cmap": DEPTHS, "linewidth": 2.2, "zorder": 4, "capstyle": "round"}
+    how: dict[str, Any] = {"cmap": _DEPTHS, "linewidth": 2.2, "zorder": 4, "capstyle": "round"}
     line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), **how)
     line.set_array(0.5 * (path[:-1, X] + path[1:, X]))
     line.set_gid("path by depth")

@@ -1,11 +1,14 @@
 """The closed loop: decide, move, measure, until the needle rests at its target."""
 
+import cmath
 import itertools
 import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from flexneedle.arguments import check_instance
 from flexneedle.control.forecast import describe_miss, warn_of_miss
@@ -17,14 +20,13 @@ from flexneedle.loop.events import PeriodEnded
 from flexneedle.loop.loop_state import LoopState, hold_after
 from flexneedle.loop.measuring import Observation, observe, observe_before_start
 from flexneedle.loop.monitor.monitor import Monitor
-from flexneedle.loop.period import make_period
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
-from flexneedle.results import Action, Insertion, Outcome, Period
+from flexneedle.results import Action, Insertion, Outcome, Period, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.pace import ROUNDING_S, travel_time
-from flexneedle.types import STILL, Motion, X
+from flexneedle.simulator.control import ROUNDING_S, travel_time
+from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Motion, Pose, X
 
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
 _Ending = tuple[Outcome, str]
@@ -92,7 +94,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
     if (first := _first_step(state)) is not None:
         clocks, observation = [start, start, start, time.perf_counter()], state.observation
         yield (
-            make_period(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks),
+            _make_period(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks),
             None,
         )
     for index in indices:
@@ -113,7 +115,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
             decided, step = decided.hold_back(motion.held, state), step.hold_back(motion.held)
         state = _advance(decided, step, observation, steering, begun, now)
         ending = _ending(task, state)
-        period = make_period(index, now, task.plan, rig, step, motion.control, observation, clocks)
+        period = _make_period(index, now, task.plan, rig, step, motion.control, observation, clocks)
         yield replace(period, warning=warn_of_miss(step.decision, state.in_a_row)), ending
         if ending is not None:
             return
@@ -199,3 +201,63 @@ def _hold_ending(scenario: Scenario, state: LoopState) -> _Ending | None:
         why = state.asked or refused.reason if held is None else observation.verdict
         return Outcome.HELD, f"held for {state.held_in_all:.2f} s in all (limit {total:g} s): {why}"
     return refused.ending(scenario.control.hold_limit_s)
+
+
+def _make_period(
+    index: int,
+    now: float,
+    plan: Plan,
+    rig: Rig,
+    step: Step,
+    applied: Control,
+    observation: Observation,
+    clocks: list[float],
+) -> Period:
+    """Return the period that ended at `now` (s).
+
+    clocks: wall clock (s) at its start and after decision, motion and measurement.
+    """
+    estimate = observation.estimate
+    state, truth = estimate.state, None if rig.truth is None else rig.truth()
+    return Period(
+        index=index,
+        time=now,
+        command=step.decision.command,
+        applied=applied,
+        measurement=observation.measurement,
+        verdict=observation.verdict,
+        readings=observation.readings,
+        innovation=estimate.innovation,
+        estimate=Pose.of(estimate.tip),
+        shape=state.nodes,
+        base=Pose.of(state.base),
+        guide=state.guide,
+        roll=state.roll,
+        strain_energy=state.strain_energy,
+        tip_load=state.tip_load,
+        path=Pose.of(np.interp(state.tip[X], plan.tips[:, X], column) for column in plan.tips.T),
+        cost=step.decision.cost,
+        spread=step.decision.spread,
+        action=step.action,
+        late=step.late,
+        decision=step.decision.why,
+        miss=_pair(step.decision.miss),
+        miss_sd=step.decision.miss_sd,
+        predicted=step.decision.predicted,
+        true_tip=None if truth is None else Pose.of(truth.tip),
+        true_strain_energy=None if truth is None else truth.strain_energy,
+        true_stretch=None if truth is None else truth.least_stretch,
+        true_shape=None if truth is None else truth.shape,
+        durations={
+            "decide": clocks[1] - clocks[0],
+            "apply": clocks[2] - clocks[1],
+            "observe": clocks[3] - clocks[2],
+            "total": clocks[1] - clocks[0] + clocks[3] - clocks[2],
+        },
+        converged=state.converged and (truth is None or truth.converged),
+    )
+
+
+def _pair(miss: float | complex) -> Lateral:
+    """Return y, z of a miss (mm); z is 0 in the plane."""
+    return UNKNOWN if cmath.isnan(miss) else (complex(miss).real, complex(miss).imag)

@@ -1,30 +1,16 @@
-"""Events of an insertion: one stream to any number of listeners, and one gate that may hold the needle.
-
-Records, progress bars, the page and ROS are listeners; a listener ignores the events that it does not need.
-"""
+"""Events of an insertion: one stream to any number of listeners, and one gate that may hold the needle."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from flexneedle.planning.events import Event, Listener, send_event
 
 if TYPE_CHECKING:  # the command line imports this module for each help text
     from flexneedle.control.interface import Decision
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.results import Insertion, Period, Plan
-
-
-class Event:
-    """An event of an insertion, from the first iteration of its planner to its end."""
-
-
-@dataclass(frozen=True, eq=False)
-class Iterated(Event):
-    """An iteration of the planner; info as for the argument `progress` of `flexneedle.plan`."""
-
-    strategy: str
-    info: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +40,6 @@ class Ended(Event):
     """The end of the insertion; the driver is stopped."""
 
     insertion: Insertion
-
-
-Listener = Callable[[Event], None]
-"""Receives the events in the thread of the insertion, and the ticks of a rig in a thread of its supervisor.
-
-An exception of a listener ends the insertion; raise StoppedError to interrupt it.
-"""
 
 
 class Gate:
@@ -103,12 +82,5 @@ class Stream:
     gate: Gate = Gate()  # noqa: RUF009  it has no state
 
     def send(self, event: Event) -> None:
-        """Send an event to all listeners, even if one of them fails; raise the first error."""
-        errors: list[Exception] = []
-        for listener in self.listeners:
-            try:
-                listener(event)
-            except Exception as error:  # noqa: BLE001  raised below
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        """Send an event to all listeners, as `send_event`."""
+        send_event(event, self.listeners)

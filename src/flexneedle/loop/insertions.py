@@ -7,16 +7,17 @@ from pathlib import Path
 from flexneedle.arguments import check_instance
 from flexneedle.control import controller_tables
 from flexneedle.control.controllers import DEFAULT, with_controller_defaults
-from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
+from flexneedle.control.limits import check_guide
 from flexneedle.errors import RunError
 from flexneedle.loop.choices import Choices
 from flexneedle.loop.closed_loop import run
-from flexneedle.loop.events import Ended, Gate, Listener, Stream
+from flexneedle.loop.events import Ended, Gate, Stream
 from flexneedle.loop.guard import Guard
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.step import Steering
 from flexneedle.loop.virtual import Seeds
+from flexneedle.planning.events import Listener
 from flexneedle.planning.origin import check_origin, with_planned_entry
 from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.files import load_scenario

@@ -15,21 +15,40 @@ from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import DEFAULT_PLANT, PlantFactory, find_plant
-from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, TipTrackerFactory, find_tracker
 from flexneedle.phantom.tracking.field.field_tracker import FieldTracker
-from flexneedle.phantom.tracking.field.poses import SensorPose, tip_sensor_pose
+from flexneedle.phantom.tracking.field.poses import SensorPose, placed_references, tip_sensor_pose
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.measurement_table import TIP
-from flexneedle.phantom.tracking.placement import placed_references
 from flexneedle.phantom.tracking.simulated import NoisyTracker
 from flexneedle.phantom.tracking.stage import OnStage, tilt_of
+from flexneedle.plugins import find_part, function_rule
 from flexneedle.ports import TipTracker
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import Lateral, Point
+from flexneedle.types import TIP, Lateral, Point
 
+TipTrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
+"""Makes a tracker of the tip, from a scenario, the phantom (tip_at, pose_at, now) and a random generator."""
+
+SCENARIO_TRACKER = "scenario"
+"""Name of the tracker that the scenario describes."""
+
+_INCLUDED: dict[str, TipTrackerFactory | None] = {SCENARIO_TRACKER: None}
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
+
+
+def find_tracker(given: str | TipTrackerFactory) -> tuple[str, TipTrackerFactory | None]:
+    """Return the name of a tracker in records, and its factory; None for the tracker of the scenario.
+
+    Args:
+        given: `SCENARIO_TRACKER`, `module:NAME`, or a factory.
+
+    Raises:
+        InputError: There is no such tracker.
+    """
+    return find_part(
+        "tracker", given, _INCLUDED, lambda found: function_rule(found, "scenario", "phantom", "rng")
+    )
 
 
 @dataclass(frozen=True)
@@ -105,14 +124,14 @@ def virtual_rig(
     if tracker is not None:
         own = tracker(scenario, phantom, np.random.default_rng(seeds.tracker))
         return Rig(phantom, phantom, own, phantom.condition)
-    errors = _Errors(truth.bias, registration_error(scenario.tracker.registration, seeds.room))
+    wrong = registration_error(scenario.tracker.registration, seeds.room)
     rng = np.random.default_rng(seeds.tracker)
     plate_distance = None if plate_distance_at is None else plate_distance_at(0.0)
     around = virtual_room(scenario, seeds.room, plate_distance)
     if around is None:
-        described: TipTracker = _noisy_tracker(scenario, phantom, errors, rng)
+        described: TipTracker = _noisy_tracker(scenario, phantom, truth.bias, wrong, rng)
     else:
-        described = _field_tracker(scenario, around, phantom, errors, rng, plate_distance_at)
+        described = _field_tracker(scenario, around, phantom, truth.bias, wrong, rng, plate_distance_at)
     return Rig(phantom, phantom, described, phantom.condition)
 
 
@@ -141,31 +160,23 @@ def to_stage(registration: Registration | None) -> Rigid:
     return Rigid(to_matrix(np.array(registration.rotation)), np.array(registration.translation_mm))
 
 
-@dataclass(frozen=True)
-class _Errors:
-    """Constant errors: bias x, y, z in mm, and the registration error as a map."""
-
-    bias: Point
-    registration: Rigid
-
-
 def _noisy_tracker(
-    scenario: Scenario, phantom: Phantom, errors: _Errors, rng: np.random.Generator
+    scenario: Scenario, phantom: Phantom, bias: Point, wrong: Rigid, rng: np.random.Generator
 ) -> NoisyTracker:
-    """Return the tracker with white noise only."""
+    """Return the tracker with white noise, a bias (mm) and a wrong registration."""
 
     def tip_at(time: float) -> Point:
         tip = phantom.tip_at(time)
         if scenario.tracker.registration is None:
             return tip
-        x, y, z = errors.registration.apply(np.array(tip)).tolist()
+        x, y, z = wrong.apply(np.array(tip)).tolist()
         return x, y, z
 
     def direction_at(time: float) -> Lateral:
         pose = phantom.pose_at(time)
         if scenario.tracker.registration is None:
             return pose.theta, pose.psi
-        return tilt_of(errors.registration.rotation @ np.array(pose.axis))
+        return tilt_of(wrong.rotation @ np.array(pose.axis))
 
     jitter = scenario.tracker.direction_jitter
     return NoisyTracker(
@@ -176,7 +187,7 @@ def _noisy_tracker(
         rng,
         delay=_delay(scenario),
         missing=scenario.phantom.missing_fraction,
-        bias=errors.bias,
+        bias=bias,
         axes=scenario.setup.axes,
         direction_at=None if jitter is None else direction_at,
         direction_jitter=jitter or 0.0,
@@ -187,7 +198,8 @@ def _field_tracker(
     scenario: Scenario,
     around: tuple[Room, Mapping[str, SensorPose]],
     phantom: Phantom,
-    errors: _Errors,
+    bias: Point,
+    wrong: Rigid,
     rng: np.random.Generator,
     plate_distance_at: Callable[[float], float | None] | None,
 ) -> OnStage:
@@ -198,7 +210,7 @@ def _field_tracker(
 
     def poses_at(time: float) -> Mapping[str, SensorPose]:
         pose = phantom.pose_at(time)
-        x, y, z = (value + off for value, off in zip(pose.point, errors.bias, strict=True))
+        x, y, z = (value + off for value, off in zip(pose.point, bias, strict=True))
         return {
             TIP: tip_sensor_pose((x, y, z), pose.axis, offset),
             **references,
@@ -214,7 +226,7 @@ def _field_tracker(
         delay=_delay(scenario),
         ahead=scenario.monitor.indicator_window_s,  # so that the field is known at the start
         missing=scenario.phantom.missing_fraction,
-        to_tracker=registered.inverse().after(errors.registration),
+        to_tracker=registered.inverse().after(wrong),
         plate_distance_at=plate_distance_at,
     )
     return OnStage(tracker, registered, offset)

@@ -25,32 +25,21 @@ from flexneedle.mechanics.needle import (
 from flexneedle.mechanics.shape import put, sample
 from flexneedle.mechanics.solve import solve
 from flexneedle.mechanics.spring import spring_energy, spring_rest
+from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 Bools = NDArray[np.bool_]
-DB_X, DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z, ROLL, SPIN = range(9)
-"""Columns of a command: motion of the base along x, y, z (mm) and of its slopes dy/dx, dz/dx (rad), of the guide along
-y, z (mm); roll of the needle before the move and, evenly, during it (rad)."""
-COMMAND_SIZE = 9
 POSE_SIZE = 5
 """Columns of a pose: x, y, z (mm), slopes θ = dy/dx and ψ = dz/dx (rad)."""
 
 
 class Outputs(NamedTuple):
-    """Arrays that a rollout of N sequences of m steps fills; an array that is not wanted has size 0.
+    """Arrays that a rollout of N sequences of m steps fills; an array that is not wanted has size 0."""
 
-    Attributes:
-        tips: Poses (N, m, 5).
-        energy: Strain energy of the tissue (N, m), mJ.
-        converged: Whether each step converged (N, m).
-        deflection: Mean square distance (N, m) of the needle from an axis, mm².
-        shapes: Poses at n nodes (N, m, n, 5).
-    """
-
-    tips: Floats
-    energy: Floats
-    converged: Bools
-    deflection: Floats
-    shapes: Floats
+    tips: Floats  # poses (N, m, 5)
+    energy: Floats  # strain energy of the tissue (N, m), mJ
+    converged: Bools  # whether each step converged (N, m)
+    deflection: Floats  # mean square distance (N, m) of the needle from an axis, mm²
+    shapes: Floats  # poses at n nodes (N, m, n, 5)
 
 
 _SAME_PLACE = 1e-3  # of a part: a tip this near the end of a part is there

@@ -23,9 +23,8 @@ CELLS = 256
 DEGREE = 5
 _ENERGY, _SHARPNESS = DEGREE + 1, DEGREE + 2  # columns: w at the start of the cell; bound of |w‴|/w″ in it
 _COLUMNS = DEGREE + 3
-_LIMIT, _FORCE, _STIFFNESS, _STORED, _PER_UNIT = range(
-    5
-)  # of the row after the cells: limit, w′, w″, w there; 1/width
+# Of the row after the cells: limit, w′, w″, w there; 1/width.
+_LIMIT, _FORCE, _STIFFNESS, _STORED, _PER_UNIT = range(5)
 
 
 class Law(Protocol):
@@ -65,9 +64,8 @@ def tables(laws: Sequence[Law]) -> Floats:
 def _table(law: Law) -> Floats:
     width = law.limit / CELLS
     start = width * np.arange(CELLS)
-    points = 0.5 * (
-        1.0 - np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
-    )  # Chebyshev–Lobatto: s is continuous
+    # Chebyshev–Lobatto points: s is continuous.
+    points = 0.5 * (1.0 - np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE))
     e = start[:, None] + width * points
     at = np.where(e > 0.0, e, 1.0)
     secant = np.where(e > 0.0, law.force(np.where(e > 0.0, e, 0.0)) / at, 1.0)

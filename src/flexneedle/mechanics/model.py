@@ -42,36 +42,22 @@ LAYER = np.dtype(
 
 
 class Model(NamedTuple):
-    """A needle in layered tissue.
+    """A needle in layered tissue."""
 
-    Attributes:
-        bending_stiffness: Bending stiffness (N·mm²).
-        length: Length (mm).
-        bevel_offset: Offset of the bevel (mm).
-        bevel_length: Length of the bevel (mm).
-        nodes: Possible loads.
-        layers: Tissue layers.
-        laws: Tables of `law`.
-        part: Length (mm) of the parts of a step down to the depth `zone`.
-        zone: Depth (mm) to which steps have parts.
-        curvature: Lateral curvature of the free needle (1/mm), relative to the bevel's direction, with which it turns.
-        clearance: Clearance of the needle in the guide, to either side (mm).
-        tolerance: Estimated distance from equilibrium at which a solve ends (mm).
-        slide: Largest distance (mm) by which a solved tip is moved along its own line to its depth.
-    """
-
-    bending_stiffness: float
-    length: float
-    bevel_offset: float
-    bevel_length: float
-    nodes: Nodes
+    bending_stiffness: float  # bending stiffness (N·mm²)
+    length: float  # length (mm)
+    bevel_offset: float  # offset of the bevel (mm)
+    bevel_length: float  # length of the bevel (mm)
+    nodes: Nodes  # possible loads
     layers: Layers
-    laws: Floats
-    part: float
-    zone: float
+    laws: Floats  # tables of `law`
+    part: float  # length (mm) of the parts of a step down to the depth `zone`
+    zone: float  # depth (mm) to which steps have parts
+    # lateral curvature of the free needle (1/mm), relative to the bevel's direction, with which it turns
     curvature: Any = 0.0
-    clearance: float = 0.0
-    tolerance: float = 1e-7
+    clearance: float = 0.0  # clearance of the needle in the guide, to either side (mm)
+    tolerance: float = 1e-7  # estimated distance from equilibrium at which a solve ends (mm)
+    # largest distance (mm) by which a solved tip is moved along its own line to its depth
     slide: float = 2e-5
 
 
@@ -131,26 +117,18 @@ def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
 
 
 class Adaptation(NamedTuple):
-    """Estimated changes of a model's constants.
+    """Estimated changes of a model's constants."""
 
-    Attributes:
-        shift: Shift of the ends of all layers but the last (k − 1,), mm.
-        stiffness: Factor on the modulus of each layer (k,).
-        cell: Length (mm) of cells along the depth from the skin.
-        variation: Further factor on the modulus in each cell (c,); the last cell has no end.
-        bevel: Factor on the bevel offset.
-        bend: Lateral distance (mm) of the free needle's tip from the straight, relative to the bevel's direction, with
-            which it turns.
-        clearance: Clearance of the needle in the guide, to either side (mm).
-    """
-
-    shift: Floats
-    stiffness: Floats
-    cell: float = 1.0
+    shift: Floats  # shift of the ends of all layers but the last (k − 1,), mm
+    stiffness: Floats  # factor on the modulus of each layer (k,)
+    cell: float = 1.0  # length (mm) of cells along the depth from the skin
+    # further factor on the modulus in each cell (c,); the last cell has no end
     variation: Floats = np.ones(1)
-    bevel: float = 1.0
+    bevel: float = 1.0  # factor on the bevel offset
+    # lateral distance (mm) of the free needle's tip from the straight, relative to the bevel's direction, with
+    # which it turns
     bend: Any = 0.0
-    clearance: float = 0.0
+    clearance: float = 0.0  # clearance of the needle in the guide, to either side (mm)
 
 
 def adapt(model: Model, adaptation: Adaptation) -> Model:

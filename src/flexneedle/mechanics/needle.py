@@ -50,35 +50,21 @@ class Cut(NamedTuple):
 
 
 class Bearing(NamedTuple):
-    """A needle in a guide with clearance.
+    """A needle in a guide with clearance."""
 
-    Attributes:
-        wall: Unit vector to the wall on which it bears, 0 for none.
-        give: Displacement of the needle in the guide per force (mm/N).
-        y: Displacement from the guide's middle in the iteration before.
-        force: Force in the iteration before.
-    """
-
-    wall: Lateral
-    give: float
-    y: Lateral
-    force: Lateral
+    wall: Lateral  # unit vector to the wall on which it bears, 0 for none
+    give: float  # displacement of the needle in the guide per force (mm/N)
+    y: Lateral  # displacement from the guide's middle in the iteration before
+    force: Lateral  # force in the iteration before
 
 
 class Iterate(NamedTuple):
-    """Start of an iteration.
+    """Start of an iteration."""
 
-    Attributes:
-        spring: Compression of the tip spring.
-        shortening: Shortening (mm).
-        guide: The needle in its guide.
-        behind: Number of nodes behind the tip.
-    """
-
-    spring: Lateral
-    shortening: float
-    guide: Bearing
-    behind: int
+    spring: Lateral  # compression of the tip spring
+    shortening: float  # shortening (mm)
+    guide: Bearing  # the needle in its guide
+    behind: int  # number of nodes behind the tip
 
 
 class Loads(NamedTuple):

@@ -127,9 +127,7 @@ def _bearing(
     free = y - times(give, force)
     distance = size(free)
     pulls = dot(force, last.wall) > 0.0
-    off = distance <= model.clearance and (
-        pulls or not bears
-    )  # a wall that pushes stays, however weak the push
+    off = distance <= model.clearance and (pulls or not bears)  # a wall that pushes stays, however weakly
     if off or (pulls and dot(free, last.wall) <= 0.0):
         return not bears, Bearing(times(0.0, y), give, y, force)
     wall = free / distance if distance > 0.0 else last.wall

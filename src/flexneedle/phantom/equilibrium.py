@@ -6,24 +6,19 @@ A needle that begins in the plane z = 0 remains there, to the last bit.
 import math
 
 from flexneedle.mechanics.compile import inner, kernel
-from flexneedle.phantom.hinges import add_hinges
 from flexneedle.phantom.loads import (
     Before,
     add_bevel,
     add_channel,
     add_guide,
+    add_hinges,
     add_rotation_friction,
     cut_length,
     new_offset,
     set_friction,
     slip_angle,
 )
-from flexneedle.phantom.rod import (
-    Records,
-    Rod,
-    State,
-    move_nodes,
-)
+from flexneedle.phantom.rod import Records, Rod, State, move_nodes
 from flexneedle.phantom.space import (
     Floats,
     accumulate,
@@ -50,9 +45,8 @@ _TRIALS = 16  # of the length of a Newton step
 _UPHILL = 4  # full steps that may lead uphill
 _SAME_RAD = 1e-3
 _SOFTER = 5  # powers of ten: first softening of the guide after a failed solve
-_ROLL_RAD = (
-    0.5  # largest rotation in one solve where friction acts against it: its slip has the sign of the rotation
-)
+# Largest rotation in one solve where friction acts against it: its slip has the sign of the rotation.
+_ROLL_RAD = 0.5
 
 
 @inner

@@ -9,8 +9,7 @@ import numpy as np
 
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import Plant, PlantFactory, make_plant
-from flexneedle.simulator.control import MOVES, Limits, limit_half_turn
-from flexneedle.simulator.pace import roll_time
+from flexneedle.simulator.control import MOVES, Limits, limit_half_turn, roll_time
 from flexneedle.types import (
     COLUMNS,
     DB_X,
@@ -38,21 +37,14 @@ _WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
 class Condition(NamedTuple):
-    """True state.
+    """True state."""
 
-    Attributes:
-        tip: Pose of the tip (mm, rad).
-        strain_energy: Strain energy of the tissue (mJ).
-        least_stretch: Smallest stretch λ since the start.
-        converged: Whether all steps converged.
-        shape: Points x, y, z (n, 3) of the needle's axis at equal distances along it, the base first (mm); None if the
-            plant has no nodes.
-    """
-
-    tip: Floats
-    strain_energy: float
-    least_stretch: float
-    converged: bool
+    tip: Floats  # pose of the tip (mm, rad)
+    strain_energy: float  # strain energy of the tissue (mJ)
+    least_stretch: float  # smallest stretch λ since the start
+    converged: bool  # whether all steps converged
+    # points x, y, z (n, 3) of the needle's axis at equal distances along it, the base first (mm); None if the
+    # plant has no nodes
     shape: Floats | None = None
 
 

@@ -108,49 +108,27 @@ Records = Any
 
 
 class Rod(NamedTuple):
-    """Constants of the exact needle.
+    """Constants of the exact needle."""
 
-    Attributes:
-        stiffness: Bending stiffness (N·mm²).
-        torsion: Torsional stiffness (N·mm²).
-        segment: Length of a segment (mm).
-        curvature: Natural curvature towards the bevel (1/mm).
-        curvature_across: Natural curvature towards a quarter turn from the bevel (1/mm).
-        bevel_offset: Offset of the bevel (mm).
-        bevel_length: Length of the bevel (mm).
-        guide_x: Plane of the guide (mm, NaN: none).
-        clearance: Clearance of the guide (mm).
-        guide_stiffness: Stiffness of the guide (N/mm).
-        friction: Friction along the axis (N/mm).
-        rotation_friction: Friction against rotation (N·mm/mm).
-        spacing: Spacing of channel points (mm).
-        cell: Length of the cells of tissue along the depth (mm).
-        laws: Tables of `mechanics.law`.
-        law: Index of the law of each cell.
-        height: Compression length of each cell (mm).
-        foundation: Initial stiffness (N/mm) of 1 mm of needle in each cell.
-        weight: Layer weight of each cell.
-    """
-
-    stiffness: float
-    torsion: float
-    segment: float
-    curvature: float
-    curvature_across: float
-    bevel_offset: float
-    bevel_length: float
-    guide_x: float
-    clearance: float
-    guide_stiffness: float
-    friction: float
-    rotation_friction: float
-    spacing: float
-    cell: float
-    laws: Floats
-    law: NDArray[np.int64]
-    height: Floats
-    foundation: Floats
-    weight: Floats
+    stiffness: float  # bending stiffness (N·mm²)
+    torsion: float  # torsional stiffness (N·mm²)
+    segment: float  # length of a segment (mm)
+    curvature: float  # natural curvature towards the bevel (1/mm)
+    curvature_across: float  # natural curvature towards a quarter turn from the bevel (1/mm)
+    bevel_offset: float  # offset of the bevel (mm)
+    bevel_length: float  # length of the bevel (mm)
+    guide_x: float  # plane of the guide (mm, NaN: none)
+    clearance: float  # clearance of the guide (mm)
+    guide_stiffness: float  # stiffness of the guide (N/mm)
+    friction: float  # friction along the axis (N/mm)
+    rotation_friction: float  # friction against rotation (N·mm/mm)
+    spacing: float  # spacing of channel points (mm)
+    cell: float  # length of the cells of tissue along the depth (mm)
+    laws: Floats  # tables of `mechanics.law`
+    law: NDArray[np.int64]  # index of the law of each cell
+    height: Floats  # compression length of each cell (mm)
+    foundation: Floats  # initial stiffness (N/mm) of 1 mm of needle in each cell
+    weight: Floats  # layer weight of each cell
 
 
 @kernel

@@ -17,6 +17,7 @@ from flexneedle.planning import cross_entropy as ce
 from flexneedle.types import Floats
 
 OnIteration = Callable[[dict[str, Any]], None]
+"""Receives the entry of each iteration in its history, `iteration`, `iterations`, and its `Samples` as `samples`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,23 +45,14 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-        z: The best sample (d,).
-        cost: Its cost.
-        terms: The cost's weighted terms by name.
-        trajectories: Its rollout (N = 1).
-        search_state: State of the search.
-        samples: Samples of the last iteration.
-    """
-
-    z: Floats
+    z: Floats  # the best sample (d,)
     cost: float
-    terms: dict[str, float]
-    trajectories: Trajectories
+    terms: dict[str, float]  # the cost's weighted terms by name
+    trajectories: Trajectories  # its rollout (N = 1)
     search_state: ce.SearchState
-    samples: Samples
+    samples: Samples  # samples of the last iteration
 
 
 def find_best(
@@ -71,7 +63,7 @@ def find_best(
     rng: np.random.Generator,
     *,
     first: Floats | None = None,
-    progress: OnIteration | None = None,
+    progress: OnIteration = lambda _info: None,
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
@@ -83,8 +75,7 @@ def find_best(
         rng: Random numbers.
         first: Samples (n, d) of the first iteration in place of the Gaussian's, at least as many as the elite. The best
             sample is kept: the result is never worse than an incumbent among them.
-        progress: Called after each iteration with a dict: the entry of its history, `iteration`, `iterations`, and its
-            `Samples` as `samples`.
+        progress: Called after each iteration (default: nothing).
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
     search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
@@ -97,8 +88,7 @@ def find_best(
         return latest[0].costs
 
     def show(info: dict[str, Any]) -> None:
-        if progress is not None:
-            progress({**info, "samples": latest[0]})
+        progress({**info, "samples": latest[0]})
 
     opening = ce.sample(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
@@ -108,15 +98,11 @@ def find_best(
     return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state, latest[0])
 
 
-def count_iterations(
-    progress: OnIteration | None, before: int, usual: int, least: float
-) -> OnIteration | None:
+def count_iterations(progress: OnIteration, before: int, usual: int, least: float) -> OnIteration:
     """Return `progress` of a search after `before` iterations of others, which found a cost of `least`.
 
     usual: number of iterations of all searches together.
     """
-    if progress is None:
-        return None
 
     def show(info: dict[str, Any]) -> None:
         now = before + info["iteration"]

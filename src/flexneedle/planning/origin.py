@@ -2,7 +2,6 @@
 
 from flexneedle.errors import InputError
 from flexneedle.results import Plan
-from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 
 PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "plan")
@@ -29,12 +28,6 @@ def check_origin(plan: Plan, scenario: Scenario) -> None:
         return
     own_target = plan.target == scenario.target.position
     sections = [name for name in PLANNER_INPUTS if not (own_target and name == "target")]
-    if (key := made.first_difference(scenario, sections)) is not None:
-        was, now = (_format_value(each, key) for each in (made, scenario))
+    if (found := made.first_difference(scenario, sections)) is not None:
         rule = "make a plan for this scenario, or use the scenario of the plan (plan.scenario)"
-        raise InputError(f"{key} = {now}: the plan was made with {was}: {rule}")
-
-
-def _format_value(scenario: Scenario, key: str) -> str:
-    value = scenario.flat().get(".".join(map(str, split_key(key))))
-    return "none" if value is None else str(value)
+        raise InputError(f"{found.key} = {found.new}: the plan was made with {found.old}: {rule}")

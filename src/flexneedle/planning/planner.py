@@ -11,8 +11,10 @@ import numpy as np
 from flexneedle.arguments import check_point, check_whole
 from flexneedle.costs.weighted_sum import RolloutFunction, Trajectories
 from flexneedle.errors import InputError
+from flexneedle.planning import STRATEGIES
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.entry import mounted_axes, with_entry
+from flexneedle.planning.events import Iterated, Listener, send_event
 from flexneedle.planning.horizon import OnIteration, count_iterations
 from flexneedle.planning.limit import find_limit
 from flexneedle.planning.primitives import Solution, search_primitives, widen_search
@@ -27,7 +29,6 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, Control, Floats, X, Z
 
 _TARGET = "depth and lateral offsets in mm"
-STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 # plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
@@ -40,9 +41,9 @@ def plan(
     target: Sequence[float] | None = None,
     strategy: str = "manipulation",
     seed: int = 0,
-    progress: OnIteration | None = None,
     *,
     threads: int | None = None,
+    listeners: Sequence[Listener] = (),
 ) -> Plan:
     """Plan an insertion to a target by the cross-entropy method. Same seed, same plan.
 
@@ -55,9 +56,8 @@ def plan(
         strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
             needle itself, not on a softer one).
         seed: Seed of the search.
-        progress: Called after each iteration with a dict, which includes the samples of the search
-            (`planning.horizon.Samples`).
         threads: Threads of rollouts (default: all cores), without effect on the result.
+        listeners: Functions that receive an `Iterated` after each iteration.
 
     Raises:
         ScenarioError: The scenario excludes the target.
@@ -70,7 +70,7 @@ def plan(
     check_target(scenario, *goal)
     begun, rng = time.perf_counter(), np.random.default_rng(seed)
     simulator = Simulator(scenario, threads)
-    problem = make_problem(scenario, goal, strategy)
+    problem, progress = make_problem(scenario, goal, strategy), _report_to(listeners, strategy)
     found = _carry_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
     if not found.reached and not problem.bevel_alone:
         # A search that begins with small lateral steps can lose its spread before it gets to a far target.
@@ -81,21 +81,18 @@ def plan(
     return replace(found, seconds=time.perf_counter() - begun)
 
 
+def _report_to(listeners: Sequence[Listener], strategy: str) -> OnIteration:
+    return lambda info: send_event(Iterated(strategy, info), listeners)
+
+
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """Result of one search, carried out without stops.
+    """Result of one search, carried out without stops."""
 
-    Attributes:
-        tips: Poses of the tip (m + 1, 5).
-        needle: Nodes of the needle at the end (n, 5).
-        roll: Its roll at the start (rad).
-        error_mm: Distance from its tip to the target.
-    """
-
-    tips: Floats
-    needle: Floats
-    roll: float
-    error_mm: float
+    tips: Floats  # poses of the tip (m + 1, 5)
+    needle: Floats  # nodes of the needle at the end (n, 5)
+    roll: float  # its roll at the start (rad)
+    error_mm: float  # distance from its tip to the target
 
     @property
     def reached(self) -> bool:
@@ -107,9 +104,9 @@ def sketch(
     scenario: Scenario,
     strategy: str = "manipulation",
     seed: int = 0,
-    progress: OnIteration | None = None,
     *,
     threads: int | None = None,
+    listeners: Sequence[Listener] = (),
 ) -> Sketch:
     """Search once for an insertion to the scenario's target, as `plan` does, for a quick preview.
 
@@ -118,6 +115,7 @@ def sketch(
     """
     simulator, goal = Simulator(scenario, threads), scenario.target.position
     problem = make_problem(scenario, goal, strategy)
+    progress = _report_to(listeners, strategy)
     found = _search(simulator, problem, np.random.default_rng(seed), progress, _ENOUGH_ROLLS)
     simulator, _ = _fix_entry(simulator, problem, found, strategy)
     rows = _end_at_depth(simulator, found.controls, found.roll, goal[0])
@@ -187,7 +185,7 @@ def _search(
     simulator: Simulator,
     problem: PlanProblem,
     rng: np.random.Generator,
-    progress: OnIteration | None,
+    progress: OnIteration,
     most_rolls: int = MOST_ROLLS,
 ) -> Solution:
     """Return the best primitives, or the best rolls where only the bevel is free."""
@@ -205,8 +203,7 @@ def _make_rollout(simulator: Simulator) -> RolloutFunction:
     def rollout(controls: Floats) -> Trajectories:
         # Base and guide are mounted at a free entry by the first control, which no limit applies to.
         axes = mounted_axes(simulator.scenario, controls[:, 0]) if free else None
-        result = simulator.rollout(start, controls, deflection=True, limits=not free, axes=axes)
-        return Trajectories(controls, *result[:4])
+        return simulator.rollout(start, controls, deflection=True, limits=not free, axes=axes)
 
     return rollout
 

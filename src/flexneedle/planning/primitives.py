@@ -6,9 +6,7 @@ direction, and the logarithm of its share, before normalisation. In the plane, a
 the sign of ε_y is the direction. The needle is rolled, and charged by the angle, where the wanted direction changes.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.entry import add_along, entry_bounds, mount_needle, read_entry
-from flexneedle.planning.horizon import Found, Variables, find_best
+from flexneedle.planning.horizon import Found, OnIteration, Variables, find_best
 from flexneedle.planning.problem import ADVANCE, LATERAL, MOVES, PlanProblem
 from flexneedle.types import COLUMNS, DB_X, ROLL, Floats, wrap_angles
 
@@ -31,22 +29,13 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 
 @dataclass(frozen=True)
 class Solution:
-    """The best controls of a plan, and the search behind them.
+    """The best controls of a plan, and the search behind them."""
 
-    Attributes:
-        controls: Controls (m, 9).
-        entry: Entry as changes of y + iz (mm) and slope.
-        roll: Roll at the start (rad).
-        cost: Cost.
-        terms: Cost by term.
-        search_state: State of the search.
-    """
-
-    controls: Floats
-    entry: tuple[complex, complex]
-    roll: float
+    controls: Floats  # controls (m, 9)
+    entry: tuple[complex, complex]  # entry as changes of y + iz (mm) and slope
+    roll: float  # roll at the start (rad)
     cost: float
-    terms: dict[str, float]
+    terms: dict[str, float]  # cost by term
     search_state: SearchState
 
 
@@ -55,7 +44,7 @@ def search_primitives(
     problem: PlanProblem,
     search: Search,
     rng: np.random.Generator,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: OnIteration = lambda _info: None,
 ) -> Solution:
     """Search the primitives.
 
@@ -135,9 +124,8 @@ def make_controls(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     wanted = _directions(problem, primitives[:, :, problem.bevel])
     ends = np.cumsum(count, axis=1)
     index = np.arange(ends[:, -1].max())
-    owner = (index[None, :, None] >= ends[:, None, :]).sum(
-        axis=2
-    )  # primitive of each step; P when it is over
+    # Primitive of each step; P when the last one is over.
+    owner = (index[None, :, None] >= ends[:, None, :]).sum(axis=2)
     rows = np.arange(len(z))[:, None]
     steps = np.concatenate([steps, np.zeros((len(z), 1, steps.shape[2]))], axis=1)
     controls = np.zeros((len(z), index.size, len(COLUMNS)))

@@ -24,51 +24,29 @@ _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
 
 @dataclass(frozen=True)
 class PlanProblem:
-    """Target, limits and cost of a plan: mm, rad.
+    """Target, limits and cost of a plan: mm, rad."""
 
-    Attributes:
-        target: x, y, z.
-        travel: Insertion from the start to the target depth.
-        air: The part of the travel before the skin.
-        primitives: Number of primitives.
-        step: Largest step of each column of travel of a control, (7,).
-        reach: Largest sum of the steps of each column, (7,).
-        sigma: Initial standard deviation of each coordinate of a primitive, (c,); 0: fixed.
-        settings: Weights of the cost.
-        axes: 1 or 2 lateral axes.
-        half_turns: Whether the needle rolls by half turns only.
-        rotation: Largest angle of the needle to either side.
-        frame: Direction of the first of two lateral coordinates.
-        entry: Largest change of the point on the skin and of the slope.
-        mounts: x of base and guide at the start.
-        axis: y + iz of the needle's axis at the target's depth.
-        slope: Slope of the axis.
-        steepest: Largest slope of the axis on each lateral axis.
-        lateral_travel: Largest distance of the target from the axis, on each lateral axis.
-        home: Changes of point and slope of an entry within `lateral_travel`.
-        left: Vector y + iz from the nearest axis that is permitted to the target.
-    """
-
-    target: Point
-    travel: float
-    air: float
+    target: Point  # x, y, z
+    travel: float  # insertion from the start to the target depth
+    air: float  # the part of the travel before the skin
     primitives: int
-    step: Floats
-    reach: Floats
-    sigma: Floats
-    settings: PlanSettings
-    axes: int = 1
-    half_turns: bool = True
-    rotation: float = np.inf
-    frame: complex = 1.0
-    entry: tuple[float, float] = (0.0, 0.0)
-    mounts: tuple[float, float] = (0.0, 0.0)
-    axis: complex = 0.0
-    slope: complex = 0.0
-    steepest: float = np.inf
-    lateral_travel: float = np.inf
+    step: Floats  # largest step of each column of travel of a control, (7,)
+    reach: Floats  # largest sum of the steps of each column, (7,)
+    sigma: Floats  # initial standard deviation of each coordinate of a primitive, (c,); 0: fixed
+    settings: PlanSettings  # weights of the cost
+    axes: int = 1  # 1 or 2 lateral axes
+    half_turns: bool = True  # whether the needle rolls by half turns only
+    rotation: float = np.inf  # largest angle of the needle to either side
+    frame: complex = 1.0  # direction of the first of two lateral coordinates
+    entry: tuple[float, float] = (0.0, 0.0)  # largest change of the point on the skin and of the slope
+    mounts: tuple[float, float] = (0.0, 0.0)  # x of base and guide at the start
+    axis: complex = 0.0  # y + iz of the needle's axis at the target's depth
+    slope: complex = 0.0  # slope of the axis
+    steepest: float = np.inf  # largest slope of the axis on each lateral axis
+    lateral_travel: float = np.inf  # largest distance of the target from the axis, on each lateral axis
+    # changes of point and slope of an entry within `lateral_travel`
     home: tuple[complex, complex] = (0.0, 0.0)
-    left: complex = 0.0
+    left: complex = 0.0  # vector y + iz from the nearest axis that is permitted to the target
 
     @property
     def terms(self) -> tuple[Term, ...]:

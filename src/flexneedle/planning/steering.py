@@ -36,7 +36,7 @@ def search_rolls(
     problem: PlanProblem,
     search: Search,
     rng: np.random.Generator,
-    progress: OnIteration | None = None,
+    progress: OnIteration = lambda _info: None,
     most: int = MOST_ROLLS,
 ) -> Solution:
     """Search the depths of 0 to `most` rolls with either side at the start, until one more does not lower the cost.
@@ -52,10 +52,8 @@ def search_rolls(
     for rolls in range(most + 1):
         before = min((one.cost for *_, one in found), default=np.inf)
         for side in (1.0, -1.0):
-            alone = (
-                rolls == 0 and problem.entry_coordinates == 0 and not problem.narrow
-            )  # all samples are one
-            count = search.elite if alone else search.samples
+            same = rolls == 0 and problem.entry_coordinates == 0 and not problem.narrow
+            count = search.elite if same else search.samples
             depths = np.sort(rng.uniform(size=(count, rolls)), axis=1)
             entries = _propose_entries(problem, count, rng)
             angles = _propose_angles(problem, size, side, rolls, entries)
@@ -240,7 +238,7 @@ def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]
     return min(along), max(along)
 
 
-def _count_iterations(progress: OnIteration | None, search: Search, found: list[Found]) -> OnIteration | None:
+def _count_iterations(progress: OnIteration, search: Search, found: list[Found]) -> OnIteration:
     """Return `progress` with iterations and best cost counted through all searches."""
     before = sum(one.search_state.iterations for one in found)
     usual = _USUAL_SEARCHES * (search.usual or search.iterations)

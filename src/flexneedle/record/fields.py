@@ -4,20 +4,25 @@ A row of the CSV, and of the topic `/control/status`, has the columns of all fie
 numbers are exact (`repr`), so that a period is restored from its row to the last bit. A verdict is its kind, or
 `KIND: REASON`, divided at the first ": ", which no kind contains.
 
-To add a field: a line in `types.Period`, its value in `loop.period`, and a line here.
+To add a field: a line in `results.Period`, its value in `loop.closed_loop`, and a line here.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import degrees, hypot, isfinite
+from statistics import median
 from typing import Any
 
+import numpy as np
+
+from flexneedle.loop.monitor.rules import has_indicator
 from flexneedle.record.messages import Message, joints, number, path, points, pose, table, vector
-from flexneedle.results import Action, Period
+from flexneedle.results import Action, Period, Plan
 from flexneedle.types import COLUMNS as CONTROL
 from flexneedle.types import (
     ROLL,
+    TIP,
     CheckedMeasurement,
     Control,
     Floats,
@@ -25,6 +30,9 @@ from flexneedle.types import (
     Pose,
     Verdict,
     VerdictKind,
+    X,
+    Y,
+    Z,
 )
 
 _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "sensor_msgs/msg/JointState"
@@ -48,13 +56,13 @@ class PeriodField:
     """A field of `Period`.
 
     columns: names with their parsers; restored: makes the field of several parsed columns; topics: of its messages;
-    page: key and value of a row of the page.
+    page: key and value of a row of the page (default value: the field).
     """
 
     columns: tuple[tuple[str, _Parser], ...] = ()
     restored: Callable[..., Any] | None = None
     topics: tuple[Topic, ...] = ()
-    page: tuple[str, Callable[[Any], Any]] | None = None
+    page: tuple[str] | tuple[str, Callable[[Period, Plan], Any]] | None = None
 
 
 def parse_verdict(text: str) -> Verdict:
@@ -65,14 +73,6 @@ def parse_verdict(text: str) -> Verdict:
 
 def _flag(value: object) -> bool:
     return str(value) == "True"
-
-
-def _same(value: Any) -> Any:
-    return value
-
-
-def _point(value: Pose | None) -> Any:
-    return None if value is None else value.point
 
 
 def _numbers(*names: str) -> tuple[tuple[str, _Parser], ...]:
@@ -99,8 +99,29 @@ def _make_measured(period: Period) -> Message | None:
     return pose(period.measurement.time, Pose(x, y, z or 0.0, 0.0, 0.0))
 
 
-def _measured_point(value: Measurement) -> Any:
+def _measured_point(period: Period, _plan: Plan) -> Any:
+    value = period.measurement
     return None if value.x is None else (value.x, value.y, value.z)
+
+
+def _error(period: Period, plan: Plan) -> float:
+    """Return the lateral distance (mm) of the true tip, if it is known, from the planned path at its depth."""
+    x, y, z = (period.true_tip or period.estimate).point
+    planned_y, planned_z = (float(np.interp(x, plan.tips[:, X], plan.tips[:, column])) for column in (Y, Z))
+    return hypot(y - planned_y, z - planned_z)
+
+
+def _largest_indicator(period: Period, _plan: Plan) -> float | None:
+    """Return the largest median of the references' indicators in a period; without references the tip's."""
+    found: dict[str, list[float]] = {}
+    for checked in period.readings:
+        frame = checked.measurement.frame
+        for name, reading in ({} if frame is None else frame.readings).items():
+            if has_indicator(reading):
+                found.setdefault(name, []).append(reading.indicator or 0.0)
+    medians = {name: median(values) for name, values in found.items()}
+    references = [value for name, value in medians.items() if name != TIP]
+    return max(references, default=medians.get(TIP))
 
 
 def _joint_states(period: Period) -> Message:
@@ -108,8 +129,8 @@ def _joint_states(period: Period) -> Message:
 
 
 FIELDS: dict[str, PeriodField] = {
-    "index": PeriodField((("index", int),), page=("index", _same)),
-    "time": PeriodField(_numbers("time_s"), page=("time", _same)),
+    "index": PeriodField((("index", int),), page=("index",)),
+    "time": PeriodField(_numbers("time_s"), page=("time",)),
     "shape": PeriodField(topics=(Topic(SHAPE, _PATH, lambda one: path(one.time, one.shape)),)),
     "predicted": PeriodField(
         topics=(
@@ -146,7 +167,7 @@ FIELDS: dict[str, PeriodField] = {
         (Topic("/tip/measured", _POSE, _make_measured),),
         ("measured", _measured_point),
     ),
-    "verdict": PeriodField((("verdict", parse_verdict),), page=("verdict", str)),
+    "verdict": PeriodField((("verdict", parse_verdict),), page=("verdict", lambda one, _: str(one.verdict))),
     "innovation": PeriodField(
         _numbers("innovation_x_mm", "innovation_y_mm", "innovation_z_mm"),
         topics=(Topic("/control/innovation", _VECTOR, lambda one: vector(one.time, one.innovation)),),
@@ -155,22 +176,25 @@ FIELDS: dict[str, PeriodField] = {
         _poses("estimate"),
         Pose,
         (Topic("/tip/estimate", _POSE, lambda one: pose(one.time, one.estimate)),),
-        ("estimate", _point),
+        ("estimate", lambda one, _: one.estimate.point),
     ),
     "base": PeriodField(_poses("base"), Pose, (Topic("/joint_states", _JOINTS, _joint_states),)),
-    "guide": PeriodField(_numbers("guide_y_mm", "guide_z_mm"), page=("guide", _same)),
-    "roll": PeriodField(_numbers("roll_rad"), page=("roll_deg", degrees)),
+    "guide": PeriodField(_numbers("guide_y_mm", "guide_z_mm"), page=("guide",)),
+    "roll": PeriodField(_numbers("roll_rad"), page=("roll_deg", lambda one, _: degrees(one.roll))),
     "strain_energy": PeriodField(
         _numbers("strain_energy_mj"),
         topics=(Topic("/tissue/strain_energy", _NUMBER, lambda one: number(one.strain_energy * 1e-3)),),
-        page=("energy_mj", _same),
+        page=("energy_mj",),
     ),
     "tip_load": PeriodField(
         _numbers("tip_load_y_n", "tip_load_z_n"),
         topics=(Topic("/control/tip_load", _NUMBER, lambda one: number(hypot(*one.tip_load))),),
     ),
     "path": PeriodField(
-        _poses("path"), Pose, (Topic("/tip/path", _POSE, lambda one: pose(one.time, one.path)),)
+        _poses("path"),
+        Pose,
+        (Topic("/tip/path", _POSE, lambda one: pose(one.time, one.path)),),
+        ("error_mm", _error),
     ),
     "cost": PeriodField(
         _numbers("cost"), topics=(Topic("/control/cost", _NUMBER, lambda one: number(one.cost)),)
@@ -179,17 +203,17 @@ FIELDS: dict[str, PeriodField] = {
         _numbers("spread_mm"),
         topics=(Topic("/control/spread", _NUMBER, lambda one: number(one.spread * 1e-3)),),
     ),
-    "action": PeriodField((("action", Action),), page=("action", str)),
-    "late": PeriodField((("late", _flag),), page=("late", _same)),
-    "decision": PeriodField((("decision", str),), page=("decision", _same)),
-    "miss": PeriodField(_numbers("miss_y_mm", "miss_z_mm"), page=("miss_mm", _same)),
-    "miss_sd": PeriodField(_numbers("miss_sd_mm"), page=("miss_sd_mm", _same)),
-    "warning": PeriodField((("warning", str),), page=("warning", _same)),
+    "action": PeriodField((("action", Action),), page=("action", lambda one, _: str(one.action))),
+    "late": PeriodField((("late", _flag),), page=("late",)),
+    "decision": PeriodField((("decision", str),), page=("decision",)),
+    "miss": PeriodField(_numbers("miss_y_mm", "miss_z_mm"), page=("miss_mm",)),
+    "miss_sd": PeriodField(_numbers("miss_sd_mm"), page=("miss_sd_mm",)),
+    "warning": PeriodField((("warning", str),), page=("warning",)),
     "true_tip": PeriodField(
         _poses("true"),
         Pose,
         (Topic("/tip/true", _POSE, lambda one: one.true_tip and pose(one.time, one.true_tip)),),
-        ("true", _point),
+        ("true", lambda one, _: one.true_tip and one.true_tip.point),
     ),
     "true_strain_energy": PeriodField(
         _numbers("true_strain_energy_mj"),
@@ -200,10 +224,12 @@ FIELDS: dict[str, PeriodField] = {
                 lambda one: None if one.true_strain_energy is None else number(one.true_strain_energy * 1e-3),
             ),
         ),
-        page=("true_energy_mj", _same),
+        page=("true_energy_mj",),
     ),
     "true_stretch": PeriodField(_numbers("true_stretch")),
     "converged": PeriodField((("converged", _flag),)),
+    "readings": PeriodField(page=("indicator", _largest_indicator)),
+    "durations": PeriodField(page=("decide_ms", lambda one, _: 1e3 * one.durations.get("decide", 0.0))),
 }
 """Fields of `Period` by name, in the order of the columns. `true_…` are of the virtual phantom, which no controller
 knows. `record.topics` has durations and readings."""
@@ -222,10 +248,12 @@ def to_values(period: Period) -> dict[str, Any]:
     return {name: math.nan if value is None else value for name, value in _cells(period)}
 
 
-def page_values(period: Period) -> dict[str, Any]:
-    """Return what a row of the page shows of a period, by key."""
+def page_values(period: Period, plan: Plan) -> dict[str, Any]:
+    """Return the row of the page for a period of an insertion with this plan, by key."""
     shown = ((name, field.page) for name, field in FIELDS.items() if field.page is not None)
-    return {key: value_of(getattr(period, name)) for name, (key, value_of) in shown}
+    return {
+        page[0]: page[1](period, plan) if len(page) > 1 else getattr(period, name) for name, page in shown
+    }
 
 
 def from_row(

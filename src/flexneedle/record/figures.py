@@ -1,22 +1,23 @@
-"""The figures of a run. They are always drawn from its folder: `view` reproduces them exactly."""
+"""The figures of plans and insertions; those of a run are drawn from its folder, so that `view` reproduces them."""
 
 from collections.abc import Callable
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from flexneedle.errors import RunError
 from flexneedle.figures.insertion import insertion_figure
-from flexneedle.figures.perspective import perspective_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import save
 from flexneedle.record.folder import TRACE_FILE, read_run
 from flexneedle.record.loading import insertion_of, unfinished_note
+from flexneedle.results import Insertion, Plan, scenario_of
 
 
 def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -> list[Path]:
     """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
-    An insertion in space is drawn in perspective, too: `perspective.png` and `.svg`. note: called with a line if the
-    record or its trace lacks its end.
+    note: called with a line if the record or its trace lacks its end.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
@@ -28,8 +29,19 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     if lacking:
         note(lacking)
     if insertion is not None and insertion.periods:
-        paths = save(insertion_figure(run.scenario, insertion), folder, "insertion")
-        if run.scenario.setup.axes == 2:
-            paths += save(perspective_figure(run.scenario, insertion), folder, "perspective")
-        return paths
+        return save(insertion_figure(run.scenario, insertion), folder, "insertion")
     return save(plan_figure(run.scenario, list(run.plans.values())), folder, "plan")
+
+
+def plot(record: Plan | Insertion) -> Figure:
+    """Return the figure of a plan or of an insertion, as `flexneedle view` draws it.
+
+    An insertion without a period is drawn as its plan.
+
+    Raises:
+        InputError: Not a plan or insertion, or without a scenario.
+    """
+    scenario = scenario_of(record)
+    if isinstance(record, Insertion) and record.periods:
+        return insertion_figure(scenario, record)
+    return plan_figure(scenario, [record.plan if isinstance(record, Insertion) else record])

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_line
 from flexneedle.loop.choices import Choices
-from flexneedle.loop.events import Ended, Event, Gate, Iterated, Listener, PeriodEnded, Planned, Stream
+from flexneedle.loop.events import Ended, Gate, PeriodEnded, Planned, Stream
 from flexneedle.loop.insertions import carry_out, check_choices
+from flexneedle.planning.events import Event, Listener
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import Folder
@@ -87,10 +87,7 @@ def record_insertion(
 
 
 def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, stream: Stream) -> Plan:
-    def send(info: dict[str, Any]) -> None:
-        stream.send(Iterated(strategy, info))
-
-    made = make_plan(scenario, strategy=strategy, seed=seed, progress=send)
+    made = make_plan(scenario, strategy=strategy, seed=seed, listeners=stream.listeners)
     keep_plan(folder, made)
     return made
 

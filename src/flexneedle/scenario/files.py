@@ -7,9 +7,8 @@ from pydantic import ValidationError
 
 from flexneedle.arguments import shorten
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario.library import Library, label
+from flexneedle.scenario.library import PRESETS, WORLD, Library, label
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import describe
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, Environment
 from flexneedle.scenario.sections.registration import Registration

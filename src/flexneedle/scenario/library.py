@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
 from importlib.resources.abc import Traversable
 from os import fspath
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from flexneedle.errors import FileError, make_printable
+from flexneedle.errors import FileError, ScenarioError, make_printable
 from flexneedle.scenario.problems import describe
 
 _SUFFIX = ".toml"
@@ -21,19 +22,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Library:
-    """A kind of TOML file.
+    """A kind of TOML file."""
 
-    Attributes:
-        kind: Name of the kind, such as "a scenario file".
-        noun: Name of a file that comes with the package, such as "preset".
-        folder: Folder of the files that come with the package, None if there are none.
-        error: Type raised, with one line for each problem.
-    """
-
-    kind: str
-    noun: str = ""
+    kind: str  # name of the kind, such as "a scenario file"
+    noun: str = ""  # name of a file that comes with the package, such as "preset"
+    # folder of the files that come with the package, None if there are none
     folder: Traversable | None = None
-    error: type[FileError] = FileError
+    error: type[FileError] = FileError  # type raised, with one line for each problem
 
     def names(self) -> list[str]:
         """Return the names of the files that come with the package."""
@@ -101,3 +96,9 @@ class Library:
 def label(source: str | Path) -> str:
     """Return a name or path for the opening of a message."""
     return make_printable(fspath(source)) or '""'
+
+
+PRESETS = Library("a scenario file", "preset", files(__package__) / "presets", ScenarioError)
+"""The scenarios that come with the package."""
+WORLD = "world:"
+"""Prefix of the name of a world's scenario; the number follows and, unless it is `real`, a colon and the case."""

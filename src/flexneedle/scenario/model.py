@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from itertools import chain
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -22,8 +22,7 @@ from flexneedle.scenario.rules import (
 from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, expand_environment
 from flexneedle.scenario.sections.fields import Section, Title
-from flexneedle.scenario.sections.guard import GuardSettings
-from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.scenario.sections.monitor import GuardSettings, MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
 from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.structure import structure_problems
@@ -31,6 +30,14 @@ from flexneedle.scenario.tissue.laws import AnyLayer
 from flexneedle.scenario.tissue.layer import Contact
 
 _ENVIRONMENT = "tracker.environment"
+
+
+class Difference(NamedTuple):
+    """A key as in messages, such as `tissue[0].alpha`, with its values in two scenarios, "none" if it is not set."""
+
+    key: str
+    old: Any
+    new: Any
 
 
 class Scenario(Section):
@@ -116,15 +123,16 @@ class Scenario(Section):
         """Return all values by dotted key (`tissue.0.alpha`), in the order of the schema."""
         return flatten(self.values())
 
-    def first_difference(self, other: "Scenario", sections: Collection[str] | None = None) -> str | None:
-        """Return the first key whose value differs, as `tissue[0].alpha`, or None if all are equal.
-
-        sections: sections to compare (default: all).
-        """
-        mine, theirs = (flatten(_part(each.values(), sections)) for each in (self, other))
-        return next(
-            (key_path(split_key(key)) for key in mine | theirs if mine.get(key) != theirs.get(key)), None
+    def first_difference(self, other: "Scenario", sections: Collection[str]) -> Difference | None:
+        """Return the first difference of another scenario in some sections, None if they are equal."""
+        mine, theirs = (
+            flatten(each.model_dump(mode="json", exclude_none=True, include={*sections}))
+            for each in (self, other)
         )
+        for key in mine | theirs:
+            if mine.get(key) != theirs.get(key):
+                return Difference(key_path(split_key(key)), mine.get(key, "none"), theirs.get(key, "none"))
+        return None
 
     def __repr__(self) -> str:
         layers = f"{len(self.tissue)} layer{'s' if len(self.tissue) > 1 else ''}"
@@ -153,10 +161,6 @@ class Scenario(Section):
         for layer in self.tissue[:-1]:
             tops.append(tops[-1] + (layer.thickness_mm or 0.0))
         return tuple(tops)
-
-
-def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mapping[str, Any]:
-    return values if sections is None else {name: values[name] for name in sections}
 
 
 def _expand_environment(key: str, value: Any) -> Any:

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from flexneedle.errors import ScenarioError, make_printable
+from flexneedle.scenario.library import PRESETS, WORLD
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.sections.needle import GAUGES
 
 TRAINING = 1000

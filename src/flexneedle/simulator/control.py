@@ -1,4 +1,4 @@
-"""Limits of control inputs U = (δb, δθ, δψ, δg, roll, spin), and arrays of them."""
+"""Control inputs U = (δb, δθ, δψ, δg, roll, spin): arrays of them, their limits, and the time they take."""
 
 import math
 from dataclasses import dataclass
@@ -10,10 +10,12 @@ from flexneedle.arguments import check_whole, make_refusal
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
-from flexneedle.types import COLUMNS, DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, ROLL, SPIN, Floats
+from flexneedle.types import COLUMNS, DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, ROLL, SPIN, Control, Floats
 
 MOVES = ROLL
 """Number of columns of a control that are travel: of the base and of the guide."""
+ROUNDING_S = 1e-7
+"""Largest time (s) by which a travel may be shorter than its duration."""
 _SIZES = "give the sizes one by one: controls(4, 30, db_x=1.0)"
 _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 
@@ -67,21 +69,13 @@ def _reasons_fixed(setup: Setup) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of commands.
+    """Limits of commands."""
 
-    Attributes:
-        step: Largest step of each column of travel, (7,).
-        travel: Range of the sum of steps from the start, (7, 2).
-        half_turns: Key and value that restrict the needle to half turns, or "".
-        rotation: Largest angle from 0 to either side (rad).
-        fixed: Reason why each column of travel may not move, or "".
-    """
-
-    step: Floats
-    travel: Floats
-    half_turns: str = "setup.axes = 1"
-    rotation: float = math.inf
-    fixed: tuple[str, ...] = ("",) * MOVES
+    step: Floats  # largest step of each column of travel, (7,)
+    travel: Floats  # range of the sum of steps from the start, (7, 2)
+    half_turns: str = "setup.axes = 1"  # key and value that restrict the needle to half turns, or ""
+    rotation: float = math.inf  # largest angle from 0 to either side (rad)
+    fixed: tuple[str, ...] = ("",) * MOVES  # reason why each column of travel may not move, or ""
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Limits":
@@ -141,3 +135,21 @@ class Limits:
         unit = "rad" if index[-1] in (DB_THETA, DB_PSI, ROLL, SPIN) else "mm"
         text = rule if limit is None else f"{rule} {bound:g} {unit}"
         raise CommandError(name, float(values[index]), bound, text)
+
+
+def roll_time(setup: Setup, roll: float) -> float:
+    """Return the time (s) of a roll (rad), during which the needle does not advance."""
+    return abs(roll) / setup.rotation_speed
+
+
+def travel_time(setup: Setup, command: Control) -> float:
+    """Return the time (s) of base, guide and spin, which move together after the roll: the time of the slowest axis."""
+    sizes = command._replace(roll=0.0)
+    return max(abs(size) / speed for size, speed in zip(sizes, _speeds(setup), strict=True))
+
+
+def _speeds(setup: Setup) -> Control:
+    """Return the speed of each column (mm/s, rad/s)."""
+    base, turn, guide = setup.base_speed, setup.base_turn_speed, setup.guide_speed
+    rotation = setup.rotation_speed
+    return Control(setup.insertion_speed_mm_s, base, base, turn, turn, guide, guide, rotation, rotation)

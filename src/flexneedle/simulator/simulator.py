@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flexneedle.arguments import check_instance, check_whole, make_refusal
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
@@ -21,38 +22,16 @@ from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import MOVES, Limits, controls, drive_along_entry, limit_half_turn
-from flexneedle.simulator.state import State, first_mechanics_difference, freeze_solve, load_state
+from flexneedle.simulator.state import State, freeze_solve
 from flexneedle.types import COLUMNS, ROLL, Control, Floats
 
+_MECHANICS = ("needle", "setup", "entry", "tissue", "contact")  # the sections that a state depends on
 _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1
 _AHEAD_TOLERANCE_MM = 1e-4  # of rollouts without limits
 _LATERAL_MM = 1.0
 _ALL_CORES = "leave it out for one per core"
-
-
-class Rollout(NamedTuple):
-    """Result of N sequences of m steps.
-
-    Attributes:
-        tips: Poses of the tip (N, m, 5).
-        strain_energy: Strain energy (N, m), mJ.
-        converged: Whether each step converged (N, m).
-        deflection: On demand, the mean square of the needle's distance from its axis (N, m), mm²; else of size 0.
-        shapes: On demand, poses at the needle's nodes (N, m, n, 5); else of size 0.
-    """
-
-    tips: Floats
-    strain_energy: Floats
-    converged: NDArray[np.bool_]
-    deflection: Floats
-    shapes: Floats
-
-    def __repr__(self) -> str:
-        sequences, steps = self.strain_energy.shape
-        share = f"{np.mean(self.converged):.0%} of the steps converged"
-        return f"<Rollout of {sequences} sequences of {steps} steps, {share}>"
 
 
 class Assimilation(NamedTuple):
@@ -82,7 +61,7 @@ class Simulator:
         constants: model.Model | None = None,
     ) -> None:
         self.scenario = load_scenario(scenario)
-        self.threads = _count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
+        self.threads = count_cores() if threads is None else check_whole("threads", threads, 1, _ALL_CORES)
         self._model = constants or _build_model(self.scenario)
         self._limits = Limits.of(self.scenario)
 
@@ -171,7 +150,7 @@ class Simulator:
         deflection: bool = False,
         shapes: bool = False,
         axes: ArrayLike | None = None,
-    ) -> Rollout:
+    ) -> Trajectories:
         """Run each of N sequences of controls (N, m, 9) from `state`. Bit-identical to repeated `step`.
 
         Args:
@@ -195,7 +174,7 @@ class Simulator:
             raise make_refusal("shape of controls", rows.shape, rule)
         if limits:
             self._limits.check(state.travel, rows, state.roll)
-        rows = drive_along_entry(self.scenario, rows)
+        given, rows = rows, drive_along_entry(self.scenario, rows)
         n, m = rows.shape[:2]
         lines = self._axes(n, axes)
         out = insertion.outputs(
@@ -214,7 +193,7 @@ class Simulator:
         else:
             edges = np.unique(np.linspace(0, n, threads * _CHUNKS_A_THREAD + 1).astype(int))
             list(self._pool.map(run, edges[:-1], edges[1:]))
-        return Rollout(*out)
+        return Trajectories(given, *out)
 
     def assimilate(
         self, state: State, tip: Sequence[float], points: Sequence[Sequence[float]] = ()
@@ -253,10 +232,6 @@ class Simulator:
             total += float((of["weight"] * of["stiffness"] * of["height"] ** 2 * stored).sum())
         return total
 
-    def load(self, path: str | Path) -> State:
-        """Read a state that `State.save` wrote. Raises StateError with the differing key for another scenario."""
-        return load_state(path, self.start())
-
     def _assimilate(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
         place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
@@ -286,9 +261,8 @@ class Simulator:
     def _check_mechanics(self, state: State) -> None:
         if state.scenario is self.scenario:
             return
-        if (key := first_mechanics_difference(state.scenario, self.scenario)) is not None:
-            theirs, mine = state.scenario.flat().get(key), self.scenario.flat().get(key)
-            raise StateError(f"state of another scenario: {key} was {theirs}, is {mine}")
+        if (found := state.scenario.first_difference(self.scenario, _MECHANICS)) is not None:
+            raise StateError(f"state of another scenario: {found.key} was {found.old}, is {found.new}")
 
     def _work(self, state: State) -> tuple[nd.Laterals, nd.Laterals, nd.Work]:
         """Return copies of rest positions and compressions, and a work array."""
@@ -310,7 +284,7 @@ def _point(values: Sequence[float], axes: int) -> list[float]:
     return [float(value) for value in values]
 
 
-def _count_cores() -> int:
+def count_cores() -> int:
     """Return the number of cores that the process may use; of all cores where the system does not report that."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

@@ -1,20 +1,14 @@
-"""The state (X, C) of an insertion: a frozen value that can be compared, pickled, saved and loaded."""
+"""The state (X, C) of an insertion: a frozen value that can be compared and pickled."""
 
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import BytesIO
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.errors import StateError
-from flexneedle.files import replace_file
 from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.lateral import lateral
@@ -24,9 +18,7 @@ from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import THETA, Floats, Lateral
 
-_MECHANICS = ("needle.", "setup.", "entry.", "tissue", "contact.")  # the keys that a state depends on
 _Array = TypeVar("_Array", bound=NDArray[Any])
-_Record = TypeVar("_Record", bound=tuple[Any, ...])
 _ACROSS = ("y", "slope", "shear", "moment", "force")
 _ENERGIES = ("energy", "weighted")
 
@@ -35,22 +27,14 @@ class Contacts(NamedTuple):
     """Contact points of the cut channel by depth, (k,).
 
     A point ahead of a tip that was pulled back is not active: it is undisplaced, position = rest and stretch 1.
-
-    Attributes:
-        x: x (mm).
-        rest: Position y, z at rest (k, 2), mm.
-        position: Present position y, z (k, 2), mm.
-        stretch: Stretch λ.
-        active: Whether the point is behind the tip.
-        law: Index of the tissue's law, as in `laws_of`.
     """
 
-    x: Floats
-    rest: Floats
-    position: Floats
-    stretch: Floats
-    active: NDArray[np.bool_]
-    law: NDArray[np.int64]
+    x: Floats  # x (mm)
+    rest: Floats  # position y, z at rest (k, 2), mm
+    position: Floats  # present position y, z (k, 2), mm
+    stretch: Floats  # stretch λ
+    active: NDArray[np.bool_]  # whether the point is behind the tip
+    law: NDArray[np.int64]  # index of the tissue's law, as in `laws_of`
 
     def __repr__(self) -> str:
         least = f", least stretch {self.stretch.min():.4f}" if len(self.x) else ""
@@ -222,22 +206,6 @@ class State:
         needle = self.needle._replace(boundary=boundary._replace(base=pose, load=load))
         return replace(self, needle=needle, clamp=moved)
 
-    def save(self, path: str | Path) -> None:
-        """Write the state to `path` (NumPy npz); load it with `Simulator.load`."""
-        sink = BytesIO()
-        np.savez(sink, scenario=np.array(json.dumps(self.scenario.values())), **self._arrays())
-        replace_file(Path(path), sink.getvalue())
-
-    def _arrays(self) -> dict[str, Any]:
-        return {
-            "needle": np.array(_flatten(self.needle)),
-            "clamp": np.array(self.clamp),
-            "rest": self.rest,
-            "compression": self.compression,
-            "mesh": self.mesh,
-            "ends": np.array([self.spring_energy, self.roll]),
-        }
-
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
         """Return x, y and slope of base, nodes and tip."""
         ends = self.needle.boundary.base, self.needle.solution.tip
@@ -246,7 +214,8 @@ class State:
         return first, second, third
 
     def _bytes(self) -> tuple[bytes, ...]:
-        return tuple(array.tobytes() for array in self._arrays().values())
+        numbers = np.array([*_flatten(self.needle), *self.clamp, self.spring_energy, self.roll])
+        return tuple(array.tobytes() for array in (numbers, self.rest, self.compression, self.mesh))
 
     def __eq__(self, other: object) -> bool:
         """Return whether scenario and arrays are the same, to the bit: 0 is not −0, and NaN equals the same NaN."""
@@ -267,40 +236,6 @@ class State:
         )
         ended = "converged" if self.converged else "NOT converged"
         return f"<State {where}, {self.strain_energy:.4g} mJ in the tissue, {ended}>"
-
-
-def first_mechanics_difference(one: Scenario, other: Scenario) -> str | None:
-    """Return the first key on which the mechanics of two scenarios differ, or None."""
-    mine, theirs = one.flat(), other.flat()
-    for key in [*mine, *(key for key in theirs if key not in mine)]:
-        if key.startswith(_MECHANICS) and mine.get(key) != theirs.get(key):
-            return key
-    return None
-
-
-def load_state(path: str | Path, start: State) -> State:
-    """Read a file of `State.save`, for the scenario and model of `start`.
-
-    Raises:
-        StateError: The file is no state, or a state of another scenario, with the key that differs.
-    """
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
-    except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
-        raise StateError(f"{path}: not a saved state ({error})") from error
-    if (key := first_mechanics_difference(saved, start.scenario)) is not None:
-        mine, theirs = start.scenario.flat().get(key), saved.flat().get(key)
-        raise StateError(f"{path}: saved under another scenario: {key} was {theirs}, is {mine}")
-    known = {name: (array.dtype, array.ndim) for name, array in start._arrays().items()}
-    if {name: (array.dtype, array.ndim) for name, array in arrays.items()} != known:
-        raise StateError(f"{path}: saved by another version of flexneedle")
-    needle = _fill(start.needle, iter(arrays.pop("needle").tolist()))
-    clamp = nd.NodePose(*arrays.pop("clamp").tolist())
-    energy, roll = arrays.pop("ends").tolist()
-    parts = {name: _freeze(array) for name, array in arrays.items()}
-    return replace(start, needle=needle, clamp=clamp, spring_energy=energy, roll=roll, **parts)
 
 
 def _with_z(given: Sequence[float]) -> tuple[float, float]:
@@ -325,16 +260,6 @@ def _row(pose: nd.NodePose) -> Floats:
 def _flatten(record: tuple[Any, ...]) -> list[Any]:
     """Return all numbers of nested records."""
     return [number for part in record for number in (_flatten(part) if isinstance(part, tuple) else [part])]
-
-
-def _fill(like: _Record, numbers: Iterator[Any]) -> _Record:
-    """Return records as `like`, filled with these numbers."""
-    parts = (_fill(part, numbers) if isinstance(part, tuple) else _cast(part, next(numbers)) for part in like)
-    return type(like)(*parts)
-
-
-def _cast(like: Any, number: Any) -> Any:
-    return type(like)(number) if isinstance(like, complex) else type(like)(number.real)
 
 
 def freeze_solve(

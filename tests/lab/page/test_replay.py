@@ -15,7 +15,7 @@ import flexneedle.lab.page
 from flexneedle.lab.page import replay
 from flexneedle.lab.page.replay import bundle_modules, encode_record, make_document
 from flexneedle.lab.page.shape_frames import FrameSource, ShapeFrame, pack_frame
-from flexneedle.lab.page.worker.recordings import row_of
+from flexneedle.record.fields import page_values
 from flexneedle.types import Pose
 from page_frames import unpack_frame
 from replays import File, insertion, record
@@ -75,7 +75,7 @@ def test_the_error_is_the_lateral_distance_from_the_planned_path_at_the_depth_of
     (x, y, z), period = made.plan.tips[20, :3], made.periods[30]
     tip = Pose(x, y + 3.0, z - 4.0, 0.0, 0.0)
     for changed in (replace(period, true_tip=tip), replace(period, true_tip=None, estimate=tip)):
-        assert row_of(changed, made.plan)["error_mm"] == pytest.approx(5.0, abs=1e-9)
+        assert page_values(changed, made.plan)["error_mm"] == pytest.approx(5.0, abs=1e-9)
 
 
 def test_a_text_of_the_record_ends_no_element():

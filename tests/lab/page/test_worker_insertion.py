@@ -16,10 +16,11 @@ from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from flexneedle.lab.page.worker import recordings
 from flexneedle.lab.page.worker.disturbances import DisturbedPlant, Disturber
 from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
-from flexneedle.lab.page.worker.recordings import read_run, row_of
+from flexneedle.lab.page.worker.recordings import read_run
 from flexneedle.lab.page.worker.task import Cancelled
 from flexneedle.phantom.draw import draw
 from flexneedle.record.export import mark_columns
+from flexneedle.record.fields import page_values
 from flexneedle.record.saving import save
 from page_tasks import NO_WAIT, Reported, done, plain, short, task
 
@@ -45,7 +46,7 @@ def in_field():
 
 
 def rows_of(insertion):
-    return plain(row_of(period, insertion.plan) for period in insertion.periods)
+    return plain(page_values(period, insertion.plan) for period in insertion.periods)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,7 @@ def test_the_indicator_is_the_largest_of_the_references(expected, in_field):
         frames = [checked.measurement.frame for checked in period.readings]
         by_name = {name: [frame.readings[name].indicator for frame in frames] for name in REFERENCES}
         medians = [np.median([one for one in values if one is not None]) for values in by_name.values()]
-        assert row_of(period, in_field.plan)["indicator"] == pytest.approx(max(medians), rel=1e-12)
+        assert page_values(period, in_field.plan)["indicator"] == pytest.approx(max(medians), rel=1e-12)
 
 
 def test_the_indicator_of_the_tip_counts_only_without_references(in_field):
@@ -102,7 +103,7 @@ def test_the_indicator_of_the_tip_counts_only_without_references(in_field):
                 sensors["tip"] = replace(sensors["tip"], indicator=9.0)
             measured = replace(checked.measurement, frame=replace(frame, readings=sensors))
             readings.append(replace(checked, measurement=measured))
-        return row_of(replace(period, readings=tuple(readings)), in_field.plan)["indicator"]
+        return page_values(replace(period, readings=tuple(readings)), in_field.plan)["indicator"]
 
     assert indicator("tip", *REFERENCES) == indicator(*REFERENCES) < 1.0
     assert (indicator("tip"), indicator()) == (9.0, None)

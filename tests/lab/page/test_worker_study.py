@@ -12,9 +12,9 @@ from flexneedle.lab.page.protocol import StudyRow
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from flexneedle.lab.page.worker import study_jobs
 from flexneedle.lab.page.worker.__main__ import carry_out
-from flexneedle.lab.page.worker.recordings import row_of
 from flexneedle.lab.page.worker.study_jobs import ShownRows, list_rows
 from flexneedle.lab.study.recompute import recompute
+from flexneedle.record.fields import page_values
 from page_tasks import Reported, plain, task
 
 pytestmark = pytest.mark.usefixtures("empty_figures")
@@ -99,7 +99,9 @@ def test_a_row_is_reported_as_a_recording_and_saved_as_a_run(made, tmp_path):
     (message,) = one.report.of("insertion")
     assert (message.of, message.name, message.state, message.row) == ("second", "small, row 6", "done", 6)
     assert (message.seed, message.summary) == (insertion.seed, insertion.summary)
-    assert plain(one.report.rows) == plain(row_of(period, insertion.plan) for period in insertion.periods)
+    assert plain(one.report.rows) == plain(
+        page_values(period, insertion.plan) for period in insertion.periods
+    )
     (needles,) = one.report.shapes(FrameKind.NEEDLE, FrameSource.SECOND)
     assert needles.values.shape[0] == message.periods == len(insertion.periods)
     shares = [job.share for job in one.report.of("job")]

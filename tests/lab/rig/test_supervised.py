@@ -28,7 +28,7 @@ from flexneedle.loop.events import Gate, PeriodEnded, Stream
 from flexneedle.loop.step import Step as LoopStep
 from flexneedle.record.topics import READINGS
 from flexneedle.results import Action
-from flexneedle.simulator.pace import travel_time
+from flexneedle.simulator.control import travel_time
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control
 from stages import RIG

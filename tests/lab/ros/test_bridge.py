@@ -18,7 +18,8 @@ from flexneedle.lab.ros import bridge as module
 from flexneedle.lab.ros.bridge import Bridge, load_checked_profile
 from flexneedle.lab.ros.profile import load_profile
 from flexneedle.lab.ros.records import NodeLoss, RosArm, RosRefusal, RosState, RosStop, RosTarget
-from flexneedle.loop.events import Ended, Iterated, PeriodEnded, Planned, Stream
+from flexneedle.loop.events import Ended, PeriodEnded, Planned, Stream
+from flexneedle.planning.events import Iterated
 from flexneedle.record.reader import read_trace
 from flexneedle.record.topics import READINGS
 from flexneedle.results import Period

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flexneedle.errors import InputError
+from flexneedle.lab.tables.columns import COLUMNS
 from flexneedle.lab.tables.write import write_table
 from flexneedle.lab.tracker_evaluation.simulate import Experiment, measure_grid
-from flexneedle.phantom.tracking.measurement_table import COLUMNS
 from flexneedle.scenario.files import load_environment
 from rooms import environment
 

@@ -18,8 +18,8 @@ import numpy as np
 from pydantic import Field
 
 from flexneedle.control.forecast import format_miss, probability_beyond
-from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Controller, Decision
+from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
@@ -70,24 +70,15 @@ class Memory:
     """The memory from period to period: the current path, and the derivatives ahead of the tip.
 
     The next estimate shows which of the two paths is current: a needle that is held or rests does not roll.
-
-    Attributes:
-        path: The path as decided.
-        rolled: The same path after the roll of the command.
-        roll: The needle's angle (rad) before the command.
-        scale: Energy (mJ) of the tissue down to the target displaced by 1 mm.
-        outlook: Derivatives ahead of the tip, None before the first decision.
-        rests: Number of rests already made.
-        blur: Standard deviation (mm) of a miss after all corrections that can still take effect.
     """
 
-    path: GuidePath
-    rolled: GuidePath
-    roll: float
-    scale: float
-    outlook: Outlook | None = None
-    rests: int = 0
-    blur: float = 0.0
+    path: GuidePath  # the path as decided
+    rolled: GuidePath  # the same path after the roll of the command
+    roll: float  # the needle's angle (rad) before the command
+    scale: float  # energy (mJ) of the tissue down to the target displaced by 1 mm
+    outlook: Outlook | None = None  # derivatives ahead of the tip, None before the first decision
+    rests: int = 0  # number of rests already made
+    blur: float = 0.0  # standard deviation (mm) of a miss after all corrections that can still take effect
 
 
 def begin(task: Task) -> Memory:
@@ -188,11 +179,10 @@ def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
 def rollout_as_measured(fitted: Identified, controls: Floats) -> Trajectories:
     """Return trajectories of controls (N, m, 9) on the fitted model, with tips as a perfect tracker measures them."""
     predicted = fitted.simulator.rollout(fitted.state, controls, limits=False, rough=True)
-    tips, energy, converged = predicted[:3]
     off = fitted.run_out * bevel_directions(fitted.state.bevel, controls, fitted.axes) + fitted.residual
-    tips[:, :, Y] += off.real
-    tips[:, :, Z] += off.imag
-    return Trajectories(controls, tips, energy, converged)
+    predicted.tips[:, :, Y] += off.real
+    predicted.tips[:, :, Z] += off.imag
+    return predicted
 
 
 def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:

@@ -45,16 +45,11 @@ class BroydenMpc(Section):
 
 @dataclass(frozen=True, eq=False)
 class JacobianEstimate:
-    """Jacobian from insertion and guide to the tip, and the recorded inputs.
+    """Jacobian from insertion and guide to the tip, and the recorded inputs."""
 
-    Attributes:
-        jacobian: Derivatives (1 + a, 1 + g) of the tip on a lateral axes, for a guide on g axes.
-        history: The last rows (tip x, insertion, guide), as commanded.
-        last_update: Tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading.
-    """
-
-    jacobian: Floats
-    history: tuple[tuple[float, ...], ...] = ()
+    jacobian: Floats  # derivatives (1 + a, 1 + g) of the tip on a lateral axes, for a guide on g axes
+    history: tuple[tuple[float, ...], ...] = ()  # the last rows (tip x, insertion, guide), as commanded
+    # tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading
     last_update: tuple[Floats, Floats] | None = None
 
 

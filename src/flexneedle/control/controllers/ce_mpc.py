@@ -17,8 +17,8 @@ from flexneedle.estimation.task import Task
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
     roll, why = bang_bang.decide_roll(task, estimate, task.settings)
-    choice = mpc.choose_step(estimate.simulator, task.plan, estimate.state, task.settings, roll=roll, rng=rng)
-    return Decision(choice.command, why, choice.cost, choice.spread, samples=choice.samples), memory
+    model, state, settings = estimate.simulator, estimate.state, task.settings
+    return mpc.choose_step(model, task.plan, state, settings, roll=roll, rng=rng, why=why), memory
 
 
 CONTROLLER = Controller(

@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from flexneedle.control import bang_bang
-from flexneedle.control.guide import guide_reach
 from flexneedle.control.interface import Controller, Decision, travel_left
+from flexneedle.control.limits import guide_reach
 from flexneedle.control.mpc import planned_offset, steps_to_planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection

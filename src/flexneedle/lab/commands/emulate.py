@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed
+from flexneedle.cli.progress import print_line, print_note
 from flexneedle.cli.values import port
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
             print(serial.link, flush=True)
             tip = RestingTip(CENTRE) if args.still else CIRCLE
             session = EmulatorSession(device, faults, args.seed, monotonic(), tip=tip)
-            serve(session, serial, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
+            serve(session, serial, _orders(), lambda line: print_line(execute(session, line)), print_line)
         except KeyboardInterrupt:
             return 0
 
@@ -162,7 +163,7 @@ def _emulate_galil(args: argparse.Namespace) -> int:
         try:
             print("{}:{}".format(*tcp.address), flush=True)
             session = GalilSession(ControllerState(), faults, monotonic(), args.seed)
-            serve(session, tcp, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
+            serve(session, tcp, _orders(), lambda line: print_line(execute(session, line)), print_line)
         except KeyboardInterrupt:
             return 0
 
@@ -193,7 +194,7 @@ def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> Emula
 def _print_message(message: Mapping[str, Any]) -> None:
     """Print a message of an emulated rig: a line of JSON, or on stderr a note for a person."""
     if "note" in message:
-        _print_line(f"flexneedle: {message['note']}")
+        print_note(message["note"])
     else:
         print(json.dumps(message), flush=True)
 
@@ -202,7 +203,3 @@ def _orders() -> Orders:
     from flexneedle.lab.emulators.orders import Orders
 
     return Orders(None if sys.stdin is None else sys.stdin.fileno())
-
-
-def _print_line(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

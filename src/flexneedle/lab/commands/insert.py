@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from contextlib import ExitStack
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.cli.commands import Commands
-from flexneedle.cli.common import ARMS, STILL_IN, confirm_motions, require_terminal, with_target
+from flexneedle.cli.common import with_target
 from flexneedle.cli.insert import Connection
+from flexneedle.cli.progress import print_line, print_note
 from flexneedle.errors import InputError
 from flexneedle.interrupts import SIGNALS
+from flexneedle.lab.commands.confirmation import ARMS, confirm_motions, require_terminal
+from flexneedle.lab.rig.notices import STILL_IN
 from flexneedle.loop.events import AllGates, Gate
 
 if TYPE_CHECKING:
     from flexneedle.cli.progress import Progress
     from flexneedle.lab.rig.rig_file import RigFile, RosSettings
     from flexneedle.lab.ros.bridge import Bridge
-    from flexneedle.loop.events import Listener
+    from flexneedle.planning.events import Listener
     from flexneedle.record.folder import Folder
     from flexneedle.scenario.model import Scenario
 
@@ -78,7 +79,7 @@ class RosConnection(Connection):
             )
         from flexneedle.lab.ros.bridge import Bridge
 
-        self._bridge = stack.enter_context(Bridge(settings, partial(print, file=sys.stderr, flush=True)))
+        self._bridge = stack.enter_context(Bridge(settings, print_line))
         return with_target(scenario, self._bridge.await_target()) if settings.target else scenario
 
     def add_record(self, folder: Folder) -> None:
@@ -152,7 +153,7 @@ class RigConnection(RosConnection):
     def end(self) -> None:
         """Print how the needle is withdrawn."""
         if self._rig.moves:
-            print(f"flexneedle: {STILL_IN.format(rig=self.args.rig)}", file=sys.stderr)
+            print_note(STILL_IN.format(rig=self.args.rig))
 
 
 def interrupt_on_signals(stack: ExitStack) -> None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command, add_group
-from flexneedle.cli.common import ARMS, add_strategy, confirm_motions, print_json
+from flexneedle.cli.common import add_strategy, print_json
+from flexneedle.cli.progress import print_line, print_note
 from flexneedle.cli.values import finite, positive
 from flexneedle.errors import DriverError
+from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 
 if TYPE_CHECKING:
     from flexneedle.lab.rig.preflight.moves import AxisHoming, AxisMove
@@ -236,7 +237,7 @@ def _home(args: argparse.Namespace) -> int:
     rig = load_rig(args.rig)
     chosen = plan_homings(rig, args.axes)
     if not chosen:
-        print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
+        print_note("no axis needs homing: all have absolute encoders")
         return 0
 
     def home(operator: SupervisorClient) -> None:
@@ -257,10 +258,7 @@ def _retract(args: argparse.Namespace) -> int:
     move = plan_retraction(rig, position, args.to, args.speed)
     if move is None:
         at, end = map(rig.axes.insertion.to_text, (position, withdrawn_position(rig)))
-        print(
-            f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
-            file=sys.stderr,
-        )
+        print_note(f"insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract")
         return 0
     return _confirm_and_move(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
 
@@ -275,7 +273,7 @@ def _off(args: argparse.Namespace) -> int:
     )
     with open_supervisor(rig) as operator, _stop_on_error(operator):
         operator.off()
-    print("done", file=sys.stderr)
+    print_line("done")
     return 0
 
 
@@ -313,14 +311,14 @@ def _confirm_and_move(
                 require_start(move, operator.positions[move.name])
         _arm(operator)
         command(operator)
-    print("done", file=sys.stderr)
+    print_line("done")
     return 0
 
 
 def _arm(operator: SupervisorClient) -> None:
     """Switch the motors on, and print what else has changed."""
     if changed := operator.arm():
-        print(f"flexneedle: {changed}", file=sys.stderr)
+        print_note(changed)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import port
 from flexneedle.errors import InputError
 from flexneedle.files import RUNS
@@ -115,7 +116,7 @@ def _load_rig(source: str) -> RigReference:
 def _announce(address: str, opens: bool) -> None:
     """Print the address, and open it. A browser may take its time to start, which the server does not wait for."""
     print(address, flush=True)
-    print("flexneedle: Ctrl-C ends the server", file=sys.stderr)
+    print_note("Ctrl-C ends the server")
     if opens:
         from webbrowser import open as open_page
 

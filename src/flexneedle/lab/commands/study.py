@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from math import isnan
@@ -12,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
-from flexneedle.cli.common import compile_first, print_json
+from flexneedle.cli.common import compile_first, print_json, print_table
+from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import make_number_type
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from flexneedle.lab.study.runner import StudyProgress
 
 
-_TABLE_WIDTH = 120  # at least, so that rows are not wrapped in a file
 _STAGES = ("Planning", "Inserting")
 
 
@@ -97,7 +96,7 @@ def _study(args: argparse.Namespace) -> int:
                 command=_command(args, folder),
             )
     except KeyboardInterrupt:
-        print(f"flexneedle: interrupted; resume with: {_command(args, folder, '--resume')}", file=sys.stderr)
+        print_note(f"interrupted; resume with: {_command(args, folder, '--resume')}")
         return 130
     except RunError as error:
         raise RunError(f"{error}: {_command(args, folder, '--resume')}") from error
@@ -178,43 +177,29 @@ def _report(folder: Path, as_json: bool, seconds: float) -> int:
         return 0
     first = found.endings[0]
     message = make_printable(f"{first.outcome}: {first.reason}".removesuffix(": "))
-    print(f"flexneedle: no insertion finished; most frequent failure: {message}", file=sys.stderr)
+    print_note(f"no insertion finished; most frequent failure: {message}")
     return 1
 
 
 def _print_table(found: Findings, spent: Mapping[str, float]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(soft_wrap=True, highlight=False)
-    console.width = max(console.width, _TABLE_WIDTH)
-    table = Table(box=box.SIMPLE, show_edge=False)
     heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="right" if number else "left", no_wrap=True)
     varied = [factor.key for factor in found.design.factors if factor.varies]
     pooled = found.whole if len(found.groups) > len(found.whole) else ()
     rows = [(_label(group.levels, varied) or group.name, group) for group in found.groups]
     rows += [(f"{group.name}, all", group) for group in pooled]
-    for name, group in rows:
-        table.add_row(*map(Text, (name, *_format_cells(group))))
     unconverged = sum(group.unconverged_periods for group in found.whole)
-    console.print(Text(found.study.title, style="bold"), table, sep="\n\n")
-    console.print(
-        "\nFinished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
+    print_table(found.study.title, heads, ((name, *_format_cells(group)) for name, group in rows))
+    print(
+        "Finished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
         "periods, relative to the plan."
     )
     if unconverged:
-        console.print(
-            f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet."
-        )
-    console.print(
+        print(f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet.")
+    print(
         f"Time, all workers: planning {spent['plan_s']:.1f} s, control {spent['control_s']:.1f} s, "
         f"plant {spent['plant_s']:.1f} s, other {spent['rest_s']:.1f} s; wall-clock time {spent['wall_s']:.1f} s"
     )
-    console.print(Text(f"Tables: {found.study.folder}"))
+    print(f"Tables: {found.study.folder}")
 
 
 def _label(levels: Mapping[str, str], varied: Sequence[str]) -> str:

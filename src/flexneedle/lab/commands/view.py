@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands
-from flexneedle.cli.view import draw, print_note
+from flexneedle.cli.progress import print_note
+from flexneedle.cli.view import draw
 from flexneedle.errors import InputError
 
 if TYPE_CHECKING:

@@ -195,7 +195,7 @@ class ReachMessage(ServerMessage):
 class RowsMessage(ServerMessage):
     """Rows of an insertion's periods from `first` on, in order. of: "live", "first" or "second" recording.
 
-    A row has the keys of `record.fields.page_values`, and those that `worker.recordings.row_of` adds.
+    A row has the keys of `record.fields.page_values`.
     """
 
     by = "of"

@@ -25,14 +25,14 @@ from flexneedle.lab.rig.preflight.fit import (
 from flexneedle.lab.rig.rig_file import RigFile, load_rig
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.protocol import Expectation, MotionResult, SupervisorTask, TickReport
-from flexneedle.loop.events import Event, Stream
+from flexneedle.loop.events import Stream
 from flexneedle.loop.measuring import innovation_limit
 from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
+from flexneedle.planning.events import Event
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.control import MOVES, Limits, limit_half_turn
-from flexneedle.simulator.pace import ROUNDING_S, roll_time, travel_time
+from flexneedle.simulator.control import MOVES, ROUNDING_S, Limits, limit_half_turn, roll_time, travel_time
 from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN, STILL, Control, Motion, Pose, Z
 
 _MOST_TICKS = 200_000  # an hour and more

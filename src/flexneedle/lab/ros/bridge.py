@@ -20,7 +20,8 @@ from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.client import open_node
 from flexneedle.lab.ros.profile import TopicProfile, load_profile
 from flexneedle.lab.ros.records import NodeLoss, Received, RosArm, RosRefusal, RosState, RosStop, RosTarget
-from flexneedle.loop.events import Ended, Event, Gate, PeriodEnded, Planned
+from flexneedle.loop.events import Ended, Gate, PeriodEnded, Planned
+from flexneedle.planning.events import Event
 from flexneedle.results import Period
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.types import Point

@@ -8,10 +8,9 @@ from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.profile import DeviceAge, load_part
 from flexneedle.lab.ros.records import Received, RosRefusal, ShapeReading, TipReading
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock
 from flexneedle.scenario.sections.fields import Section
-from flexneedle.types import VISIBLE, Frame, SensorReading
+from flexneedle.types import TIP, VISIBLE, Frame, SensorReading
 
 
 class RosTrackerSettings(Section):

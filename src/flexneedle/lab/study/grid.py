@@ -16,8 +16,8 @@ from flexneedle.control.controllers import (
     find_controller,
     find_own_controllers,
 )
-from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Controller
+from flexneedle.control.limits import check_guide
 from flexneedle.errors import InputError, ScenarioError, make_printable
 from flexneedle.lab.study.spec import (
     ALL,
@@ -36,9 +36,9 @@ from flexneedle.lab.study.spec import (
     read_study_file,
     with_worlds,
 )
+from flexneedle.loop.virtual import SCENARIO_TRACKER, find_tracker
 from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, find_plant
-from flexneedle.phantom.tracking.factory import SCENARIO_TRACKER, find_tracker
-from flexneedle.planning.planner import STRATEGIES
+from flexneedle.planning import STRATEGIES
 from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
 from flexneedle.scenario.model import Scenario

@@ -10,10 +10,10 @@ from typing import Any
 from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.reach import compute_reach
-from flexneedle.loop.events import Listener
 from flexneedle.loop.insertions import insert
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.kernels import compile_kernels
+from flexneedle.planning.events import Listener
 from flexneedle.planning.planner import plan
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain, plan_values

@@ -1,7 +1,6 @@
 """Executors of a study: local processes or a Dask cluster, both as `concurrent.futures.Executor`."""
 
 import multiprocessing
-import os
 import re
 import signal
 from collections.abc import Callable, Iterator
@@ -13,15 +12,11 @@ from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, make_printable
 from flexneedle.lab.study.worker import set_up_worker
 from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.simulator.simulator import count_cores
 
 _CONNECT_S = 20
 _LAST_PORT = 65535
 _ADDRESS = re.compile(r"(tcp|tls|ws|wss)://(\[[0-9A-Fa-f:.]+\]|[^\s/:@?#\[\]]+):(?P<port>[0-9]{1,5})")
-
-
-def count_cores() -> int:
-    """Return the number of cores available to this process, or of the machine if unknown."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexneedle.control.guide import guide_axes
+from flexneedle.control.limits import guide_axes
 from flexneedle.costs.terms import PLAN
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Phantom

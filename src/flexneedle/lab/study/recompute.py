@@ -9,7 +9,8 @@ from flexneedle.errors import InputError
 from flexneedle.lab.study.folder import PLANS_FOLDER, RecordedStudy, read_folder
 from flexneedle.lab.study.jobs import insert_at
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs
-from flexneedle.loop.events import Event, PeriodEnded
+from flexneedle.loop.events import PeriodEnded
+from flexneedle.planning.events import Event
 from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain
 from flexneedle.record.results import insertion_row

@@ -11,9 +11,8 @@ from pydantic import AfterValidator, Field, model_validator
 from flexneedle.errors import InputError
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.library import Library, label
+from flexneedle.scenario.library import PRESETS, Library, label
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.fields import Section, Title, count
 from flexneedle.scenario.worlds import LARGEST_WORLD

@@ -1,9 +1,35 @@
-"""Columns of a table: by the names of flexneedle, or by other names that are mapped to them."""
+"""Columns of a table of repeated measurements: by the names of flexneedle, or by other names that are mapped to them.
+
+A table has one row per sample and many samples per grid point. `flexneedle em simulate` and `em record` write it, `em
+evaluate` reads it.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 
 from flexneedle.errors import InputError
-from flexneedle.phantom.tracking.measurement_table import COLUMNS
+
+REQUIRED = (
+    "point_id",
+    "true_x_mm",
+    "true_y_mm",
+    "true_z_mm",
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "indicator",
+    "sensor",
+    "environment",
+)
+"""Required columns: grid point and true position of the sensor (from the stage), measured position and indicator, name
+of the sensor and of the environment. The indicator may be empty or omitted for sensors without one."""
+
+OPTIONAL = ("qw", "qx", "qy", "qz")
+"""Optional columns: orientation as a unit quaternion."""
+
+COLUMNS = REQUIRED + OPTIONAL
+
+REFERENCE = "reference"
+"""Name in the column `sensor` of the 6-DOF sensor (paper, Table II); the 5-DOF sensor is `types.TIP` (Table I)."""
 
 _OPTION = "--columns NAME=COLUMN"
 

@@ -19,10 +19,9 @@ from flexneedle.geometry.rigid import (
     localisation_error,
     target_error,
 )
-from flexneedle.lab.tables.columns import map_columns
+from flexneedle.lab.tables.columns import REQUIRED, map_columns
 from flexneedle.lab.tables.row_rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
 from flexneedle.lab.tables.sample_table import SampleTable, open_table
-from flexneedle.phantom.tracking.measurement_table import REQUIRED
 from flexneedle.scenario.sections.registration import Registration
 
 Floats = NDArray[np.float64]

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.quaternion import along, z_axis
+from flexneedle.lab.tables.columns import COLUMNS, REFERENCE
 from flexneedle.phantom.tracking.field.room import REFERENCES, Room, grid
 from flexneedle.phantom.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
-from flexneedle.phantom.tracking.measurement_table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
+from flexneedle.types import TIP
 
 Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]

@@ -7,9 +7,8 @@ from itertools import pairwise
 from statistics import median
 
 from flexneedle.loop.monitor import rules
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import OK, Frame, Measurement, Point, Verdict, VerdictKind
+from flexneedle.types import OK, TIP, Frame, Measurement, Point, Verdict, VerdictKind
 
 TipAt = Callable[[float], Point]
 """Predicted position of the tip (mm) at a time (s)."""

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from statistics import median
 
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.types import (
     OK,
+    TIP,
     VISIBLE,
     Frame,
     Measurement,

@@ -48,9 +48,7 @@ class NoisyTracker:
         self._delay, self._missing, self._bias, self._axes = delay, missing, bias, axes
         self._direction_at, self._direction_jitter = direction_at, direction_jitter
         self._rng_direction = rng.spawn(1)[0]
-        self._first = -math.ceil(
-            delay / period - 1e-6
-        )  # available at the start; number k is taken at k periods
+        self._first = -math.ceil(delay / period - 1e-6)  # number k is taken at k periods
         self._taken = self._first - 1  # the last reading
 
     def read(self) -> tuple[Measurement, ...]:

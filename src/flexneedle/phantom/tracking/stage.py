@@ -6,9 +6,8 @@ import numpy as np
 
 from flexneedle.geometry.quaternion import z_axis
 from flexneedle.geometry.rigid import Rigid
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Tracker
-from flexneedle.types import VISIBLE, Floats, Frame, Lateral, Measurement
+from flexneedle.types import TIP, VISIBLE, Floats, Frame, Lateral, Measurement
 
 
 def tip_on_stage(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Measurement:

@@ -3,6 +3,7 @@
 from math import hypot
 from typing import Annotated
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from flexneedle.scenario.sections.environment import Vector
@@ -19,18 +20,12 @@ def _unit(turn: tuple[float, float, float, float]) -> tuple[float, float, float,
 
 
 def _not_on_a_line(points: tuple[Vector, ...]) -> tuple[Vector, ...]:
-    middle = [sum(axis) / len(points) for axis in zip(*points, strict=True)]
-    arms = [[x - m for x, m in zip(point, middle, strict=True)] for point in points]
-    longest = max(arms, key=lambda arm: hypot(*arm))
-    reach = hypot(*longest)
-    across = max(hypot(*_cross(longest, arm)) for arm in arms)
-    if across <= 1e-6 * reach**2:
+    arms = np.subtract(points, np.mean(points, axis=0))
+    reach = np.linalg.norm(arms, axis=1)
+    across = np.linalg.norm(np.cross(arms[reach.argmax()], arms), axis=1)
+    if across.max() <= 1e-6 * reach.max() ** 2:
         raise ValueError("must not be on one line")
     return points
-
-
-def _cross(a: list[float], b: list[float]) -> tuple[float, float, float]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 UnitQuaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flexneedle.errors import InputError, RunError
+from flexneedle.lab.tables.columns import COLUMNS
 from flexneedle.lab.tracker_evaluation.recording.grid import read_grid
 from flexneedle.lab.tracker_evaluation.recording.grid_recording import (
     EXTRA,
@@ -11,7 +12,6 @@ from flexneedle.lab.tracker_evaluation.recording.grid_recording import (
     open_session,
     record_grid,
 )
-from flexneedle.phantom.tracking.measurement_table import COLUMNS
 from flexneedle.types import Frame, SensorReading
 from recordings import ALL, Stage, assert_complete, rows_of, run
 

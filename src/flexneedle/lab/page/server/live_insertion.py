@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from flexneedle.cli.common import STILL_IN
 from flexneedle.lab.page.job_orders import Report, RigReport, WorkOrder
 from flexneedle.lab.page.protocol import DisturbancesMessage, InsertionMessage
 from flexneedle.lab.page.requests import DisturbRequest
@@ -13,6 +12,7 @@ from flexneedle.lab.page.server.connected_rig import ConnectedRig
 from flexneedle.lab.page.server.hub import Hub
 from flexneedle.lab.page.server.job_queue import JobQueue
 from flexneedle.lab.page.shape_frames import FrameSource
+from flexneedle.lab.rig.notices import STILL_IN
 
 _KEY, _ROWS = "insertion live", "rows live"
 _RUNS = ("waiting", "planning", "ready", "running", "paused", "holding")

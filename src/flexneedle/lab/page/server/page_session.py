@@ -14,9 +14,9 @@ from flexneedle.lab.page.requests import OptionsRequest
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.library import PRESETS, WORLD
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import find_doubts
-from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.sections.needle import GAUGES, Needle
 from flexneedle.scenario.sections.settings import Target
 

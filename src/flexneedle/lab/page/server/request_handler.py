@@ -29,7 +29,7 @@ from flexneedle.lab.page.server.live_insertion import LiveInsertion
 from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.lab.page.server.runs_folder import RunsFolder
 from flexneedle.lab.page.shape_frames import FrameSource
-from flexneedle.scenario.preset import PRESETS
+from flexneedle.scenario.library import PRESETS
 
 _SEARCHES: tuple[JobKind, ...] = ("plan", "compare", "reach")
 _RESULTS = ("scene", "estimate", "iteration", "plan", "reach")

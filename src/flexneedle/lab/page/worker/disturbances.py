@@ -15,12 +15,11 @@ from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import Seeds, VirtualRig, virtual_rig
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.plants import ExactPlant
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import TipTracker
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.environment import ENVIRONMENTS
-from flexneedle.types import Measurement, SensorReading
+from flexneedle.types import TIP, Measurement, SensorReading
 
 _MISSING = "missing"
 _METAL = "noisy"

@@ -9,8 +9,9 @@ from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
 from flexneedle.lab.page.worker.recordings import save_complete
 from flexneedle.lab.page.worker.rig_insertion import insert_on_rig
 from flexneedle.lab.page.worker.task import Cancelled, JobControl, WorkerTask
-from flexneedle.loop.events import Event, Iterated, PeriodEnded
+from flexneedle.loop.events import PeriodEnded
 from flexneedle.loop.insertions import insert
+from flexneedle.planning.events import Event
 from flexneedle.planning.origin import with_planned_entry
 from flexneedle.planning.planner import plan as make_plan
 from flexneedle.results import Insertion
@@ -51,12 +52,7 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
     """Insert on a virtual rig that can be disturbed."""
     task, order, control = reporter.task, reporter.task.order, reporter.task.control
 
-    plan = make_plan(
-        task.scenario,
-        strategy=order.strategy,
-        seed=order.seed,
-        progress=lambda info: reporter.take(Iterated(order.strategy, info)),
-    )
+    plan = make_plan(task.scenario, strategy=order.strategy, seed=order.seed, listeners=[reporter.take])
     reporter.report_plan(plan)
     disturber = Disturber(with_planned_entry(task.scenario, plan), task.report)
 

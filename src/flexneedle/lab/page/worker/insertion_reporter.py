@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass, field
 
-from flexneedle.cli.common import STILL_IN
 from flexneedle.control.interface import Decision
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.lab.page.protocol import InsertionMessage, RowsMessage, describe_scene
 from flexneedle.lab.page.shape_frames import FrameSource
 from flexneedle.lab.page.worker.plan_jobs import samples_of, shapes_of
-from flexneedle.lab.page.worker.recordings import channel_of, frames_of, row_of
+from flexneedle.lab.page.worker.recordings import channel_of, frames_of
 from flexneedle.lab.page.worker.task import WorkerTask
-from flexneedle.loop.events import Decided, Event, Iterated, PeriodEnded, Planned
+from flexneedle.lab.rig.notices import STILL_IN
+from flexneedle.loop.events import Decided, PeriodEnded, Planned
+from flexneedle.planning.events import Event, Iterated
+from flexneedle.record.fields import page_values
 from flexneedle.results import Insertion, Outcome, Period, Plan
 
 _ENDED = (Outcome.DONE, Outcome.HELD, Outcome.FAILED, Outcome.INTERRUPTED)
@@ -90,7 +92,7 @@ class InsertionReporter:
         self.periods = period.index + 1
         for frame in frames_of([period], FrameSource.LIVE):
             self.task.report(frame)
-        self.task.report(RowsMessage(of="live", first=period.index, rows=[row_of(period, self.plan)]))
+        self.task.report(RowsMessage(of="live", first=period.index, rows=[page_values(period, self.plan)]))
         depth = max(self.plan.tips[-1, 0] - self.plan.tips[0, 0], 1e-9)
         share = (period.estimate.x - self.plan.tips[0, 0]) / depth
         self.task.report_job("running", min(max(share, 0.0), 1.0), f"tip at {period.estimate.x:.1f} mm")

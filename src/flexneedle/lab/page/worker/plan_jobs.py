@@ -1,6 +1,7 @@
 """Plans: the needle at the start, a first estimate, and a search with its samples."""
 
 import math
+from collections.abc import Mapping
 from time import monotonic
 from typing import Any
 
@@ -10,9 +11,11 @@ from flexneedle.lab.page.protocol import EstimateMessage, IterationMessage, Plan
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.phantom.kernels import compile_kernels
+from flexneedle.planning import STRATEGIES
+from flexneedle.planning.events import Event, Iterated
 from flexneedle.planning.horizon import Samples
-from flexneedle.planning.planner import STRATEGIES, sketch
 from flexneedle.planning.planner import plan as make_plan
+from flexneedle.planning.planner import sketch
 from flexneedle.results import Plan
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -59,7 +62,7 @@ def estimate(task: WorkerTask) -> None:
         with_smaller_search(task.scenario, *_ESTIMATE),
         order.strategy,
         order.seed,
-        lambda _info: task.control.check(),
+        listeners=[lambda _event: task.control.check()],
         threads=1,  # few samples are not faster on two; the browser gets the other cores
     )
     task.report(make_frame(FrameKind.PATH, FrameSource.SCENE, 0, found.tips[:, :3]))
@@ -79,7 +82,7 @@ def plan(task: WorkerTask) -> None:
     strategies = STRATEGIES if task.order.kind == "compare" else (task.order.strategy,)
     for index, strategy in enumerate(strategies):
         search = _Search(task, strategy, index, len(strategies))
-        found = make_plan(task.scenario, strategy=strategy, seed=task.order.seed, progress=search.add)
+        found = make_plan(task.scenario, strategy=strategy, seed=task.order.seed, listeners=[search.add])
         search.report()
         for frame in shapes_of(found, FrameSource[strategy.upper()]):
             task.report(frame)
@@ -95,12 +98,15 @@ class _Search:
         self._best: list[float] = []
         self._elite: list[float] = []
         self._median: list[float] = []
-        self._newest: dict[str, Any] | None = None  # not reported yet
+        self._newest: Mapping[str, Any] | None = None  # not reported yet
         self._due = -math.inf
 
-    def add(self, info: dict[str, Any]) -> None:
+    def add(self, event: Event) -> None:
         """Add an iteration, and report it if it is time."""
         self._task.control.check()
+        if not isinstance(event, Iterated):
+            return
+        info = event.info
         _, elite, median, _ = info["cost_quantiles"]
         for costs, cost in ((self._best, info["best"]), (self._elite, elite), (self._median, median)):
             costs.append(cost)

@@ -78,7 +78,7 @@ def _end(task: WorkerTask, size: Size, depth: float, direction: complex) -> Poin
         target,
         task.order.strategy,
         task.order.seed,
-        progress=lambda _info: task.control.check(),
+        listeners=[lambda _event: task.control.check()],
     )
     return found.tip_mm
 

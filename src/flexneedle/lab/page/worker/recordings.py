@@ -1,9 +1,7 @@
 """Recorded insertions: read, described as rows and frames, and saved."""
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from statistics import median
 from typing import Any
 from uuid import uuid4
 
@@ -19,14 +17,12 @@ from flexneedle.lab.page.protocol import (
 )
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, ShapeFrame, make_frame
 from flexneedle.lab.page.worker.task import WorkerTask
-from flexneedle.loop.monitor.rules import has_indicator
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.record.fields import page_values
 from flexneedle.record.loading import load_insertion
 from flexneedle.record.saving import save
-from flexneedle.results import Insertion, Period, Plan, scenario_of
+from flexneedle.results import Insertion, Period, scenario_of
 from flexneedle.simulator.state import Contacts
-from flexneedle.types import Floats, Shape, X
+from flexneedle.types import Floats, Shape
 
 
 def read_run(task: WorkerTask) -> None:
@@ -67,7 +63,7 @@ def describe_recording(
     yield make_frame(FrameKind.PATH, source, 0, plan.tips[:, :3])
     if insertion.periods:
         yield from frames_of(insertion.periods, source)
-    yield RowsMessage(of=of, first=0, rows=[row_of(period, plan) for period in insertion.periods])
+    yield RowsMessage(of=of, first=0, rows=[page_values(period, plan) for period in insertion.periods])
 
 
 def save_complete(insertion: Insertion, folder: str) -> None:
@@ -86,34 +82,6 @@ def save_complete(insertion: Insertion, folder: str) -> None:
                 part.rename(whole)
             except OSError as error:
                 raise InputError(f"{whole}: cannot be created: {error.strerror}") from error
-
-
-def row_of(period: Period, plan: Plan) -> dict[str, Any]:
-    """Return the row of a period: its fields, and three values for the plots.
-
-    error_mm: lateral distance of the true tip (on a rig: of the estimated tip) from the planned path at its depth;
-    indicator: as `_largest_indicator`; decide_ms: time of the decision.
-    """
-    x, y, z = (period.true_tip or period.estimate).point
-    planned_y, planned_z = (float(np.interp(x, plan.tips[:, X], plan.tips[:, column])) for column in (1, 2))
-    return page_values(period) | {
-        "error_mm": math.hypot(y - planned_y, z - planned_z),
-        "indicator": _largest_indicator(period),
-        "decide_ms": 1e3 * period.durations.get("decide", 0.0),
-    }
-
-
-def _largest_indicator(period: Period) -> float | None:
-    """Return the largest median of the references' indicators in a period; without references the tip's."""
-    found: dict[str, list[float]] = {}
-    for checked in period.readings:
-        frame = checked.measurement.frame
-        for name, reading in ({} if frame is None else frame.readings).items():
-            if has_indicator(reading):
-                found.setdefault(name, []).append(reading.indicator or 0.0)
-    medians = {name: median(values) for name, values in found.items()}
-    references = [value for name, value in medians.items() if name != TIP]
-    return max(references, default=medians.get(TIP))
 
 
 def frames_of(periods: Sequence[Period], source: FrameSource) -> list[ShapeFrame]:

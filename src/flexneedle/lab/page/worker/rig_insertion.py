@@ -9,7 +9,6 @@ from threading import Lock
 from time import monotonic
 from typing import Any
 
-from flexneedle.cli.common import SWITCHED_ON
 from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import StoppedError
 from flexneedle.files import create_folder
@@ -19,6 +18,7 @@ from flexneedle.lab.page.rigs import usable_rig
 from flexneedle.lab.page.worker.insertion_reporter import InsertionReporter
 from flexneedle.lab.page.worker.task import WorkerTask
 from flexneedle.lab.rig.devices.clock import WallClock
+from flexneedle.lab.rig.notices import SWITCHED_ON
 from flexneedle.lab.rig.preflight.moves import describe_insertion
 from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion, check_rig
 from flexneedle.lab.rig.supervised import SupervisedRig, Tick
@@ -28,8 +28,9 @@ from flexneedle.lab.rig.supervisor.protocol import TickReport
 from flexneedle.lab.ros.bridge import Bridge
 from flexneedle.lab.ros.topic_check import check_ros
 from flexneedle.loop.choices import Choices
-from flexneedle.loop.events import AllGates, Event, Gate, Listener
+from flexneedle.loop.events import AllGates, Gate
 from flexneedle.loop.insertions import check_choices
+from flexneedle.planning.events import Event, Listener
 from flexneedle.record.folder import Folder
 from flexneedle.record.recording import record_insertion
 from flexneedle.results import Insertion

@@ -13,11 +13,10 @@ from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.lab.rig.devices.replay import Replay
 from flexneedle.lab.rig.devices.tracker_recording import read_frames
 from flexneedle.lab.rig.rig_file import check_settings
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock
 from flexneedle.record.folder import TRACE_FILE
 from flexneedle.scenario.sections.fields import Positive, Section, one_line
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import TIP, Frame, Measurement, SensorReading
 
 PathText = Annotated[str, Field(max_length=4000), AfterValidator(one_line)]
 

@@ -16,10 +16,9 @@ from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import active_switches, resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import VISIBLE, Frame, is_reference
+from flexneedle.types import TIP, VISIBLE, Frame, is_reference
 
 _PAUSE_S = 0.01
 _READINGS = 5  # of the motors, for the time of a reply

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from flexneedle.cli.common import print_table
+from flexneedle.lab.tables.columns import REFERENCE
 from flexneedle.lab.tracker_evaluation.commands.terminal_tables import (
     format_interval,
     format_number,
     print_notes,
-    print_rows,
 )
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, IndicatorSummary
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples
-from flexneedle.phantom.tracking.measurement_table import REFERENCE
 
 _ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
 _INDICATOR = ("mean", "sd", "max", "min", "p95")
@@ -32,16 +32,16 @@ def _print_tables(evaluation: Evaluation) -> None:
     frame = " after rigid registration of each sensor and environment" if evaluation.options.register else ""
     heads = ("", "rmse", "95 %", "max", "jitter", "points", "samples")
     results = evaluation.results
-    print_rows(f"Errors (mm){frame}", heads, [row for result in results for row in _error_rows(result)])
+    print_table(f"Errors (mm){frame}", heads, [row for result in results for row in _error_rows(result)])
     shown = [row for result in results for row in _indicator_rows(result)]
     if shown:
-        print_rows(
+        print_table(
             "Indicator (means at grid points)", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
         )
     pair = evaluation.options.pair
     fits = [row for found in evaluation.fits for row in _fit_rows(found, *pair)]
     if fits:
-        print_rows("Error by indicator", ("", "", "95 % interval", "paper"), fits)
+        print_table("Error by indicator", ("", "", "95 % interval", "paper"), fits)
 
 
 def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:

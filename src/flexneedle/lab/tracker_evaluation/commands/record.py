@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.progress import print_line
 from flexneedle.cli.values import make_number_type
 
 if TYPE_CHECKING:
@@ -64,13 +65,13 @@ def _record(args: argparse.Namespace) -> int:
     with open_session(args.out, grid) as session:
         if session.remaining:
             if session.done:
-                _print(f"{args.out}: resuming after {session.done} recorded points")
+                print_line(f"{args.out}: resuming after {session.done} recorded points")
             with open_tracker(args.tracker, clock) as tracker:
                 record_grid(
                     session, tracker, clock, grid, _operator(grid, args.dwell, args.force, clock.wait)
                 )
         else:
-            _print(f"{args.out}: complete, {session.done} points")
+            print_line(f"{args.out}: complete, {session.done} points")
     print(args.out)
     return 0
 
@@ -82,12 +83,12 @@ def _operator(
     from flexneedle.lab.tracker_evaluation.recording.grid_recording import StageOperator
 
     def announce(stop: GridStop) -> None:
-        _print(f"{_progress(grid, stop)}: {_target(stop)}")
+        print_line(f"{_progress(grid, stop)}: {_target(stop)}")
         wait(dwell or 0.0)
 
     motorised = dwell is not None
     operator = StageOperator(
-        announce if motorised else lambda stop: _ask(grid, stop), _print, retries=not motorised
+        announce if motorised else lambda stop: _ask(grid, stop), print_line, retries=not motorised
     )
     if force:
         return replace(operator, accepts=_force)
@@ -110,12 +111,12 @@ def _ask(grid: StageGrid, stop: GridStop) -> None:
 
 
 def _confirm(mismatch: str) -> bool:
-    _print(mismatch)
+    print_line(mismatch)
     return _answer("press Enter to measure this point again, k to keep it:") == "k"
 
 
 def _force(mismatch: str) -> bool:
-    _print(f"{mismatch}; recorded (--force)")
+    print_line(f"{mismatch}; recorded (--force)")
     return True
 
 
@@ -136,7 +137,3 @@ def _answer(question: str) -> str:
             "end of input on stdin: resume with the same --out, or use --dwell for a motorised stage"
         )
     return line.strip()
-
-
-def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

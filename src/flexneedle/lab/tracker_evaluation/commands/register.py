@@ -88,4 +88,5 @@ def _table(registered: RegistrationResult, path: Path) -> None:
     w, i, j, k = values["rotation"]
     rows.append(("rotation w, x, y, z", f"{w:.6f}, {i:.6f}, {j:.6f}, {k:.6f}"))
     rows.append(("translation", ", ".join(f"{value:.3f}" for value in values["translation_mm"]) + " mm"))
-    print_table("Tracker registered to stage", rows, path)
+    print_table("Tracker registered to stage", ("", ""), rows)
+    print(f"Record and figures: {path}")

@@ -137,7 +137,7 @@ def _line(snapshot: TrackerSnapshot) -> str:
 
 def _cells(frame: Frame) -> Iterator[str]:
     """Yield position and indicator of the tip (without a tip: of the first sensor), and the other indicators."""
-    from flexneedle.phantom.tracking.measurement_table import TIP
+    from flexneedle.types import TIP
 
     first = TIP if TIP in frame.readings else next(iter(frame.readings), "")
     for name, reading in frame.readings.items():

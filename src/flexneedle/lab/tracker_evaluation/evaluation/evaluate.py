@@ -7,7 +7,7 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.lab.tables.columns import map_columns
+from flexneedle.lab.tables.columns import OPTIONAL, REFERENCE, REQUIRED, map_columns
 from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
@@ -33,7 +33,6 @@ from flexneedle.lab.tracker_evaluation.evaluation.repeatability import (
     compute_relative_distance,
     compute_repeatability,
 )
-from flexneedle.phantom.tracking.measurement_table import OPTIONAL, REFERENCE, REQUIRED
 from flexneedle.record.plain import to_text
 
 _RESULT_FILE = "evaluation.json"

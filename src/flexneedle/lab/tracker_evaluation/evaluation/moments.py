@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.rigid import Rigid
+from flexneedle.lab.tables.columns import REFERENCE
 from flexneedle.lab.tables.row_rules import (
     INDICATORS,
     ORIENTATIONS,
@@ -23,7 +24,7 @@ from flexneedle.lab.tables.row_rules import (
 )
 from flexneedle.lab.tables.sample_table import EMPTY, Rule, SampleTable, first_violation
 from flexneedle.lab.tracker_evaluation.evaluation.published import THRESHOLD
-from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
+from flexneedle.types import TIP
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]

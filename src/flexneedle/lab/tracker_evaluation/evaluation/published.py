@@ -7,7 +7,8 @@ and II. Text and tables of the paper differ (0.17 and 0.25 mm against 0.65 and 0
 import re
 from collections.abc import Mapping
 
-from flexneedle.phantom.tracking.measurement_table import REFERENCE, TIP
+from flexneedle.lab.tables.columns import REFERENCE
+from flexneedle.types import TIP
 
 IDEAL, NOISY = "ideal", "noisy"
 """The paper's environments: with nothing but the stage nearby, and above a metal plate."""

@@ -8,11 +8,10 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.library import Library
 from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title, count
-from flexneedle.types import Point
+from flexneedle.types import TIP, Point
 
 GRIDS = Library("a grid file", "grid", files(__package__) / "grids")
 _LARGEST_COUNT = 100_000

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.interrupts import delay_signals
+from flexneedle.lab.tables.columns import COLUMNS
 from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
 from flexneedle.lab.tracker_evaluation.recording.steps import StageVisit, find_mismatch
-from flexneedle.phantom.tracking.measurement_table import COLUMNS
 from flexneedle.ports import Clock, Tracker
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 

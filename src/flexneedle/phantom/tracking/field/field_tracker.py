@@ -10,9 +10,8 @@ from flexneedle.geometry.rigid import Rigid, identity
 from flexneedle.phantom.tracking.field.poses import SensorPose
 from flexneedle.phantom.tracking.field.room import SENSORS, Room
 from flexneedle.phantom.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.ports import Clock
-from flexneedle.types import VISIBLE, Floats, Frame, Point, Quaternion, SensorReading
+from flexneedle.types import TIP, VISIBLE, Floats, Frame, Point, Quaternion, SensorReading
 
 MISSING = "missing"
 """Status of a reading without a position."""
@@ -64,9 +63,7 @@ class FieldTracker:
         after, before = rng.spawn(2)
         self._rngs = dict(zip(SENSORS, after.spawn(len(SENSORS)), strict=True))
         self._rngs_before = dict(zip(SENSORS, before.spawn(len(SENSORS)), strict=True))
-        self._taken = -math.ceil(
-            (delay + ahead) / period - 1e-6
-        )  # the last frame; number k is taken at k periods
+        self._taken = -math.ceil((delay + ahead) / period - 1e-6)  # number k is taken at k periods
         self._first = self._taken + 1
         self._at_rest: dict[str, tuple[tuple[SensorPose, float | None], Noiseless]] = {}
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.environment import Environment, Plate
-from flexneedle.types import Floats
+from flexneedle.types import TIP, Floats
 
 Rng = np.random.Generator
 Envelope = Callable[[Floats, float | None], Floats]
@@ -116,19 +115,13 @@ class Room:
 
 
 class SensorFields(NamedTuple):
-    """Fields of one sensor.
+    """Fields of one sensor."""
 
-    Attributes:
-        bias: Error without a plate.
-        plate: Part of the error due to the plate.
-        coils: With two coils, the error of the second minus the error of the first, without a plate.
-        plate_coils: The part of this difference due to the plate.
-    """
-
-    bias: Part
-    plate: Part | None = None
+    bias: Part  # error without a plate
+    plate: Part | None = None  # part of the error due to the plate
+    # with two coils, the error of the second minus the error of the first, without a plate
     coils: Part | None = None
-    plate_coils: Part | None = None
+    plate_coils: Part | None = None  # the part of this difference due to the plate
 
 
 def grid(edge: float, count: int = 5) -> Floats:

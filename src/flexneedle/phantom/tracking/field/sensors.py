@@ -12,9 +12,8 @@ import numpy as np
 
 from flexneedle.geometry.quaternion import from_vector, product, z_axis
 from flexneedle.phantom.tracking.field.room import Room
-from flexneedle.phantom.tracking.measurement_table import TIP
 from flexneedle.scenario.sections.environment import Environment
-from flexneedle.types import Floats
+from flexneedle.types import TIP, Floats
 
 LARGEST_INDICATOR = 9.9
 _PER_MILLI = 1e-3
