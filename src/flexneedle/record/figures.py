@@ -1,4 +1,4 @@
-"""The figures of plans and insertions; those of a run are drawn from its folder, so that `view` reproduces them."""
+"""The figures of plans and insertions. Figures of a run are drawn from its folder, so that `view` reproduces them."""
 
 from collections.abc import Callable
 from pathlib import Path
