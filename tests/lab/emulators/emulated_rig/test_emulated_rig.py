@@ -132,7 +132,7 @@ def test_faults_are_injected_on_command_with_their_time(tmp_path):
         prepared(rig)
         assert rig.order("fault galil:stal=A")["reason"].startswith("fault stal=A: unknown kind")
         assert "DEVICE aurora or galil" in rig.order("fault stall=A")["reason"]
-        rig.ask("SPA=10000;PRA=1000000;BGA")
+        rig.ask("SPA=2000;PRA=1000000;BGA")
         until(lambda: float(rig.ask("MG _TPA").strip(" \r\n:")) > 2000.0)
         stalled = rig.order("fault galil:stall=A:0.2")
         with Aurora(rig.ready["ready"]["aurora"], Monotonic()) as aurora:
