@@ -276,9 +276,8 @@ def test_a_home_is_found_at_the_switch_of_the_emulated_rig_again_and_again(tmp_p
                 truth.append(read_truth(tmp_path / "truth.csv").positions["guide_y"][-1])
                 supervisor.arm()
                 supervisor.move_to("guide_y", -14.4 + further)
-    assert truth == pytest.approx(
-        [-14.6] * 3, abs=0.3
-    )  # the switch is 15 mm off; there the axis slows down first
+    # The switch is 15 mm off, and the axis slows down there before it backs off.
+    assert truth == pytest.approx([-14.6] * 3, abs=0.3)
     assert max(truth) - min(truth) < 0.04  # the distance in which it slows down from 4 mm/s
 
 

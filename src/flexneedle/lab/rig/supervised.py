@@ -289,9 +289,8 @@ class SupervisedRig(RigSource):
                 speed = min(scenario.setup.rotation_speed, rig.axes.rotation.speed)
                 supervisor.move_to("rotation", plan.roll, speed)
             if scenario.monitor.enabled and scenario.monitor.references:
-                supervisor.wait(
-                    scenario.monitor.indicator_window_s
-                )  # the field must be known before the start
+                # The field must be known before the start.
+                supervisor.wait(scenario.monitor.indicator_window_s)
             driver = SupervisedDriver(supervisor, scenario, plan.roll)
             deadline = 1e-3 * rig.loop.decision_ms
             ports = Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)

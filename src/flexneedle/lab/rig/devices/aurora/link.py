@@ -182,10 +182,8 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
             _report(channel, "error", kind, reason)
             if code in LOST or (code == TIMEOUT and not device.synchronise(_SYNCHRONISE_S)):
                 break
-        elif fault := _SYSTEM.get(
-            (bits := device.system_status(read) & sum(_SYSTEM)) & -bits
-        ):  # the lowest bit
-            reason = f"the tracker reports: {fault}"
+        elif bits := device.system_status(read) & sum(_SYSTEM):
+            reason = f"the tracker reports: {_SYSTEM[bits & -bits]}"  # by its lowest bit
             _report(channel, "error", "system", reason)
         else:
             found = {handle: device.reading(read, handle) for handle in handles}

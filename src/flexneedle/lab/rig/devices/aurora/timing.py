@@ -21,9 +21,8 @@ class Timeline:
     def stamp(self, number: int, requested: float) -> float:
         """Return the time of measurement (s, on the clock of `requested`) of frame `number`; numbers must increase."""
         self._starts.append(requested - number * self._period)
-        return min(
-            requested, min(self._starts) + number * self._period
-        )  # also where a large number is rounded
+        # The minimum matters where a large number is rounded.
+        return min(requested, min(self._starts) + number * self._period)
 
 
 class Numbering:

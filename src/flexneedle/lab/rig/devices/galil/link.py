@@ -165,9 +165,8 @@ class Link:
                 self._socket.setblocking(False)
                 self._socket.send(self.farewell.encode("ascii") + _END)
                 self._socket.shutdown(socket.SHUT_WR)
-                self._socket.recv(
-                    _MOST_UNREAD
-                )  # unread data would make closing a reset, and the farewell be lost
+                # With unread data, closing would be a reset, and the farewell would be lost.
+                self._socket.recv(_MOST_UNREAD)
         self.close(problem)
         return DriverError(f"{self.name}: {problem}; {_REMEDY}")
 
