@@ -13,10 +13,17 @@ from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.axes import RigAxes
 from flexneedle.lab.rig.supervisor.checks import stuck_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
-from flexneedle.lab.rig.supervisor.homing import end_leaving_switch, leave_switch, make_homing
 from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
 from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
-from flexneedle.lab.rig.supervisor.requests import RequestRules, make_move, make_step, start_problem
+from flexneedle.lab.rig.supervisor.requests import (
+    RequestRules,
+    end_leaving_switch,
+    leave_switch,
+    make_homing,
+    make_move,
+    make_step,
+    start_problem,
+)
 from flexneedle.lab.rig.supervisor.tip_watch import TrackedTip
 from flexneedle.ports import Clock, Motors, Tracker
 
@@ -140,17 +147,16 @@ class Supervisor:
             self._handle_lost_motors(str(error))
 
     def _begin_step(self, step: protocol.StepCommand) -> None:
+        number = step.number
         if self.state is SupervisorState.HOLDING and self._stopping is not None:
-            self._report_nothing_done(step.number)
+            self._report_nothing_done(number)
             return
-        if not self._allow(RigEvent.STEP, step.number):
-            return
-        if not self._accept(self._rules.step_problem(step), step.number):
+        if not self._allow(RigEvent.STEP, number) or not self._accept(self._rules.step_problem(step), number):
             return
         if step.expected is not None:  # until the travel begins the tip rests
             self._tip.expect_start(step.expected, self._clock.now())
         if not self._tip.verdict.ok:
-            self._report_nothing_done(step.number)
+            self._report_nothing_done(number)
             return
         self._begin(RigEvent.STEP, make_step(step))
 
@@ -166,15 +172,14 @@ class Supervisor:
             self._begin(event, make_move(go, self._axes.drives[go.axis], self._axes.goal(go.axis)))
 
     def _begin_homing(self, home: protocol.HomeCommand) -> None:
-        if not self._allow(RigEvent.HOME, home.number):
-            return
-        if not self._accept(self._rules.home_problem(home), home.number):
+        number = home.number
+        if not self._allow(RigEvent.HOME, number) or not self._accept(self._rules.home_problem(home), number):
             return
         drive = self._axes.drives[home.axis]
-        if not self._accept(stuck_problem(drive, self._axes.state(drive)), home.number):
+        if not self._accept(stuck_problem(drive, self._axes.state(drive)), number):
             return
         self._change_state(RigEvent.HOME)
-        self._motion = motion = make_homing(home.number, drive, at_switch=self._axes.is_at_switch(drive))
+        self._motion = motion = make_homing(number, drive, at_switch=self._axes.is_at_switch(drive))
         now = self._clock.now()
         if motion.here is None:
             self._begin_next_leg(now)
@@ -335,9 +340,8 @@ class Supervisor:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
             motion.spans.append(leg.span(now, done=True))
             axes.keep_goal(leg)
-            if (drive := motion.released) is not None and end_leaving_switch(
-                motion, drive, axes.state(drive)
-            ):
+            drive = motion.released
+            if drive is not None and end_leaving_switch(motion, drive, axes.state(drive)):
                 self._define_home(drive, motion.shift)
             self._begin_next_leg(now)
         elif leg.is_overdue(axes.states, now):
