@@ -77,6 +77,20 @@ def test_retraction_and_reinsertion_return_to_the_same_shape(pull):
     assert_same_curve(one, other, 2e-3)
 
 
+def test_points_ahead_of_a_retracted_tip_rest():
+    """They stay in the list, are not active, carry no energy and keep the path."""
+    state = insert_to(SIMULATOR, 30.0)
+    out = repeat(SIMULATOR, state, Control(db_x=-1.0), 10)[-1]
+    contacts = out.contacts
+    assert contacts.x.size == state.contacts.x.size == 35
+    np.testing.assert_array_equal(contacts.active, contacts.x < out.tip[0])
+    ahead = ~contacts.active
+    assert ahead.sum() == 10
+    np.testing.assert_array_equal(contacts.rest, state.contacts.rest)
+    np.testing.assert_array_equal(contacts.position[ahead], contacts.rest[ahead])
+    assert np.all(contacts.stretch[ahead] == 1.0)
+
+
 ROWS = st.tuples(
     st.floats(-0.3, 1.0),
     st.floats(-0.3, 0.3),
