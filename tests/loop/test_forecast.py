@@ -55,13 +55,6 @@ def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_re
     assert done.held_s == pytest.approx(done.periods[-1].time - before)
 
 
-def test_the_scenario_limits_the_duration_of_the_hold(plan):
-    patient = PHANTOM.with_values({"control.hold_limit_s": 2.5})
-    done, _ = inserted(plan, [3.0], force=False, scenario=patient)
-    assert done.periods[-1].time == pytest.approx(2.5, abs=2.0 * PHANTOM.tracker.period)
-    assert done.outcome == "held"
-
-
 def test_a_hold_ends_when_a_path_is_found_again(plan):
     """Held for less than the limit; the next hold has the whole limit again."""
     misses = [0.0] * 3 + [3.0] * 10 + [0.0] * 3 + [3.0]

@@ -8,7 +8,6 @@ import pytest
 from flexneedle.loop.virtual import Seeds, virtual_rig, virtual_room
 from flexneedle.types import THETA, Control
 from insertions import PHANTOM
-from rooms import STILL
 
 
 def rig_of(seed=4, phantom="exact", **values):
@@ -45,20 +44,6 @@ def test_measurements_are_plain_numbers(environment):
     assert {type(value) for sample in measured for value in (sample.time, sample.x, sample.y)} == {float}
     assert "np." not in repr(samples)
     assert "np." not in repr([sample.frame.readings for sample in samples if sample.frame])
-
-
-@pytest.mark.parametrize("environment", ["none", STILL])
-def test_the_rigs_tracker_has_the_bias_of_the_scenario(environment):
-    """0.3 mm in one direction, the same for all readings; the recorded truth is without it."""
-    quiet = {"tracker.environment": environment, "phantom.tracker_bias_mm": 0.3, "tracker.jitter_mm": 0.0}
-    errors = []
-    for seed in (0, 10):
-        rig = rig_of(seed, "model", **quiet, **{"phantom.missing_fraction": 0.0})
-        rig.clock.wait(1.5)
-        errors.append(np.array([(s.x, s.y) for s in rig.tracker.read()]) - rig.truth().tip[:2])
-        np.testing.assert_allclose(np.hypot(*errors[-1].T), 0.3)
-        assert np.ptp(errors[-1], axis=0).max() < 1e-9
-    assert np.abs(errors[0][-1] - errors[1][-1]).max() > 0.01
 
 
 def test_the_scenario_sets_the_share_of_missing_readings():

@@ -6,7 +6,6 @@ from dataclasses import fields, replace
 from io import StringIO
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.text import Text
 
@@ -52,6 +51,12 @@ def same(one, other):
     return True
 
 
+@pytest.fixture
+def pd():
+    """Pandas, which no other test needs."""
+    return pytest.importorskip("pandas")
+
+
 @pytest.mark.parametrize(
     ("record", "kind", "shown"),
     [
@@ -71,7 +76,7 @@ def test_plot_returns_the_figure_that_the_commands_draw(record, kind, shown, mon
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, capsys):
+def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(pd, tmp_path, capsys):
     half = replace(INSERTION, periods=(*INSERTION.periods[:-1], blind(INSERTION.periods[-1])))
     flexneedle.save(half, tmp_path / "run")
     assert cli.main(["export", str(tmp_path / "run"), "--csv", str(tmp_path / "periods.csv")]) == 0
@@ -89,7 +94,7 @@ def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, ca
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_each_record_of_a_dry_run_is_marked_as_one(tmp_path, capsys):
+def test_each_record_of_a_dry_run_is_marked_as_one(pd, tmp_path, capsys):
     dry, folder = replace(INSERTION, phantom="", rig="Bench", dry_run=True), tmp_path / "run"
     assert dry.summary == f"dry run: {INSERTION.summary}"
     flexneedle.save(dry, folder)

@@ -140,10 +140,6 @@ def test_each_kind_of_structural_mismatch_is_as_likely():
     np.testing.assert_allclose(count, len(guided) / 5, atol=35)
 
 
-def test_the_name_of_a_real_world_needs_no_case():
-    assert load_scenario("world:100012") == load_scenario("world:100012:real") == world(100012)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -224,10 +220,9 @@ def test_a_world_is_found_by_its_name(number, case):
         assert load_scenario(f"world:{number}:{case}:{rig}") == world(number, case, rig)
 
 
-def test_names_of_worlds_in_space():
+def test_the_name_of_a_real_world_needs_no_case_and_in_the_plane_no_rig():
     assert load_scenario("world:3:one-axis") == world(3, "real", "one-axis")
-    assert world(3, "real", PLANE) == world(3)
-    assert load_scenario("world:3:plane") == world(3)
+    assert load_scenario("world:3") == load_scenario("world:3:plane") == world(3, "real", PLANE) == world(3)
     assert RIGS[0] == PLANE
     with pytest.raises(ScenarioError, match="world_rig = 'three-axes': must be one of plane, two-axes"):
         world(3, "real", "three-axes")
