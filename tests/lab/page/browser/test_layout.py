@@ -90,7 +90,11 @@ def test_each_state_fits_its_width_with_named_controls_and_both_colours(
             insertion("ready", rig="Bench"),
             waits,
         ],
-        "recorded": [insertion("done", of="first", name="mine"), rows(0, 3, "first")],
+        "recorded": [
+            insertion("interrupted", rig="Bench"),
+            insertion("done", of="first", name="mine"),
+            rows(0, 3, "first"),
+        ],
     }
     for state, news in states.items():
         server.send(*news)
@@ -99,7 +103,8 @@ def test_each_state_fits_its_width_with_named_controls_and_both_colours(
             painted(page)
         arrived(page)
         if state in ("inserting", "recorded"):
-            page.wait_for_selector("[data-panel=plots] canvas >> nth=5")
+            page.locator("[data-panel=plots]").scroll_into_view_if_needed()
+            page.wait_for_selector("[data-panel=plots] canvas")
         assert too_wide(page) == [], state
         check_names(page)
         pictures(page, f"{state}-{size[0]}-{scheme}")
