@@ -94,18 +94,6 @@ def test_commands_are_distributed_over_lines_in_their_order():
         split_lines(("X" * 81,))
 
 
-@settings(max_examples=200)
-@given(st.binary(max_size=40), st.integers(1, 5))
-def test_any_bytes_are_replies_or_awaited_or_refused(received, count):
-    try:
-        found = parse_replies(received, count)
-    except GarbledError:
-        return
-    assert found is None or len(found) == count
-    if found is not None:
-        assert "".join(each.data + "?:"[each.accepted] for each in found).encode() == received
-
-
 @settings(max_examples=100)
 @given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=8), st.data())
 def test_a_reply_arrives_in_any_pieces(values, data):

@@ -105,3 +105,22 @@ def test_the_status_is_from_the_newest_message():
 def test_no_time_is_after_the_request_of_its_frame_though_numbers_are_huge():
     found = incoming(READY, frame(5, 99.9), frame(2**32 - 1, 99.921))
     assert [one.time for one in found.read()] == [99.9, 99.921]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'["ready", {}]',
+        b'["ready", {"10": ["01", "00"], "11": ["01"]}]',
+        b'["frame", 4294967296, 0.0, {}]',
+        b'["frame", 1, NaN, {}]',
+        b'["frame", 1, 0.0, {"10": [0, 49, 1, [0, 0, 0]]}]',
+        b"",
+        b"[" * 100_000,
+    ],
+)
+def test_an_invalid_message_is_refused_in_one_line(line):
+    with pytest.raises(ValueError, match="not a message: ") as refusal:
+        parse(line)
+    assert len(str(refusal.value)) < 320
+    assert "\n" not in str(refusal.value)
