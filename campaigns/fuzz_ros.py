@@ -205,7 +205,13 @@ class Consumers:
         self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
         link = JointLink.__new__(JointLink)
         vars(link).update(
-            _channels=("a", "b"), _stale=1e9, _topic="joints", _reading=None, _refused="", _node=self.nodes[1]
+            _channels=("a", "b"),
+            _stale=1e9,
+            _topic="joints",
+            _reading=None,
+            _refused="",
+            _lost="",
+            _node=self.nodes[1],
         )
         self.motors = RosMotors(("a", "b"), lambda: link)
         for channel in ("a", "b"):

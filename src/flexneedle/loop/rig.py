@@ -52,7 +52,8 @@ class Rig(RigSource):
         tracker: Measures its tip.
         truth: Returns the true state, which is only recorded; None on hardware.
         expect: Called with the estimate and the command before each motion, so that readings during it can be checked;
-            None if they are not.
+            None if they are not. The event `Decided` is no substitute: a late decision is carried out with a later
+            estimate, and a refused one not at all.
         deadline: Time (s) of a decision after which it is late: the tracker is read again before it is used. None: no
             decision is late.
 

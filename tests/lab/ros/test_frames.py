@@ -50,12 +50,6 @@ def wxyz(turn):
     return np.array([turn.w, turn.x, turn.y, turn.z])
 
 
-def test_there_are_24_right_handed_axes():
-    assert len(set(AXES)) == 24
-    for axes in AXES:
-        assert np.linalg.det(FrameAxes(id="f", **dict(zip("xyz", axes, strict=True))).rotation) == 1.0
-
-
 @given(
     POSES,
     st.sampled_from(AXES),
@@ -84,39 +78,29 @@ def test_metres_along_x_are_unchanged_to_the_last_bit():
     assert frame(("x", "y", "z")).map_pose(at) == at
 
 
-def test_a_point_40_mm_deep_is_at_z_of_the_needle_and_y_of_the_stage():
-    deep = PointMessage(0.040, 0.003, -0.002)
-    np.testing.assert_allclose(xyz(smartneedle("needle").map_point(deep)), (2.0, 3.0, 40.0))
-    np.testing.assert_allclose(xyz(smartneedle("stage").map_point(deep)), (-2.0, 40.0, 3.0))
-
-
-def test_a_straight_needle_has_no_rotation_in_its_own_frame():
-    straight = pose(0.0, Pose(10.0, 0.0, 0.0, 0.0, 0.0)).pose
-    np.testing.assert_allclose(
-        wxyz(smartneedle("needle").map_pose(straight).orientation), (1, 0, 0, 0), atol=1e-15
-    )
-    turn = to_matrix(wxyz(smartneedle("stage").map_pose(straight).orientation))
-    np.testing.assert_allclose(turn @ (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), atol=1e-15)  # z of the needle along y
-
-
 def test_the_origin_is_the_skin_entry():
     there = frame(("z", "y", "-x"), unit="mm", origin=(1.0, 2.0, 28.5))
     np.testing.assert_allclose(xyz(there.map_point(PointMessage(0.0, 0.0, 0.0))), (1.0, 2.0, 28.5))
     np.testing.assert_allclose(there.to_point(PointMessage(1.0, 2.0, 0.0)), (-28.5, 0.0, 0.0), atol=1e-12)
 
 
-def test_variances_have_the_unit_squared_and_turned_axes():
-    turned = smartneedle("needle").map_covariance(np.diag([1.0, 4.0, 9.0]) * 1e-6)
+def test_impossible_positions_and_orientations_are_refused():
+    for bad in (math.nan, math.inf, -math.inf, 1e300, 10.1):
+        with pytest.raises(InputError, match="position"):
+            frame(("x", "y", "z")).to_point(PointMessage(0.0, bad, 0.0))
+    for turn in ((0, 0, 0, 0), (math.nan, 0, 0, 1), (0, 0, 0, 2), (1e308, 1e308, 0, 0)):
+        with pytest.raises(InputError, match="not a unit quaternion"):
+            frame(("x", "y", "z")).to_orientation(Quaternion(*map(float, turn)))
+
+
+def test_the_frames_of_smartneedle():
+    """A point 40 mm deep is at z of the needle and at y of the stage; variances have its unit squared."""
+    needle, stage = smartneedle("needle"), smartneedle("stage")
+    deep, straight = PointMessage(0.040, 0.003, -0.002), pose(0.0, Pose(10.0, 0.0, 0.0, 0.0, 0.0)).pose
+    np.testing.assert_allclose(xyz(needle.map_point(deep)), (2.0, 3.0, 40.0))
+    np.testing.assert_allclose(xyz(stage.map_point(deep)), (-2.0, 40.0, 3.0))
+    np.testing.assert_allclose(wxyz(needle.map_pose(straight).orientation), (1, 0, 0, 0), atol=1e-15)
+    turn = to_matrix(wxyz(stage.map_pose(straight).orientation))
+    np.testing.assert_allclose(turn @ (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), atol=1e-15)  # z of the needle along y
+    turned = needle.map_covariance(np.diag([1.0, 4.0, 9.0]) * 1e-6)
     np.testing.assert_allclose(turned, np.diag([9.0, 4.0, 1.0]))
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300, 10.1])
-def test_an_impossible_position_is_refused(bad):
-    with pytest.raises(InputError, match="position"):
-        frame(("x", "y", "z")).to_point(PointMessage(0.0, bad, 0.0))
-
-
-@pytest.mark.parametrize("turn", [(0, 0, 0, 0), (math.nan, 0, 0, 1), (0, 0, 0, 2), (1e308, 1e308, 0, 0)])
-def test_an_impossible_orientation_is_refused(turn):
-    with pytest.raises(InputError, match="not a unit quaternion"):
-        frame(("x", "y", "z")).to_orientation(Quaternion(*map(float, turn)))

@@ -67,6 +67,11 @@ def test_neutral_lists_all_topics_but_those_of_smartneedle_alone():
     every = {f"publish.{key}" for key in PUBLISHED} | {f"subscribe.{key}" for key in SUBSCRIBED}
     assert every - set(listed) == {"publish.skin_entry", "publish.needle_pose", "publish.guide_pose"}
     assert all(getattr(topic, "unit", "m") == "m" for topic in listed.values())
+    reduced = load_profile("neutral").select(**INSERTION_KEYS)  # measurements and motors have separate nodes
+    read = {key for key, _ in reduced.list_topics() if key.startswith("subscribe")}
+    assert read == {"subscribe.stop", "subscribe.arm", "subscribe.target"}
+    assert reduced.publish.joint_targets is None
+    assert reduced.publish.shape == load_profile("neutral").publish.shape
 
 
 def test_smartneedle_has_the_topics_types_and_units_of_that_system():
@@ -74,6 +79,13 @@ def test_smartneedle_has_the_topics_types_and_units_of_that_system():
     found = {key: (topics[key].topic, kind_of(key), topics[key].unit) for key in SMARTNEEDLE}
     assert found == SMARTNEEDLE
     assert topics["publish.shape"].spacing_mm == topics["publish.predicted_shape"].spacing_mm == 0.5
+    listed = {key: topic.topic for key, topic in topics_of("smartneedle-fbg").items()}
+    assert (
+        listed["subscribe.shape"] == "/needle/state/current_shape"
+    )  # a fibre-optic needle measures its shape
+    assert listed["publish.predicted_shape"] == "/needle/state/predicted_shape"
+    own = {f"publish.{key}" for key in ("shape", "skin_entry", "needle_pose", "guide_pose")}
+    assert not own & set(listed)
 
 
 def test_the_needle_is_turned_into_the_stage_as_in_that_system():
@@ -84,15 +96,6 @@ def test_the_needle_is_turned_into_the_stage_as_in_that_system():
     about_x, about_z = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), np.diag([-1.0, -1.0, 1.0])
     to_stage = frames["stage"].rotation @ frames["needle"].rotation.T
     np.testing.assert_array_equal(to_stage, about_x @ about_z)
-
-
-def test_the_fibre_optic_needle_publishes_its_own_shape():
-    listed = {key: topic.topic for key, topic in topics_of("smartneedle-fbg").items()}
-    assert listed["subscribe.shape"] == "/needle/state/current_shape"
-    assert listed["publish.predicted_shape"] == "/needle/state/predicted_shape"
-    assert not {f"publish.{key}" for key in ("shape", "skin_entry", "needle_pose", "guide_pose")} & set(
-        listed
-    )
 
 
 @pytest.mark.parametrize(
@@ -117,17 +120,5 @@ def test_an_invalid_profile_is_refused(tmp_path, changes, key):
     with pytest.raises(RigError) as caught:
         load_profile(path)
     assert caught.value.problems[0].startswith(f"{path}: {key}")
-
-
-def test_a_profile_by_path_or_name(tmp_path):
-    assert load_profile(write(tmp_path / "own.toml", publish__tip=None)).publish.tip is None
     with pytest.raises(RigError, match=f"choices: {', '.join(NAMES)}"):
         load_profile("slicer")
-
-
-def test_the_node_of_an_insertion_leaves_measurements_and_motors_to_separate_nodes():
-    reduced = load_profile("neutral").select(**INSERTION_KEYS)
-    read = {key for key, _ in reduced.list_topics() if key.startswith("subscribe")}
-    assert read == {"subscribe.stop", "subscribe.arm", "subscribe.target"}
-    assert reduced.publish.joint_targets is None
-    assert reduced.publish.shape == load_profile("neutral").publish.shape

@@ -46,29 +46,21 @@ def tracker(node):
     return RosTracker(node, WallClock(), late_s=0.25)
 
 
-def test_a_reading_is_a_frame_once(node, tracker):
+def test_a_reading_is_a_frame_once_on_the_clock_of_the_run(node, tracker):
+    clock = ManualClock()
+    clock.time = 12.0
+    before = time.monotonic()
+    late = RosTracker(node, clock, late_s=0.25)
+    after = time.monotonic()
+    node.records = [reading(at=before - 0.01, position=None, status="position (nan, 0, 0): not a number")]
+    (frame,) = late.read()
+    assert 11.99 - (after - before) - 1e-9 <= frame.time <= 11.99 + 1e-9
+    assert frame.readings["tip"].status == "position (nan, 0, 0): not a number"
     node.records = [reading(7), ShapeReading(((0.0, 0.0, 0.0), (4.0, 5.0, 6.0)), reading(9))]
     frames = tracker.read()
     assert [frame.number for frame in frames] == [7, 9]
     assert [frame.readings["tip"].position for frame in frames] == [(1.0, 2.0, 3.0)] * 2
     assert tracker.read() == ()
-
-
-def test_times_are_on_the_clock_of_the_run(node):
-    clock = ManualClock()
-    clock.time = 12.0
-    before = time.monotonic()
-    tracker = RosTracker(node, clock, late_s=0.25)
-    after = time.monotonic()
-    node.records = [reading(at=before - 0.01)]
-    (frame,) = tracker.read()
-    assert 11.99 - (after - before) - 1e-9 <= frame.time <= 11.99 + 1e-9
-
-
-def test_a_tip_without_a_position_has_its_reason(node, tracker):
-    node.records = [reading(position=None, status="position (nan, 0, 0): not a number")]
-    (frame,) = tracker.read()
-    assert frame.readings["tip"].status == "position (nan, 0, 0): not a number"
 
 
 def test_the_status_is_the_reason_why_no_frame_arrives(node):

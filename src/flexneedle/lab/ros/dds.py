@@ -170,8 +170,7 @@ class TopicReader:
         reliable: bool = True,
         latched: bool = False,
     ) -> None:
-        usual = _make_quality(kind, _TAKEN, reliable=reliable, latched=latched)
-        qos = Qos(Policy.IgnoreLocal.Participant, base=usual)
+        qos = _make_quality(kind, _TAKEN, reliable=reliable, latched=latched)
         self._reader: Any = DataReader(domain, _make_topic(domain, topic, kind), qos=qos)
         self.condition = ReadCondition(self._reader, _ANY)
 
