@@ -219,15 +219,6 @@ def measure_plan() -> dict[str, Any]:
     }
 
 
-def measure_period() -> dict[str, Any]:
-    """Control periods of three insertions: deciding and observing, without the phantom."""
-    plan = flexneedle.plan(SCENARIO, seed=0)
-    done = [flexneedle.insert(SCENARIO, plan, seed=seed) for seed in range(2000, 2003)]
-    totals = 1e3 * np.array([period.durations["total"] for one in done for period in one.periods])
-    p50, p99, most = np.percentile(totals, (50, 99, 100)).tolist()
-    return {"period_ms": {"p50": p50, "p99": p99, "max": most}, "periods": totals.size}
-
-
 # ---- processes
 
 
@@ -267,7 +258,6 @@ PARTS = {
     "depth": measure_depth,
     "threads": measure_threads,
     "plan": measure_plan,
-    "period": measure_period,
     "help": measure_help,
     "start": measure_start,
 }

@@ -139,10 +139,3 @@ def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
     rig = flexneedle.VirtualRig("model")
     with pytest.raises(InputError, match="controller odd: decide must return a Decision and the memory"):
         flexneedle.insert(PHANTOM, make_plan(), controller=own, rig=rig, force=True)
-
-
-@pytest.mark.parametrize("command", [(1.0, 0.0), (1.0, 0.0, 0.0, 0.0, -1), (*STILL, 0.0), 1.0, "forward"])
-def test_a_command_has_nine_columns(command):
-    with pytest.raises(InputError, match=r": must be a Control, or its 9 columns db_x, db_y, db_z, "):
-        flexneedle.Decision(command, "short")
-    assert flexneedle.Decision(list(STILL), "still").command == STILL

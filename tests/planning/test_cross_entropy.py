@@ -69,18 +69,21 @@ def test_smoothing_takes_the_old_moments_of_the_last_iteration():
     np.testing.assert_allclose(twice.covariance, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("elite", "mean"), [(1, 1.0), (2, 1.5), (3, 2.0), (5, 3.0)])
-def test_elite_are_the_samples_of_least_cost(elite, mean):
-    """The cost of a sample is its value; they are in disorder."""
-    values = [4.0, 1.0, 5.0, 3.0, 2.0]
-    search_state = after(values, [(v, 0) for v in values], elite=elite, smoothing=0.0)
+@pytest.mark.parametrize(
+    ("costs", "elite", "mean", "quantile"),
+    [
+        *(
+            ([4, 1, 5, 3, 2], elite, mean, elite)
+            for elite, mean in ((1, 2.0), (2, 3.5), (3, 11 / 3), (5, 3.0))
+        ),
+        ([2, 1, 2, 2], 2, 1.5, 2),  # of equal costs the first drawn counts
+    ],
+)
+def test_elite_are_the_samples_of_least_cost(costs, elite, mean, quantile):
+    """The samples are 1, 2, 3 … in the order in which they are drawn."""
+    search_state = after(costs, [(k + 1, 0) for k in range(len(costs))], elite=elite, smoothing=0.0)
+    assert search_state.history[-1]["cost_quantiles"][1] == quantile
     assert search_state.mean[0] == pytest.approx(mean)
-    assert search_state.history[-1]["cost_quantiles"][1] == float(elite)
-
-
-def test_ties_at_the_quantile_leave_the_size_of_the_elite_the_first_drawn_win():
-    search_state = after([2.0, 1.0, 2.0, 2.0], [(10, 0), (0, 0), (20, 0), (30, 0)], elite=2, smoothing=0.0)
-    assert search_state.mean[0] == pytest.approx(5.0)
 
 
 def test_samples_have_the_mean_and_covariance_of_the_state():
@@ -101,30 +104,31 @@ def test_first_sample_is_the_mean_and_later_the_second_the_best_so_far():
     assert (ce.sample(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
 
 
-def test_every_sample_keeps_its_bounds():
-    tight = replace(FREE, lower=np.array([-0.5, 0.2]), upper=np.array([0.1, 0.3]), iterations=5)
-    evaluated = []
+class Recorded:
+    """The quadratic cost, which keeps the samples of each iteration."""
 
-    def cost(z):
-        evaluated.append(z.copy())
+    def __init__(self):
+        self.evaluated = []
+
+    def __call__(self, z):
+        self.evaluated.append(z.copy())
         return quadratic(z)
 
+
+def test_every_sample_keeps_its_bounds():
+    tight = replace(FREE, lower=np.array([-0.5, 0.2]), upper=np.array([0.1, 0.3]), iterations=5)
+    cost = Recorded()
     search(cost, tight, mean=(0.0, 0.9))
-    samples = np.concatenate(evaluated)
+    samples = np.concatenate(cost.evaluated)
     assert (samples >= tight.lower).all()
     assert (samples <= tight.upper).all()
     assert (samples == tight.lower).any()
 
 
 def test_a_coordinate_without_sigma_stays_at_its_mean():
-    evaluated = []
-
-    def cost(z):
-        evaluated.append(z.copy())
-        return quadratic(z)
-
+    cost = Recorded()
     found = search(cost, mean=(0.0, 1.0), sigma=(2.0, 0.0))
-    np.testing.assert_allclose(np.concatenate(evaluated)[:, 1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.concatenate(cost.evaluated)[:, 1], 1.0, rtol=1e-12)
     assert not found.covariance[1].any()
     assert not found.covariance[:, 1].any()
     assert found.best[0] == pytest.approx(LEAST[0] - 0.9 * (1.0 - LEAST[1]), abs=1e-3)  # least on that line
@@ -234,18 +238,12 @@ def test_while_the_best_cost_falls_the_search_continues():
 
 def test_samples_of_the_first_iteration_can_be_given():
     given = np.array([[3.0, 3.0], [1.5, -2.0], [0.0, 1.0]])
-    evaluated = []
-
-    def cost(z):
-        evaluated.append(z.copy())
-        return quadratic(z)
-
-    settings = replace(FREE, elite=2, iterations=2)
+    cost, settings = Recorded(), replace(FREE, elite=2, iterations=2)
     found = ce.minimize(
         cost, ce.start(np.zeros(2), np.ones(2)), settings, np.random.default_rng(0), first=given
     )
-    np.testing.assert_array_equal(evaluated[0], given)
-    assert [len(z) for z in evaluated] == [3, 60]
+    np.testing.assert_array_equal(cost.evaluated[0], given)
+    assert [len(z) for z in cost.evaluated] == [3, 60]
     assert found.best_cost == 0.0
 
 
