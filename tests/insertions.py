@@ -57,7 +57,7 @@ class RecordedPhantom:
         return Rig(self.phantom, self, self, self.phantom.condition)
 
 
-class Stage:
+class TapedRig:
     """No phantom: a clock, and a driver and a tracker that replay recordings; then commands are applied exactly."""
 
     status = VISIBLE

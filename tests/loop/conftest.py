@@ -6,7 +6,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import DEFAULT
-from insertions import PHANTOM, RecordedPhantom, Stage, run
+from insertions import PHANTOM, RecordedPhantom, TapedRig, run
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +39,7 @@ def late(plan):
 def replayed(plan, real):
     """A replay of `real` without its phantom: only readings and applied commands."""
     recorded = real[1]
-    return run(plan, Stage(recorded.tape, recorded.applied).rig(), controller=DEFAULT)
+    return run(plan, TapedRig(recorded.tape, recorded.applied).rig(), controller=DEFAULT)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from insertions import (
     READING,
     STILL,
     RecordedPhantom,
-    Stage,
+    TapedRig,
     acted,
     blind,
     loop,
@@ -156,7 +156,7 @@ def test_a_bad_reading_among_good_ones_is_not_used(plan, quick):
     tape, applied = quick[1].tape, quick[1].applied
     kinds, none = cycle([blind, garbled, jumping]), cycle([lost])
     one, other = (
-        run(plan, Stage(loop(spoilt_tape(tape, 1, lambda it, f=f: next(f)(it))), applied).rig())
+        run(plan, TapedRig(loop(spoilt_tape(tape, 1, lambda it, f=f: next(f)(it))), applied).rig())
         for f in (kinds, none)
     )
     assert list(map(acted, one.periods)) == list(map(acted, other.periods))
@@ -168,7 +168,7 @@ def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, quick
     done, recorded = quick
     *way, last = recorded.tape
     again = (replace(last[-1], time=last[-1].time + READING),)
-    rig = Stage([*way, (garbled(last[-1]),), again], recorded.applied).rig()
+    rig = TapedRig([*way, (garbled(last[-1]),), again], recorded.applied).rig()
     held = run(plan, rig)
     assert [str(period.verdict) for period in held.periods[-2:]] == ["not a number: y nan", "ok"]
     assert len(held.periods) == len(done.periods) + 1

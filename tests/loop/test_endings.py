@@ -18,7 +18,7 @@ from insertions import (
     PHANTOM,
     STILL,
     RecordedPhantom,
-    Stage,
+    TapedRig,
     first_periods,
     moving,
     of_any_scenario,
@@ -53,7 +53,7 @@ def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan
     assert first_periods(1, missing_by(plan, 1.01), RecordedPhantom(plan.roll).rig(), controller=DEFAULT)
 
 
-class Stuck(Stage):
+class Stuck(TapedRig):
     """A driver that does not move, with a tracker that measures the needle at rest."""
 
     def __init__(self):

@@ -17,7 +17,7 @@ from insertions import (
     PHANTOM,
     STILL,
     RecordedPhantom,
-    Stage,
+    TapedRig,
     commanded_and_estimated,
     facts,
     first_periods,
@@ -140,7 +140,7 @@ def test_each_period_is_sent_when_it_ends(plan):
 def test_replayed_readings_give_the_same_commands(plan, real, replayed):
     """Without any phantom, and with another one: the controller has access only to readings and applied commands."""
     done, recorded = real
-    other, stage = RecordedPhantom(plan.roll, seed=2777), Stage(recorded.tape)
+    other, stage = RecordedPhantom(plan.roll, seed=2777), TapedRig(recorded.tape)
     rig = Rig(other.phantom, other, stage, other.phantom.condition)
     swapped = run(plan, rig, controller=DEFAULT)
     for again in (replayed, swapped):
@@ -157,7 +157,7 @@ def test_other_readings_give_other_commands(plan, real):
     at = 40
     changed = [replace(recorded.tape[at][-1], y=recorded.tape[at][-1].y + 1.5)]
     tape = [*recorded.tape[:at], (*recorded.tape[at][:-1], *changed), *recorded.tape[at + 1 :]]
-    rig = Stage(tape, recorded.applied).rig()
+    rig = TapedRig(tape, recorded.applied).rig()
     other = first_periods(at + 2, plan, rig, controller=DEFAULT)
     same = [one.command == two.command for one, two in zip(done.periods, other, strict=False)]
     assert same == [True] * (at + 1) + [False]

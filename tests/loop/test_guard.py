@@ -19,7 +19,7 @@ from insertions import PHANTOM, RecordedPhantom, run
 from observed import begun, in_tissue
 
 FAR = {"setup.max_guide_travel_mm": 60.0, "setup.max_guide_step_mm": 2.0}
-ASIDE = Control(dg_y=0.5)
+LATERAL = Control(dg_y=0.5)
 SPACE = PHANTOM.with_values({"setup.axes": 2})
 
 
@@ -54,7 +54,7 @@ def test_by_default_tissue_may_be_compressed_to_a_share_of_what_its_law_allows(p
 def test_the_strain_of_a_cantilever_equals_beam_theory():
     """In air the guide bends the needle over its distance a from the clamp: M = F a, strain M d/2EI."""
     simulator, needle = Simulator(PHANTOM, 1), PHANTOM.needle
-    bent = driven(simulator, simulator.start(), ASIDE, 10)
+    bent = driven(simulator, simulator.start(), LATERAL, 10)
     arm = -PHANTOM.setup.guide_to_skin_mm - float(bent.base[0])
     moment = 3.0 * needle.bending_stiffness * 5.0 / arm**2
     assert bent.reactions.guide_force[0] * arm == pytest.approx(moment, rel=1e-3)
@@ -65,7 +65,7 @@ def test_the_strain_of_a_cantilever_equals_beam_theory():
 
 def test_the_strain_in_tissue_follows_from_the_curvature():
     simulator = Simulator(PHANTOM, 1)
-    bent = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
+    bent = driven(simulator, in_tissue(simulator, 49), LATERAL, 8)
     curvature = np.abs(np.gradient(bent.nodes[:, 3], bent.nodes[:, 0]))
     expected = curvature.max() * PHANTOM.needle.outer_diameter / 2.0
     assert bending_strain(bent) == pytest.approx(expected, rel=0.1)
@@ -83,7 +83,7 @@ def test_the_scenario_sets_the_limits(plan):
 def test_a_command_within_the_limits_is_not_refused(plan):
     estimate = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40))
     both = Control(db_x=1.0, dg_y=-0.5, flip=True)
-    for command in (STILL, Control(db_x=1.0), ASIDE, both, Control(db_x=-1.0)):
+    for command in (STILL, Control(db_x=1.0), LATERAL, both, Control(db_x=-1.0)):
         assert Guard.of(PHANTOM, plan).refusal(estimate, command) == ""
 
 
@@ -99,7 +99,7 @@ def test_a_command_within_the_limits_is_not_refused(plan):
 def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, back):
     """The state after the command is compared with the state before it."""
     simulator = Simulator(PHANTOM, 1)
-    state = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
+    state = driven(simulator, in_tissue(simulator, 49), LATERAL, 8)
     guard = guard_of(replace(plan, target=(20.0, 0.0, 0.0)), **limit)
     estimate, worse = estimate_at(state), Control(db_x=1.0, dg_y=0.5)
     assert re.fullmatch(reason, guard.refusal(estimate, worse))
@@ -111,7 +111,7 @@ def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, 
 def test_the_force_of_the_guide_is_limited_alike_in_every_direction(plan, degrees):
     """In air, where the needle is as stiff to all sides."""
     simulator, angle = Simulator(SPACE, 1), math.radians(degrees)
-    along_y = abs(driven(simulator, simulator.start(), ASIDE, 5).reactions.guide_force[0])
+    along_y = abs(driven(simulator, simulator.start(), LATERAL, 5).reactions.guide_force[0])
     command = Control(dg_y=0.5 * math.cos(angle), dg_z=0.5 * math.sin(angle))
     estimate = estimate_at(driven(simulator, simulator.start(), command, 4))
     refusal = guard_of(plan, guide_force_n=0.99 * along_y).refusal(estimate, command)
@@ -122,7 +122,7 @@ def test_the_force_of_the_guide_is_limited_alike_in_every_direction(plan, degree
 def test_a_model_that_does_not_converge_is_no_prediction(plan, monkeypatch):
     estimate = estimate_at(in_tissue(Simulator(PHANTOM, 1), 40))
     monkeypatch.setattr(State, "converged", property(lambda _: False))
-    assert Guard.of(PHANTOM, plan).refusal(estimate, ASIDE).startswith("guard: the model does not converge")
+    assert Guard.of(PHANTOM, plan).refusal(estimate, LATERAL).startswith("guard: the model does not converge")
 
 
 def test_a_refusal_takes_one_step_of_the_model(plan, monkeypatch):
@@ -131,7 +131,7 @@ def test_a_refusal_takes_one_step_of_the_model(plan, monkeypatch):
     monkeypatch.setattr(
         Simulator, "_carry_out", lambda *given: rows.append(len(given[2])) or carry_out(*given)
     )
-    Guard.of(PHANTOM, plan).refusal(estimate, ASIDE)
+    Guard.of(PHANTOM, plan).refusal(estimate, LATERAL)
     assert rows == [1]
 
 
@@ -154,8 +154,8 @@ def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan):
     """Also with `force`."""
     scenario = PHANTOM.with_values(FAR)
     recorded = RecordedPhantom(plan.roll, scenario=scenario)
-    aside = replace(plan, scenario=None, target=(30.0, 0.0, 0.0))
-    done = run(aside, recorded.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=True)
+    deeper = replace(plan, scenario=None, target=(30.0, 0.0, 0.0))
+    done = run(deeper, recorded.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=True)
     assert done.outcome is Outcome.HELD
     assert done.reason.startswith(("guard: needle strain", "guard: tissue stretch"))
     held = [period for period in done.periods if period.decision.startswith("held: guard: ")]
@@ -164,8 +164,8 @@ def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan):
     }
     limit = PHANTOM.control.hold_limit_s
     assert done.periods[-1].time - held[0].time == pytest.approx(limit, abs=0.05)
-    aside_s = [period for period in done.periods if period.decision == "wild"]
-    assert len(aside_s) >= 3
+    wild_periods = [period for period in done.periods if period.decision == "wild"]
+    assert len(wild_periods) >= 3
     assert done.periods[-1].true_stretch >= 0.3
 
 

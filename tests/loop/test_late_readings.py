@@ -12,7 +12,7 @@ from insertions import (
     READING,
     RESTING,
     STILL,
-    Stage,
+    TapedRig,
     blind,
     moving,
     run,
@@ -57,7 +57,7 @@ def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):
     tape, rests = list(recorded.tape), sum(period.decision == RESTING for period in done.periods)
     spoilt = tuple(map(blind, tape[-1]))
     again = [replace(sample, time=sample.time + READING) for sample in tape[-1]]
-    held = run(plan, Stage([*tape[:-1], spoilt, again], recorded.applied).rig(), controller=DEFAULT)
+    held = run(plan, TapedRig([*tape[:-1], spoilt, again], recorded.applied).rig(), controller=DEFAULT)
     assert held.outcome == "done"
     assert len(held.periods) == len(done.periods) + 1
     assert [period.decision for period in held.periods[-rests - 1 :]] == [*[RESTING] * rests, HELD]

@@ -11,7 +11,7 @@ from flexneedle.estimation.moves import Move, position_along
 from flexneedle.results import Outcome
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion
-from insertions import PHANTOM, RecordedPhantom, Stage, run
+from insertions import PHANTOM, RecordedPhantom, TapedRig, run
 
 THINKING_S = 0.1
 
@@ -62,7 +62,7 @@ def test_between_two_moves_the_tip_rests():
     np.testing.assert_allclose(found, expected)
 
 
-class Stopped(Stage):
+class Stopped(TapedRig):
     """A driver that counts its stops and is interrupted in a motion."""
 
     def __init__(self, error):

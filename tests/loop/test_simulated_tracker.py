@@ -14,7 +14,7 @@ from flexneedle.phantom.tracking.field.sensors import indicator, noiseless
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import STILL as AT_REST
 from flexneedle.types import Control, Frame, SensorReading
-from insertions import Stage
+from insertions import TapedRig
 from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -158,7 +158,7 @@ def test_references_are_placed_relative_to_the_center_of_the_workspace():
         np.testing.assert_allclose(np.subtract(there[name].position, centers[1]), pose.position, atol=1e-9)
 
 
-class Bench(Stage):
+class Bench(TapedRig):
     """A needle that does not move, and readings by sensor, `readings_at(time)`, at 40 Hz from 1 s before the start.
 
     None: no frame.

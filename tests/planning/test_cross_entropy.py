@@ -104,7 +104,7 @@ def test_first_sample_is_the_mean_and_later_the_second_the_best_so_far():
     assert (ce.sample(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
 
 
-class Recorded:
+class RecordedCost:
     """The quadratic cost, which keeps the samples of each iteration."""
 
     def __init__(self):
@@ -117,7 +117,7 @@ class Recorded:
 
 def test_every_sample_keeps_its_bounds():
     tight = replace(FREE, lower=np.array([-0.5, 0.2]), upper=np.array([0.1, 0.3]), iterations=5)
-    cost = Recorded()
+    cost = RecordedCost()
     search(cost, tight, mean=(0.0, 0.9))
     samples = np.concatenate(cost.evaluated)
     assert (samples >= tight.lower).all()
@@ -126,7 +126,7 @@ def test_every_sample_keeps_its_bounds():
 
 
 def test_a_coordinate_without_sigma_stays_at_its_mean():
-    cost = Recorded()
+    cost = RecordedCost()
     found = search(cost, mean=(0.0, 1.0), sigma=(2.0, 0.0))
     np.testing.assert_allclose(np.concatenate(cost.evaluated)[:, 1], 1.0, rtol=1e-12)
     assert not found.covariance[1].any()
@@ -238,7 +238,7 @@ def test_while_the_best_cost_falls_the_search_continues():
 
 def test_samples_of_the_first_iteration_can_be_given():
     given = np.array([[3.0, 3.0], [1.5, -2.0], [0.0, 1.0]])
-    cost, settings = Recorded(), replace(FREE, elite=2, iterations=2)
+    cost, settings = RecordedCost(), replace(FREE, elite=2, iterations=2)
     found = ce.minimize(
         cost, ce.start(np.zeros(2), np.ones(2)), settings, np.random.default_rng(0), first=given
     )
