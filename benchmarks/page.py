@@ -236,7 +236,7 @@ def painted(browser: Browser, page: Page, names: Sequence[str], rng: np.random.G
 
 
 def searched(names: Sequence[str], count: int, rng: np.random.Generator) -> Figure:
-    """Times of plans to targets that are drawn as those that are dragged, when neither page nor server runs."""
+    """Times of plans to random targets like the dragged ones, while neither page nor server runs."""
     plan(names[0])  # compiles or loads the kernels
     times = {name: [1e3 * plan(aimed(name, rng)).seconds for _ in range(count)] for name in names}
     return spread("such a plan by itself", "ms", times, None)

@@ -7,8 +7,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# Before numpy is loaded: OpenBLAS rounds differently on each kind of processor, and a closed loop carries the last
-# digit on, so that the figures that the pages print would belong to another insertion.
+# Before numpy is loaded: OpenBLAS rounds differently on each kind of processor. A closed loop amplifies the last
+# digit, and the figures on the pages would no longer match.
 os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 from fake_engine import draw_nothing, install

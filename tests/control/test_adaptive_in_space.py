@@ -48,7 +48,7 @@ def ends(state, *, first=0.0, then=0.0):
 
 
 def prepared(state, target, scenario=SPACE):
-    """Task, estimate, memory and path ahead of a needle whose guide stays, and which rolls no more."""
+    """Task, estimate, memory and path ahead of a needle whose guide stays and which does not roll again."""
     plan = replace(make_plan("manipulation", (END, target.real, target.imag), 0), scenario=scenario)
     estimate = estimate_of(state, scenario)
     estimate = replace(estimate, precision=1e8 * estimate.precision)  # as good as certain

@@ -40,7 +40,7 @@ def test_it_advances_by_full_steps_and_moves_nothing_laterally(quick_plan, estim
 @pytest.mark.parametrize("rolled", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_bevel_rolls_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, rolled):
-    """The target is further off the tip's line than either path bends."""
+    """The target is further from the tip's line than either path."""
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=rolled))
         right_way = state.bevel.real == side

@@ -78,7 +78,7 @@ def test_limit_and_confidence_are_the_scenarios():
 
 
 def warned(decisions):
-    """Warnings of decisions one after another."""
+    """Return the warning after each of several decisions."""
     in_a_row, lines = 0, []
     for decision in decisions:
         in_a_row = count_likely_misses(decision, in_a_row)
@@ -87,7 +87,7 @@ def warned(decisions):
 
 
 def test_several_likely_misses_in_a_row_make_a_warning():
-    """One alone does not, nor do as many with a good decision in between."""
+    """A single one does not, and neither does a row that a good decision interrupts."""
     bad, good = predicting(3.0, 0.5), predicting(0.1, 0.1)
     lines = warned([bad] * 5)
     first = next(k for k, line in enumerate(lines) if line)

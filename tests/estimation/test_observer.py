@@ -72,7 +72,7 @@ def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
 
 @pytest.mark.parametrize("load", [0.003, -0.003])
 def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(load):
-    """The model lacks a force on the tip: its prediction errs at first, and no longer at the end."""
+    """The model lacks a force on the tip: its prediction is off at first and exact at the end."""
     simulator = Simulator(QUIET)
     state = in_tissue(simulator)
     _, estimate, innovations = follow(state, begun(simulator, state), simulator, 30, force=load)

@@ -63,7 +63,7 @@ def test_cells_are_not_so_short_that_a_fit_would_never_end():
 )  # fmt: skip
 @hypothesis_settings(max_examples=60)
 def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
-    """The offset is at most 0.7 of the shortest compression length, whatever the prior of the factor."""
+    """The offset is at most 0.7 of the shortest compression length, for any prior of the factor."""
     offset = min(offset, 0.69 * min(heights))
     top = PHANTOM.values()["tissue"][0]
     layers = [

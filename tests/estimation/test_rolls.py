@@ -1,4 +1,4 @@
-"""A needle rolls before it travels. Its tip then goes round the needle's axis.
+"""A needle rolls before it travels. In the roll its tip circles the needle's axis.
 
 The observer that fits a run-out uses the readings of a roll, by the mean direction of the bevel; the other one, for
 which the tip is on the axis, leaves them out.

@@ -1,4 +1,4 @@
-"""A rig ends motions before their goal, since its checks differ from the loop's: the loop must not repeat forever."""
+"""A rig whose checks are stricter than the loop's ends motions early: the loop must not repeat them forever."""
 
 import pytest
 

@@ -95,7 +95,7 @@ def test_a_spin_does_not_depend_on_the_step(rate):
 
 
 def lag(needle):
-    """Return the angle (rad) by which the roll of the tip is behind the roll of the base."""
+    """Return the lag (rad) of the roll at the tip behind the roll of the base."""
     return -float(needle.s["twist"])
 
 

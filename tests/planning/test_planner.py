@@ -126,7 +126,7 @@ def test_a_sketch_is_the_plan_of_one_search(monkeypatch, strategy, changes):
     sketch = planner.sketch(scenario, strategy, 3)
     monkeypatch.setattr(planner, "search_rolls", lambda *args: search(*args[:5], 1))
     plan = flexneedle.plan(scenario, strategy=strategy, seed=3)
-    assert plan.reached  # so that it is of one search, too
+    assert plan.reached  # after one search
     np.testing.assert_allclose(sketch.tips, plan.tips, atol=1e-9)
     np.testing.assert_allclose(sketch.needle, plan.shapes[-1], atol=1e-9)
     assert (sketch.roll, sketch.reached) == (plan.roll, True)

@@ -153,7 +153,7 @@ def test_each_weight_scales_its_own_term_alone():
 
 
 def test_first_turn_is_free_and_padding_costs_nothing():
-    """A start with −1 is not charged, nor are steps that do nothing."""
+    """Neither a start with −1 nor a step that does nothing is charged."""
     assert terms(primitives(*[(1, 0, 0, 0, -1, 0)] * 3))["flips"] == 0.0
     shorter = replace(PROBLEM, travel=9.0)
     found = terms(primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), padded, problem=shorter)

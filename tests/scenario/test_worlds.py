@@ -90,7 +90,7 @@ def test_worlds_have_the_documented_shares():
 
 
 def difference(number, case):
-    """Return the values by which a case differs from the real world."""
+    """Return the values of a case that differ from the real world."""
     real, other = world(number).flat(), world(number, case).flat()
     return {key: other[key] for key in other if real.get(key) != other[key]}
 

@@ -128,7 +128,7 @@ def deep():
     ids=["tip", "two contacts", "between nodes", "plane"],
 )
 def test_held_tip_and_points_agree(deep, axes, points):
-    """Held, cut anew, held on while the base moves, and released; points that coincide with contacts."""
+    """Hold the tip, cut, hold it again while the base moves, release it; points coincide with contacts."""
     pair = deep[axes].copy()
     tip = pair.state.tip[: 1 + axes]
     innovation = pair.hold(tip + [0.3, 0.4, -0.3][: 1 + axes], points)

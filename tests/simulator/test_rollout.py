@@ -108,7 +108,7 @@ def test_empty_and_single_batches():
 
 
 def test_rollout_leaves_its_inputs_alone(controls):
-    """Neither the state nor the controls change; lists and read-only arrays do."""
+    """Neither the state nor the controls change; lists and read-only arrays are accepted."""
     simulator = Simulator(PHANTOM)
     state = insert_to(simulator, 12.0)
     before, kept = (numbers(state).tobytes(), state.rest.tobytes(), state.mesh.tobytes()), controls.copy()

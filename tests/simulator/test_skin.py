@@ -42,7 +42,7 @@ def test_halving_steps_and_spacing_converges(number):
 
 @pytest.mark.parametrize("number", THIN)
 def test_even_intervals_and_whole_steps_would_be_far_off(number, monkeypatch):
-    """Several times as far as with the resolution below the skin."""
+    """The error is several times larger than with the finer resolution below the skin."""
     scenario = world(number, "perfect")
     fine, resolved = refined(scenario, 0.125), refined(scenario, 1.0)
     monkeypatch.setattr(model, "_SKIN_EDGES", ())

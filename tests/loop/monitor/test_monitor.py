@@ -149,7 +149,7 @@ def after_a_second(**sensors):
 
 
 def test_other_sensors_do_not_replace_a_reference_but_may_show_a_distortion():
-    """A second coil in the needle, and references out of volume, which do not count whatever their indicator."""
+    """A second coil in the needle, and references out of volume, which never count."""
     clean = SensorReading((0.0, 0.0, 0.0), indicator=0.01)
     outside, distorted = replace(clean, status="out of volume"), replace(clean, indicator=0.2)
     two = {"ref1": clean, "ref2": clean, "tip.2": clean}
