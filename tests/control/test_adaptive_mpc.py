@@ -57,7 +57,7 @@ def carried_out(plan, scenario, plant=None, steps=100, seed=0):
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("rolled", [False, True])
 def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_plan, side, rolled):
-    """The target is where the bevel alone leads, with or without a roll now; the path rolls if only a roll leads there."""
+    """The target is where the bevel alone leads, rolled now or not; the path rolls only if a roll leads there."""
     simulator = Simulator(ROLLING, threads=1)
     state = simulator.start()
     for k in range(35):
