@@ -9,43 +9,49 @@ import pytest
 import flexneedle
 
 HEAVY = {"numba", "numpy", "scipy", "duckdb", "matplotlib", "pydantic", "rosbags", "mcap"}
-HELP = """
+STEPS = """
+import contextlib, io, sys
+import flexneedle
+print(*sys.modules)
+
 from flexneedle.cli.main import main
 for line in ("--help", "--version", "scenario --help", "em evaluate --help"):
-    try:
-        main(line.split())
-    except SystemExit as ended:
-        assert not ended.code
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            main(line.split())
+        except SystemExit as ended:
+            assert not ended.code
+print(*sys.modules)
+
+flexneedle.load_scenario("phantom")
+print(*sys.modules)
+print(flexneedle.devices.Bridge.__name__, flexneedle.testing.PlantConformance.__name__)
 """
 
 
-def modules_after(script: str) -> set[str]:
-    """Return the names of the modules loaded in a new interpreter."""
-    script = f"import sys\n{script}\nprint()\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(done.stdout.splitlines()[-1].split())
+@pytest.fixture(scope="module")
+def printed():
+    """Names of the modules that a new interpreter has loaded after each step, then names of two public classes."""
+    done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
+    return [set(line.split()) for line in done.stdout.splitlines()]
 
 
-def test_public_modules_are_imported_on_first_use():
-    names = "flexneedle.devices.Bridge.__name__, flexneedle.testing.PlantConformance.__name__"
-    script = f"import flexneedle; print({names})"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.split() == ["Bridge", "PlantConformance"]
+def test_the_import_loads_no_subpackage(printed):
+    assert {name for name in printed[0] if name.startswith("flexneedle")} == {"flexneedle"}
+    assert not printed[0] & HEAVY
 
 
-def test_the_import_loads_no_subpackage():
-    loaded = modules_after("import flexneedle")
-    assert {name for name in loaded if name.startswith("flexneedle")} == {"flexneedle"}
-    assert not loaded & HEAVY
+def test_help_loads_nothing_heavy(printed):
+    assert not printed[1] & HEAVY
 
 
-def test_help_loads_nothing_heavy():
-    assert not modules_after(HELP) & HEAVY
+def test_loading_a_scenario_does_not_load_the_compiler(printed):
+    assert "pydantic" in printed[2]
+    assert not printed[2] & {"numba", "matplotlib", "scipy", "rosbags"}
 
 
-def test_loading_a_scenario_does_not_load_the_compiler():
-    loaded = modules_after("import flexneedle; flexneedle.load_scenario('phantom')")
-    assert not loaded & {"numba", "matplotlib", "scipy", "rosbags"}
+def test_public_modules_are_imported_on_first_use(printed):
+    assert printed[3] == {"Bridge", "PlantConformance"}
 
 
 def test_public_names_are_listed():
