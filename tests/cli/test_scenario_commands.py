@@ -24,11 +24,6 @@ def run(capsys, *argv):
     return status, out, err.splitlines()
 
 
-def run_process(*argv, stdout=subprocess.PIPE):
-    line = [sys.executable, "-m", "flexneedle", *argv]
-    return subprocess.run(line, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
-
-
 def test_list_names_the_presets(capsys):
     listed = "phantom      Two-layer tissue phantom\nphantom3d    Two-layer tissue phantom in space\n"
     assert run(capsys, "scenario", "list") == (0, listed, [])
@@ -122,17 +117,18 @@ def test_errors_are_one_line_and_an_exit_status(raised, status, lines, capsys, m
 def test_a_closed_pipe_prints_no_error():
     reading, writing = os.pipe()
     os.close(reading)
-    done = run_process("scenario", "schema", stdout=writing)
+    line = [sys.executable, "-m", "flexneedle", "scenario", "schema"]
+    done = subprocess.run(line, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert done.stderr == ""
 
 
-def test_a_path_that_is_not_valid_unicode_is_accepted(minimal_text, tmp_path):
-    path = os.fsencode(tmp_path) + b"/\xff.toml"
-    Path(os.fsdecode(path)).write_text(minimal_text)
-    done = run_process("scenario", "check", path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.endswith("\\udcff.toml: ok, Minimal\n")
+def test_a_path_that_is_not_valid_unicode_is_accepted(capsys, minimal_text, tmp_path):
+    path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.toml")
+    Path(path).write_text(minimal_text)
+    status, out, err = run(capsys, "scenario", "check", path)
+    assert (status, err) == (0, [])
+    assert out.endswith("\\udcff.toml: ok, Minimal\n")
 
 
 def test_check_warns_of_implausible_values(capsys, minimal_text, scenario_file):
