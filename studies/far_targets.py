@@ -10,15 +10,12 @@ stdout; FILE gets one row per target as JSON. Times are for one processor, witho
 for tuning, those from 100,000 on for reports.
 """
 
-import argparse
 import json
 import math
-import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -26,7 +23,8 @@ import numpy as np
 
 import flexneedle
 from flexneedle import Plan, Scenario
-from flexneedle.scenario.worlds import TRAINING, world
+from flexneedle.scenario.worlds import world
+from steering import parse_worlds
 
 SHARES = (0.0, 0.5, 0.8, 1.0)
 DEPTHS = 2
@@ -146,18 +144,9 @@ def table_of_widths(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; exit status 1 if a plan misses a target that a wide search hits."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--worlds", nargs=2, type=int, default=(100_000, 40), metavar=("FIRST", "COUNT"))
-    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write one row per target as JSON")
-    args = parser.parse_args(argv)
-    first, count = args.worlds
-    if count < 1 or first < 0 or first < 100 * TRAINING < first + count:
-        parser.error(
-            f"worlds = {first} {count}: must be FIRST >= 0 and COUNT >= 1, all below or all from {100 * TRAINING}"
-        )
+    args = parse_worlds(__doc__, 40, argv)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        rows = [row for rows in pool.map(plan_world, range(first, first + count)) for row in rows]
+        rows = [row for rows in pool.map(plan_world, args.worlds) for row in rows]
     print(table(rows), table_of_widths(rows), sep="\n\n")
     if args.out is not None:
         args.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

@@ -7,17 +7,15 @@ on stdout; exit status 1 after any failure, 130 after an interrupt. `--seed S --
 """
 
 import argparse
-import json
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-import flexneedle
 from flexneedle import Control, Scenario
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.equilibrium import MAX_ITERATIONS
@@ -25,34 +23,21 @@ from flexneedle.phantom.phantom import Phantom
 from flexneedle.simulator.control import MOVES, Limits
 from flexneedle.types import DB_PSI, DB_THETA, DB_X, ROLL, SPIN
 from reference.draws import draw_scenario
+from robustness import FailureTally
 
 STEPS = 80
-SHOWN = 5
 TILTS = (DB_THETA, DB_PSI)
 _MOST_TILT = 0.15  # rad, of the base
 
 
 @dataclass
-class Tally:
-    """Counts of a run; steps of the plant are a quarter of a millimetre or less."""
+class PlantTally(FailureTally):
+    """Counts of insertions; steps of the plant are a quarter of a millimetre or less."""
 
     insertions: int = 0
-    steps: int = 0
-    unconverged: int = 0
-    not_finite: int = 0
-    exceptions: int = 0
-    fallback_steps: int = 0
-    most_iterations: int = 0
     mean_iterations: float = 0.0
-    worst_residual_mm: float = 0.0
     deepest_mm: float = 0.0
     widest_mm: float = 0.0
-    failures: list[str] = field(default_factory=list)
-
-    @property
-    def failed(self) -> bool:
-        """Whether there was any failure."""
-        return self.unconverged + self.not_finite + self.exceptions > 0
 
 
 def rough(scenario: Scenario, rng: np.random.Generator) -> Scenario:
@@ -103,7 +88,7 @@ def _within(steps: np.ndarray, low: float, high: float) -> np.ndarray:
     return kept
 
 
-def run_one(seed: int, number: int, tally: Tally) -> None:
+def run_one(seed: int, number: int, tally: PlantTally) -> None:
     """Run one insertion; failures are counted, not raised."""
     rng = np.random.default_rng((seed, number))
     options = f"--seed {seed} --number {number}"
@@ -118,7 +103,7 @@ def run_one(seed: int, number: int, tally: Tally) -> None:
     tally.insertions += 1
 
 
-def _count(phantom: Phantom, rows: np.ndarray, options: str, tally: Tally) -> None:
+def _count(phantom: Phantom, rows: np.ndarray, options: str, tally: PlantTally) -> None:
     plant, before = phantom._plant, tally.unconverged + tally.not_finite
     step, place = plant.step, [0]
 
@@ -147,18 +132,6 @@ def _count(phantom: Phantom, rows: np.ndarray, options: str, tally: Tally) -> No
     )
 
 
-def summary(tally: Tally, seed: int, seconds: float) -> str:
-    """Return the JSON summary."""
-    result = asdict(tally) | {
-        "failures": tally.failures[:SHOWN],
-        "seed": seed,
-        "seconds": round(seconds, 1),
-        "version": flexneedle.__version__,
-        "passed": not tally.failed,
-    }
-    return json.dumps(result, indent=2)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the study; 0 if nothing failed, 1 otherwise, 130 if interrupted."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -168,7 +141,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.insertions < 1:
         parser.error("--insertions must be 1 or more")
-    tally, start, interrupted = Tally(), time.perf_counter(), False
+    tally, start, interrupted = PlantTally(), time.perf_counter(), False
     numbers = range(options.insertions) if options.number is None else [options.number]
     try:
         for number in numbers:
@@ -182,10 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         interrupted = True
         print("\ninterrupted", file=sys.stderr)
-    print(summary(tally, options.seed, time.perf_counter() - start))
-    if tally.failures:
-        print(f"reproduce: python studies/plant_robustness.py {tally.failures[0]}", file=sys.stderr)
-    return 130 if interrupted else int(tally.failed)
+    return tally.conclude("plant_robustness.py", options.seed, start, interrupted)
 
 
 if __name__ == "__main__":

@@ -27,16 +27,14 @@ SHOWN = 5
 
 
 @dataclass
-class Tally:
-    """Counts of a run; `worst_residual_mm` is over sequences that are repeated step by step."""
+class FailureTally:
+    """Counts of a run, and the arguments that reproduce each failure."""
 
-    sequences: int = 0
     steps: int = 0
     unconverged: int = 0
     not_finite: int = 0
     exceptions: int = 0
     fallback_steps: int = 0
-    checked_steps: int = 0
     most_iterations: int = 0
     worst_residual_mm: float = 0.0
     failures: list[str] = field(default_factory=list)
@@ -45,6 +43,31 @@ class Tally:
     def failed(self) -> bool:
         """Whether there was any failure."""
         return self.unconverged + self.not_finite + self.exceptions > 0
+
+    def conclude(self, script: str, seed: int, start: float, interrupted: bool) -> int:
+        """Print the summary in JSON and how to reproduce the first failure; return the exit status.
+
+        start: `time.perf_counter()` at the start.
+        """
+        result = asdict(self) | {
+            "failures": self.failures[:SHOWN],
+            "seed": seed,
+            "seconds": round(time.perf_counter() - start, 1),
+            "version": flexneedle.__version__,
+            "passed": not self.failed,
+        }
+        print(json.dumps(result, indent=2))
+        if self.failures:
+            print(f"reproduce: python studies/{script} {self.failures[0]}", file=sys.stderr)
+        return 130 if interrupted else int(self.failed)
+
+
+@dataclass
+class Tally(FailureTally):
+    """Counts of sequences; `worst_residual_mm` is over sequences that are repeated step by step."""
+
+    sequences: int = 0
+    checked_steps: int = 0
 
 
 def draw_layer(rng: np.random.Generator) -> dict[str, float]:
@@ -194,18 +217,6 @@ def _repeat_by_step(simulator: Simulator, rows: np.ndarray, roll: float, tally: 
         tally.checked_steps += 1
 
 
-def summary(tally: Tally, seed: int, seconds: float) -> str:
-    """Return the JSON summary."""
-    result = asdict(tally) | {
-        "failures": tally.failures[:SHOWN],
-        "seed": seed,
-        "seconds": round(seconds, 1),
-        "version": flexneedle.__version__,
-        "passed": not tally.failed,
-    }
-    return json.dumps(result, indent=2)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the study; 0 if nothing failed, 1 otherwise, 130 if interrupted."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -229,10 +240,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         interrupted = True
         print("\ninterrupted", file=sys.stderr)
-    print(summary(tally, options.seed, time.perf_counter() - start))
-    if tally.failures:
-        print(f"reproduce: python studies/robustness.py {tally.failures[0]}", file=sys.stderr)
-    return 130 if interrupted else int(tally.failed)
+    return tally.conclude("robustness.py", options.seed, start, interrupted)
 
 
 def _progress(tally: Tally, batches: int, done: int, start: float) -> None:

@@ -101,20 +101,30 @@ def line(name: str, rows: Iterable[dict[str, Any]]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study; exit status 1 if fewer than 95 % of the targets meet both bounds."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--worlds", nargs=2, type=int, default=(100_000, 100), metavar=("FIRST", "COUNT"))
+def parse_worlds(doc: str, worlds: int, argv: Sequence[str] | None) -> argparse.Namespace:
+    """Return worlds as a range, jobs and out of a study of random worlds; worlds: number by default.
+
+    Exits if worlds for tuning and for reports are mixed.
+    """
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    parser.add_argument("--worlds", nargs=2, type=int, default=(100_000, worlds), metavar=("FIRST", "COUNT"))
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write one row per world as JSON")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write all rows as JSON")
     args = parser.parse_args(argv)
     first, count = args.worlds
     if count < 1 or first < 0 or first < 100 * TRAINING < first + count:
         parser.error(
             f"worlds = {first} {count}: must be FIRST >= 0 and COUNT >= 1, all below or all from {100 * TRAINING}"
         )
+    args.worlds = range(first, first + count)
+    return args
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study; exit status 1 if fewer than 95 % of the targets meet both bounds."""
+    args = parse_worlds(__doc__, 100, argv)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        rows = list(pool.map(steer, range(first, first + count)))
+        rows = list(pool.map(steer, args.worlds))
     print(table(rows))
     for row in sorted(rows, key=lambda row: -row["claim_error_mm"])[:5]:
         print(

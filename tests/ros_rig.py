@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 
-import psutil
 import tomli_w
 
 import flexneedle
@@ -152,18 +151,6 @@ class Started:
         """The calls of the motors with these names: (what, when, where)."""
         lines = self.notes.read_text().splitlines() if self.notes.exists() else []
         return [call for call in map(json.loads, lines) if call[0] in wanted]
-
-    def node(self):
-        """The process of the insertion's node."""
-        return self._child("flexneedle.lab.ros.node")
-
-    def supervisor(self):
-        """The process of the insertion's supervisor."""
-        return self._child("flexneedle.lab.rig.supervisor.process")
-
-    def _child(self, module):
-        children = psutil.Process(self.process.pid).children()
-        return next(child for child in children if module in child.cmdline())
 
     def end(self, seconds=PATIENCE_S):
         """Wait for its end; return exit status, stdout and the lines of stderr."""

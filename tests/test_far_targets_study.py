@@ -49,11 +49,3 @@ def test_targets_are_counted_by_what_a_wide_search_hits():
     rows = [made(0.9, 0.9), made(1.1, 0.2, 0.4), made(3.0, 1.1, 0.4), made(3.0, 2.0, 0.6)]
     cells = [cell.strip() for cell in far_targets.line("all", rows).split("|")[1:-1]]
     assert cells[:5] == ["all", "4", "2 (50.0%)", "1 (25.0%)", "1"]
-
-
-@pytest.mark.parametrize("worlds", [("-1", "5"), ("0", "0"), ("99990", "20")])
-def test_worlds_for_tuning_and_for_reports_are_not_mixed(worlds, capsys):
-    with pytest.raises(SystemExit) as left:
-        far_targets.main(["--worlds", *worlds])
-    assert left.value.code == 2
-    assert "worlds = " in capsys.readouterr().err

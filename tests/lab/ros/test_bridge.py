@@ -91,49 +91,6 @@ def test_a_rig_is_armed_on_its_topic_and_stopped_when_it_is_disarmed(tmp_path):
     assert insertion.calls("power")[0][1] < insertion.calls("follow")[0][1]
 
 
-@pytest.mark.long
-def test_the_motors_are_off_after_a_stop_ends_the_wait_for_an_arm(tmp_path):
-    with started(tmp_path, NEUTRAL, ros={"arm": True}) as insertion:
-        peer = insertion.peer()
-        insertion.until_state(peer, "idle")
-        insertion.await_that(lambda: insertion.notes.exists())  # devices are open
-        peer.send("stop", Bool(True))
-        status, _, errors = insertion.end()
-    assert status == 130
-    stored = insertion.stored["status"], insertion.stored["reason"]
-    assert stored == ("interrupted", "stopped: ROS topic /flexneedle/stop"), errors
-    assert insertion.calls("power", "follow") == []
-
-
-@pytest.mark.long
-def test_a_node_that_is_killed_stops_a_rig_that_it_has_armed(tmp_path):
-    with started(tmp_path, NEUTRAL, "--yes", ros={"arm": True}) as insertion:
-        peer = insertion.peer(("state", "tip"), ("arm", "stop"))
-        insertion.await_that(lambda: insertion.notes.exists())
-        insertion.await_that(lambda: peer.send("arm", Bool(True)) or "armed" in str(peer.received("state")))
-        insertion.until_state(peer, "inserting")
-        until(lambda: len(peer.received("tip")) > 1)
-        insertion.node().kill()
-        status, _, _ = insertion.end()
-    lost = "the ROS node has ended"
-    assert (status, insertion.stored["reason"]) == (130, f"stopped: {lost}")
-    assert events(insertion)[-1] == f"stop: {lost}"
-
-
-@pytest.mark.long
-def test_a_supervisor_that_is_killed_is_a_fault_on_the_topic_of_states(tmp_path):
-    with started(tmp_path, NEUTRAL, "--yes", ros={}) as insertion:
-        peer = insertion.peer(("state", "tip"))
-        insertion.until_state(peer, "inserting")
-        until(lambda: len(peer.received("tip")) > 1)
-        insertion.supervisor().kill()
-        insertion.until_state(peer, "fault")
-        status, _, _errors = insertion.end()
-        assert [one.data for one in peer.received("state")][-1] == "fault"
-    assert status == 1
-    assert "the supervisor has ended" in insertion.stored["reason"]
-
-
 @pytest.mark.slow
 def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_run(tmp_path):
     one, other = tmp_path / "dry", tmp_path / "simulated"
@@ -304,7 +261,7 @@ def test_a_stop_before_the_question_stops_the_rig(bridge, arm):
     until(lambda: listed(made))
     with suppress(StoppedError):
         made.confirm(rig)
-    assert rig.stops == ["ROS topic /stop"]
+    assert rig.stops == ["ROS topic /stop"]  # before anything is armed
     with pytest.raises(StoppedError, match=r"^stopped: ROS topic /stop$"):
         made.check()
 
@@ -319,6 +276,15 @@ def test_a_lost_node_stops_a_rig_that_it_arms_and_no_other(bridge, arm):
     until(lambda: listed(made))
     assert rig.stops == (["gone"] if arm else [])
     assert listed(made)[0].startswith("stop: gone" if arm else "gone: nothing is published")
+
+
+def test_a_supervisor_that_has_ended_is_a_fault_on_the_topic_of_states(bridge):
+    rig, made = Rig(), bridge(node := Node())
+    made.confirm(rig)
+    rig.ended = "killed"
+    until(lambda: any(isinstance(one, RosState) and one.state == "fault" for one in node.published))
+    last = [one for one in node.published if isinstance(one, RosState)][-1]
+    assert (last.good, last.reason) == (False, "the supervisor has ended: killed")
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
