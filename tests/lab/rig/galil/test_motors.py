@@ -21,14 +21,15 @@ BOTH_MODES = pytest.mark.parametrize("mode", ["tracking", "moves"])
 
 
 @contextmanager
-def driven(mode="tracking", channels=("A", "B"), timeout_ms=1000, *, on=True, switch=math.inf):
+def driven(mode="tracking", channels=("A", "B"), seconds=60.0, *, on=True, switch=math.inf):
     """Motors and their controller, which advances by 5 ms a line; the list of lines begins after the connection.
 
-    switch: position of the forward limit switch of A.
+    seconds: for the replies to a call, enough for a busy machine; switch: position of the forward limit switch of A.
     """
     with peer() as device:
-        given = {"address": f"127.0.0.1:{device.port}", "mode": mode, "reply_timeout_ms": timeout_ms}
+        given = {"address": f"127.0.0.1:{device.port}", "mode": mode, "reply_timeout_ms": 1000}
         with factory(given, channels) as motors:
+            motors._timeout = seconds
             if on:
                 device.device, _ = reply(device.device, "SHABCD")
             first, *others = device.device.axes
@@ -335,7 +336,7 @@ def test_a_refusal_has_the_commands_and_the_controllers_reason():
     [(b"?", "unknown reason: .*TC1 refused: no reason given"), (None, "unknown reason: .*no reply in time")],
 )
 def test_a_refusal_without_a_reason_is_still_one(answer, reason):
-    with driven(timeout_ms=100) as (motors, device):
+    with driven(seconds=1.0) as (motors, device):
         device.damage = lambda line, true: (
             b"?" if line.startswith("SP") else answer if line == "TC1" else true
         )
@@ -345,12 +346,13 @@ def test_a_refusal_without_a_reason_is_still_one(answer, reason):
 
 
 def test_a_driver_that_only_reads_stops_no_motion_of_another():
-    with driven(timeout_ms=100) as (motors, device):
+    with driven() as (motors, device):
         for _ in range(2):
+            motors._timeout = 0.1
             device.damage = lambda _line, _true: b"garbage"
             with pytest.raises(DriverError, match="start again"):
                 motors.read()
-            device.damage = None
+            device.damage, motors._timeout = None, 60.0
             with pytest.raises(DriverError, match="not connected"):
                 motors.read()
             motors.reconnect()
@@ -358,13 +360,14 @@ def test_a_driver_that_only_reads_stops_no_motion_of_another():
 
 
 def test_a_failed_reconnection_is_tried_again_by_the_next():
-    with driven(timeout_ms=100) as (motors, device):
+    with driven() as (motors, device):
         motors.stop()
+        motors._timeout = 0.1
         device.damage = lambda _line, _true: None
         for _ in range(2):
             with pytest.raises(DriverError, match="no reply in time"):
                 motors.reconnect()
-        device.damage = None
+        device.damage, motors._timeout = None, 60.0
         assert device.lines.count("STAB") == 1, "the new peer may be any device"
         begun = len(device.lines)
         motors.reconnect()

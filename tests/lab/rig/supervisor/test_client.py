@@ -53,6 +53,9 @@ class ScriptedProcess:
         self._line.send(protocol.SupervisorEnded())
         self._line.close()
 
+    def _refuse(self, why, state):
+        self._line.send(protocol.RequestRefused(0, why, state))
+
     def _answer(self, request):
         match request:
             case protocol.StopCommand():
@@ -62,8 +65,7 @@ class ScriptedProcess:
                 requests, rests = self._next.pop(0)
                 self._report(requests, at_rest=rests)
             case protocol.ResetCommand() if self._next:
-                why = "motors have not come to rest yet"
-                self._line.send(protocol.RequestRefused(0, why, SupervisorState.STOPPED))
+                self._refuse("motors have not come to rest yet", SupervisorState.STOPPED)
                 self._report(self._requests, at_rest=False)
                 # The number of requests never falls, also if a late client sends heartbeats.
                 self._next = [(self._requests, rests) for _, rests in self._next]
@@ -75,6 +77,9 @@ class ScriptedProcess:
             case protocol.OffCommand():
                 on = {"insertion": protocol.AxisState(0.0, MotorState(0.0, 0.0, on=True))}
                 self._report(self._requests, why="A is in motion", axes=on)
+            case protocol.ArmCommand(deepest) if deepest < 0.0:
+                self._refuse("guide_y is beyond its range", SupervisorState.IDLE)
+                self._report(self._requests, SupervisorState.IDLE, "")
             case protocol.ArmCommand():
                 self._report(self._requests, SupervisorState.FAULT, "the motor does not follow")
 
@@ -152,6 +157,8 @@ def test_a_refused_request_has_its_reason(supervisor):
     supervisor.request_stop("another thread")
     with pytest.raises(RefusedError, match="motors have not come to rest yet"):
         supervisor.reset()
+    with pytest.raises(RefusedError, match="guide_y is beyond its range"):
+        supervisor.arm(-1.0)
 
 
 def test_arming_that_ends_in_a_fault_and_a_motor_that_stays_on_are_errors_with_their_reason(supervisor):

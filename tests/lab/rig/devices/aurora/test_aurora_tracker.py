@@ -201,7 +201,6 @@ def test_a_broken_connection_is_reported_and_opened_again(path, order, fault, te
     ],
 )
 def test_a_link_that_crashes_or_hangs_is_replaced(path, kill, text, monkeypatch):
-    monkeypatch.setattr(aurora_tracker, "_SILENT_S", 0.5)
     monkeypatch.setattr(aurora_tracker, "_STOP_S", 0.2)
     with Aurora(path, WallClock()) as aurora:
         before, _ = read_until(aurora, at_least(3))
