@@ -70,7 +70,7 @@ class SupervisorClient(SupervisorConnection):
             refused = error
         report = self.report
         self._raise_end_state(report.state, report.why)
-        if False:
+        if refused is not None:
             raise refused
         return report.why
 
