@@ -16,7 +16,7 @@ function composed(canvas) {
   return pen.getImageData(0, 0, copy.width, copy.height).data;
 }
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-// Share from 0 to 1 by which a pixel has come closer to a tone, or 0 where it has changed to something else.
+// Share from 0 to 1 of a pixel's way to a tone, or 0 where it has changed to something else.
 function shareOf(before, after, at, tone) {
   const change = [0, 1, 2].map((part) => after[at + part] - before[at + part]);
   const whole = [0, 1, 2].map((part) => tone[part] - before[at + part]);

@@ -75,7 +75,7 @@ class FakePage:
         self.drop()
         self._thread.join(PATIENCE_S)
 
-    def begin_anew(self):
+    def reset(self):
         """Wait until all clients have left, and reset the server; return the invalid requests."""
         asyncio.run_coroutine_threadsafe(self._left(), self._loop).result(PATIENCE_S)
         invalid = self.invalid

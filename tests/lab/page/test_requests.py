@@ -200,7 +200,7 @@ def test_anybody_may_stop(server, client):
 
 
 NEVER_READY = ("page_script_worker", "channel.receive(None)")
-"""A worker that imports and compiles for ever."""
+"""A worker that never becomes ready."""
 
 
 @pytest.mark.parametrize(

@@ -200,12 +200,6 @@ def test_it_is_held_when_control_is_lost_and_never_continues_by_itself(server, w
     watcher.has("rig", state="inserting")
 
 
-def test_a_prepared_rig_is_released_when_control_is_lost(server, watcher):
-    with Client(server) as client:
-        armed(client.steer())
-    watcher.has("rig", state="stopped", why=LOST)
-
-
 def test_a_fault_is_shown_until_the_next_preparation(client):
     client.do("options", seed=FAULTY)
     armed(client)

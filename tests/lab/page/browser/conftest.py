@@ -8,7 +8,7 @@ import pytest
 from chromium import ARGUMENTS, CHROMIUM
 from fake_page import PATIENCE_S, FakePage
 
-# In software each drawing of the view in space takes as long as the rest of a test.
+# Drawing the view in space in software takes as long as the rest of a test.
 DRAWS_NOTHING = """for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
   WebGL2RenderingContext.prototype[name] = () => {};
 }"""
@@ -40,7 +40,7 @@ def server(kept_server):
     A request that the page's server would refuse as no request fails the test.
     """
     yield kept_server
-    assert kept_server.begin_anew() == []
+    assert kept_server.reset() == []
 
 
 @pytest.fixture

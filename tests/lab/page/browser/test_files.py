@@ -37,7 +37,7 @@ DROPPED = """(element, text) => {
   const drop = (type) => element.dispatchEvent(new DragEvent(type, { bubbles: true, cancelable: true, dataTransfer }));
   return ["dragover", "drop"].map((type) => !drop(type));
 }"""
-"""Drop a file on an element; whether the page takes it, as otherwise the browser opens it in the place of the page."""
+"""Drop a file on an element; return whether the page accepts it, since the browser would open it otherwise."""
 
 
 def payload(name, data):

@@ -200,7 +200,7 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     assert page.locator(".findings > ul li").all_inner_texts() == ["insertion, motor: A, off; moves"]
     assert page.locator(".findings details li").count() == 2
     page.click(".findings summary")
-    server.send(*opening(seed=3)[2:3])  # what has not changed stays as it is, such as open
+    server.send(*opening(seed=3)[2:3])  # an unchanged list stays open
     until(page, "flexneedle.store.get('session').seed === 3")
     painted(page)
     assert page.locator(".findings details[open]").count() == 1

@@ -80,7 +80,7 @@ ALONE = f"""async (parts) => {{
     return [name, tone ? blended(nothing, picture, toneOf(tone)) : changed(picture)];
   }});
 }}"""
-"""Number of pixels of each part by itself, where it has a tone in this: in the scene some hide others."""
+"""Pixels of each part drawn alone, counted in its tone if it has one: in the scene some hide others."""
 ROOM = {"grid": "--grid", "layer": "--tissue", "surface": "--skin", "edge": "--skin", "labels": None}
 PARTS = {
     "opening": {**ROOM, "needle": None, "target": None, "guide": "--guide", "bevel": "--ink"},

@@ -1,7 +1,7 @@
 """The connected rig, and the conditions under which it may move.
 
 Its insertion waits in the worker until it is armed and started. A client in control who has confirmed the motions arms
-it for one start. It holds while nobody is in control, and never starts again by itself.
+it for one start. It holds while nobody is in control, and starts again only on request.
 """
 
 import asyncio

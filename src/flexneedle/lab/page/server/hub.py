@@ -50,7 +50,7 @@ class ShapeLog:
         self.frames.append(frame)
 
     def since(self, number: int) -> ShapeFrame | None:
-        """Return the shapes from a period on, at most the size of a message; None without any."""
+        """Return the shapes from a period on, at most the size of a message; None if there are none."""
         first = bisect_right(self.frames, number, key=lambda frame: frame.end)
         if first == len(self.frames):
             return None

@@ -1,4 +1,4 @@
-// The web socket: connects and connects again by itself, matches answers to requests, passes messages to the store.
+// The web socket: connects and reconnects automatically, matches answers to requests, passes messages to the store.
 
 import { unpacked } from "./frames.js";
 

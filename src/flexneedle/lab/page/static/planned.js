@@ -32,7 +32,7 @@ export function sampledPaths(store) {
 }
 
 // The needle at the target {path, text, spread}: predicted with its standard deviation (column 4) during an insertion,
-// the last of the plan before one; path is null without any.
+// the last of the plan before one; path is null if there is none.
 export function foreseen(store, of) {
   const { shape, estimated } = of === "scene" ? present(store, "sweep") : { shape: shownShape(store, "predicted", of) };
   const path = of === "scene" ? last(shape) : first(shape);

@@ -7,7 +7,7 @@
 
 const RUNS = ["waiting", "planning", "ready", "running", "paused", "holding"];
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
-const SAME = 1e-3; // s, by which times of the same period may differ
+const SAME = 1e-3; // s, largest difference between times of the same period
 
 // Return whether an insertion (message "insertion", or none) runs or waits.
 export const runs = (live) => RUNS.includes(live?.state);
@@ -106,7 +106,7 @@ export function steers(store) {
 // Return whether the shown state can be edited: the scene before an insertion.
 export const mayMove = (store) => maySteer(store) && shownOf(store) === "scene";
 
-// The reach, if it is that of the present scenario, or null; it is kept while only the target moves (protocol.py).
+// The reach, if it belongs to the present scenario, or null; it is kept while only the target moves (protocol.py).
 export function shownReach(store) {
   const reach = shownOf(store) === "scene" ? store.get("reach") : null;
   return reach && reach.revision >= store.get("session")?.reach_since ? reach : null;

@@ -37,7 +37,7 @@ export class FieldView {
     return `${key} ${label} ${unit} ${description}`.toLowerCase();
   }
 
-  // Show a value. state: {changed: from that of the file, problem: of the server, pending: not answered yet}. Text
+  // Show a value. state: {changed: differs from the file's, problem: of the server, pending: not answered yet}. Text
   // that is being written, or was refused, stays.
   update(value, { changed, problem, pending }) {
     this.element.classList.toggle("changed", changed);

@@ -1,4 +1,4 @@
-// What is not in the scenario: seed, strategy, controller.
+// Options outside the scenario: seed, strategy, controller.
 
 import { button, make } from "../dom.js";
 

@@ -21,7 +21,7 @@ export class PlotView {
   #start = 0;
   #time = null;
 
-  // spec: {title, lines: [{name, tone, of, dash, thin}], none: text without any value}; choose: called with the index of the clicked row.
+  // spec: {title, lines: [{name, tone, of, dash, thin}], none: text if no value is known}; choose: called with the index of the clicked row.
   constructor(parent, spec, choose) {
     [this.#spec, this.#choose] = [spec, choose];
     this.#place = make("div.plot", { role: "img", "aria-label": spec.title });
@@ -59,7 +59,7 @@ export class PlotView {
     return [rows.map(({ time }) => time - start), ...this.#spec.lines.map(({ of }) => rows.map(of))];
   }
 
-  // The lines that have a value, or the text without any.
+  // The lines that have a value, or the text if none has.
   #showLegend(data) {
     const known = this.#lines.filter((_, at) => data[at + 1].some((value) => (value ?? null) !== null));
     const none = known.length ? "" : this.#spec.none ?? "";
