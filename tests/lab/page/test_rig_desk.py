@@ -68,6 +68,12 @@ def bench(monkeypatch):
     return Bench()
 
 
+def test_it_is_armed_for_one_start(bench):
+    bench.starts()
+    bench.refuses_to_go()
+    assert bench.jobs.changes == [{"go": True}]
+
+
 def test_a_report_from_before_the_start_is_no_new_wait(bench):
     bench.starts()
     bench.reports("idle", why="late", waits=1)
