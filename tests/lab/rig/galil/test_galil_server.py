@@ -1,73 +1,16 @@
-"""The emulated controller on TCP, a separate process, and its faults over time."""
+"""The emulated controller over time: its motions, their observation, and its faults."""
 
 import re
-import socket
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from emulated import DEADLINE_S, emulator, until
-from flexneedle.errors import InputError
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.galil.controller import ControllerState, reply
-from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer
+from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession
 
 PAGE = (Path(__file__).parents[4] / "docs" / "rig" / "galil.md").read_text()
-
-
-def connect(address):
-    """Return a connection whose call sends a line and returns the reply."""
-    line = socket.create_connection(address, timeout=DEADLINE_S)
-
-    def ask(command):
-        line.sendall(f"{command}\r".encode())
-        answer = b""
-        while answer.count(b":") + answer.count(b"?") <= command.count(";"):
-            if not (got := line.recv(4096)):
-                raise ConnectionResetError
-            answer += got
-        return answer.decode()
-
-    return line, ask
-
-
-def test_a_client_moves_a_motor_until_the_controller_is_unplugged_and_can_connect_again():
-    with emulator("--fault", "unplug@0.5:0.3", device="galil") as (address, _):
-        host, port = address.rsplit(":", 1)
-        line, ask = connect((host, int(port)))
-        assert ask("BGX;TC1") == "? 4 Operand error\r\n:"
-        assert ask("SHA;SPA=2000;PRA=2000000;BGA") == "::::"
-        positions = []
-
-        def is_lost():
-            try:
-                positions.append(int(ask("TPA").strip(" \r\n:")))
-            except OSError:
-                return True
-            return False
-
-        until(is_lost)
-        line.close()
-        assert positions == sorted(positions)
-        until(lambda: is_reachable((host, int(port))))
-
-
-def is_reachable(address):
-    try:
-        line, ask = connect(address)
-    except OSError:
-        return False
-    with line:
-        return ask("EO 0") == ":"
-
-
-def test_a_port_in_use_is_reported_in_one_line():
-    with (
-        TcpServer("127.0.0.1", 0) as tcp,
-        pytest.raises(InputError, match="cannot be listened on: Address already"),
-    ):
-        TcpServer(*tcp.address).plug()
 
 
 def session(*faults):
