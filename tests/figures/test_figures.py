@@ -51,7 +51,7 @@ ARRANGED = ("reached", "one period", "held from the start", "held on the way", "
 
 
 @cache
-def drawn(case="reached"):
+def drawn(case):
     """Return the figure of a case; it is shared by the tests."""
     with nullcontext() if case in ARRANGED else unarranged():
         return insertion_figure(PHANTOM, CASES[case]())
@@ -68,7 +68,7 @@ def saved(tmp_path_factory):
 
 
 def test_the_scene_is_to_scale_with_the_target_in_a_circle_of_1_mm():
-    for ax in axes(drawn(), "scene", "end"):
+    for ax in axes(drawn("reached"), "scene", "end"):
         box = ax.get_window_extent()
         (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
         assert box.width / (right - left) == pytest.approx(box.height / (high - low), rel=1e-6)
@@ -77,7 +77,7 @@ def test_the_scene_is_to_scale_with_the_target_in_a_circle_of_1_mm():
 
 
 def test_the_needle_is_drawn_with_its_thickness():
-    (scene,) = axes(drawn(), "scene")
+    (scene,) = axes(drawn("reached"), "scene")
     (needle,) = (patch for patch in scene.patches if patch.get_label() == "estimated needle")
     upper, lower = np.split(needle.get_xy()[:-1], 2)  # the outline is closed
     shape = INSERTION.periods[-1].shape
@@ -89,7 +89,7 @@ def test_the_needle_is_drawn_with_its_thickness():
 
 
 def test_the_guide_is_drawn_open_at_its_end_position():
-    (scene,) = axes(drawn(), "scene")
+    (scene,) = axes(drawn("reached"), "scene")
     jaws = [p for p in scene.patches if isinstance(p, Rectangle) and p.get_gid() == "guide"]
     upper, lower = sorted(jaws, key=lambda jaw: -jaw.get_y())
     assert lower.get_x() < GUIDE_X < lower.get_x() + lower.get_width()
@@ -100,7 +100,7 @@ def test_the_guide_is_drawn_open_at_its_end_position():
 
 
 def test_the_mark_of_the_guide_travel_is_upright_in_the_legend():
-    (legend,) = drawn().legends
+    (legend,) = drawn("reached").legends
     marks = dict(zip(names(legend), legend.legend_handles, strict=True))
     x, y = marks["guide travel"].get_data()
     assert x[0] == x[1] == pytest.approx(marks["planned path"].get_xdata().mean())
@@ -109,7 +109,7 @@ def test_the_mark_of_the_guide_travel_is_upright_in_the_legend():
 
 
 def test_paths_are_from_plan_and_record():
-    (scene,) = axes(drawn(), "scene")
+    (scene,) = axes(drawn("reached"), "scene")
     expected = {
         "planned path": INSERTION.plan.tips[:, :2],
         "true path": [period.true_tip[:2] for period in INSERTION.periods],
@@ -122,7 +122,7 @@ def test_paths_are_from_plan_and_record():
 
 
 def test_marks_of_rolls_show_side_and_position():
-    (scene,), plan = axes(drawn(), "scene"), INSERTION.plan
+    (scene,), plan = axes(drawn("reached"), "scene"), INSERTION.plan
     (planned,) = lines(scene, "bevel flip, planned")
     assert (planned.get_marker(), planned.get_markerfacecolor()) == ("v", "none")  # from +1 to −1
     assert planned.get_xdata()[0] == plan.tips[45, 0]
@@ -185,7 +185,7 @@ def test_the_legend_names_all_that_is_drawn_and_nothing_else(case, missing):
 
 
 def test_panels_show_error_motion_and_energy_over_depth():
-    error, motion, energy = axes(drawn(), "deviation", "motion", "energy")
+    error, motion, energy = axes(drawn("reached"), "deviation", "motion", "energy")
     (true,) = lines(error, "true")
     lateral = [p.true_tip.y - q[1] for p, q in zip(INSERTION.periods, INSERTION.plan.tips[1:], strict=True)]
     np.testing.assert_allclose(true.get_ydata(), lateral, atol=1e-12)
@@ -227,7 +227,7 @@ def test_a_reading_without_a_position_does_not_set_the_depths():
     first = INSERTION.periods[0]
     unknown = replace(first, measurement=replace(first.measurement, x=None, y=None))
     figure = insertion_figure(PHANTOM, replace(INSERTION, periods=(unknown, *INSERTION.periods[1:])))
-    (one,), (other,) = axes(figure, "deviation"), axes(drawn(), "deviation")
+    (one,), (other,) = axes(figure, "deviation"), axes(drawn("reached"), "deviation")
     assert one.get_xlim() == other.get_xlim()
 
 
@@ -268,8 +268,8 @@ def test_without_holds_or_monitor_the_panel_has_neither_shade_nor_resume_limit()
 
 @unarranged()
 def test_without_indicators_of_references_there_is_no_such_panel():
-    assert "field" not in {ax.get_label() for ax in drawn().axes}
-    assert len(insertion_figure(PHANTOM, without_indicators()).axes) == len(drawn().axes)
+    assert "field" not in {ax.get_label() for ax in drawn("reached").axes}
+    assert len(insertion_figure(PHANTOM, without_indicators()).axes) == len(drawn("reached").axes)
 
 
 # ---- texts
@@ -323,7 +323,7 @@ def test_no_labels_overlap_in_any_scenario(name, plans):
 
 
 def test_a_layer_has_as_much_of_its_name_as_fits():
-    assert {"air", "skin", "superficial, μ 1.82 kPa", "deep, μ 3.63 kPa"} <= set(texts(drawn()))
+    assert {"air", "skin", "superficial, μ 1.82 kPa", "deep, μ 3.63 kPa"} <= set(texts(drawn("reached")))
     tissue = with_tissue(("wide", 20.0), ("narrow", 10.5), ("very narrow", 5.5), ("thin", 1.0), ("last", 0.0))
     named = [text for text in texts(insertion_figure(tissue, INSERTION)) if "kPa" in text]
     assert named == ["wide, μ 1.25 kPa", "narrow\nμ 1.625 kPa", "μ 2 kPa", "last\nμ 2.75 kPa"]

@@ -51,7 +51,7 @@ DAILY = ("reached", "deep", "without truth")
 
 
 @cache
-def drawn(case="reached"):
+def drawn(case):
     """Return the figure of a case; it is shared by the tests."""
     with nullcontext() if case == "reached" else unarranged():
         return insertion_figure(*CASES[case]())
@@ -72,7 +72,7 @@ def scale(ax):
 
 
 def test_sections_are_above_each_other_and_beside_the_view_along_the_axis_all_to_scale():
-    shown = axes(drawn(), *VIEWS, "end y", "end z")
+    shown = axes(drawn("reached"), *VIEWS, "end y", "end z")
     scales = [scale(ax) for ax in shown]
     for right, up in scales:
         assert right == pytest.approx(up, rel=1e-6)
@@ -101,29 +101,29 @@ def test_an_insertion_turned_by_a_right_angle_is_drawn_in_the_other_section():
 
 def test_the_target_has_its_circle_in_every_view_and_is_named_with_both_offsets():
     for name, view in (VIEWS | {"end y": (X, Y), "end z": (X, Z)}).items():
-        (ax,) = axes(drawn(), name)
+        (ax,) = axes(drawn("reached"), name)
         (circle,) = (patch for patch in ax.patches if isinstance(patch, Circle))
         assert circle.center == tuple(INSERTION.target[column] for column in view)
         assert circle.radius == 1.0
     target = "target 40 mm deep, 4.12668 mm and 2.82321 mm lateral"
-    found = [text.replace("\n", " ") for text in texts(drawn())]
+    found = [text.replace("\n", " ") for text in texts(drawn("reached"))]
     assert f"Two-layer tissue phantom in space: {target} (seed 0)" in found
 
 
 def test_the_path_along_the_axis_is_coloured_by_depth():
-    (ax,) = axes(drawn(), "along")
+    (ax,) = axes(drawn("reached"), "along")
     (path,) = (one for one in ax.collections if isinstance(one, LineCollection))
     true = np.array([period.true_tip for period in INSERTION.periods])
     ends = [(segment[0], segment[1]) for segment in path.get_segments()]
     np.testing.assert_allclose(ends, list(zip(true[:-1, [Z, Y]], true[1:, [Z, Y]], strict=True)))
     np.testing.assert_allclose(path.get_array(), (true[1:, X] + true[:-1, X]) / 2)
-    assert "depth of the tip (mm)" in texts(drawn())
+    assert "depth of the tip (mm)" in texts(drawn("reached"))
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("lateral z (mm)", "lateral y (mm)")
 
 
 @pytest.mark.parametrize(("name", "view"), VIEWS.items())
 def test_arrows_are_the_directions_of_the_bevel(name, view):
-    (ax,) = axes(drawn(), name)
+    (ax,) = axes(drawn("reached"), name)
     size = 4.0 if name in SECTIONS else 0.15 * np.ptp(ax.get_xlim())
     angles = np.array([ANGLE, *(period.roll for period in ROLLED)])
     expected = size * np.column_stack([0.0 * angles, np.cos(angles), np.sin(angles)])[:, view]
@@ -136,7 +136,7 @@ def test_arrows_are_the_directions_of_the_bevel(name, view):
 
 
 def test_panels_show_both_axes_and_the_angle_of_the_needle():
-    deviation, motion, roll = axes(drawn(), "deviation", "motion", "roll")
+    deviation, motion, roll = axes(drawn("reached"), "deviation", "motion", "roll")
     assert names(deviation.get_legend()) == ["tracker y", "true y", "tracker z", "true z"]
     assert names(motion.get_legend()) == ["planned y", "applied y", "planned z", "applied z"]
     (along_z,) = lines(motion, "applied z")
@@ -151,7 +151,7 @@ def test_panels_show_both_axes_and_the_angle_of_the_needle():
 
 def test_a_guide_of_one_axis_has_one_line_and_half_turns_are_named_flips():
     assert names(axes(drawn("half turns"), "motion")[0].get_legend()) == ["planned y", "applied y"]
-    assert "bevel rolls: 3 (planned 1)" in "\n".join(texts(drawn()))
+    assert "bevel rolls: 3 (planned 1)" in "\n".join(texts(drawn("reached")))
     assert "bevel flips: 0 (planned 1)" in "\n".join(texts(drawn("half turns")))
 
 
@@ -170,11 +170,11 @@ def test_a_needle_without_a_guide_shows_its_base_where_it_is_mounted():
 
 
 def test_the_guide_is_a_ring_at_its_end_position():
-    (ax,) = axes(drawn(), "along")
+    (ax,) = axes(drawn("reached"), "along")
     (ring,) = (patch for patch in ax.patches if isinstance(patch, Annulus))
     assert ring.get_center() == INSERTION.periods[-1].guide[::-1]
     for name, place in zip(SECTIONS, INSERTION.periods[-1].guide, strict=True):
-        (section,) = axes(drawn(), name)
+        (section,) = axes(drawn("reached"), name)
         jaws = [patch for patch in section.patches if patch.get_gid() == "guide"]
         assert [jaw.get_x() + jaw.get_width() / 2 for jaw in jaws] == pytest.approx([GUIDE_X, GUIDE_X])
         assert sum(jaw.get_y() + jaw.get_height() / 2 for jaw in jaws) / 2 == pytest.approx(place)
@@ -185,7 +185,7 @@ def test_the_band_is_two_standard_deviations_to_either_side_of_the_predicted_sha
     assert period.estimate.x <= 20.0 < INSERTION.periods[period.index + 1].estimate.x
     label = f"final shape ± 2 sd, predicted at {period.estimate.x:.0f} mm"
     for (name, view), half in zip(SECTIONS.items(), (0.4, 0.8), strict=True):
-        (ax,) = axes(drawn(), name)
+        (ax,) = axes(drawn("reached"), name)
         (band,) = (one for one in ax.collections if one.get_label() == label)
         upper = period.predicted.nodes[:, view] + [0.0, half]
         vertices = band.get_paths()[0].vertices

@@ -85,7 +85,7 @@ def test_phantoms_of_other_seeds_are_reached(plan, inserted):
 
 def test_the_record_depends_on_the_seed_and_not_on_the_threads(inserted):
     """To the last bit."""
-    one, again = (inserted(2001, threads=threads) for threads in (None, 1))
+    one, again = (inserted(2001, **options) for options in ({}, {"threads": 1}))
     assert list(map(facts, one.periods)) == list(map(facts, again.periods))
     assert (one.seed, one.phantom, one.controller) == (2001, "exact", DEFAULT)
     assert (one.outcome, one.reason) == (again.outcome, again.reason) == ("done", "")
