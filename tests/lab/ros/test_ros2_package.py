@@ -3,16 +3,16 @@
 import runpy
 import subprocess
 import sys
+from collections import defaultdict
 from pathlib import Path
-from threading import Thread
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import pytest
 from ruamel.yaml import YAML
 
-from emulated import until
+from emulated import DEADLINE_S
 from flexneedle.lab.ros.profile import LATCHED, PUBLISHED, load_profile
 
 FOLDER = Path(__file__).parents[3] / "ros2" / "flexneedle_ros"
@@ -120,143 +120,67 @@ def test_the_manifest_names_the_imported_packages():
     assert needed >= {"rclpy", "std_msgs", "std_srvs", "launch", "launch_ros", "rviz2"}
 
 
-class Rclpy:
-    """A replacement for rclpy: it keeps the parts of the node, and spins until the test ends it."""
-
-    def __init__(self, monkeypatch):
-        self.sent, self.services, self.publishers, self.spinning = [], {}, 1, True
-        self.node = SimpleNamespace(
-            declare_parameter=lambda _name, default: SimpleNamespace(value=default),
-            create_subscription=lambda _kind, topic, call, _qos, **_: setattr(self, "state", (topic, call)),
-            create_publisher=lambda _kind, topic, _depth: SimpleNamespace(
-                publish=lambda message: self.sent.append((topic, message.data))
-            ),
-            create_service=lambda _kind, name, call, **_: self.services.update({name: call}),
-            count_publishers=lambda _topic: self.publishers,
-            destroy_node=lambda: None,
-        )
-        parts = {
-            "rclpy": {
-                "init": lambda **_: None,
-                "create_node": lambda _name: self.node,
-                "try_shutdown": lambda: None,
-            },
-            "rclpy.callback_groups": {"ReentrantCallbackGroup": object},
-            "rclpy.executors": {
-                "MultiThreadedExecutor": lambda: SimpleNamespace(
-                    add_node=lambda _node: None, spin=lambda: until(lambda: not self.spinning)
-                ),
-                "ExternalShutdownException": type("ExternalShutdownException", (Exception,), {}),
-            },
-            "rclpy.qos": {"DurabilityPolicy": MagicMock(), "QoSProfile": lambda **given: given},
-            "std_msgs": {},
-            "std_msgs.msg": {"Bool": SimpleNamespace, "String": SimpleNamespace},
-            "std_srvs": {},
-            "std_srvs.srv": {"Trigger": SimpleNamespace},
-        }
-        for name, values in parts.items():
-            module = ModuleType(name)
-            vars(module).update(values)
-            monkeypatch.setitem(sys.modules, name, module)
-
-    def report(self, state):
-        """Report a state of the rig."""
-        self.state[1](SimpleNamespace(data=state))
-
-    def call(self, name):
-        """Call a service; return whether it succeeds, and its text."""
-        answered = self.services[f"~/{name}"](None, SimpleNamespace())
-        return answered.success, answered.message
-
-    def call_while(self, name, meanwhile):
-        """Call a service, and do something until it answers."""
-        answers = []
-        caller = Thread(target=lambda: answers.append(self.call(name)))
-        caller.start()
-        meanwhile(answers)
-        caller.join()
-        return answers[0]
-
-
-@pytest.fixture
-def running(request, operator, monkeypatch):
-    answer_s = getattr(request, "param", 20.0)  # the default is for an idle machine
-    monkeypatch.setitem(operator.DEFAULTS, "answer_s", answer_s)
-    rclpy = Rclpy(monkeypatch)
-    thread = Thread(target=operator.main)
-    thread.start()
-    until(lambda: "~/arm" in rclpy.services)
-    yield rclpy
-    rclpy.spinning = False
-    thread.join()
-
-
-@pytest.mark.parametrize("before", ["inserting", "idle"])
-def test_a_stop_is_repeated_until_the_rig_reports_it(running, before):
-    """Also of an idle rig: its last report may be older than the stop, and an arm may be on its way."""
-
-    def stop(_answers):
-        until(lambda: len(running.sent) >= 3)
-        running.report(before)  # once a second
-        running.report("stopped")
-
-    assert running.state[0] == "/flexneedle/state"
-    running.report(before)
-    assert running.call_while("stop", stop) == (True, "the rig reports 'stopped'")
-    assert set(running.sent) == {("/flexneedle/stop", True)}
-
-
-@pytest.mark.parametrize(("name", "state", "sent"), [("stop", "stopped", 3), ("arm", "armed", 1)])
-def test_a_state_from_before_the_call_is_not_an_answer(running, name, state, sent):
-    """It may be the state of a rig that has ended, while another one begins."""
-
-    def report_again(answers):
-        until(lambda: len(running.sent) >= sent)
-        assert answers == []
-        running.report(state)
-
-    running.report(state)
-    assert running.call_while(name, report_again)[0]
-
-
-@pytest.mark.parametrize("running", [0.2], indirect=True)
-def test_without_a_report_of_an_idle_rig_a_call_fails_and_an_arm_is_sent_once(running):
-    running.report("idle")
-    failed = (False, "not done within 0.2 s: the rig reports 'idle'")
-    assert running.call("arm") == failed
-    assert running.sent == [("/flexneedle/arm", True)]
-    assert running.call("stop") == failed
-    assert ("/flexneedle/stop", True) in running.sent
-
-
 @pytest.mark.parametrize(
-    ("before", "after", "done"),
+    ("service", "before", "reports", "done", "published"),
     [
-        ("idle", ("armed", "inserting"), True),
-        ("idle", ("inserting",), True),  # the topic keeps one state, so that "armed" may never come
-        ("inserting", ("inserting",), False),
-        ("inserting", ("armed", "inserting"), True),
+        # Published, repeatedly for a stop, until the state is reported; its last report may be older than the call.
+        ("stop", "inserting", ["", "inserting", "stopped"], True, 3),
+        ("stop", "idle", ["", "idle", "stopped"], True, 3),
+        ("stop", "stopped", ["", "stopped"], True, 2),
+        ("stop", "idle", [], False, None),
+        ("arm", "armed", ["armed"], True, 1),
+        ("arm", "armed", [], False, 1),
+        ("arm", "idle", [], False, 1),
+        # An arm is done also if the rig inserts already: the topic keeps one state, so that "armed" may never come.
+        ("arm", "idle", ["inserting"], True, 1),
+        ("arm", "inserting", ["inserting"], False, 1),
+        ("arm", "inserting", ["armed"], True, 1),
     ],
 )
-def test_an_arm_is_done_also_if_the_rig_inserts_already(operator, before, after, done):
-    states = operator.States()
+def test_a_call_is_done_when_the_rig_then_reports_its_effect(
+    operator, service, before, reports, done, published
+):
+    states, left, sent = operator.States(), iter(reports), []
     states.report(before)
-    published = []
 
     def publish():
-        published.append(1)
-        for state in after:
+        sent.append(1)
+        if state := next(left, ""):
             states.report(state)
 
-    given = {"repeat": False, "missing": ""}
-    assert operator.carry_out(publish, states, operator.ARMED, 0.2, **given)[0] is done
-    assert len(published) == 1
+    wanted, repeat = (operator.STOPPED, True) if service == "stop" else (operator.ARMED, False)
+    seconds = DEADLINE_S if done else 0.2
+    found, text = operator.carry_out(publish, states, wanted, seconds, repeat=repeat, missing="")
+    assert (found, text) == (
+        done,
+        f"{'' if done else 'not done within 0.2 s: '}the rig reports {states.last!r}",
+    )
+    assert len(sent) == published or (published is None and sent)
 
 
-def test_without_a_rig_a_service_fails_and_a_stop_is_still_sent(running):
-    running.publishers = 0
-    running.report("stopped")  # of a rig that has ended
-    assert running.call("stop") == (False, "no rig publishes /flexneedle/state")
-    assert running.sent == [("/flexneedle/stop", True)]
-    assert not running.call("arm")[0]
-    assert len(running.sent) == 1
+def test_the_node_serves_stops_and_arms(operator, stand_ins):
+    """Without a rig a call fails, and a stop is still sent."""
+    modules = stand_ins(
+        "rclpy", "rclpy.callback_groups", "rclpy.executors", "rclpy.qos", "std_msgs", "std_msgs.msg", "std_srvs",
+        "std_srvs.srv",
+    )  # fmt: skip
+    modules["std_msgs.msg"].Bool = SimpleNamespace
+    node, publishers = modules["rclpy"].create_node.return_value, defaultdict(MagicMock)
+    node.declare_parameter.side_effect = lambda _name, default: SimpleNamespace(value=default)
+    node.create_publisher.side_effect = lambda _kind, topic, _depth: publishers[topic]
+    node.count_publishers.return_value = 1
+    assert operator.main() == 0
+    _, topic, report, _ = node.create_subscription.call_args.args
+    services = {call.args[1]: call.args[2] for call in node.create_service.call_args_list}
+    assert (topic, list(services)) == ("/flexneedle/state", ["~/stop", "~/arm"])
+    for key, state in (("stop", "stopped"), ("arm", "armed")):
+        publish = publishers[f"/flexneedle/{key}"].publish
+        publish.side_effect = lambda _message, state=state: report(SimpleNamespace(data=state))
+        answered = services[f"~/{key}"](None, SimpleNamespace())
+        assert (answered.success, answered.message) == (True, f"the rig reports {state!r}")
+        publish.assert_called_once_with(SimpleNamespace(data=True))
+    node.count_publishers.return_value = 0
+    for key, sent in (("stop", 2), ("arm", 1)):
+        answered = services[f"~/{key}"](None, SimpleNamespace())
+        assert (answered.success, answered.message) == (False, "no rig publishes /flexneedle/state")
+        assert publishers[f"/flexneedle/{key}"].publish.call_count == sent
