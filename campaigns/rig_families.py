@@ -19,8 +19,9 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Lock
@@ -35,7 +36,7 @@ from flexneedle.lab.rig.rig_file import RIGS, LoopSettings
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.worlds import has_rig, world
-from rig_trials import Inserted, Witness, resume_rows, run_insertion, witness
+from rig_trials import Inserted, Witness, collect_rows, run_insertion, witness
 
 FIRST_WORLD, FIRST_SEED = 13_000_000, 730_000
 _WORLDS_OF_A_RIG = 100  # the first of these numbers that has, or has not, a guide
@@ -359,12 +360,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--out", type=Path, default=Path("runs/rig-families"))
     args = parser.parse_args(argv)
-    numbers, rows = range(args.first, args.first + args.rigs), []
+    numbers = range(args.first, args.first + args.rigs)
     with witness() as seen:
-        for row, new in _rows(numbers, args.out, seen, args.workers):
-            rows.append(row)
-            if new:
-                print(f"{len(rows)} of {len(numbers)}: {format_row(row)}", file=sys.stderr, flush=True)
+        run = partial(measure, out=args.out, seen=seen)
+        rows = collect_rows(
+            args.out / "rows.jsonl", numbers, run, args.workers, lambda number: {"number": number}, format_row
+        )
     if not rows:
         return 1
     print(summary(rows))
@@ -372,16 +373,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if len(rows) < len(numbers):
         print(f"{len(numbers) - len(rows)} of {len(numbers)} rigs have no row", file=sys.stderr)
     return int(len(rows) < len(numbers) or any(map(is_bad, rows)))
-
-
-def _rows(numbers: range, out: Path, seen: Witness, workers: int) -> Iterator[tuple[dict[str, Any], bool]]:
-    yield from resume_rows(
-        out / "rows.jsonl",
-        numbers,
-        lambda number: measure(number, out, seen),
-        workers,
-        lambda number: {"number": number},
-    )
 
 
 if __name__ == "__main__":

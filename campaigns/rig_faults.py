@@ -25,7 +25,7 @@ from fault_judging import problems
 from fault_list import FAULTS, Fault
 from fault_report import draw, table
 from fault_trial import Trial, run_trial
-from rig_trials import Row, resume_rows
+from rig_trials import Row, collect_rows
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,14 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     faults = [fault for fault in FAULTS if any(part in fault.name for part in parts)]
     trials = [Trial(fault, case(number)) for number in range(args.timings) for fault in faults]
     run = partial(run_trial, keep=args.out if args.keep else None)
-    rows: list[Row] = []
+    show = partial(format_row, faults=faults)
     try:
-        for row, new in resume_rows(
-            args.out / "rows.jsonl", trials, run, args.workers, lambda trial: trial.key
-        ):
-            rows.append(row)
-            if new:
-                print(f"{len(rows)} of {len(trials)}: {format_row(row, faults)}", file=sys.stderr, flush=True)
+        rows = collect_rows(args.out / "rows.jsonl", trials, run, args.workers, lambda trial: trial.key, show)
     except KeyboardInterrupt:
         return 130
     if not rows:

@@ -261,6 +261,23 @@ def resume_rows(
             signal.signal(number, handler)
 
 
+def collect_rows(
+    file: Path,
+    tasks: Sequence[Task],
+    run: Callable[[Task], Row],
+    workers: int,
+    key: Callable[[Task], Row],
+    show: Callable[[Row], str],
+) -> list[Row]:
+    """Return the rows of `resume_rows`, and print a line of each new one. show: returns a row as a line."""
+    rows: list[Row] = []
+    for row, new in resume_rows(file, tasks, run, workers, key):
+        rows.append(row)
+        if new:
+            print(f"{len(rows)} of {len(tasks)}: {show(row)}", file=sys.stderr, flush=True)
+    return rows
+
+
 def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
     """The rows of tasks as they end, without those that fail. Raises KeyboardInterrupt once `interrupted` is set."""
     left = set(running)

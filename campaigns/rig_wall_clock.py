@@ -30,7 +30,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import count, product
 from pathlib import Path
 from time import monotonic
@@ -43,7 +43,7 @@ import flexneedle
 from decision_time import MOST_GROWTH_MM, MOST_INNOVATION_MM, TARGETS
 from flexneedle.lab.rig.preflight.fit import fit_problems
 from flexneedle.lab.rig.rig_file import load_rig
-from rig_trials import Witness, axial_innovation, resume_rows, run_insertion, witness
+from rig_trials import Witness, axial_innovation, collect_rows, run_insertion, witness
 
 FIRST_WORLD, FIRST_SEED = 14_000_000, 720_000
 DECISIONS_MS = (0, 50, 150)
@@ -294,14 +294,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/rig-wall-clock"))
     args = parser.parse_args(argv)
     jobs = [Job(*one) for one in product(range(args.pairs), DECISIONS_MS)]
-    rows: list[dict[str, Any]] = []
     with witness() as seen:
-        for row, new in resume_rows(
-            args.out / "rows.jsonl", jobs, lambda job: measure(job, args.out, seen), args.workers, vars
-        ):
-            rows.append(row)
-            if new:
-                print(f"{len(rows)} of {len(jobs)}: {_shown(row)}", file=sys.stderr, flush=True)
+        run = partial(measure, out=args.out, seen=seen)
+        rows = collect_rows(args.out / "rows.jsonl", jobs, run, args.workers, vars, _shown)
     results = list(lines(rows))
     print(table(results))
     if results:

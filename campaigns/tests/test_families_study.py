@@ -90,6 +90,6 @@ def test_the_summary_has_errors_of_those_that_are_done_and_lists_the_others(tmp_
 
 @pytest.mark.parametrize(("count", "status"), [(2, 0), (1, 1), (0, 1)])
 def test_a_rig_without_a_row_is_not_as_required(tmp_path, monkeypatch, count, status):
-    monkeypatch.setattr(study, "_rows", lambda *_: ((row(number), False) for number in range(count)))
+    monkeypatch.setattr(study, "collect_rows", lambda *_: [row(number) for number in range(count)])
     monkeypatch.setattr(study, "draw", lambda *_: None)
     assert study.main(["--rigs", "2", "--out", str(tmp_path)]) == status
