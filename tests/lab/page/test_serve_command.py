@@ -29,7 +29,7 @@ def test_the_server_does_not_import_the_compiler_or_the_simulator():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert not loaded & {"numba", "scipy", "matplotlib", "pyarrow", "pandas", "mcap"}
-    rooms = ("simulator", "mechanics", "planning", "estimation", "control", "phantom", "lab.rig")
+    rooms = ("simulator", "mechanics", "planning", "estimation", "control", "phantom", "lab.rig.rig_file")
     assert not loaded & {f"flexneedle.{room}" for room in rooms}
 
 
