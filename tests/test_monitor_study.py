@@ -7,8 +7,9 @@ import pytest
 
 import monitor as study
 from flexneedle import load_scenario
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Measurement
 from synthetic import make_periods, make_plan
+from synthetic_readings import frame_of
 
 
 def record(indicator, tip=None, distortion=0.0, held=(), step=0.2):
@@ -37,26 +38,10 @@ def test_medians_are_of_the_worst_reference_over_the_window():
     periods = list(make_periods(plan))[:10]
     values = np.random.default_rng(0).uniform(0.0, 0.1, (10, 4, 2))
     for k, period in enumerate(periods):
+        frames = [frame_of(0, 0.0, {"ref1": one, "ref2": other}) for one, other in values[k]]
         readings = [
-            CheckedMeasurement(
-                Measurement(
-                    0.2 * k + 0.05 * j,
-                    0.0,
-                    0.0,
-                    0.0,
-                    Frame(
-                        0.0,
-                        0,
-                        {
-                            "tip": SensorReading((0.0, 0.0, 0.0)),
-                            "ref1": SensorReading((0.0, 0.0, 0.0), indicator=values[k, j, 0]),
-                            "ref2": SensorReading((0.0, 0.0, 0.0), indicator=values[k, j, 1]),
-                        },
-                    ),
-                ),
-                "ok",
-            )
-            for j in range(4)
+            CheckedMeasurement(Measurement(0.2 * k + 0.05 * j, 0.0, 0.0, 0.0, frame), "ok")
+            for j, frame in enumerate(frames)
         ]
         object.__setattr__(period, "readings", tuple(readings))
     flat = values.reshape(40, 2)
