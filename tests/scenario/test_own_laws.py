@@ -1,6 +1,7 @@
 """Custom laws: the required definitions, and functions that are consistent with each other."""
 
 import sys
+from runpy import run_path
 from types import ModuleType
 
 import numpy as np
@@ -8,24 +9,11 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import ScenarioError
+from markdown_examples import EXAMPLES
 
 SIZE = {"shear_modulus_kpa": 3.63, "compression_length_mm": 20.0, "engaged_width_mm": 5.2}
-
-
-class Fung(flexneedle.Layer):
-    """An exponential law."""
-
-    limit = 0.7
-    exponent: float = 6.0
-
-    def energy(self, e):
-        return np.expm1(self.exponent * e**2) / (2 * self.exponent)
-
-    def force(self, e):
-        return e * np.exp(self.exponent * e**2)
-
-    def stiffness(self, e):
-        return (1 + 2 * self.exponent * e**2) * np.exp(self.exponent * e**2)
+Fung = run_path(str(EXAMPLES / "fung.py"))["Fung"]
+"""The exponential law of docs/extend.md."""
 
 
 class Bilinear(Fung):
@@ -91,7 +79,9 @@ def scenario(monkeypatch, law):
     module = ModuleType("own_laws")
     module.Law = law
     monkeypatch.setitem(sys.modules, "own_laws", module)
-    return flexneedle.load_scenario("phantom").with_values({"tissue": [{"law": "own_laws:Law", **SIZE}]})
+    return flexneedle.load_scenario("phantom").with_values(
+        {"tissue": [{"law": "own_laws:Law", "exponent": 6.0, **SIZE}]}
+    )
 
 
 @pytest.mark.parametrize("law", [Fung, Bilinear])
