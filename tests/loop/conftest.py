@@ -30,9 +30,9 @@ def quick(plan):
 
 @pytest.fixture(scope="session")
 def late(plan):
-    """An insertion as `real` with readings delayed by a control period."""
+    """An insertion as `quick` with readings delayed by a control period."""
     recorded = RecordedPhantom(plan.roll, delay=0.2)
-    return run(plan, recorded.rig(), controller=DEFAULT), recorded
+    return run(plan, recorded.rig()), recorded
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.control.controllers import DEFAULT
 from insertions import (
     HELD,
     PHANTOM,
@@ -57,7 +56,7 @@ def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):
     tape, rests = list(recorded.tape), sum(period.decision == RESTING for period in done.periods)
     spoilt = tuple(map(blind, tape[-1]))
     again = [replace(sample, time=sample.time + READING) for sample in tape[-1]]
-    held = run(plan, TapedRig([*tape[:-1], spoilt, again], recorded.applied).rig(), controller=DEFAULT)
+    held = run(plan, TapedRig([*tape[:-1], spoilt, again], recorded.applied).rig())
     assert held.outcome == "done"
     assert len(held.periods) == len(done.periods) + 1
     assert [period.decision for period in held.periods[-rests - 1 :]] == [*[RESTING] * rests, HELD]
