@@ -16,11 +16,11 @@ from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.emulators.galil.controller import ControllerState
 from flexneedle.lab.emulators.galil.galil_server import FAULTS, GalilSession, TcpServer, serve
 from flexneedle.lab.process import MessageChannel
+from flexneedle.lab.rig.devices.galil.settings import split_address
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
 
 _REST_S = 0.05  # between two records at rest
-_PORT, _LAST_PORT = 23, 65535
 
 
 def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:
@@ -47,16 +47,10 @@ def make_controller(job: EmulationJob) -> ControllerState:
 def address_of(rig: RigFile) -> tuple[str, int]:
     """Return host and port of the controller in a rig file. Raises RigError."""
     given = rig.driver.settings.get("address")
-    rule = f'driver.address = {given!r}: must be "HOST:PORT", such as "127.0.0.1:2323"'
-    if not isinstance(given, str):
-        raise RigError(rule)
-    host, colon, port = given.partition(":")
-    if not host or not (port.isascii() and port.isdigit() if colon else True):
-        raise RigError(rule)
-    number = int(port) if colon else _PORT
-    if number > _LAST_PORT:
-        raise RigError(rule)
-    return host, number
+    try:
+        return split_address(given if isinstance(given, str) else "", lowest=0)  # 0: any free port
+    except ValueError as error:
+        raise RigError(f"driver.address = {given!r}: {error}") from None
 
 
 class _Observer:

@@ -19,17 +19,23 @@ _LAST_PORT = 65535
 _ADDRESS = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.%a-z]+\])(:(?P<port>[0-9]{1,5}))?")
 
 
-def _address(text: str) -> str:
+def split_address(text: str, lowest: int = 1) -> tuple[str, int]:
+    """Return host and port of an address. Raises ValueError, also for a port below the lowest."""
     form = _ADDRESS.fullmatch(text)
-    if form is None or not 1 <= int(form["port"] or _TELNET) <= _LAST_PORT:
+    if form is None or not lowest <= int(form["port"] or _TELNET) <= _LAST_PORT:
         raise ValueError(f"must be HOST or HOST:PORT, such as 192.168.1.10:{_TELNET}")
+    return form["host"].strip("[]"), int(form["port"] or _TELNET)
+
+
+def _check_address(text: str) -> str:
+    split_address(text)
     return text
 
 
 class GalilSettings(Section):
     """Table `driver` of a rig file with `kind = "galil"`."""
 
-    address: Annotated[str, AfterValidator(_address)]
+    address: Annotated[str, AfterValidator(_check_address)]
     """Host name or IP address of the controller, and port if it is not 23."""
     mode: Literal["tracking", "moves"] = "tracking"
     """Position tracking (PT), or a separate move for each target (PA, BG)."""
@@ -39,14 +45,12 @@ class GalilSettings(Section):
     @property
     def host(self) -> str:
         """Host of the address."""
-        form = _ADDRESS.fullmatch(self.address)
-        return form["host"].strip("[]") if form else ""
+        return split_address(self.address)[0]
 
     @property
     def port(self) -> int:
         """Port of the address."""
-        form = _ADDRESS.fullmatch(self.address)
-        return int(form["port"] or _TELNET) if form else _TELNET
+        return split_address(self.address)[1]
 
 
 def check_galil_settings(settings: Mapping[str, Any], channels: Sequence[str]) -> GalilSettings:
