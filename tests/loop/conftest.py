@@ -6,7 +6,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.controllers import DEFAULT
-from insertions import PHANTOM, RecordedPhantom, TapedRig, run
+from insertions import PHANTOM, RecordedPhantom, run
 
 
 @pytest.fixture(scope="session")
@@ -33,13 +33,6 @@ def late(plan):
     """An insertion as `quick` with readings delayed by a control period."""
     recorded = RecordedPhantom(plan.roll, delay=0.2)
     return run(plan, recorded.rig()), recorded
-
-
-@pytest.fixture(scope="session")
-def replayed(plan, real):
-    """A replay of `real` without its phantom: only readings and applied commands."""
-    recorded = real[1]
-    return run(plan, TapedRig(recorded.tape, recorded.applied).rig(), controller=DEFAULT)
 
 
 @pytest.fixture(scope="session")

@@ -147,9 +147,11 @@ def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
 
 
 def test_without_a_truth_the_true_error_is_not_known(plan, quick):
-    """The tracker decides whether the target is reached."""
+    """The tracker decides whether the target is reached; the commands are the same."""
     done, recorded = quick
     replayed = run(plan, TapedRig(recorded.tape, recorded.applied).rig())
+    commands = [[period.command for period in one.periods] for one in (done, replayed)]
+    assert commands[0] == commands[1]
     assert math.isnan(replayed.true_error_mm)
     assert replayed.error_mm == replayed.residual_mm <= 1.0
     assert replayed.reached
