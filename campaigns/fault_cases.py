@@ -1,9 +1,9 @@
 """Insertions for the injection of faults: a family of scenarios by number, the same for each fault.
 
-Every second one is in space, with drivers of each kind alternately; of both, every second is a preset with a random
+Every second scenario is in space, with each kind of driver alternately. Half of the scenarios are presets with a random
 target, the others random worlds (needle, bevel, 1 to 4 layers, target). All have a guide and fit the shipped rig file.
-They are short, so that a trial is: at most 40 mm from the tip's start to the target. In every third case a fault that
-may fall in a roll does so, and a fault of the base's motor is a fault of the rotation's motor instead.
+Trials are short: at most 40 mm from the start of the tip to the target. In every third case a fault that may occur in
+a roll does so, and the rotation's motor takes the faults of the base's motor.
 """
 
 from dataclasses import dataclass

@@ -100,7 +100,7 @@ class _Plain:
     """An injection that needs no preparation."""
 
     def prepare(self, folder: Path, _stack: ExitStack) -> Setting:
-        """A record in the folder."""
+        """Return the setting of a record in the folder."""
         return Setting(folder / "run")
 
 
@@ -108,7 +108,7 @@ class Nothing(_Plain):
     """Nothing: the controller itself is the fault."""
 
     def inject(self, _trial: Running) -> float:
-        """From now on."""
+        """Return the present time: the fault begins without an injection."""
         return monotonic()
 
 
@@ -119,7 +119,7 @@ class Device(_Plain):
     order: str
 
     def inject(self, trial: Running) -> float:
-        """Order it."""
+        """Order the fault."""
         return trial.rig.fault(self.order.format(channel=_CHANNELS[trial.axis]))
 
 
@@ -130,7 +130,7 @@ class Kill(_Plain):
         self.names = names
 
     def inject(self, trial: Running) -> float:
-        """Kill them."""
+        """Kill the processes."""
         processes = {"controller": trial.controller, "supervisor": trial.supervisor}
         now = monotonic()
         for name in self.names:
@@ -146,7 +146,7 @@ class Signal(_Plain):
     group: bool = False
 
     def inject(self, trial: Running) -> float:
-        """Send it."""
+        """Send the signal."""
         now = monotonic()
         (os.killpg if self.group else os.kill)(trial.controller.pid, self.number)
         return now
@@ -156,7 +156,7 @@ class Disk:
     """The file system of the record becomes full."""
 
     def prepare(self, folder: Path, stack: ExitStack) -> Setting:
-        """A small file system for the record alone."""
+        """Mount a small file system for the record alone."""
         disk = folder / "disk"
         disk.mkdir()
         subprocess.run(["mount", "-t", "tmpfs", "-o", _DISK, "tmpfs", str(disk)], check=True)
@@ -164,7 +164,7 @@ class Disk:
         return Setting(disk / "run")
 
     def inject(self, trial: Running) -> float:
-        """Fill it."""
+        """Fill the file system."""
         now = monotonic()
         try:
             with (trial.folder / "disk" / "filler").open("wb", buffering=0) as file:
@@ -181,7 +181,7 @@ class Clock:
     seconds: int
 
     def prepare(self, folder: Path, _stack: ExitStack) -> Setting:
-        """A library with the shifted clock. Raises RuntimeError if a process with it has the usual time."""
+        """Build a library with the shifted clock. Raises RuntimeError if a process with it has the usual time."""
         source, library, shift = folder / "clock.c", folder / "clock.so", folder / "shift"
         source.write_text(_CLOCK)
         subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
@@ -195,7 +195,7 @@ class Clock:
         return Setting(folder / "run", environment)
 
     def inject(self, trial: Running) -> float:
-        """Step it. Raises RuntimeError if a process of the insertion has the usual clock."""
+        """Step the clock. Raises RuntimeError if a process of the insertion has the usual clock."""
         for process in (trial.controller, trial.supervisor):
             if "clock.so" not in Path(f"/proc/{process.pid}/maps").read_text():
                 raise RuntimeError(f"process {process.pid} has the usual clock")

@@ -85,8 +85,10 @@ class Evidence:
         }
 
     def _span(self, detection: State | None, resumed: float) -> tuple[float, float] | None:
-        """From when to when only the rest of a motion may move: from detection until the insertion is taken up again;
-        from the fault on if a process is killed and nothing is recorded; during a late decision. None: at no time.
+        """Return the times between which only the rest of a motion may move; None: none.
+
+        From detection until the insertion resumes; from the fault on if a process is killed and nothing is recorded;
+        during a late decision.
         """
         if self.fault.reaction is RESTED:
             return self.injected, self.injected + self.fault.decision_s
@@ -107,7 +109,7 @@ class Evidence:
         return moved_between(self.truth, since, until, axis)
 
     def _from_motion(self, time: float) -> float | None:
-        """Time since the fault, or since the axis was to begin to move if that is later; None if it never was.
+        """Return the time since the fault, or since the axis had to begin to move if that is later; None if it had not.
 
         Base and guide move together, so that the other axes show when the faulty one had to begin. For a guide, which
         moves seldom, the last time before detection counts; for a base the first one after the fault, and that only if
@@ -151,7 +153,7 @@ class Evidence:
 
 
 def entered(run: Mapping[str, Any], since: float) -> Sequence[State]:
-    """The states that a supervisor has entered since a time, by its record; changes of the reason alone are none."""
+    """Return the states that a supervisor has recorded since a time, without changes of the reason alone."""
     ticks = (run.get("timing") or {}).get("ticks") or {}
     return [one for one in _changes(ticks.get("states", ())) if one.time >= since]
 
@@ -202,14 +204,14 @@ def _reason(fault: Fault, row: Mapping[str, Any]) -> str:
 
 
 def _is_because(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Return whether the reason names the fault; without a detection by the supervisor there is none to compare."""
+    """Return whether the reason names the fault, or the supervisor has detected nothing."""
     if row["detection_s"] is None and set(fault.reaction.detected) & set(_RECORDED):
         return True
     return re.search(fault.because.format(axis=row["axis"]), _reason(fault, row)) is not None
 
 
 def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
-    """Return whether it was in time. A fault that shows only in a motion need not be detected without one."""
+    """Return whether the detection was in time. A fault that shows only in a motion need not be detected at rest."""
     seconds = seconds_of(fault, row)
     if fault.within is None:
         return True

@@ -104,7 +104,7 @@ class Trial:
 def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
     """Run one trial; return its row. keep: folder for the record of the insertion.
 
-    A fault of a roll that came too late for it, by delays of the computer, is not what is tested: it is tried again.
+    A fault that came too late for its roll, as the computer was busy, is tried again.
     Raises RuntimeError if the insertion ends before the fault is injected, or a process of the rig does.
     """
     for attempt in range(_ATTEMPTS):
@@ -169,7 +169,7 @@ def _await_moment(
     folder: Path,
     rng: np.random.Generator,
 ) -> float:
-    """Wait until the fault is due; return that time (s, monotonic): of a late decision its beginning."""
+    """Wait until the fault is due; return that time (s, monotonic), for a late decision its beginning."""
     begun = _first_advance(rig, process)
     if trial.fault.decision_s:
         return _read_marker(folder / "marker", process)
@@ -222,9 +222,9 @@ def _check_running(process: subprocess.Popen[bytes]) -> None:
 
 
 def _await_end(fault: Fault, process: subprocess.Popen[bytes], injected: float, record: Path) -> None:
-    """Wait until the insertion ends; one that is stopped by a signal continues once that must have been detected.
+    """Wait until the insertion ends. If a signal has stopped it, continue it once that must have been detected.
 
-    One whose record is complete is ended: its pictures would take more of the processor than the insertion.
+    An insertion with a complete record is ended: its pictures would take more processor time than the insertion.
     """
     if fault.injection == Signal(SIGSTOP):
         sleep(max(0.0, injected + _STOPPED_S - monotonic()))
@@ -244,7 +244,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _ended_by_force(processes: tuple[psutil.Process, ...]) -> int:
-    """The number of processes that have not ended with the insertion; they are killed."""
+    """Kill the processes that have not ended with the insertion; return their number."""
     left = [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
     for one in left:
         one.kill()

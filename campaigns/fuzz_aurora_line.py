@@ -66,7 +66,7 @@ def decode_text(reply: bytes) -> list[Point] | None:
 
 @dataclass
 class Sent:
-    """The intact readings that were sent: numbers of replies by rounded position, and and when each reply was made."""
+    """The intact readings that were sent: numbers of replies by rounded position, and when each reply was made."""
 
     by_position: dict[Point, set[int]] = field(default_factory=dict)
     times: list[float] = field(default_factory=list)

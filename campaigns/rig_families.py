@@ -187,8 +187,9 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _adapt(scenario: Scenario, file: dict[str, Any], rng: np.random.Generator) -> Scenario:
-    """The scenario as a user adapts it to the rig: speeds, the guide's step, the range of the rotation, and the rate of
-    the tracker where the loop is slower.
+    """Return the scenario as a user adapts it to the rig.
+
+    Speeds, the guide's step, the range of the rotation, and the rate of the tracker where the loop is slower.
     """
     axes, setup = file["axes"], scenario.setup
     speed = round(float(rng.uniform(0.5, 1.0)) * axes["insertion"]["speed_mm_s"], 2)
