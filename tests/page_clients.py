@@ -26,8 +26,8 @@ from page_worker import WorkerThread
 STUB = ("page_worker",)
 PATIENCE_S = 200.0
 """Deadline of a wait, which takes milliseconds on an idle machine; workers start slowly beside other processes."""
-QUICK = PageLimits(rest_s=60.0, alone_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
-"""Limits with short waits; a changed scenario is planned only on request."""
+QUICK = PageLimits(rest_s=60.0, alone_s=60.0, cancel_s=60.0, stop_s=60.0, runs_s=0.05)
+"""Limits that a busy machine does not reach; a changed scenario is planned only on request."""
 
 IN_CONTROL = {
     "edit": {"values": {"target.depth_mm": 35.0}}, "preset": {"name": "phantom3d"},

@@ -192,7 +192,7 @@ class Worker:
                 self.insertion(order, "holding", as_text(change))
             elif change.stop and order.seed != UNSTOPPABLE:
                 self.rig("stopped", change.stop)
-                for _ in range(3 if order.seed == RECORDS else 0):
+                for _ in range(8 if order.seed == RECORDS else 0):
                     while self.change(order) != JobChange(order.job):
                         pass
                 self.insertion(order, "interrupted", as_text(change))

@@ -73,7 +73,7 @@ def test_a_client_that_reads_nothing_is_disconnected_and_the_others_are_served(
     """
     if not by_system:
         monkeypatch.delattr(socket, "TCP_USER_TIMEOUT", raising=False)
-    with served(tmp_path, limits=replace(QUICK, send_s=2.0)) as server, Client(server) as client:
+    with served(tmp_path, limits=replace(QUICK, send_s=5.0)) as server, Client(server) as client:
         stuck = SlowClient(server)
         client.has("clients", clients=2)
         client.steer().do("insert")

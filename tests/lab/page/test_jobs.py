@@ -57,17 +57,19 @@ def test_a_reach_continues_while_the_target_is_moved_and_after_a_plan(planned):
 
 
 @pytest.mark.parametrize("seed", [HANGS, CRASHES])
-def test_a_worker_that_does_not_cancel_or_has_ended_is_started_again(planned, seed):
-    planned.do("options", seed=seed)
-    planned.do("start", work="plan")
-    if seed == HANGS:
-        planned.do("cancel", job=planned.job("plan", "running")["job"])
-        planned.job("plan", "cancelled")
-    else:
-        assert "exit status 3" in planned.job("plan", "failed")["text"]
-    planned.do("options", seed=0)
-    planned.do("start", work="plan")
-    planned.job("plan", "done")
+def test_a_worker_that_does_not_cancel_or_has_ended_is_started_again(tmp_path, seed):
+    with served(tmp_path, limits=replace(QUICK, cancel_s=0.1)) as server, Client(server) as client:
+        client.job("plan", "done")
+        client.steer().do("options", seed=seed)
+        client.do("start", work="plan")
+        if seed == HANGS:
+            client.do("cancel", job=client.job("plan", "running")["job"])
+            client.job("plan", "cancelled")
+        else:
+            assert "exit status 3" in client.job("plan", "failed")["text"]
+        client.do("options", seed=0)
+        client.do("start", work="plan")
+        client.job("plan", "done")
 
 
 def test_an_insertion_whose_worker_ends_has_failed(server, client):
@@ -125,7 +127,12 @@ def wait_for(condition):
         Event().wait(0.01)
 
 
-def test_work_is_cancelled_when_nobody_is_connected_and_its_results_are_computed_again(server):
+def test_work_is_cancelled_when_nobody_is_connected_and_its_results_are_computed_again(tmp_path):
+    with served(tmp_path, limits=replace(QUICK, alone_s=0.1)) as server:
+        check_unattended(server)
+
+
+def check_unattended(server):
     with Client(server) as client:
         client.job("plan", "done")
         client.steer().inserts("paused", paused=True)
@@ -147,14 +154,13 @@ def test_work_is_cancelled_when_nobody_is_connected_and_its_results_are_computed
         assert client.newest["job plan"]["job"] == last  # it was not missing
 
 
-def test_a_page_that_is_loaded_again_keeps_the_work(tmp_path):
-    with served(tmp_path, limits=replace(QUICK, alone_s=60.0)) as server:
-        with Client(server) as client:
-            client.job("plan", "done")
-            client.steer().do("start", work="reach")
-            job = client.job("reach", "running")["job"]
-        with Client(server) as client:
-            assert client.job("reach", "running")["job"] == job
+def test_a_page_that_is_loaded_again_keeps_the_work(server):
+    with Client(server) as client:
+        client.job("plan", "done")
+        client.steer().do("start", work="reach")
+        job = client.job("reach", "running")["job"]
+    with Client(server) as client:
+        assert client.job("reach", "running")["job"] == job
 
 
 @pytest.fixture

@@ -225,7 +225,7 @@ def test_a_worker_that_ends_leaves_a_fault_and_starts_nothing_again(server, clie
 
 @pytest.mark.parametrize(("seed", "state"), [(UNSTOPPABLE, "fault"), (RECORDS, "stopped")])
 def test_a_worker_that_does_not_stop_is_killed_but_not_while_it_writes_the_record(tmp_path, seed, state):
-    with served(tmp_path, rig=RIG, limits=replace(QUICK, stop_s=0.1)) as server, Client(server) as client:
+    with served(tmp_path, rig=RIG, limits=replace(QUICK, stop_s=1.0)) as server, Client(server) as client:
         client.steer().do("options", seed=seed)
         inserting(client)
         client.do("stop")
