@@ -170,23 +170,6 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
 
 
 @pytest.mark.slow
-def test_anybody_stops_it(tmp_path):
-    with bench(tmp_path, **LONGER) as one, one.visitor() as watcher, one.visitor() as client:
-        inserting(client.steer())
-        one.advanced(3.0)
-        watcher.do("stop")
-        stopped = monotonic()
-        assert rig_is(watcher, "stopped")["why"] == f"person {watcher.number} on the page"
-        watcher.job("insertion", "done")
-        assert one.moved_after(stopped + RESTS_S) < 0.005
-        recorded = one.run_file()
-        assert (str(recorded.outcome), recorded.reason) == (
-            "interrupted", f"stopped: person {watcher.number} on the page",
-        )  # fmt: skip
-        assert "flexneedle rig retract" in watcher.newest["insertion live"]["summary"]
-
-
-@pytest.mark.slow
 def test_a_steering_client_that_is_silent_is_lost(tmp_path):
     """Its computer has crashed or its line is cut: the connection stays open and silent."""
     with bench(tmp_path, **LONGER) as one, one.visitor() as watcher:

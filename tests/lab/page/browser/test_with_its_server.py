@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-import small_study
 from fake_page import until
 from flexneedle.lab.page.server.clients import PageLimits
 from page_clients import PATIENCE_S, served
@@ -83,44 +82,3 @@ def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
     with zipfile.ZipFile(downloaded(page, "Run folder of mine", tmp_path / "run.zip")) as archive:
         assert {"mine/run.json", "mine/trace.mcap"} <= set(archive.namelist())
         assert archive.testzip() is None
-
-
-LOST = "((rows) => rows.some((_, at) => at > 2 && rows.slice(at - 3, at + 1).every(({ measured }) => !measured)))"
-"""The tip was not measured in four successive periods."""
-
-
-@pytest.mark.slow
-def test_searches_a_stopped_insertion_and_a_row_of_a_study(address, tab, tmp_path):
-    page = tab(1280, 800, "light")
-    page.goto(address)
-    see(page, f"{PLANS} >> text=Manipulation:")
-
-    page.click(f"{PLANS} [data-work=reach]")
-    page.click(f"{PLANS} button:has-text('Cancel')")
-    until(page, "flexneedle.store.get('job reach').state === 'cancelled'")
-    assert not page.evaluate("flexneedle.store.get('reach')")
-    page.click(f"{PLANS} [data-work=compare]")
-    see(page, f"{PLANS} >> text=Steering:")
-    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
-    costs = page.locator(f"{PLANS} tr:has(th:text-is('Cost')) td").all_inner_texts()
-    assert 0.0 < float(costs[0]) < float(costs[1])  # out of reach by the bevel alone
-    page.click(f"{PLANS} [data-work=reach]")
-    see(page, "[data-panel=section] .legend >> text=reach")
-
-    page.locator(INSERTION).get_by_role("button", name="Insert", exact=True).click()
-    see(page, f"{INSERTION} .decisions .now:has-text('Period')")
-    page.locator(INSERTION).get_by_role("button", name="Drop", exact=True).click()
-    page.wait_for_selector(f"{INSERTION} >> text=Active: tip not measured for 1 s")
-    until(page, f"{LOST}(flexneedle.store.get('rows live'))")
-    page.locator(INSERTION).get_by_role("button", name="Stop", exact=True).click()
-    see(page, f"{INSERTION} >> text=Stopped: adaptive-mpc, seed 0")
-
-    (tmp_path / "runs").mkdir(exist_ok=True)
-    small_study.run(tmp_path).rename(tmp_path / "runs" / "small")
-    see(page, "[aria-label='Rows of small']")
-    page.click("[aria-label='Rows of small']")
-    page.click("[aria-label='Open row 3']")
-    see(page, f"{PLAYER} [aria-pressed=true][data-of=first]:visible")
-    again = page.evaluate("flexneedle.store.get('insertion first').error_mm")
-    rows = page.evaluate("flexneedle.store.get('study').rows")
-    assert again == pytest.approx(next(row["error_mm"] for row in rows if row["index"] == 3), abs=1e-9)
