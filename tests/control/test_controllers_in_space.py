@@ -72,9 +72,10 @@ def plans():
         ("two axes", "resolved-rate", 0.2),
         ("two axes", "broyden-mpc", 0.2),
         ("one axis", "open-loop", 0.05),
-        ("one axis", "adaptive-mpc", 0.15),
-        pytest.param("one axis", "ce-mpc", 0.3, marks=pytest.mark.long),
-        pytest.param("one axis", "resolved-rate", 0.3, marks=pytest.mark.long),
+        *(
+            pytest.param("one axis", controller, most, marks=pytest.mark.long)
+            for controller, most in (("adaptive-mpc", 0.15), ("ce-mpc", 0.3), ("resolved-rate", 0.3))
+        ),
         ("no guide", "open-loop", 0.05),
         ("no guide", "adaptive-mpc", 0.2),
         pytest.param("no guide", "ce-mpc", 0.3, marks=pytest.mark.long),
