@@ -31,8 +31,8 @@ POSITIVE = _keys("""
     phantom.structure: compression_length_factor bevel_length_factor
     plan: tolerance
     setup: guide_to_skin_mm tip_to_skin_mm stroke_mm max_advance_mm max_guide_step_mm max_guide_travel_mm
-    setup: max_base_step_mm max_base_travel_mm max_base_turn_step_mrad insertion_speed_mm_s
-    setup: rotation_speed_deg_s max_rotation_deg
+    setup: max_base_step_mm max_base_travel_mm max_base_turn_step_mrad insertion_speed_mm_s guide_speed_mm_s
+    setup: base_speed_mm_s base_turn_speed_mrad_s rotation_speed_deg_s max_rotation_deg
     tissue[0]: thickness_mm compression_length_mm
     tissue[1]: shear_modulus_kpa engaged_width_mm
     tracker: direction_jitter_mrad rate_hz
@@ -163,7 +163,10 @@ RULES = [
     ("phantom.step_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("tracker.workspace_center_mm[0]", 1e7, "must be at most 1e+06"),
     ("tracker.rate_hz", 1e6, "must be at most 50000, 10000 readings in a control step"),
-    ("setup.rotation_speed_deg_s", 0.7, "must be at least 0.72, 10000 readings in half a turn"),
+    ("setup.guide_speed_mm_s", 1e-3, "must be at least 0.002, 10000 readings in a motion by 0.5"),
+    ("setup.base_speed_mm_s", 1e-3, "must be at least 0.002, 10000 readings in a motion by 0.5"),
+    ("setup.base_turn_speed_mrad_s", 1e-3, "must be at least 0.02, 10000 readings in a motion by 5"),
+    ("setup.rotation_speed_deg_s", 0.7, "must be at least 0.72, 10000 readings in a motion by 180"),
     ("guard.least_stretch", 0.0, ABOVE_ZERO),
     ("guard.least_stretch", 1.0, "must be below 1"),
     # unknown keys

@@ -19,9 +19,9 @@ SLOW = PHANTOM.with_values(
     {
         "setup.axes": 2,
         "setup.insertion_speed_mm_s": 2.0,
-        "setup.max_guide_step_mm": 0.25,
-        "setup.max_base_step_mm": 0.125,
-        "setup.max_base_turn_step_mrad": 2.0,
+        "setup.guide_speed_mm_s": 0.5,
+        "setup.base_speed_mm_s": 0.25,
+        "setup.base_turn_speed_mrad_s": 4.0,
         "setup.rotation_speed_deg_s": 90.0,
     }
 )

@@ -128,10 +128,16 @@ def grid_problems(
         rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"
         yield Problem("tracker.rate_hz", tracker.rate_hz, rule)
         return
-    speed, slowest = setup.rotation_speed_deg_s, _HALF_TURN_DEG * tracker.rate_hz / _MOST_READINGS_A_STEP
-    if speed < slowest:
-        rule = f"must be at least {slowest:g}, {_MOST_READINGS_A_STEP} readings in half a turn"
-        yield Problem("setup.rotation_speed_deg_s", speed, rule)
+    for key, travel in (
+        ("guide_speed_mm_s", setup.max_guide_step_mm),
+        ("base_speed_mm_s", setup.max_base_step_mm),
+        ("base_turn_speed_mrad_s", setup.max_base_turn_step_mrad),
+        ("rotation_speed_deg_s", _HALF_TURN_DEG),
+    ):
+        speed, slowest = getattr(setup, key), travel * tracker.rate_hz / _MOST_READINGS_A_STEP
+        if speed is not None and speed < slowest:
+            rule = f"must be at least {slowest:g}, {_MOST_READINGS_A_STEP} readings in a motion by {travel:g}"
+            yield Problem(f"setup.{key}", speed, rule)
 
 
 def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iterator[Problem]:

@@ -150,6 +150,6 @@ def travel_time(setup: Setup, command: Control) -> float:
 
 def _speeds(setup: Setup) -> Control:
     """Return the speed of each column (mm/s, rad/s)."""
-    base, guide = setup.max_base_step_mm / setup.step_time, setup.max_guide_step_mm / setup.step_time
-    turn, rotation = 1e-3 * (setup.max_base_turn_step_mrad / setup.step_time), setup.rotation_speed
+    base, turn, guide = setup.base_speed, setup.base_turn_speed, setup.guide_speed
+    rotation = setup.rotation_speed
     return Control(setup.insertion_speed_mm_s, base, base, turn, turn, guide, guide, rotation, rotation)

@@ -54,8 +54,14 @@ class Setup(Section):
     max_base_turn_step_mrad: Positive = 5.0
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
-    """Mean speed of an advance; motors are faster within a step. Largest steps of guide and base last as long as the
-    largest advance."""
+    """Mean speed of an advance; motors are faster within a step."""
+    guide_speed_mm_s: Positive | None = None
+    """Mean lateral speed of the guide on an axis. Not set: its largest step lasts as long as the largest
+    advance."""
+    base_speed_mm_s: Positive | None = None
+    """Mean lateral speed of the base on an axis. Not set: as `guide_speed_mm_s`."""
+    base_turn_speed_mrad_s: Positive | None = None
+    """Mean speed of the base's rotation. Not set: as `guide_speed_mm_s`."""
     rotation_speed_deg_s: Positive = 360.0
     """Speed of rolls (without advance) and spins."""
 
@@ -120,6 +126,21 @@ class Setup(Section):
     def step_time(self) -> float:
         """Time of the largest advance, s."""
         return self.max_advance_mm / self.insertion_speed_mm_s
+
+    @property
+    def guide_speed(self) -> float:
+        """Lateral speed of the guide on an axis, mm/s."""
+        return self.guide_speed_mm_s or self.max_guide_step_mm / self.step_time
+
+    @property
+    def base_speed(self) -> float:
+        """Lateral speed of the base on an axis, mm/s."""
+        return self.base_speed_mm_s or self.max_base_step_mm / self.step_time
+
+    @property
+    def base_turn_speed(self) -> float:
+        """Speed of the base's rotation about an axis, rad/s."""
+        return 1e-3 * (self.base_turn_speed_mrad_s or self.max_base_turn_step_mrad / self.step_time)
 
     @property
     def rotation_speed(self) -> float:
