@@ -13,32 +13,25 @@ from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
-from websockets.exceptions import InvalidStatus
 
-from page_clients import IN_CONTROL, PATIENCE_S, Client, get, port_of
+from page_clients import IN_CONTROL, PATIENCE_S, Client, port_of
 
 
 @pytest.fixture
 def server(tmp_path):
-    """A server on all addresses, so that it has a token, in a cookie; it prints no traceback."""
+    """A server that prints no traceback."""
     command = [sys.executable, "-m", "flexneedle", "serve", "phantom", "--no-open", "--port", "0"]
-    command += ["--host", "0.0.0.0", "--runs", str(tmp_path / "runs")]
     with (
         (tmp_path / "errors").open("w") as errors,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+        subprocess.Popen(
+            [*command, "--runs", str(tmp_path / "runs")], stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
     ):
         try:
-            served = SimpleNamespace(address=process.stdout.readline().strip())
-            served.cookie = f"flexneedle-{port_of(served)}={served.address.partition('token=')[2]}"
-            yield served
+            yield SimpleNamespace(address=process.stdout.readline().strip())
         finally:
             process.terminate()
     assert (tmp_path / "errors").read_text() == "flexneedle: Ctrl-C ends the server\n"
-
-
-def member(server):
-    """Return a client with the token."""
-    return Client(server, additional_headers={"Cookie": server.cookie})
 
 
 def inserted(client, pace):
@@ -54,13 +47,13 @@ def inserted(client, pace):
 
 @pytest.mark.slow
 def test_attacks_are_refused_and_change_no_row_of_the_insertion(server):
-    with member(server) as client, ThreadPoolExecutor(1) as pool:
+    with Client(server) as client, ThreadPoolExecutor(1) as pool:
         client.steer().do("edit", values={"target.depth_mm": 30.0, "target.lateral_mm": 2.0})
         client.has("plan manipulation", revision=client.newest["session"]["revision"])
         alone = inserted(client, 50.0)
         watching, rounds = pool.submit(inserted, client, 1.0), 0
         while not watching.done() or rounds == 0:
-            for attack in (strangers, without_control, incomplete, invalid):
+            for attack in (without_control, incomplete, invalid):
                 attack(server)
             rounds += 1
         attacked = watching.result()
@@ -69,33 +62,9 @@ def test_attacks_are_refused_and_change_no_row_of_the_insertion(server):
     assert len(alone[0]) > 50
 
 
-def strangers(server):
-    """Requests with a wrong host or origin, or without the token, for pages and for the web socket."""
-    mine = {"Host": f"127.0.0.1:{port_of(server)}", "Cookie": server.cookie}
-    guessed = f"flexneedle-{port_of(server)}=guessed"
-    for change, status in (
-        *(
-            ({name: value}, 403)
-            for name, value in (("Host", "evil.example"), ("Origin", "http://evil.example"))
-        ),
-        *(({"Cookie": cookie}, 401) for cookie in ("", guessed, f"other={server.cookie}")),
-    ):
-        assert get(server, "/", **mine | change)[0] == status
-        if "Host" not in change:
-            with pytest.raises(InvalidStatus) as refused:
-                Client(
-                    server,
-                    origin=change.get("Origin", f"http://{mine['Host']}"),
-                    additional_headers={"Cookie": change.get("Cookie", server.cookie)},
-                )
-            assert refused.value.response.status_code == status
-    assert get(server, "/?token=guessed")[0] == 401
-    assert get(server, "/runs/..%2fsecret/run.zip", **mine)[0] == 404
-
-
 def without_control(server):
-    """Requests of a client with the token, while another client is in control."""
-    with member(server) as client:
+    """Requests of a client while another one is in control."""
+    with Client(server) as client:
         reason = f"person {client.newest['clients']['steering']} is in control"
         for type_, values in {**IN_CONTROL, "steer": {"take": True}}.items():
             assert client.refused(type_, **values).startswith(reason)
@@ -104,7 +73,7 @@ def without_control(server):
 def incomplete(server):
     """Parts of a request on a web socket."""
     whole = json.dumps({"type": "edit", "values": {"target.depth_mm": 25.0}})
-    with member(server) as client:
+    with Client(server) as client:
         for text in (*(whole[:end] for end in range(len(whole) + 1)), b"\x01\x02", "x" * 390_000):
             client.newest.pop("refused", None)
             client.socket.send(text)
@@ -113,7 +82,7 @@ def incomplete(server):
 
 def invalid(server):
     """Other protocols, methods, and headers, addresses and bodies that are too long."""
-    host = f"Host: 127.0.0.1:{port_of(server)}\r\nCookie: {server.cookie}\r\nConnection: close\r\n"
+    host = f"Host: 127.0.0.1:{port_of(server)}\r\nConnection: close\r\n"
 
     def ask(first, more="", body=b""):
         return exchange(server, f"{first} HTTP/1.1\r\n{host}{more}\r\n".encode() + body)

@@ -9,7 +9,7 @@ from fake_page import until
 from flexneedle.lab.page.replay import make_document
 from flexneedle.lab.page.shape_frames import FrameSource
 from page_frames import unpack_frame
-from recorded_page import PERIODS, insertion, period_frames, row, rows
+from recorded_page import PERIODS, insertion, period_frames, rows
 
 pytestmark = pytest.mark.page
 
@@ -85,16 +85,6 @@ def test_a_run_is_read_played_and_scrubbed(replay):
     assert page.input_value(SCRUB) == str(PERIODS - 1)
     page.locator(PLOTS).scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
-    at(page, 20)
-    page.wait_for_selector(f"{PLOTS} [aria-label^='Error from the planned path (mm) at 4.0 s']")
-    label = page.get_attribute(f"{PLOTS} [aria-label^='Error']", "aria-label")
-    assert label == f"Error from the planned path (mm) at 4.0 s: true tip {row(20)['error_mm']:.3f}"
-    plot = page.locator(f"{PLOTS} .u-over").first
-    plot.scroll_into_view_if_needed()
-    box = plot.bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2 - 3, box["y"] + 20)
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
-    until(page, f"Math.abs(flexneedle.store.get('view period') - {PERIODS // 2}) <= 3")
 
 
 def test_names_are_text_in_a_browser_without_storage_and_webgl(replay):
