@@ -7,7 +7,7 @@ from itertools import count, islice
 from flexneedle.lab.rig.supervisor import protocol
 from stages import Bench
 
-WARM, STEPS = 420, 40
+WARM, STEPS = 180, 40
 
 
 def move(bench, numbers, steps):
