@@ -155,9 +155,9 @@ def test_commands_move_axes_and_switch_motors_off_after_a_fault(controller, caps
             return motors.read()
 
     order("fault stall=C")
-    status, error = command("jog", "guide_y", "5")
+    status, error = command("jog", "guide_y", "1")
     assert status == 1
-    assert "the motors have not arrived: guide_y 5.000 mm from the goal" in error
+    assert "the motors have not arrived: guide_y 1.000 mm from the goal" in error
     assert command("off") == (0, "done")
     assert [state.on for state in read().values()] == [False, False, False]
     order("clear")
