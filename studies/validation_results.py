@@ -18,7 +18,7 @@ CUBIC = slice(3, 8)  # of SCALES: where the cube of the angle is most of the dif
 RESOLUTIONS, BEVELS = (1.0, 0.5, 0.25), (1.0, 3.0)
 STEPS = (0.5, 0.25, 0.125, 0.0625)
 ELEMENTS = np.array([2.0, 1.0, 0.5, 0.25, 0.125])
-SIZES = {  # of one kind, the rest as shipped; the last is what the others are compared with
+SIZES = {  # of one kind, the rest as shipped; the last one is the reference
     "element": np.array([2.0, 1.0, 0.5, 0.25, 0.0625]),
     "step": np.array([0.5, 0.25, 0.125, 0.0625, 0.015625]),
     "spacing": np.array([1.0, 0.5, 0.25, 0.125]),

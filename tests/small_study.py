@@ -29,12 +29,19 @@ values = [0.0, 0.3]
 def run(folder):
     """Run it; the folder of its 8 rows."""
     (folder / "mine.toml").write_text(STUDY)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pools, "open_processes", _local)
+    with in_threads():
         return run_study(folder / "mine.toml", folder / "study")
 
 
 @contextmanager
-def _local(_workers=None):
-    with ThreadPoolExecutor(1) as pool:
-        yield pool
+def in_threads():
+    """Run studies in threads of this process, so that tests can monkeypatch their functions."""
+
+    @contextmanager
+    def open_threads(workers=None):
+        with ThreadPoolExecutor(workers or 1) as pool:
+            yield pool
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pools, "open_processes", open_threads)
+        yield

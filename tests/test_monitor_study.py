@@ -63,16 +63,16 @@ def test_a_hold_is_timed_from_the_start_and_from_the_distortion():
     assert math.isnan(never.after_distortion)
 
 
-def test_a_shorter_run_keeps_its_last_position():
-    short, long = record([0.0] * 3), record([0.0] * 8)
-    assert study.tip_distance(long, short, 1.6) == pytest.approx(5.0)
-    assert study.tip_distance(long, short, math.inf) == pytest.approx(5.0)
-
-
 def test_runs_with_different_periods_are_compared_at_the_same_time():
     """1 mm in 0.2 s, and 1 mm in 0.4 s: after 1.6 s the eighth and the fourth position, 4 mm apart."""
     fast, slow = record([0.0] * 10), record([0.0] * 10, step=0.4)
     assert study.tip_distance(fast, slow, 1.6) == pytest.approx(4.0)
+    short, long = record([0.0] * 3), record([0.0] * 8)  # the last position is kept
+    assert (
+        study.tip_distance(long, short, 1.6)
+        == study.tip_distance(long, short, math.inf)
+        == pytest.approx(5.0)
+    )
     kept = record([0.0] * 10, held=(7,))
     off = [[k, 0.1 * k] for k in range(10)]
     runs = study.Runs([], [record([0.0] * 10, off, step=0.4)], [], [kept], np.array([]))

@@ -290,7 +290,7 @@ def test_a_supervisor_that_has_ended_is_a_fault_on_the_topic_of_states(bridge):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("with_rig", [True, False])
 def test_a_connection_that_fails_is_a_stop(bridge, with_rig):
-    """No stop would be received any more."""
+    """No later stop would be received."""
     node, rig = Node(error=None if with_rig else ValueError("a bug")), Rig()
     made = bridge(node)
     if with_rig:

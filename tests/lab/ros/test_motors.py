@@ -58,7 +58,7 @@ def motors(connected, joints):  # noqa: ARG001  at their start
 
 
 def borrowed(part):
-    """A part that several objects use, none of which closes it."""
+    """A part that several objects share and none closes."""
     return MagicMock(wraps=part, close=lambda: None)
 
 

@@ -55,7 +55,7 @@ def test_a_rig_without_ros_has_no_finding():
 
 
 def test_without_publishers_each_topic_is_listed_without_a_problem(monkeypatch):
-    domain = str(200 + os.getpid() % 30)  # in which nobody else is
+    domain = str(200 + os.getpid() % 30)  # with no other participant
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     found = {one.item: one for one in check_ros(rig(**ROS), WallClock(), 0.1)}
     assert found["connection"].found == f"neutral, domain {domain}"

@@ -1,12 +1,10 @@
 """A quick study: 2 targets, 2 cases, both plants, 2 repeats, with a controller without computations."""
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from flexneedle.lab.study import pools
+import small_study
 from flexneedle.lab.study.runner import run_study
 
 QUICK = """\
@@ -48,17 +46,13 @@ def quick(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def uninterrupted(quick, tmp_path_factory) -> Path:
-    """The folder of the quick study, run by two processes without interruption."""
-    return run_study(quick, tmp_path_factory.mktemp("whole") / "study", workers=2)
+    """The folder of the quick study, run without interruption."""
+    with small_study.in_threads():
+        return run_study(quick, tmp_path_factory.mktemp("whole") / "study")
 
 
 @pytest.fixture
-def in_threads(monkeypatch):
-    """Run studies in threads of this process, so that tests can monkeypatch their functions."""
-
-    @contextmanager
-    def local(workers=None):
-        with ThreadPoolExecutor(workers or 1) as pool:
-            yield pool
-
-    monkeypatch.setattr(pools, "open_processes", local)
+def in_threads():
+    """Run studies in threads of this process."""
+    with small_study.in_threads():
+        yield

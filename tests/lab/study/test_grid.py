@@ -122,7 +122,7 @@ name = "as in the scenario"
 
 
 def test_a_case_may_have_its_own_targets(study):
-    """They vary after the cases and before the axes; without z they are in the plane; without any, the scenario's."""
+    """They vary after the cases and before the axes. The default is the scenario's target, and z = 0."""
     points = study(OWN_TARGETS).points
     targets = [(point.case, point.scenario.target.position) for point in points[::2]]
     assert targets == [
@@ -144,7 +144,6 @@ def test_a_case_may_have_its_own_targets(study):
 
 
 def test_a_target_of_two_numbers_is_in_the_plane(study):
-    """Whatever the scenario's own target."""
     points = study('scenario = "phantom3d"\n[[axes]]\nkey = "target"\nvalues = [[30, 1, 2], [30, 1]]').points
     assert [point.scenario.target.position for point in points] == [(30.0, 1.0, 2.0), (30.0, 1.0, 0.0)]
 

@@ -49,7 +49,7 @@ def ran(tmp_path, in_threads):  # noqa: ARG001
 
 
 def change(folder, name, **values):
-    """Change what is recorded in `study.json`, in one of its tables."""
+    """Change a table of `study.json`."""
     stored = json.loads((folder / "study.json").read_text())
     stored[name] |= values
     (folder / "study.json").write_text(json.dumps(stored))
@@ -172,7 +172,7 @@ def test_a_world_is_the_same_also_after_one_that_is_left_out(ran, monkeypatch):
 
 @pytest.mark.parametrize("source", ["phantom", "gauges", "quick", "worlds"])
 def test_a_recorded_study_has_the_insertions_of_the_study(source, quick, tmp_path):
-    """Also those that are made alone, and not after all before them."""
+    """Even if an insertion is made alone, without the earlier ones."""
     (tmp_path / "worlds.toml").write_text(WORLDS)
     files = {"quick": quick, "worlds": tmp_path / "worlds.toml"}
     study = load_study(files.get(source, source))
@@ -264,8 +264,8 @@ def test_what_differs_from_the_recorded_row_is_noted(copied, changed, recorded, 
     assert re.fullmatch(note if "\\" in note else re.escape(note), recompute(copied, 2).note)
 
 
-def test_it_ends_with_what_is_raised_at_a_share(uninterrupted):
-    """So it is cancelled."""
+def test_an_error_of_the_progress_ends_it(uninterrupted):
+    """This cancels it."""
 
     class CancelledError(Exception):
         pass

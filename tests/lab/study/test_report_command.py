@@ -42,9 +42,3 @@ def test_the_path_of_the_page_or_all_statistics_are_printed(capsys, study, tmp_p
     assert len(repr(mean["value"])) > 12  # all digits
     assert values["controllers"][0]["verdict"] == "better"
     assert values["endings"][0]["reason"] == "plan misses the target"
-
-
-def test_a_missing_study_is_bad_input(capsys, tmp_path):
-    status, out, err = run(capsys, "report", str(tmp_path / "nowhere"))
-    assert (status, out) == (2, "")
-    assert err.count("\n") == 1

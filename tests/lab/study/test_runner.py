@@ -85,9 +85,14 @@ def test_one_plan_is_made_for_each_target_and_used_by_all_cases_and_plants(unint
 
 
 @pytest.mark.long
+def test_two_processes_write_the_same_bytes_as_threads(quick, uninterrupted, tmp_path):
+    assert tables(run_study(quick, tmp_path / "two", workers=2)) == tables(uninterrupted)
+
+
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_killed_study_resumes_and_ends_with_the_same_bytes(quick, uninterrupted, tmp_path):
-    """The workers exit with the parent, else `stop` would not return. Threads give the same bytes."""
+    """The workers exit with the parent, else `stop` would not return."""
     out = tmp_path / "killed"
     killed = stop("SIGKILL", 5, "study", quick, "--workers", 2, "--out", out)
     assert killed.returncode == -signal.SIGKILL

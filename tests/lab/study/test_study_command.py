@@ -147,7 +147,7 @@ def progress_of(monkeypatch, *advances):
     ]
 
 
-def test_rate_and_remaining_time_are_those_of_this_run(monkeypatch):
+def test_rate_and_remaining_time_are_of_this_run(monkeypatch):
     """From the first completed plan and insertion; completed planning is shown once."""
     advances = ((40, 105, 40, 30.0), (41, 105, 40, 20.0), (45, 105, 40, 20.0), (105, 105, 41, 10.0))
     planning, inserting = progress_of(monkeypatch, *advances, (105, 105, 46, 0.0))

@@ -138,7 +138,7 @@ def test_tips_far_outside_are_counted():
     assert figure.axes[0].get_xlim()[1] == pytest.approx(45.0 + 6.0)
 
 
-def test_targets_that_are_many_are_laid_on_one_another():
+def test_many_targets_are_drawn_at_the_origin():
     rng = np.random.default_rng(0)
     targets = rng.uniform((25.0, -5.0), (45.0, 5.0), (200, 2))
     own = target_panel(targets=targets, repeats=1)
@@ -208,7 +208,7 @@ def test_a_line_of_shares_has_steps_at_the_errors_and_lacks_unfinished_insertion
 SURE, UNSURE = "mean with 95 % interval", "not separable from no difference"
 
 
-def test_differences_that_hold_zero_are_hollow():
+def test_differences_not_separable_from_zero_are_hollow():
     rows = [
         DifferenceRow("sure", look(0), 0.1, 0.05, 0.15),
         DifferenceRow("sure, too", look(0), -0.1, -0.15, -0.05),
@@ -222,7 +222,7 @@ def test_differences_that_hold_zero_are_hollow():
     assert ends == [[row.low, row.high] for row in rows[:3]]
 
 
-def test_names_are_no_mathematics_and_never_too_long():
+def test_names_are_not_typeset_and_are_shortened():
     name = "$5_phantom$ " + "long " * 30
     named = replace(target_panel(), title=name)
     figure = draw_targeting([named] * 3)

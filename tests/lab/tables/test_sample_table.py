@@ -1,7 +1,5 @@
 """The reader of tables: separators, decimal marks, empty values, and malformed rows by line number."""
 
-import sys
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -136,9 +134,3 @@ def test_a_written_table_is_read_to_the_last_digit(tmp_path, suffix):
     assert read(path) == [("a", x[0], 0.0), ("b, c", None, 1.0), ("d", x[2], 2.0)]
     with pytest.raises(InputError, match="already exists"):
         write_table({"x_mm": x}, path)
-
-
-def test_without_duckdb_the_extra_is_named(written, monkeypatch):
-    monkeypatch.setitem(sys.modules, "duckdb", None)
-    with pytest.raises(InputError, match=r"duckdb: .*pip install 'flexneedle\[em\]'"):
-        read(written(COMMAS + "a,1,2\n"))

@@ -93,7 +93,7 @@ def _add_jog(commands: Commands) -> None:
     )
     _add_speed(parser, "mm/s or deg/s")
     _add_yes(parser)
-    # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
+    # With this pattern argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
 
 

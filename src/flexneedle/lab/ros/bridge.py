@@ -206,7 +206,7 @@ class Bridge(Gate):
     # The thread
 
     def _listen(self) -> None:
-        """Listen to the end. A failure of this thread is a stop, because no stop would be received any more."""
+        """Listen until the end. A failure of this thread stops the rig, since no later stop would be received."""
         try:
             self._keep_listening()
         except Exception as error:

@@ -112,7 +112,7 @@ class NodeClient:
         self._process.close()
 
     def _find_loss(self) -> str:
-        """Return the reason why nothing is received any more, or ""."""
+        """Return the reason why nothing more is received, or ""."""
         if self._channel.ended:
             line = self._process.last_line()
             return f"the ROS node has ended: {line}" if line else "the ROS node has ended"

@@ -46,7 +46,7 @@ def make_inputs(domain: DomainParticipant, profile: TopicProfile) -> list[Input]
 
 
 def _make_readers(domain: DomainParticipant, subscription: Subscription) -> list[TopicReader]:
-    """Return the readers of a subscription. Stops are read from each publisher of any quality, also earlier stops."""
+    """Return the readers of a subscription. Stops of any quality of service are read, earlier ones included."""
     topic, kind = subscription.topic, subscription.kind
     if subscription.key == "stop":
         qualities = ({"reliable": False}, {"reliable": True}, {"reliable": True, "latched": True})

@@ -102,7 +102,7 @@ class RosRefusal:
 
 @dataclass(frozen=True)
 class NodeLoss:
-    """The node has ended or does not answer: nothing is received any more, no stop either."""
+    """The node has ended or does not answer: nothing more is received, not even a stop."""
 
     time: float
     reason: str

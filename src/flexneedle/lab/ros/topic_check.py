@@ -21,7 +21,7 @@ _SHARED = "diagnostics"  # published by all ROS nodes together
 def check_ros(rig: RigFile, clock: Clock, seconds: float) -> list[Finding]:
     """Return findings about the topics of the section `ros` in `seconds`; none without it. clock: real time.
 
-    A domain that cannot be joined is a finding, too.
+    A domain that cannot be joined is also a finding.
     """
     settings = rig.ros
     if settings is None:

@@ -1,4 +1,4 @@
-"""Jobs of a worker: plan, or run insertions and return a row for each. A failure is a row, too."""
+"""Jobs of a worker: plan, or run insertions and return a row for each. A failure is also a row."""
 
 import time
 import warnings

@@ -66,7 +66,7 @@ class StudyCase(Section):
     targets: Any = None
     """Targets of the case, in place of an axis of targets: each [depth, y] or [depth, y, z] in mm."""
     reach: bool = False
-    """Whether `reach_mm` is computed in this case, too, as in worlds."""
+    """Whether `reach_mm` is also computed in this case, as in worlds."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "StudyCase":
@@ -196,7 +196,7 @@ def _check_target(key: str, value: Any) -> Iterator[Problem]:
 
 
 def _check_target_once(values: Mapping[str, Any]) -> Iterator[Problem]:
-    """Yield the targets of a case that its values set, too."""
+    """Yield the targets of a case that its values also set."""
     for key in flatten_settings(values):
         if key in TARGET_KEYS:
             yield Problem(f"values.{key}", None, "also set by targets")

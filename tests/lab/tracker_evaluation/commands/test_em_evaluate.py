@@ -94,42 +94,24 @@ def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, m
     assert err == "flexneedle: duckdb: not installed: pip install 'flexneedle[em]'\n"
 
 
-def test_an_invalid_table_gives_one_line_and_status_2(capsys, tmp_path):
-    path = write_csv(tmp_path / "t.csv", [{"a": 1.0}])
-    status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "out")
-    assert (status, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith(f"flexneedle: {path}: no column point_id, true_x_mm")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.usefixtures("no_figures")
-def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
+def test_names_of_environments_and_labels_of_all_rows_are_shown(capsys, table, tmp_path, rows):
     table.write_text(table.read_text().replace(",ideal", ",lab empty").replace(",noisy", ",with table"))
-    argv = (
-        "em",
-        "evaluate",
-        table,
-        "--ideal",
-        "lab empty",
-        "--noisy",
-        "with table",
-        "--out",
-        tmp_path / "out",
-    )
-    _, out, _ = run(capsys, *argv)
-    for text in ("reference, lab empty: error", "reference, with table: slope"):
-        assert text in out
+    names = ("--ideal", "lab empty", "--noisy", "with table", "--out", tmp_path / "out")
+    _, out, _ = run(capsys, "em", "evaluate", table, *names)
+    assert "reference, lab empty: error" in out
+    assert "reference, with table: slope" in out
     assert " ideal" not in out
     assert " noisy" not in out
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
-    rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
-    path = write_csv(tmp_path / "t.csv", rows)
-    argv = ("em", "evaluate", path, "--sensor", "coil", "--environment", "lab", "--out", tmp_path / "out")
-    status, out, err = run(capsys, *argv)
+    bare = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in rows[:135]]
+    path = write_csv(tmp_path / "bare.csv", bare)
+    status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "two")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"flexneedle: {path}: no column sensor, environment")
+    assert not (tmp_path / "two").exists()
+    labels = ("--environment", "lab", "--out", tmp_path / "two")
+    status, out, err = run(capsys, "em", "evaluate", path, "--sensor", "coil", *labels)
     assert (status, err) == (0, "")
     assert " coil, lab" in out
     with pytest.raises(SystemExit):
-        run(capsys, *argv[:3], "--sensor", " ")
+        run(capsys, "em", "evaluate", path, "--sensor", " ", *labels)

@@ -69,7 +69,7 @@ def list_deviation_columns(part: str) -> list[list[str]]:
 
 
 def compute_coverage(sds: Floats) -> Shares:
-    """Return the share of the known deviations (3, 2, n) that are within `WIDTH`, at each fraction; NaN without any.
+    """Return the share of the known deviations (3, 2, n) within `WIDTH`, at each fraction; NaN if none is known.
 
     y and z count separately.
     """

@@ -78,7 +78,7 @@ class _Facts:
         return controller if controller.varies or not few else few[0]
 
     def name_pooled(self, *shown: Factor) -> str:
-        """Return as text the factors, besides controller and those shown, whose levels are pooled."""
+        """Return the pooled factors as text: all but the controller and the shown ones."""
         labels = [factor.label for factor in self.found.design.besides(self.found.design.controller, *shown)]
         return f", pooled over {_list(labels)}" if labels else ""
 

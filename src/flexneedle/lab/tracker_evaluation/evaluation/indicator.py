@@ -102,7 +102,7 @@ def summarize_indicator(grid: MeasuredGrid) -> IndicatorSummary | None:
 def fit_indicator(
     sensor: str, ideal: MeasuredGrid | None, noisy: MeasuredGrid | None
 ) -> IndicatorFits | None:
-    """Return the fits to the errors of a sensor in one or two environments, None without any indicator."""
+    """Return the fits to the errors of a sensor in one or two environments, None if there is no indicator."""
     low, low_error = average_indicator(ideal) if ideal else (np.empty(0), np.empty(0))
     high, high_error = average_indicator(noisy) if noisy else (np.empty(0), np.empty(0))
     if not len(low) and not len(high):
