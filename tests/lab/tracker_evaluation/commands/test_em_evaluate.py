@@ -8,6 +8,7 @@ import pytest
 
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.cli import main as cli
+from report_page import save_nothing
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,8 @@ def test_tables_show_the_papers_and_the_manufacturers_values(capsys, table, tmp_
     assert str(tmp_path / "out") in out
 
 
-def test_json_is_one_object_in_full_precision_and_is_written_as_well(capsys, table, tmp_path):
+def test_json_is_one_object_in_full_precision_and_is_also_written(capsys, table, tmp_path, monkeypatch):
+    monkeypatch.setattr("flexneedle.lab.tracker_evaluation.figures.evaluation.save", save_nothing)
     folder = tmp_path / "out"
     status, out, _ = run(capsys, "em", "evaluate", table, "--out", folder, "--json")
     values = json.loads(out)
