@@ -1,6 +1,7 @@
 // Light or dark: as the system prefers, or as chosen by the switch, which this browser stores.
 
 const CHOICE = "flexneedle theme";
+const [SOFT, STIFF] = [1, 30]; // kPa, layers of the faintest and the strongest colour
 const colors = new Map(); // by name, in the present theme
 const system = matchMedia("(prefers-color-scheme: dark)");
 let choice = remembered(CHOICE);
@@ -55,3 +56,6 @@ function remember(key, text) {
     // as above
   }
 }
+
+// Strength of a layer's colour, from 0 for a soft layer to 1 for a stiff one, by the logarithm of its shear modulus (kPa).
+export const shadeOf = (modulus) => Math.log(Math.min(Math.max(modulus, SOFT), STIFF) / SOFT) / Math.log(STIFF / SOFT);

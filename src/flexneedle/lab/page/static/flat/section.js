@@ -1,7 +1,7 @@
 // Draws a section: tissue, grid, reach, guide, target, and moving parts.
 
 import { isMeasured, shownReach, shownRow } from "../shown.js";
-import { shadeOf } from "../tissue.js";
+import { shadeOf } from "../theme.js";
 import { layersIn } from "./layers.js";
 import { FOOT, SIDE, area, cross, disc, grid, inside, pointsOf, polyline, widthOf, words } from "./pen.js";
 import { lateral, stretchIn } from "./plane.js";

@@ -5,8 +5,7 @@ import {
   LineSegments, Mesh, MeshBasicMaterial, PlaneGeometry,
 } from "../vendor/three.js";
 import { shown } from "../dom.js";
-import { color } from "../theme.js";
-import { shadeOf } from "../tissue.js";
+import { color, shadeOf } from "../theme.js";
 
 const STEP = 5; // mm
 
