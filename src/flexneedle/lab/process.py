@@ -268,6 +268,26 @@ class ChildProcess:
             self._printed.close()
 
 
+def run_module(
+    module: str, *arguments: str, niceness: int, seconds: float
+) -> subprocess.CompletedProcess[bytes] | None:
+    """Run a Python module to its end in a separate process; return exit code and output, None if it lasts longer.
+
+    niceness: added to the niceness of this process; seconds: time after which the process is killed.
+    """
+    try:
+        return subprocess.run(
+            ["nice", "-n", str(niceness), sys.executable, "-m", module, *arguments],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=seconds,
+            start_new_session=True,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return None
+
+
 def open_channel(descriptor: int, **settings: Any) -> MessageChannel:
     """Open the child's end of the channel, the first descriptor of its command."""
     return MessageChannel(socket.socket(fileno=descriptor), **settings)

@@ -11,6 +11,7 @@ import pytest
 
 import flexneedle
 from commands import run
+from flexneedle.lab.page.server import runs_folder
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.runs_folder import RunsFolder, zip_run
 from page_clients import Client, get, port_of
@@ -184,7 +185,7 @@ def test_the_last_insertion_is_saved_and_neither_cancelled_nor_replaced_meanwhil
     client.wait(lambda: "mine" in client.run_names())
 
 
-def test_files_of_a_run_are_downloaded(runs, server):
+def test_files_of_a_run_are_downloaded(runs, server, monkeypatch):
     """The runs have no plan and no trace: the commands that export them refuse."""
     (runs / "older" / "insertion.png").write_bytes(b"\x89PNG")
     status, _text, headers = get(server, "/runs/older/figure.png")
@@ -198,6 +199,8 @@ def test_files_of_a_run_are_downloaded(runs, server):
     ):
         status, text, _headers = get(server, f"/runs/{path}")
         assert (status, reason in text, "Traceback" in text) == (404, True, False)
+    monkeypatch.setattr(runs_folder, "_EXPORT_S", 0.0)
+    assert get(server, "/runs/older/replay.html")[:2] == (404, "not ready after 0 s\n")
 
 
 @pytest.mark.usefixtures("empty_figures")

@@ -5,23 +5,20 @@ import io
 import json
 import os
 import re
-import signal
 import stat
-import sys
 import zipfile
-from asyncio.subprocess import Process
-from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from flexneedle.lab.page.server.clients import Refusal
+from flexneedle.lab.process import run_module
 from flexneedle.record.folder import RUN_FILE, STUDY_FILE
 
 _NAME = re.compile(r"[\w][\w .+-]*")
 _MOST_RUNS = 1_000
-_EXPORT_S = 60.0
+_EXPORT_S, _NICENESS = 60.0, 10
 FIGURES = ("insertion.png", "plan.png")
 """Possible names of a run's figure."""
 
@@ -136,33 +133,21 @@ def zip_run(folder: Path) -> bytes:
 
 async def export_csv(folder: Path) -> bytes:
     """Return the control periods of a run, as `flexneedle export --csv`. Raises Refusal."""
-    return await _run_command(("export", str(folder), "--csv", "-"))
+    return await _run_command("export", str(folder), "--csv", "-")
 
 
 async def export_replay(folder: Path) -> bytes:
     """Return the replay file of a run, as `flexneedle view --html`. Raises Refusal."""
-    return await _run_command(("view", str(folder), "--html", "-"))
+    return await _run_command("view", str(folder), "--html", "-")
 
 
-async def _run_command(arguments: Sequence[str]) -> bytes:
+async def _run_command(*arguments: str) -> bytes:
     """Return the output of a command in a separate process, which keeps its imports out of the server."""
-    pipe = asyncio.subprocess.PIPE
-    command = (*("nice", "-n", "10"), *(sys.executable, "-m", "flexneedle"), *arguments)
-    process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe, start_new_session=True)
-    try:
-        async with asyncio.timeout(_EXPORT_S):
-            out, errors = await process.communicate()
-    except TimeoutError:
-        raise Refusal(f"not ready after {_EXPORT_S:g} s") from None
-    finally:
-        _kill(process)
-    if process.returncode:
-        raise Refusal(errors.decode(errors="replace").strip().removeprefix("flexneedle: "))
-    return out
-
-
-def _kill(process: Process) -> None:
-    """Kill a process. Process.kill would first collect its status, of which asyncio's watcher then complains."""
-    if process.returncode is None:
-        with suppress(ProcessLookupError):
-            os.kill(process.pid, signal.SIGKILL)
+    done = await asyncio.to_thread(
+        run_module, "flexneedle", *arguments, niceness=_NICENESS, seconds=_EXPORT_S
+    )
+    if done is None:
+        raise Refusal(f"not ready after {_EXPORT_S:g} s")
+    if done.returncode:
+        raise Refusal(done.stderr.decode(errors="replace").strip().removeprefix("flexneedle: "))
+    return done.stdout
