@@ -219,8 +219,8 @@ def test_a_named_table_keeps_its_values_and_points_are_written_one_after_the_oth
     assert edit_of(page, server) == wanted
 
 
-def test_layers_are_added_removed_and_get_another_law(form, server):
-    """A layer with another law keeps the values that both laws have."""
+def test_layers_are_added_removed_and_get_another_or_a_custom_law(form, server):
+    """A layer with another law keeps the values that both laws have; a custom law could not be set again."""
     page, before = form(), load_scenario("phantom3d")
     page.locator("details[data-section='tissue.0'] > summary").click()
     page.get_by_role("button", name="Add a layer above layer 1").click()
@@ -246,13 +246,11 @@ def test_layers_are_added_removed_and_get_another_law(form, server):
     again = linear.with_values(edit_of(page, server))
     assert again.tissue[1].alpha == 8.74
     assert again.tissue[1].model_copy(update={"alpha": before.tissue[1].alpha}) == before.tissue[1]
-
-
-def test_a_layer_with_a_custom_law_has_fields_for_its_values(form):
-    """Its law is not changed here: it could not be set again."""
-    given = session(**{"tissue.1.law": "mine:Law", "tissue.1.yield_kpa": 3.0, "tissue.1.hardens": True})
+    given = session(5, **{"tissue.1.law": "mine:Law", "tissue.1.yield_kpa": 3.0, "tissue.1.hardens": True})
     del given.values["tissue.1.alpha"]
-    page = form(given)
+    server.send(given)
+    until(page, "flexneedle.store.get('session').revision === 5")
+    painted(page)
     search(page, "tissue.1.")
     keys = page.evaluate(
         "[...document.querySelectorAll('[data-key^=\"tissue.1.\"]')].map((one) => one.dataset.key)"
@@ -308,20 +306,20 @@ RECONNECTED = """(welcome) => {
 """Close and open sections after the first message of a new connection, before its session has arrived."""
 
 
-def test_sections_are_opened_while_a_new_connection_has_not_sent_its_session(form, server):
-    """The browser reports an opened section later, and a message may arrive in between."""
+def test_another_connection_sends_its_session_options_are_chosen_and_all_is_disabled_without_control(
+    form, server
+):
+    """The browser reports an opened section later, and the first message of the connection may precede it."""
     page = form()
     page.evaluate(RECONNECTED, WELCOME.model_dump_json())
     assert page.evaluate("flexneedle.store.get('session')") is None
     assert page.locator("#field-tissue-1-law").input_value() == "ogden"
-    server.send(clients(), session(3, **{"tissue.1.alpha": 7.5}))
+    server.send(
+        clients(), session(3, ["target.depth_mm"], ["plan.samples = 3: few"], **{"tissue.1.alpha": 7.5})
+    )
     until(page, "document.querySelector('#field-tissue-1-alpha').value === '7.5'")
-
-
-def test_options_are_chosen_doubts_shown_and_all_is_disabled_while_another_is_in_control(form, server):
-    page = form(session(changed=["target.depth_mm"], doubts=["plan.samples = 3: few"]))
     assert "plan.samples = 3" in page.inner_text(f"{FORM} .doubts")
-    page.wait_for_selector(".changed[data-key='target.depth_mm']")
+    page.wait_for_selector(".changed[data-key='target.depth_mm']", state="attached")
     problem = page.locator("#option-seed-problem")
     for text in ("-1", "1.5", "99999999999999999999", ""):
         enter(page, "#option-seed", text)
