@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Self
 
-from flexneedle.errors import InputError
 from flexneedle.ports import Clock
 from flexneedle.types import VISIBLE, Frame
 
@@ -15,12 +14,10 @@ ENDED = "the recording has ended"
 class Replay:
     """Tracker that replays frames on a clock, starting now: a frame recorded after t seconds arrives after t seconds.
 
-    frames: oldest first. Times are on the clock, numbers are from the recording. Raises InputError without frames.
+    frames: oldest first, at least one. Times are on the clock, numbers are from the recording.
     """
 
     def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:
-        if not frames:
-            raise InputError("a replay needs at least one frame")
         self._frames, self._clock = frames, clock
         self._start, self._next = clock.now(), 0
 
