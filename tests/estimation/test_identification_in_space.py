@@ -202,7 +202,7 @@ def test_reported_variances_become_the_variance_of_the_mean():
     """The mean of four readings has a quarter of the variance, unknown if one reading reports none."""
     covariance = ((8.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 12.0))
     readings = tuple(Measurement(0.1 * k, 1.0, 2.0, 3.0, covariance=covariance) for k in range(4))
-    move = Move(0.0, 0.4, Control(1.0), readings)
+    move = Move(Motion(Control(1.0), 0.0, 0.4), readings)
     assert move.means["tip position"][-2:] == (2.0, 2.0)
     mixed = replace(move, measurements=(*readings[:3], replace(readings[3], covariance=None)))
     assert all(map(math.isnan, mixed.means["tip position"][-2:]))

@@ -182,13 +182,13 @@ def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
 @pytest.mark.parametrize(("time", "part"), [(7.0, 0.0), (7.5, 0.25), (9.0, 1.0), (6.0, 0.0), (11.0, 1.0)])
 def test_the_tip_moves_evenly_within_a_move_and_rests_outside(time, part):
     tips = np.array([[10.0, 1.0, -2.0, 0.3, 0.1], [12.0, 0.0, 2.0, 0.2, 0.1]])
-    point = position_along((Move(7.0, 9.0, AHEAD),), tips, time)
+    point = position_along((Move(Motion(AHEAD, 7.0, 9.0)),), tips, time)
     assert point == pytest.approx((10.0 + 2.0 * part, 1.0 - part, -2.0 + 4.0 * part))
-    assert Move(7.0, 9.0, AHEAD).part(time) == pytest.approx(part)
+    assert Move(Motion(AHEAD, 7.0, 9.0)).part(time) == pytest.approx(part)
 
 
 def test_the_tip_goes_from_move_to_move():
-    moves = Move(0.0, 1.0, AHEAD), Move(1.0, 3.0, AHEAD)
+    moves = Move(Motion(AHEAD, 0.0, 1.0)), Move(Motion(AHEAD, 1.0, 3.0))
     tips = np.zeros((3, 5))
     tips[:, X], tips[:, Y], tips[:, Z] = (0.0, 1.0, 2.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4)
     assert position_along(moves, tips, 0.5) == pytest.approx((0.5, 0.1, 0.0))
@@ -201,7 +201,7 @@ def test_the_tip_goes_from_move_to_move():
 
 
 def test_a_move_without_duration_is_done_at_once():
-    assert Move(5.0, 5.0, AHEAD).part(5.0) == 1.0
+    assert Move(Motion(AHEAD, 5.0, 5.0)).part(5.0) == 1.0
 
 
 def test_an_empty_reading_is_refused():
