@@ -141,7 +141,7 @@ def test_a_plan_is_read_from_disk_unchanged(point, tmp_path):
 def test_a_damaged_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").write_text('{"seconds": 1}')
     (tmp_path / "b.json").mkdir()
-    for key, reason in (("a", "damaged: KeyError 'plan'"), ("b", "cannot be read: Is a directory")):
+    for key, reason in (("a", "damaged: KeyError: 'plan'"), ("b", "cannot be read: Is a directory")):
         with pytest.raises(InputError, match=rf"{key}\.json: {reason}: remove it to plan again"):
             StudyPlans(tmp_path).plan(key)
     with pytest.raises(InputError, match=r"a\.json: not a folder, needed for the plans"):

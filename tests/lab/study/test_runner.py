@@ -228,7 +228,7 @@ def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, t
     with monkeypatch.context() as patch:
         patch.setattr(pools, "open_processes", dying)
         with pytest.raises(
-            RunError, match=r"workers were lost \(BrokenExecutor .*\); finished rows are kept"
+            RunError, match=r"workers were lost \(BrokenExecutor: .*\); finished rows are kept"
         ):
             run_study(quick, tmp_path / "a")
     assert len(runs(tmp_path / "a")) == 4

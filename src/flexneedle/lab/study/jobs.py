@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from flexneedle.errors import RunError, ScenarioWarning
+from flexneedle.errors import RunError, ScenarioWarning, describe_error
 from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.reach import compute_reach
 from flexneedle.loop.insertions import insert
@@ -61,7 +61,7 @@ def make_plan(point: StudyPoint) -> PlanResult:
     try:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
     except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
-        return PlanResult(refusal=f"no plan: {_format_error(error)}")
+        return PlanResult(refusal=f"no plan: {describe_error(error)}")
     return PlanResult(plan_values(made), made.seconds)
 
 
@@ -83,7 +83,7 @@ def _make_row(job: InsertionJob, seed: int) -> dict[str, Any]:
         except RunError as error:
             results |= {"outcome": "refused", "reason": str(error)}
         except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
-            results["reason"] = _format_error(error)
+            results["reason"] = describe_error(error)
         else:
             results |= insertion_row(insertion)
             times = _sum_times(insertion)
@@ -100,7 +100,7 @@ def _try_reach(point: StudyPoint, seed: int) -> tuple[float | None, str]:
     try:
         return compute_reach(point.scenario, seed, point.plant, point.strategy), ""
     except Exception as error:  # noqa: BLE001  recorded in the row
-        return None, f"no reach: {_format_error(error)}"
+        return None, f"no reach: {describe_error(error)}"
 
 
 def insert_at(
@@ -132,10 +132,6 @@ def _sum_times(insertion: Insertion) -> dict[str, float]:
         "control_s": sum(period.durations["decide"] + period.durations["observe"] for period in periods),
         "plant_s": sum(period.durations["apply"] for period in periods),
     }
-
-
-def _format_error(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @cache

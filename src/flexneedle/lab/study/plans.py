@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, describe_error
 from flexneedle.files import replace_file
 from flexneedle.lab.study.grid import StudyPoint
 from flexneedle.lab.study.jobs import PlanResult
@@ -78,6 +78,4 @@ def _read_plan(path: Path) -> tuple[Plan, float]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}: remove it to plan again") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: damaged: {type(error).__name__} {error}: remove it to plan again"
-        ) from None
+        raise InputError(f"{path}: damaged: {describe_error(error)}: remove it to plan again") from None

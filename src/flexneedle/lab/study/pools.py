@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 from flexneedle.arguments import require_extra
-from flexneedle.errors import InputError, make_printable
+from flexneedle.errors import InputError, describe_error
 from flexneedle.lab.study.worker import set_up_worker
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator.simulator import count_cores
@@ -74,5 +74,4 @@ def _connect(address: str) -> Any:
     try:
         return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
     except Exception as error:  # noqa: BLE001  Dask raises many types for the response of another server
-        message = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(make_printable(f"{address}: no Dask scheduler responds: {message}")) from None
+        raise InputError(f"{address}: no Dask scheduler responds: {describe_error(error)}") from None

@@ -11,7 +11,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from flexneedle.arguments import check_path, check_whole, require_extra
-from flexneedle.errors import InputError, RunError
+from flexneedle.errors import InputError, RunError, describe_error
 from flexneedle.files import create_folder
 from flexneedle.lab.study import pools
 from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder
@@ -221,8 +221,7 @@ def _report_worker_loss() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        message = " ".join(f"{type(error).__name__} {error}".split())
         raise RunError(
-            f"workers were lost ({message}); finished rows are kept; resume with --resume; "
+            f"workers were lost ({describe_error(error)}); finished rows are kept; resume with --resume; "
             "a script needs the guard `if __name__ == '__main__':`"
         ) from error

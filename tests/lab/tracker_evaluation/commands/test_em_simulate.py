@@ -63,6 +63,13 @@ def test_bad_input_gives_one_line(tmp_path, monkeypatch, capsys, arguments, mess
     assert (tmp_path / "mine.csv").read_text() == "mine"
 
 
+def test_counts_out_of_bounds_are_refused(capsys):
+    for option, value in (("--points", "1"), ("--samples", "0"), ("--repeats", "1001")):
+        with pytest.raises(SystemExit):
+            simulate(option, value)
+        assert f"argument {option}: {value}: must be a whole number from" in capsys.readouterr().err
+
+
 # ---- the documentation page
 
 

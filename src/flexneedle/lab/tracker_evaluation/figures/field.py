@@ -40,12 +40,10 @@ def draw_field(rows: Sequence[FieldRow]) -> Figure:
     shown = rows[:MOST_ROWS]
     layers = [_slices(row.true[:, 2]) for row in shown]
     columns = max(map(len, layers))
-    across = 2 if columns == 1 and len(shown) > 1 else 1  # two single slices side by side
-    down = ceil(len(shown) / across)
     with apply_style():
-        figure = new_figure(down * (_AROUND + min((WIDTH / across - 1.6) / columns, _WIDEST)))
-        parts = figure.subfigures(down, across, squeeze=False).ravel()
-        for part, row, slices in zip(parts, shown, layers, strict=False):
+        figure = new_figure(len(shown) * (_AROUND + min((WIDTH - 1.6) / columns, _WIDEST)))
+        parts = figure.subfigures(len(shown), 1, squeeze=False).ravel()
+        for part, row, slices in zip(parts, shown, layers, strict=True):
             _draw_row(part, row, slices)
         if len(rows) > MOST_ROWS:
             figure.supxlabel(f"{len(rows) - MOST_ROWS} more not shown", color=QUIET, fontsize=8)
