@@ -1,12 +1,13 @@
 """`flexneedle em evaluate`: errors and indicator of a table of measurements, and the files of results."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
+from flexneedle.geometry.rigid import misfit
 from flexneedle.lab.tables.columns import OPTIONAL, REFERENCE, REQUIRED, map_columns
 from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tracker_evaluation.evaluation import published
@@ -23,7 +24,6 @@ from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
     summarize_indicator,
 )
 from flexneedle.lab.tracker_evaluation.evaluation.moments import MeasuredGrid, read_grids
-from flexneedle.lab.tracker_evaluation.evaluation.notes import find_notes
 from flexneedle.lab.tracker_evaluation.evaluation.points import POINTS_FILE, format_points
 from flexneedle.lab.tracker_evaluation.evaluation.repeatability import (
     Orientation,
@@ -127,8 +127,21 @@ def evaluate_table(data: Path, options: EvaluationOptions) -> Evaluation:
     registered = [result.grid for result in results]
     sensors = dict.fromkeys(grid.sensor for grid in registered)
     fits = [fit_indicator(sensor, *_environments(registered, sensor, options)) for sensor in sensors]
-    notes = find_notes(registered)
+    notes = [f"{grid.title}: {note}" for grid in registered for note in _find_notes(grid)]
     return Evaluation(data, options, rows, results, [fit for fit in fits if fit is not None], notes)
+
+
+def _find_notes(grid: MeasuredGrid) -> Iterator[str]:
+    """Yield each unusual property of the data and its treatment."""
+    count, missing = grid.points.count, int(grid.points.missing.sum())
+    if missing:
+        yield (
+            f"{missing} of {missing + int(count.sum())} samples have no position (left out), "
+            f"all samples at {int((count == 0).sum())} of {len(count)} grid points"
+        )
+    measured = grid.measured
+    if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
+        yield wrong
 
 
 def read_table(data: Path, options: EvaluationOptions) -> tuple[list[MeasuredGrid], int]:

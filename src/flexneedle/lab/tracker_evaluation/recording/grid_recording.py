@@ -18,7 +18,6 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.interrupts import delay_signals
 from flexneedle.lab.tables.columns import COLUMNS
 from flexneedle.lab.tracker_evaluation.recording.grid import GridStop, StageGrid
-from flexneedle.lab.tracker_evaluation.recording.steps import StageVisit, find_mismatch
 from flexneedle.ports import Clock, Tracker
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
@@ -27,6 +26,8 @@ EXTRA = ("time_s", "frame_number", "repeat")
 _HEADER = (*COLUMNS, *EXTRA)
 _FIRST_LINE = ",".join(_HEADER).encode() + b"\n"
 _PAUSE_S = 0.01
+_LIMIT_MM, _SHARE = 5.0, 0.2
+"""Distances may differ by 5 mm or 20 % of the stage's: twice the worst error of a working tracker."""
 _SILENT_S = 1.0  # time without a (good) frame after which it is reported
 
 
@@ -46,6 +47,14 @@ class StageOperator:
     report: Callable[[str], None]
     retries: bool = True
     accepts: Callable[[str], bool] = _refuse
+
+
+@dataclass(frozen=True)
+class StageVisit:
+    """A stop and the mean position of each sensor at it (mm, tracker's frame)."""
+
+    stop: GridStop
+    means: Mapping[str, Point]
 
 
 @dataclass
@@ -162,7 +171,7 @@ def _measure(
         frames, fault = _collect_samples(tracker, clock, grid, operator.report)
         if not fault:
             visit = _make_visit(grid, stop, frames)
-            mismatch = "" if before is None else find_mismatch(before, visit)
+            mismatch = "" if before is None else _find_mismatch(before, visit)
             if not mismatch or operator.accepts(mismatch):
                 return frames, visit
             continue
@@ -227,6 +236,23 @@ def _make_visit(grid: StageGrid, stop: GridStop, frames: Sequence[Frame]) -> Sta
     return StageVisit(
         stop, {sensor: _average(_stack_positions(frames, name)) for name, sensor in grid.file.sensors.items()}
     )
+
+
+def _find_mismatch(before: StageVisit, after: StageVisit) -> str:
+    """Return a message on the first sensor that did not move as far as the stage; "" if all did.
+
+    Only distances are compared, which needs no common frame.
+    """
+    stage = dist(before.stop.position, after.stop.position)
+    limit = max(_LIMIT_MM, _SHARE * stage)
+    for name, position in after.means.items():
+        moved = dist(before.means[name], position)
+        if abs(moved - stage) > limit:
+            return (
+                f"{name} moved {moved:.1f} mm from point {before.stop.point_id} to point {after.stop.point_id}, "
+                f"the stage {stage:.1f} mm: the difference must be at most {limit:.1f} mm"
+            )
+    return ""
 
 
 def _average(positions: NDArray[np.float64]) -> Point:
