@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_blends import added, arrived
-from browser_layout import too_wide
+from browser_checks import added, arrived, too_wide
 from flexneedle.lab.page.protocol import ReachMessage, RowsMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource
 from recorded_page import (

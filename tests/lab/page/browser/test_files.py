@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from browser_blends import painted
+from browser_checks import painted
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRowsMessage

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from browser_blends import painted
+from browser_checks import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RefusedMessage, SessionMessage
 from flexneedle.lab.page.server.catalog import build_catalog

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from browser_blends import painted
+from browser_checks import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import (
     DisturbancesMessage,

@@ -2,8 +2,7 @@
 
 import pytest
 
-from browser_blends import arrived, painted
-from browser_layout import too_wide
+from browser_checks import arrived, painted, too_wide
 from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage
 from flexneedle.scenario.files import load_scenario
 from recorded_page import (

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_blends import added, painted
+from browser_checks import added, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import EstimateMessage, JobMessage
 from flexneedle.lab.page.shape_frames import FrameSource

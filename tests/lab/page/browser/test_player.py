@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_blends import painted
+from browser_checks import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame

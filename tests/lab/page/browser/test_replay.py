@@ -2,8 +2,7 @@
 
 import pytest
 
-from browser_blends import painted
-from browser_layout import too_wide
+from browser_checks import painted, too_wide
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.replay import make_document

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_blends import arrived
+from browser_checks import arrived
 from recorded_page import opening, scene
 
 pytestmark = pytest.mark.page

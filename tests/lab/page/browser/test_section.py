@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from browser_blends import painted
+from browser_checks import painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RowsMessage
 from flexneedle.lab.page.shape_frames import FrameSource

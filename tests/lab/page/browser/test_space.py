@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_blends import BLENDS, arrived, painted
-from browser_layout import too_wide
+from browser_checks import BLENDS, arrived, painted, too_wide
 from fake_page import until
 from recorded_page import (
     NODES,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from browser_blends import PAINTED
+from browser_checks import PAINTED
 from fake_page import until
 from recorded_page import TARGET, insertion, period_frames, rows
 

@@ -1,4 +1,4 @@
-"""Pixels that a part adds to the drawings of a page: those that have come closer to its tone."""
+"""Checks of a page in a browser: pixels that a part adds to its drawings, and parts that are wider than their box."""
 
 PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 FLAT = ("[data-panel=section] canvas", "[data-panel=axial] canvas")
@@ -61,3 +61,15 @@ def added(page, server, tone, *news, canvases=FLAT):
     server.send(*news)
     arrived(page)
     return page.evaluate(_ADDED, [list(canvases), tone])
+
+
+_TOO_WIDE = """() => {
+  const boxes = [document.documentElement, ...document.querySelectorAll("main, aside, .status, .panel, [data-panel]")];
+  const name = ({ tagName, className, dataset }) => [tagName, className, dataset.panel].filter(Boolean).join(" ");
+  return boxes.filter(({ scrollWidth, clientWidth }) => scrollWidth > clientWidth).map(name);
+}"""
+
+
+def too_wide(page):
+    """Return the parts that are wider than their box: document, columns (which scroll separately), panels."""
+    return page.evaluate(_TOO_WIDE)
