@@ -83,7 +83,8 @@ class Clock:
 def paced(pace, then=()):
     control, states = JobControl(pace), []
     clock = Clock(control, then)
-    pacer = Pacer(control, clock.wait, control.take_disturbs, states.append, lambda: clock.now)
+    control.wait = clock.wait
+    pacer = Pacer(control, control.take_disturbs, states.append, lambda: clock.now)
     pacer.start()
     return pacer, clock, states
 

@@ -61,7 +61,7 @@ def _insert_virtually(reporter: InsertionReporter) -> Insertion:
             disturber.take(one)
         disturber.expire()
 
-    pacer = Pacer(control, control.wait, disturb, reporter.report_pause)
+    pacer = Pacer(control, disturb, reporter.report_pause)
     return insert(
         task.scenario,
         plan,
@@ -78,7 +78,6 @@ class Pacer:
     def __init__(
         self,
         control: JobControl,
-        wait: Callable[[float | None], None],
         on_wake: Callable[[], None],
         on_pause: Callable[[bool], None],
         now: Callable[[], float] = monotonic,
@@ -86,14 +85,12 @@ class Pacer:
         """Keep what `start` needs.
 
         Args:
-            control: Pace, stop and cancel of the job.
-            wait: Waits for a change of the job, at most a time (s; None: any).
+            control: Pace, stop and cancel of the job, and its waits for a change.
             on_wake: Called after each wait, for changes other than the pace.
             on_pause: Called when the insertion is paused (True) or continues (False).
             now: Clock (s).
         """
-        self._control, self._wait, self._on_wake = control, wait, on_wake
-        self._on_pause, self._now = on_pause, now
+        self._control, self._on_wake, self._on_pause, self._now = control, on_wake, on_pause, now
         self._since, self._rate = now(), control.pace
         self._ended = 0.0
         self._paused: bool | None = None
@@ -124,11 +121,11 @@ class Pacer:
                 self._report(paused=True)
                 if self._control.take_advance():
                     return
-                self._wait(None)
+                self._control.wait(None)
                 self._since = self._now()
             elif left > _AT_ONCE_S:
                 self._report(paused=False)
-                self._wait(left / pace)
+                self._control.wait(left / pace)
             else:
                 self._report(paused=False)
                 return
