@@ -118,6 +118,20 @@ def test_a_guide_that_steering_does_not_move_does_not_improve_the_reach():
 
 # ---- in space
 
+
+@pytest.fixture
+def ends_once(monkeypatch):
+    """Compute the end in each direction once, as it does not depend on the lateral target."""
+    known = {}
+
+    def once(truth, roll, *more):
+        if roll not in known:
+            known[roll] = insert_straight(truth, roll, *more)
+        return known[roll]
+
+    monkeypatch.setattr("flexneedle.lab.study.reach.insert_straight", once)
+
+
 FREE_IN_SPACE = world(15, "perfect", "no-guide").with_values(COARSE)
 HALF_TURNS = world(15, "perfect", "no-guide-half-turns").with_values(COARSE)
 
@@ -128,6 +142,7 @@ def aimed(scenario, offset):
 
 
 @pytest.mark.parametrize("direction", [pytest.param(1.0, marks=pytest.mark.long), -2.0])
+@pytest.mark.usefixtures("ends_once")
 def test_a_needle_that_rolls_to_any_angle_reaches_a_disc(direction):
     """As far as the constant bevel, in every direction."""
     radius = end(FREE_IN_SPACE)[1]
@@ -138,6 +153,7 @@ def test_a_needle_that_rolls_to_any_angle_reaches_a_disc(direction):
         )
 
 
+@pytest.mark.usefixtures("ends_once")
 def test_half_turns_reach_an_interval_and_nothing_beside_it():
     radius = end(HALF_TURNS)[1]
     assert compute_reach(aimed(HALF_TURNS, complex(0.5 * radius, 0.8)), 0, "model") == pytest.approx(
@@ -196,6 +212,7 @@ def test_how_far_a_target_is_beside_what_the_bevel_reaches_along_z():
     ]
 
 
+@pytest.mark.usefixtures("ends_once")
 def test_a_limited_range_reaches_the_hull_of_its_arc():
     """Within ±60°: the direction of the range's end as far as the bevel, its chord, and nothing behind that."""
     radius, limited = end(FREE_IN_SPACE)[1], FREE_IN_SPACE.with_values({"setup.max_rotation_deg": 60.0})
