@@ -161,13 +161,13 @@ values = ["resolved-rate"]
 def test_a_world_is_the_same_also_after_one_that_is_left_out(ran, monkeypatch):
     """Without a guide, in world 15, this controller has no row."""
     monkeypatch.setattr(jobs, "compute_reach", lambda *_: 1 / 0)
-    folder = ran(WORLDS)
+    folder = ran(WORLDS.replace("repeats = 2", "repeats = 1"))
     found = journalled(folder)
-    assert len(found) == 4
-    assert found[3]["reason"].endswith("no reach: ZeroDivisionError: division by zero")
-    again = recompute(folder, 3)
-    assert agrees(again.insertion, found[3] | {"reason": again.insertion.reason})
-    assert (again.insertion.seed, again.note) == (7, "")
+    assert len(found) == 2
+    assert found[1]["reason"].endswith("no reach: ZeroDivisionError: division by zero")
+    again = recompute(folder, 1)
+    assert agrees(again.insertion, found[1] | {"reason": again.insertion.reason})
+    assert (again.insertion.seed, again.note) == (3, "")
 
 
 @pytest.mark.parametrize("source", ["phantom", "gauges", "quick", "worlds"])
