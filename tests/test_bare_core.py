@@ -69,6 +69,7 @@ def test_it_plans_inserts_and_draws_without_the_laboratory(run, tmp_path):
         ("study phantom --scheduler tcp://localhost:1", "cluster"),
         ("report .", "study"),
         ("em evaluate points.csv", "em"),
+        ("em check points.csv", "em"),
         ("em register points.csv", "em"),
         ("em simulate", "em"),
         ("em watch --tracker aurora:/dev/null", "aurora"),

@@ -121,7 +121,7 @@ def test_what_cannot_be_registered_is_refused(tmp_path, name, capsys):
     assert not (tmp_path / "r.toml").exists()
 
 
-def test_the_command_writes_a_scenario_table_and_reports_errors(tmp_path, capsys):
+def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp_path, capsys):
     data, out = table(tmp_path, [*rows(0.3), *rows(sensor="tip")]), tmp_path / "rig.toml"
     command = ["em", "register", str(data), "--sensor", "ref1", "--target", "40", "5", "0", "--out", str(out)]
     assert main([*command, "--json"]) == 0
@@ -129,6 +129,7 @@ def test_the_command_writes_a_scenario_table_and_reports_errors(tmp_path, capsys
     found = register(read_pairs(data, sensor="ref1"), [(40.0, 5.0, 0.0)])
     assert printed["fre_mm"] == found.fre
     assert printed["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
+    assert {path.name for path in tmp_path.glob("rig.*")} == {"rig.toml", "rig.png", "rig.svg"}
     assert tomllib.loads(out.read_text())["result"]["points"] == 8
     scenario = load_registration(out, PHANTOM)
     assert scenario.tracker.registration == found.registration

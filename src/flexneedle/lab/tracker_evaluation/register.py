@@ -10,6 +10,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
+from flexneedle.figures.style import save
 from flexneedle.geometry.quaternion import from_matrix
 from flexneedle.geometry.rigid import (
     Rigid,
@@ -22,6 +23,7 @@ from flexneedle.geometry.rigid import (
 from flexneedle.lab.tables.columns import REQUIRED, map_columns
 from flexneedle.lab.tables.row_rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
 from flexneedle.lab.tables.sample_table import SampleTable, open_table
+from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
 from flexneedle.scenario.sections.registration import Registration
 
 Floats = NDArray[np.float64]
@@ -129,7 +131,7 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
 
 
 def write_registration(registered: RegistrationResult, path: Path) -> None:
-    """Write a TOML file with a table for a scenario and the errors.
+    """Write a TOML file with a table for a scenario and the errors, and its figure as `.png` and `.svg`.
 
     Raises InputError if the file exists.
     """
@@ -137,6 +139,7 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
         raise InputError(f"{path}: already exists: choose another file with --out")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
+    _draw(registered, path)
     values = {
         "tracker": {"registration": registered.registration.model_dump(mode="json")},
         "result": registered.values(),
@@ -148,6 +151,17 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
         raise InputError(f"{path}: already exists: choose another file with --out") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _draw(registered: RegistrationResult, path: Path) -> None:
+    stage, fle = registered.pairs.stage, registered.fle
+    figure = draw_registration(
+        stage,
+        registered.rigid.apply(registered.pairs.tracker),
+        registered.targets,
+        lambda points: target_error(stage, fle, points),
+    )
+    save(figure, path.parent, path.stem)
 
 
 _POINTS = """

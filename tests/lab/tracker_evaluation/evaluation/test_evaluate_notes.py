@@ -1,7 +1,8 @@
-"""Notes on a table: a poor fit; an unknown environment is refused."""
+"""Notes on a table: a different frame of the tracker, a poor fit; an unknown environment is refused."""
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
@@ -10,6 +11,51 @@ from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOpti
 
 def notes(path, rows, **options):
     return evaluate_table(write_csv(path / "t.csv", rows), EvaluationOptions(**options)).notes
+
+
+def rotated(rows):
+    for row in rows:
+        x = Rotation.from_euler("z", 20, degrees=True).apply([row[f"{axis}_mm"] for axis in "xyz"]) + 200.0
+        row |= dict(zip(("x_mm", "y_mm", "z_mm"), map(float, x), strict=True))
+    return rows
+
+
+def test_a_note_suggests_register_for_a_tracker_with_another_frame(tmp_path):
+    rows = rotated(random_rows(0)) + rotated(random_rows(1, sensor="reference"))
+    (found,) = notes(tmp_path, rows)
+    fit = evaluate_table(tmp_path / "t.csv", EvaluationOptions(register=True)).results
+    assert "add --register" in found
+    assert ", and 1 more)" in found
+    assert any(f"to {result.accuracy.rmse_mm:.2g} mm (" in found for result in fit)
+
+
+@pytest.mark.parametrize(
+    "case", ["registered", "in the stage's frame", "few points", "points on a line", "wrong, but not rigidly"]
+)
+def test_no_note_if_a_rigid_fit_would_not_help_or_was_made(tmp_path, case):
+    rows = rotated(random_rows(0)) if case != "in the stage's frame" else random_rows(0)
+    if case == "few points":
+        rows = [row for row in rows if row["point_id"] in (0, 1, 3, 9)]
+    if case == "points on a line":
+        line = np.outer(np.arange(8.0), (10.0, 0.0, 0.0))
+        rows = rows_of(line, np.repeat(line[:, None], 2, axis=1) + 100.0)
+    if case == "wrong, but not rigidly":
+        rows = rows_of(GRID, np.repeat(2.0 * (GRID - 25.0)[:, None] + 25.0, 2, axis=1))
+    assert notes(tmp_path, rows, register=case == "registered") == []
+
+
+@pytest.mark.parametrize(("times", "expected"), [(4.5, False), (5.5, True)])
+def test_the_note_on_the_frame_appears_from_five_times_the_residual(tmp_path, times, expected):
+    """Positions 1 % too far from the centroid, shifted so that the RMSE is `times` the residual of a fit."""
+    middle = GRID.mean(axis=0)
+    residual = 0.01 * np.sqrt(((GRID - middle) ** 2).sum(axis=1).mean())
+    shift = np.array([0.0, 0.0, residual * np.sqrt(times**2 - 1.0)])
+    positions = np.repeat((middle + 1.01 * (GRID - middle) + shift)[:, None], 2, axis=1)
+    found = notes(tmp_path, rows_of(GRID, positions))
+    assert len(found) == expected
+    assert all(
+        f"reduce the RMSE from {times * residual:.3g} mm to {residual:.2g} mm" in note for note in found
+    )
 
 
 @pytest.mark.parametrize(

@@ -46,13 +46,13 @@ def _print_tables(evaluation: Evaluation) -> None:
 def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     found, values = result.accuracy, result.values()
     counts = f"{found.n_points}", f"{found.n_samples}"
-    yield (result.grid.title, *(_format_number(values[key]) for key in _ERRORS), *counts)
+    yield (result.grid.title, *(format_number(values[key]) for key in _ERRORS), *counts)
     if any(found.intervals.values()):
-        intervals = (_format_interval(found.intervals.get(key)) for key in _ERRORS)
+        intervals = (format_interval(found.intervals.get(key)) for key in _ERRORS)
         yield (" 95 % interval", *intervals, "", "")
     for name, key in (("paper", "paper"), ("manufacturer", "official")):
         if values[key]:
-            yield (f" {name}", *(_format_number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
+            yield (f" {name}", *(format_number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
 
 
 def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
@@ -63,11 +63,11 @@ def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     yield (" single samples", *_levels(found.samples), f"{found.samples.n_samples}")
     paper = published.INDICATOR.get(result.grid.environment)
     if paper and published.find_paper_sensor(result.grid.sensor) == REFERENCE:
-        yield (" paper", *(_format_number(paper.get(key), ".4f") for key in _INDICATOR), "")
+        yield (" paper", *(format_number(paper.get(key), ".4f") for key in _INDICATOR), "")
 
 
 def _levels(found: IndicatorSummary | IndicatorSamples) -> list[str]:
-    return [_format_number(getattr(found, key, None), ".4f") for key in _INDICATOR]
+    return [format_number(getattr(found, key, None), ".4f") for key in _INDICATOR]
 
 
 def _fit_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
@@ -92,35 +92,35 @@ def _found_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[
         constant, intervals = found.ideal, found.ideal.intervals
         yield (
             f"{name}, {ideal}: error (mm)",
-            f"{_format_number(constant.mean_mm)} ± {_format_number(constant.sd_mm)}",
-            _format_interval(intervals["mean_mm"]),
+            f"{format_number(constant.mean_mm)} ± {format_number(constant.sd_mm)}",
+            format_interval(intervals["mean_mm"]),
         )
     if found.noisy:
         line, intervals = found.noisy, found.noisy.intervals
         for part in ("slope", "intercept"):
             value, interval = getattr(line, f"{part}_mm"), intervals[f"{part}_mm"]
-            yield f"{name}, {noisy}: {part} (mm)", _format_number(value), _format_interval(interval)
-        yield f"{name}, {noisy}: residual sd of the line (mm)", _format_number(line.scatter_mm), ""
+            yield f"{name}, {noisy}: {part} (mm)", format_number(value), format_interval(interval)
+        yield f"{name}, {noisy}: residual sd of the line (mm)", format_number(line.scatter_mm), ""
     if found.threshold is not None:
         yield (
             f"{name}: threshold",
-            _format_number(found.threshold, ".4f"),
-            _format_interval(found.threshold_interval, ".4f"),
+            format_number(found.threshold, ".4f"),
+            format_interval(found.threshold_interval, ".4f"),
         )
 
 
-def _format_number(value: float | None, form: str = ".3f") -> str:
+def format_number(value: float | None, form: str = ".3f") -> str:
     """Return a number as text, – if it is unknown."""
     return "–" if value is None or not isfinite(value) else f"{value:{form}}".replace("-", "−")
 
 
-def _format_interval(interval: tuple[float, float] | None, form: str = ".3f") -> str:
+def format_interval(interval: tuple[float, float] | None, form: str = ".3f") -> str:
     """Return an interval as text, empty if there is none."""
     if interval is None:
         return ""
     low, high = interval
     return (
-        f"{_format_number(low, form)}–{_format_number(high, form)}"
+        f"{format_number(low, form)}–{format_number(high, form)}"
         if isfinite(high)
-        else f"from {_format_number(low, form)}"
+        else f"from {format_number(low, form)}"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flexneedle.cli.commands import Commands, add_group
-from flexneedle.lab.tracker_evaluation.commands import evaluate, record, register, simulate, watch
+from flexneedle.lab.tracker_evaluation.commands import check, evaluate, record, register, simulate, watch
 
 
 def add_parser(commands: Commands) -> None:
@@ -12,7 +12,7 @@ def add_parser(commands: Commands) -> None:
         commands,
         "em",
         "evaluate, simulate or record an electromagnetic tracker",
-        [command.add_parser for command in (evaluate, simulate, register, record, watch)],
+        [command.add_parser for command in (evaluate, check, simulate, register, record, watch)],
         "flexneedle em simulate",
         "flexneedle em evaluate measurements.csv",
     )

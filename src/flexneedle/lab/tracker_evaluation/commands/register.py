@@ -25,7 +25,7 @@ def add_parser(commands: Commands) -> None:
         "flexneedle em register pairs.csv --target 40 5 0",
         "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
         about="Fit the rigid transform from the tracker's to the stage's frame to pairs of points, and estimate its "
-        "errors. Writes a table for a scenario (docs/tracking/register.md).",
+        "errors. Writes a table for a scenario and a figure (docs/tracking/register.md).",
     )
     parser.add_argument(
         "data",
@@ -54,7 +54,7 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         default=Path("registration.toml"),
         metavar="FILE",
-        help="new file (default: registration.toml)",
+        help="new file; its figure is written to the same folder (default: registration.toml)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 

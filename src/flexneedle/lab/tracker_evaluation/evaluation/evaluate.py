@@ -15,7 +15,9 @@ from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
     Accuracy,
     RigidFit,
     compute_accuracy,
+    compute_errors,
     register_grid,
+    root_mean_square,
 )
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import (
     IndicatorFits,
@@ -38,6 +40,9 @@ from flexneedle.record.plain import to_text
 _RESULT_FILE = "evaluation.json"
 RESULT_FILES = (_RESULT_FILE, POINTS_FILE)
 _FORMAT = 1
+_UNREGISTERED = 5.0
+"""If a rigid fit lowers the RMSE by more than this factor, tracker and stage most likely have different frames."""
+_FEWEST_POINTS = 6  # a rigid fit with its six parameters always fits fewer points well
 
 
 @dataclass(frozen=True)
@@ -128,6 +133,8 @@ def evaluate_table(data: Path, options: EvaluationOptions) -> Evaluation:
     sensors = dict.fromkeys(grid.sensor for grid in registered)
     fits = [fit_indicator(sensor, *_environments(registered, sensor, options)) for sensor in sensors]
     notes = [f"{grid.title}: {note}" for grid in registered for note in _find_notes(grid)]
+    if not options.register:
+        notes += _note_frames(registered)
     return Evaluation(data, options, rows, results, [fit for fit in fits if fit is not None], notes)
 
 
@@ -142,6 +149,31 @@ def _find_notes(grid: MeasuredGrid) -> Iterator[str]:
     measured = grid.measured
     if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
         yield wrong
+
+
+def _note_frames(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
+    """Yield a line if --register seems needed."""
+    fits = [(grid, *fit) for grid in grids if (fit := _fit(grid)) is not None]
+    if fits:
+        grid, raw, residual = max(fits, key=lambda fit: fit[1])
+        others = f", and {len(fits) - 1} more" if len(fits) > 1 else ""
+        yield (
+            f"a rigid fit would reduce the RMSE from {raw:.3g} mm to {residual:.2g} mm ({grid.title}{others}): "
+            "if tracker and stage have different frames, add --register"
+        )
+
+
+def _fit(grid: MeasuredGrid) -> tuple[float, float] | None:
+    """Return the RMSE before and after a rigid fit (mm), None if the fit does not reduce it much."""
+    measured = grid.measured
+    if len(measured) < _FEWEST_POINTS:
+        return None
+    try:
+        residual = register_grid(grid)[1].residual_mm
+    except InputError:  # collinear points: no fit to compare with
+        return None
+    raw = root_mean_square(compute_errors(measured))
+    return (raw, residual) if raw > _UNREGISTERED * residual else None
 
 
 def read_table(data: Path, options: EvaluationOptions) -> tuple[list[MeasuredGrid], int]:

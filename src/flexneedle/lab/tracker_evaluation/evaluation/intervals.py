@@ -32,10 +32,10 @@ def deviation(values: Floats, axis: int = -1) -> Floats:
     return np.asarray(values.std(axis=axis, ddof=1))
 
 
-def bootstrap(statistic: Statistic, *samples: Floats) -> Interval:
+def bootstrap(statistic: Statistic, *samples: Floats, paired: bool = True) -> Interval:
     """Return the percentile interval of a statistic of samples (n,), None for fewer than ten points.
 
-    The same points are drawn from all samples.
+    paired: the same points are drawn from all samples; otherwise each sample is resampled independently.
     """
     from scipy import stats
 
@@ -48,7 +48,7 @@ def bootstrap(statistic: Statistic, *samples: Floats) -> Interval:
             n_resamples=RESAMPLES,
             batch=max(1, _CHUNK // max(map(len, samples))),
             vectorized=True,
-            paired=True,
+            paired=paired,
             confidence_level=CONFIDENCE,
             method="percentile",
             rng=np.random.default_rng(SEED),

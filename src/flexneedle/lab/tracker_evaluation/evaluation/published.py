@@ -33,6 +33,8 @@ INDICATOR: Mapping[str, Figures] = {
 }
 FITS: Figures = {"mean_mm": 0.575, "sd_mm": 0.211, "slope_mm": 9.591, "intercept_mm": 0.051}
 """Fits of the reference sensor: err = mean ± sd in `ideal`, err = slope · 𝓘 + intercept in `noisy`."""
+POWERED = 0.04
+"""The indicator with the needle driver's power on."""
 _REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
 
 

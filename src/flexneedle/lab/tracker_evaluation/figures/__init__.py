@@ -1,1 +1,1 @@
-"""Figures of evaluations, from arrays and names."""
+"""Figures of evaluations and registrations, from arrays and names."""

@@ -1,0 +1,106 @@
+"""`flexneedle em check`: does the rig's own power distort the tracker's field?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import print_json, print_table
+from flexneedle.cli.progress import print_line
+from flexneedle.cli.values import positive
+from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
+from flexneedle.lab.tracker_evaluation.commands.evaluation_tables import format_interval, format_number
+
+if TYPE_CHECKING:
+    from flexneedle.lab.tracker_evaluation.evaluation.power_check import PowerCheck, PowerComparison
+
+_THRESHOLD = 0.0547  # paper, section IV-B
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser of `flexneedle em`."""
+    parser = add_command(
+        commands,
+        "check",
+        "compare the indicator with the rig's power off and on",
+        _check,
+        "flexneedle em check power.csv",
+        "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
+        about="Compare the distortion indicator with the rig's power off and on, two environments in "
+        "one table. Exit status 1 if the mean indicator of a sensor with power on exceeds the "
+        "threshold.",
+    )
+    parser.add_argument(
+        "data", metavar="DATA", type=Path, help="table with both environments (CSV or Parquet)"
+    )
+    for power in ("off", "on"):
+        parser.add_argument(
+            f"--{power}",
+            default=power,
+            metavar="NAME",
+            help=f"environment measured with power {power} (default: {power})",
+        )
+    parser.add_argument(
+        "--threshold",
+        type=positive,
+        default=_THRESHOLD,
+        metavar="I",
+        help="threshold of the mean indicator (default: %(default)s)",
+    )
+    add_columns(parser)
+    add_labels(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+
+
+def _check(args: argparse.Namespace) -> int:
+    from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions
+    from flexneedle.lab.tracker_evaluation.evaluation.power_check import check_power
+
+    options = EvaluationOptions(
+        tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment
+    )
+    found = check_power(args.data, args.off, args.on, args.threshold, options)
+    if args.json:
+        print_json(found.values())
+    else:
+        _print(found)
+    return 1 if found.above else 0
+
+
+def _print(found: PowerCheck) -> None:
+    rows = [row for sensor in found.sensors for row in _rows(sensor)]
+    rows.append((" paper, power on", format_number(found.paper, ".4f"), *[""] * 3))
+    heads = ("indicator", "mean", "95 %", "max", "points")
+    print_table("Indicator with power off and on (means at grid points)", heads, rows)
+    for sensor in found.sensors:
+        print(_verdict(sensor))
+    for note in found.notes:
+        print_line(f"note: {note}")
+
+
+def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
+    return [
+        (
+            f"{sensor.sensor}, power {name}",
+            *(format_number(value, ".4f") for value in (level.mean, level.p95, level.max)),
+            f"{level.n_points}",
+        )
+        for name, level in (("off", sensor.off), ("on", sensor.on))
+    ]
+
+
+def _verdict(sensor: PowerComparison) -> str:
+    interval, on = sensor.difference_interval, sensor.on
+    certainty = (
+        f"95 % interval {format_interval(interval, '.4f')}"
+        if interval
+        else "too few grid points for an interval"
+    )
+    side = "above" if sensor.above else "not above"
+    return (
+        f"{sensor.sensor}: power adds {format_number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
+        f"with power on, {side} the threshold of {sensor.threshold:g} "
+        f"({sensor.points_above} of {on.n_points} grid points above)"
+    )
