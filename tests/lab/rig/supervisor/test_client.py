@@ -67,8 +67,7 @@ class ScriptedProcess:
             case protocol.ResetCommand() if self._next:
                 self._refuse("motors have not come to rest yet", SupervisorState.STOPPED)
                 self._report(self._requests, at_rest=False)
-                # The number of requests never falls, also if a late client sends heartbeats.
-                self._next = [(self._requests, rests) for _, rests in self._next]
+                self._next = []  # heartbeats of a late client are not answered
             case protocol.ResetCommand():
                 lost = [
                     Measurement(0.0, x, 0.0, 0.0, Frame(0.0, n, {})) for n, x in enumerate((None, math.nan))
