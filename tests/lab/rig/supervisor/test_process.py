@@ -248,7 +248,7 @@ def test_a_dry_run_moves_no_motors_and_a_supervisor_that_is_killed_is_an_error(s
 @pytest.mark.parametrize("how", ["close", "end of the client", "error in the supervisor"])
 def test_motors_are_stopped_at_the_end_whatever_it_is(make_task, how):
     wakeup = signal.set_wakeup_fd(-1)
-    with SupervisorClient(make_task(how)) as made:
+    with SupervisorClient(make_task(f"{how} {os.getpid()}")) as made:
         made.take_signals()
         made.arm()
         made.step(0.0, {"insertion": 1.0}, 0.2)

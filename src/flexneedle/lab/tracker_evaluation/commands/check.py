@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
-from flexneedle.cli.common import print_json, print_table
-from flexneedle.cli.progress import print_line
+from flexneedle.cli.common import print_json
 from flexneedle.cli.values import positive
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
-from flexneedle.lab.tracker_evaluation.commands.evaluation_tables import format_interval, format_number
-
-if TYPE_CHECKING:
-    from flexneedle.lab.tracker_evaluation.evaluation.power_check import PowerCheck, PowerComparison
 
 _THRESHOLD = 0.0547  # paper, section IV-B
 
@@ -55,6 +49,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
+    from flexneedle.lab.tracker_evaluation.commands.evaluation_tables import print_power
     from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions
     from flexneedle.lab.tracker_evaluation.evaluation.power_check import check_power
 
@@ -65,42 +60,5 @@ def _check(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found.values())
     else:
-        _print(found)
+        print_power(found)
     return 1 if found.above else 0
-
-
-def _print(found: PowerCheck) -> None:
-    rows = [row for sensor in found.sensors for row in _rows(sensor)]
-    rows.append((" paper, power on", format_number(found.paper, ".4f"), *[""] * 3))
-    heads = ("indicator", "mean", "95 %", "max", "points")
-    print_table("Indicator with power off and on (means at grid points)", heads, rows)
-    for sensor in found.sensors:
-        print(_verdict(sensor))
-    for note in found.notes:
-        print_line(f"note: {note}")
-
-
-def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
-    return [
-        (
-            f"{sensor.sensor}, power {name}",
-            *(format_number(value, ".4f") for value in (level.mean, level.p95, level.max)),
-            f"{level.n_points}",
-        )
-        for name, level in (("off", sensor.off), ("on", sensor.on))
-    ]
-
-
-def _verdict(sensor: PowerComparison) -> str:
-    interval, on = sensor.difference_interval, sensor.on
-    certainty = (
-        f"95 % interval {format_interval(interval, '.4f')}"
-        if interval
-        else "too few grid points for an interval"
-    )
-    side = "above" if sensor.above else "not above"
-    return (
-        f"{sensor.sensor}: power adds {format_number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
-        f"with power on, {side} the threshold of {sensor.threshold:g} "
-        f"({sensor.points_above} of {on.n_points} grid points above)"
-    )

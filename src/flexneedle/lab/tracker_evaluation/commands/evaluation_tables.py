@@ -1,4 +1,4 @@
-"""Tables of an evaluation for the terminal."""
+"""Tables of an evaluation, and of a check of the power, for the terminal."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import Evaluation, SensorResult
 from flexneedle.lab.tracker_evaluation.evaluation.indicator import IndicatorFits, IndicatorSummary
 from flexneedle.lab.tracker_evaluation.evaluation.moments import IndicatorSamples
+from flexneedle.lab.tracker_evaluation.evaluation.power_check import PowerCheck, PowerComparison
 
 _ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
 _INDICATOR = ("mean", "sd", "max", "min", "p95")
@@ -46,13 +47,13 @@ def _print_tables(evaluation: Evaluation) -> None:
 def _error_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     found, values = result.accuracy, result.values()
     counts = f"{found.n_points}", f"{found.n_samples}"
-    yield (result.grid.title, *(format_number(values[key]) for key in _ERRORS), *counts)
+    yield (result.grid.title, *(_format_number(values[key]) for key in _ERRORS), *counts)
     if any(found.intervals.values()):
-        intervals = (format_interval(found.intervals.get(key)) for key in _ERRORS)
+        intervals = (_format_interval(found.intervals.get(key)) for key in _ERRORS)
         yield (" 95 % interval", *intervals, "", "")
     for name, key in (("paper", "paper"), ("manufacturer", "official")):
         if values[key]:
-            yield (f" {name}", *(format_number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
+            yield (f" {name}", *(_format_number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
 
 
 def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
@@ -63,11 +64,11 @@ def _indicator_rows(result: SensorResult) -> Iterator[tuple[str, ...]]:
     yield (" single samples", *_levels(found.samples), f"{found.samples.n_samples}")
     paper = published.INDICATOR.get(result.grid.environment)
     if paper and published.find_paper_sensor(result.grid.sensor) == REFERENCE:
-        yield (" paper", *(format_number(paper.get(key), ".4f") for key in _INDICATOR), "")
+        yield (" paper", *(_format_number(paper.get(key), ".4f") for key in _INDICATOR), "")
 
 
 def _levels(found: IndicatorSummary | IndicatorSamples) -> list[str]:
-    return [format_number(getattr(found, key, None), ".4f") for key in _INDICATOR]
+    return [_format_number(getattr(found, key, None), ".4f") for key in _INDICATOR]
 
 
 def _fit_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
@@ -92,35 +93,73 @@ def _found_rows(found: IndicatorFits, ideal: str, noisy: str) -> Iterator[tuple[
         constant, intervals = found.ideal, found.ideal.intervals
         yield (
             f"{name}, {ideal}: error (mm)",
-            f"{format_number(constant.mean_mm)} ± {format_number(constant.sd_mm)}",
-            format_interval(intervals["mean_mm"]),
+            f"{_format_number(constant.mean_mm)} ± {_format_number(constant.sd_mm)}",
+            _format_interval(intervals["mean_mm"]),
         )
     if found.noisy:
         line, intervals = found.noisy, found.noisy.intervals
         for part in ("slope", "intercept"):
             value, interval = getattr(line, f"{part}_mm"), intervals[f"{part}_mm"]
-            yield f"{name}, {noisy}: {part} (mm)", format_number(value), format_interval(interval)
-        yield f"{name}, {noisy}: residual sd of the line (mm)", format_number(line.scatter_mm), ""
+            yield f"{name}, {noisy}: {part} (mm)", _format_number(value), _format_interval(interval)
+        yield f"{name}, {noisy}: residual sd of the line (mm)", _format_number(line.scatter_mm), ""
     if found.threshold is not None:
         yield (
             f"{name}: threshold",
-            format_number(found.threshold, ".4f"),
-            format_interval(found.threshold_interval, ".4f"),
+            _format_number(found.threshold, ".4f"),
+            _format_interval(found.threshold_interval, ".4f"),
         )
 
 
-def format_number(value: float | None, form: str = ".3f") -> str:
+def _format_number(value: float | None, form: str = ".3f") -> str:
     """Return a number as text, – if it is unknown."""
     return "–" if value is None or not isfinite(value) else f"{value:{form}}".replace("-", "−")
 
 
-def format_interval(interval: tuple[float, float] | None, form: str = ".3f") -> str:
+def _format_interval(interval: tuple[float, float] | None, form: str = ".3f") -> str:
     """Return an interval as text, empty if there is none."""
     if interval is None:
         return ""
     low, high = interval
     return (
-        f"{format_number(low, form)}–{format_number(high, form)}"
+        f"{_format_number(low, form)}–{_format_number(high, form)}"
         if isfinite(high)
-        else f"from {format_number(low, form)}"
+        else f"from {_format_number(low, form)}"
+    )
+
+
+def print_power(found: PowerCheck) -> None:
+    """Print the comparison of power off and on."""
+    rows = [row for sensor in found.sensors for row in _power_rows(sensor)]
+    rows.append((" paper, power on", _format_number(found.paper, ".4f"), *[""] * 3))
+    heads = ("indicator", "mean", "95 %", "max", "points")
+    print_table("Indicator with power off and on (means at grid points)", heads, rows)
+    for sensor in found.sensors:
+        print(_verdict(sensor))
+    for note in found.notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def _power_rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
+    return [
+        (
+            f"{sensor.sensor}, power {name}",
+            *(_format_number(value, ".4f") for value in (level.mean, level.p95, level.max)),
+            f"{level.n_points}",
+        )
+        for name, level in (("off", sensor.off), ("on", sensor.on))
+    ]
+
+
+def _verdict(sensor: PowerComparison) -> str:
+    interval, on = sensor.difference_interval, sensor.on
+    certainty = (
+        f"95 % interval {_format_interval(interval, '.4f')}"
+        if interval
+        else "too few grid points for an interval"
+    )
+    side = "above" if sensor.above else "not above"
+    return (
+        f"{sensor.sensor}: power adds {_format_number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
+        f"with power on, {side} the threshold of {sensor.threshold:g} "
+        f"({sensor.points_above} of {on.n_points} grid points above)"
     )
