@@ -43,7 +43,7 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     with started(tmp_path, NEUTRAL, "--yes", ros={}) as insertion:
         peer = insertion.peer(("state", "tip"))
         insertion.until_state(peer, "inserting")
-        until(lambda: len(peer.received("tip")) > 2)
+        until(lambda: any(where["A"] > 1000.0 for *_, where in insertion.calls("follow")))
         sent = time.monotonic()
         peer.send("stop", Bool(True))
         insertion.until_state(peer, "stopped")
