@@ -30,7 +30,7 @@ from flexneedle.record.topics import READINGS
 from flexneedle.results import Action
 from flexneedle.simulator.control import travel_time
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control
+from flexneedle.types import UNKNOWN, Control, Pose
 from stages import RIG
 from synthetic import make_plan
 from traces import contents
@@ -175,7 +175,7 @@ class Resting:
         self.calls.append("read")
 
     def tip(self, _within):
-        return self.tips.pop(0) if len(self.tips) > 1 else self.tips[0]
+        return Pose(*(self.tips.pop(0) if len(self.tips) > 1 else self.tips[0]), *UNKNOWN)
 
     def arm(self, deepest):
         self.calls.append(("armed", round(deepest, 6)))
@@ -227,7 +227,8 @@ def test_the_needle_rolls_at_the_scenarios_speed(opened):
         # 110 mm less 40 mm + 2 mm + 28.5 mm are 39.5 mm.
         (Resting(insertion=39.6), "insertion: at 39.6 mm, 70.4 mm to the high end of range_mm (110)"),
         (Resting(rotation=math.radians(1090)), "rotation: at 1090 deg: beyond the soft limits"),
-        (Resting(tips=[(-20.0, 0.0, 0.0)]), "tip = -20.0, 0.0, 0.0 mm: must be within 5.6 mm"),
+        (Resting(tips=[(-20.0, 0.0, 0.0)]), "tip = -20.0, 0.0, 0.0 mm: x must be within 3.0 mm of -28.5"),
+        (Resting(guide_z=1.5), "guide_z: at 1.5 mm: must be within 0.02 mm of 0, on the needle's axis"),
     ],
 )
 def test_an_insertion_without_room_is_refused_before_anybody_is_asked(opened, rest, line):

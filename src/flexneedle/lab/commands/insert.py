@@ -127,7 +127,7 @@ class RigConnection(RosConnection):
 
     def with_registration(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the registration of the rig file. Raises InputError for a second one."""
-        from flexneedle.lab.rig.supervised import with_registration
+        from flexneedle.lab.rig.preflight.start import with_registration
 
         if self.args.registration is not None:
             if self._file.registration is not None:

@@ -16,12 +16,12 @@ from flexneedle.estimation.estimate import Estimate, carry_out
 from flexneedle.lab.rig.dry_run import dry_run_ports
 from flexneedle.lab.rig.preflight.fit import (
     axis_stretch,
-    check_start,
     deepest_advance,
     fit_problems,
     needed_advance,
     start_problems,
 )
+from flexneedle.lab.rig.preflight.start import tip_problems, with_registration
 from flexneedle.lab.rig.rig_file import RigFile, load_rig
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.protocol import Expectation, MotionResult, SupervisorTask, TickReport
@@ -205,19 +205,17 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
     dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
     """
     supervisor.read()  # earlier measurements may be of a needle that was moved since
-    measured = check_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
-    depth, tip = plan.target[0], None if dry else measured[0]
+    within = scenario.control.hold_limit_s
+    if (measured := supervisor.tip(within)) is None:
+        raise RigError(f"tip: not measured for {within:g} s: measure it before anything moves")
+    depth, tip, positions = plan.target[0], None if dry else measured.x, supervisor.positions
     need = needed_advance(scenario, depth, tip)
-    if problems := start_problems(supervisor.rig, scenario, supervisor.positions, plan.strategy, need):
+    if problems := [
+        *start_problems(supervisor.rig, scenario, positions, need),
+        *tip_problems(scenario, measured, positions.get("rotation", 0.0)),
+    ]:
         raise RigError(*problems)
     return deepest_advance(scenario, depth, tip)
-
-
-def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
-    """Return the scenario with the registration of the rig file, if it has one."""
-    if rig.registration is None:
-        return scenario
-    return scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
 
 
 class SupervisedRig(RigSource):

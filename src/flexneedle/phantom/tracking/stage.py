@@ -1,13 +1,15 @@
 """Map from a tracker's frames to the tip of the needle in the frame of the stage."""
 
 import math
+from collections.abc import Iterable
+from statistics import median
 
 import numpy as np
 
 from flexneedle.geometry.quaternion import z_axis
 from flexneedle.geometry.rigid import Rigid
 from flexneedle.ports import Tracker
-from flexneedle.types import TIP, VISIBLE, Floats, Frame, Lateral, Measurement
+from flexneedle.types import TIP, UNKNOWN, VISIBLE, Floats, Frame, Lateral, Measurement, Pose
 
 
 def tip_on_stage(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Measurement:
@@ -37,6 +39,25 @@ def tilt_of(axis: Floats) -> Lateral:
         return 0.0, 0.0
     angle = math.atan2(across, x)
     return angle * y / across, angle * z / across
+
+
+def has_position(measurement: Measurement) -> bool:
+    """Return whether the tip is measured, along z where the tracker has it."""
+    place = (measurement.x, measurement.y, 0.0 if measurement.z is None else measurement.z)
+    return all(value is not None and math.isfinite(value) for value in place)
+
+
+def median_pose(measurements: Iterable[Measurement]) -> Pose | None:
+    """Return the medians of the measured tips, None without any; z is 0 in the plane, unknown slopes are NaN."""
+    found = [one for one in measurements if has_position(one)]
+    if not found:
+        return None
+    places = [(one.x or 0.0, one.y or 0.0, one.z or 0.0) for one in found]
+    slopes = [
+        one.direction for one in found if one.direction is not None and np.isfinite(one.direction).all()
+    ]
+    x, y, z = (median(values) for values in zip(*places, strict=True))
+    return Pose(x, y, z, *(median(values) for values in zip(*(slopes or [UNKNOWN]), strict=True)))
 
 
 class OnStage:

@@ -176,6 +176,19 @@ def test_the_settings_of_a_controller_are_compared_with_the_file(commands, axis,
         assert found_of(findings, "guide_y", "controller's limits") == "none"
 
 
+def test_an_axis_off_its_start_is_a_problem_whether_or_not_the_scenario_moves_it():
+    made = rig(axes__guide_z={**bench_rig.VALUES["axes"]["guide_y"], "channel": "D"})
+    device = Motors(("A", "B", "C", "D"))
+    device.set("B", position=3000.0, commanded=3000.0)
+    device.set("D", position=-750.0, commanded=-750.0)
+    findings = check_motors(made, device, ManualClock(), PLANE)
+    assert problems(findings) == {
+        ("guide_z", "start"): "at 1.5 mm: must be within 0.02 mm of 0, on the needle's axis: jog it to 0"
+    }
+    assert found_of(findings, "rotation", "start").startswith("at 30 deg, rolled to the plan's angle")
+    assert ("guide_z", "start") not in problems(check_motors(made, device, ManualClock()))
+
+
 # Tracker
 
 
@@ -223,13 +236,36 @@ def test_a_tracker_that_is_not_ready_is_a_problem(device, seconds, problem):
     assert bool(line) == bool(problem)
 
 
+@pytest.mark.parametrize(
+    ("place", "turn", "changes", "problem"),
+    [
+        ((-28.5, 0.0, 1.7), None, {}, "tip = -28.5, 0.0, 1.7 mm: z must be within 0.6 mm of 0.0"),
+        ((-28.5, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5), {}, ""),  # its z axis is x
+        (
+            (-28.5, 0.0, 0.0),
+            (1.0, 0.0, 0.0, 0.0),
+            {},
+            "tip's direction: dz/dx = 1571 mrad: must be within 30",
+        ),
+        ((-28.5, 0.0, 0.0), None, {"tracker.tip_offset_mm": 2.0}, "tracker.tip_offset_mm is 2: the sensor"),
+    ],
+)
+def test_a_tip_that_is_not_at_the_start_of_the_scenario_is_a_problem(place, turn, changes, problem):
+    device = ChangedTracker(reading(lambda _: True, SensorReading(place, turn)))
+    wanted = replace(PLANE, scenario=PLANE.scenario.with_values(changes))
+    found = problems(check_tracker(device, device.clock, 1.0, wanted))
+    assert found.get(("tip", "start"), "").startswith(problem)
+    assert set(found) <= {("tip", "start")}
+    assert bool(found) == bool(problem)
+
+
 def test_the_rate_missed_frames_and_positions_are_measured():
     device = ChangedTracker(lambda frame: frame if frame.number % 4 else None)
     findings = check_tracker(device, device.clock, 1.0)
     rate, frames = found_of(findings, "tracker", "frames").split(" Hz, ")
     assert float(rate) == pytest.approx(0.75 * 40.0, rel=0.05)
     assert frames == "29 frames, 9 missed"
-    assert found_of(findings, "tracker", "sensor tip") == "measured in 100% at 1.00, 2.00, 3.00 mm"
+    assert found_of(findings, "tracker", "sensor tip") == "measured in 100% at -28.50, 0.10, 0.20 mm"
 
 
 def test_the_references_that_the_monitor_needs_are_counted():

@@ -103,7 +103,7 @@ def test_no_garbage_is_collected_and_the_process_has_priority_where_the_system_p
 
 def test_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor):
     supervisor.read()
-    assert supervisor.tip(30.0) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    assert supervisor.tip(30.0).point == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert len(supervisor.read()) >= 9
 
 

@@ -1,24 +1,21 @@
 """Fit of a rig to a scenario, before and after the devices are connected. Pure functions.
 
-An insertion starts where base and guide are when it begins. The base needs room for its advance from the tip to as far
-past the target as the needle may be, the guide for the travel that the scenario allows to either side; the angle of the
-rotation is the angle of the needle, 0 or 180° at the start.
+The base needs room for its advance from the tip to as far past the target as the needle may be; laterally, guide and
+base need it for the travel that the scenario allows to either side of 0. The angle of the rotation is the angle of the
+needle, 0 or 180° at the start.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from flexneedle.errors import RigError
+from flexneedle.lab.rig.preflight.start import SDS, axis_start_problem
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import LoopSettings, RigFile
-from flexneedle.loop.measuring import innovation_limit
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.types import Point
 
 _ROUNDING = 1e-9
-_SDS = 3.0  # standard deviations of the start that a tip may be off
 _STILL = "steering"  # the strategy that moves neither guide nor base laterally
 
 
@@ -26,8 +23,8 @@ _STILL = "steering"  # the strategy that moves neither guide nor base laterally
 class AxisNeed:
     """Requirement of a scenario for a linear axis.
 
-    travel: largest, to the positive side, or to both (mm); reason: of it, for messages; step_key, step: largest travel
-    in a control step (mm); why: the axis is needed.
+    travel: largest, from the start to the positive side, or of a lateral axis from 0 to both (mm); reason: of it, for
+    messages; step_key, step: largest travel in a control step (mm); why: the axis is needed.
     """
 
     axis: str
@@ -36,17 +33,6 @@ class AxisNeed:
     step_key: str
     step: float
     why: str
-    both: bool = True
-
-    @property
-    def back(self) -> float:
-        """Travel to the negative side, mm."""
-        return self.travel if self.both else 0.0
-
-    @property
-    def width(self) -> float:
-        """Smallest distance between the soft limits, mm."""
-        return self.travel + self.back
 
 
 def axis_needs(scenario: Scenario, strategy: str, advance: float) -> tuple[AxisNeed, ...]:
@@ -74,39 +60,35 @@ def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation
     return [to_line(problem) for problem in found]
 
 
-def room_problems(
-    rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str = "manipulation"
-) -> list[tuple[str, str]]:
-    """Return axis and line for each axis from whose position (mm) the scenario's travel would pass a soft limit."""
-    return _room_problems(rig, _needs_before_start(scenario, strategy), positions)
+def room_problem(rig: RigFile, scenario: Scenario, position: float) -> str:
+    """Return the problem of an insertion axis from whose position (mm) the travel would pass a soft limit, or ""."""
+    return _room_problem(rig, scenario, position, needed_advance(scenario, scenario.target.depth_mm))
 
 
 def start_problems(
-    rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str, advance: float
+    rig: RigFile, scenario: Scenario, positions: Mapping[str, float], advance: float
 ) -> list[str]:
     """Return one line for each axis from which an insertion with this advance of the base (mm) cannot start.
 
-    Such an axis is beyond its soft limits (positions: mm or rad), or has no room.
+    Such an axis is beyond its soft limits (positions: mm or rad), is not at its start, or has no room.
     """
-    outside = [
-        (name, f"at {axis.to_text(positions[name])} {axis.unit}: {problem}: jog it back")
-        for name, axis in rig.axes.items()
-        if (problem := limits_problem(axis, positions[name]))
-    ]
-    found = [*outside, *_room_problems(rig, axis_needs(scenario, strategy, advance), positions)]
-    return [f"{name}: {line}" for name, line in found]
+    found = list[str]()
+    for name, axis in rig.axes.items():
+        if problem := limits_problem(axis, positions[name]):
+            found.append(f"{name}: at {axis.to_text(positions[name])} {axis.unit}: {problem}: jog it back")
+        elif problem := axis_start_problem(name, axis, positions[name]):
+            found.append(f"{name}: {problem}")
+    room = _room_problem(rig, scenario, positions["insertion"], advance)
+    return [*found, *([f"insertion: {room}"] if room else [])]
 
 
-def _room_problems(
-    rig: RigFile, needs: Iterable[AxisNeed], positions: Mapping[str, float]
-) -> list[tuple[str, str]]:
-    axes = dict(rig.axes.items())
-    return [
-        (need.axis, line)
-        for need in needs
-        if need.axis in positions and need.axis in axes
-        for line in _room_lines(axes[need.axis], need, positions[need.axis])
-    ]
+def _room_problem(rig: RigFile, scenario: Scenario, position: float, advance: float) -> str:
+    axis, need = rig.axes.insertion, _insertion_need(scenario, advance)
+    high = axis.limits[1]
+    left = max(high - position, 0.0)
+    if advance <= left + axis.tolerance:
+        return ""
+    return f"at {position:.6g} mm, {left:.6g} mm to the high end of range_mm ({high:g}): {need.reason}"
 
 
 def limits_problem(axis: Axis, position: float) -> str:
@@ -140,7 +122,6 @@ def _insertion_need(scenario: Scenario, advance: float) -> AxisNeed:
         "setup.max_advance_mm",
         setup.max_advance_mm,
         "the base advances",
-        both=False,
     )
 
 
@@ -156,7 +137,7 @@ def _lateral_needs(scenario: Scenario, strategy: str) -> Iterator[AxisNeed]:
         ("base", setup.axes if sigma else 0, f"the base moves laterally with plan.base_sigma_mm = {sigma:g}"),
     ):
         travel, step = getattr(setup, f"max_{part}_travel_mm"), getattr(setup, f"max_{part}_step_mm")
-        reason = f"setup.max_{part}_travel_mm is {travel:g}, to either side"
+        reason = f"setup.max_{part}_travel_mm is {travel:g}, to either side of 0"
         for name in (f"{part}_y", f"{part}_z")[:axes]:
             yield AxisNeed(name, travel, reason, f"setup.max_{part}_step_mm", step, why)
 
@@ -166,11 +147,26 @@ def _linear_problems(rig: RigFile, scenario: Scenario, need: AxisNeed) -> Iterat
     if axis is None:
         yield Problem(f"axes.{need.axis}", None, f"missing: {need.why}")
         return
-    low, high = axis.limits
-    if need.width > high - low + _ROUNDING:
-        rule = f"must be at least {need.width:.6g} wide: {need.reason}"
-        yield Problem(f"axes.{need.axis}.range_mm", [low, high], rule)
+    if rule := _range_rule(axis, need):
+        yield Problem(f"axes.{need.axis}.range_mm", [*axis.limits], rule)
     yield from _speed_problems(axis, scenario, need)
+
+
+def _range_rule(axis: Axis, need: AxisNeed) -> str:
+    """Return the rule that the soft limits of an axis break, or "".
+
+    A lateral axis may start off 0 by half of its backlash.
+    """
+    low, high = axis.limits
+    if need.axis == "insertion":
+        short = need.travel > high - low + _ROUNDING
+        return f"must be at least {need.travel:.6g} wide: {need.reason}" if short else ""
+    slack = max(0.5 * axis.backlash - axis.tolerance, 0.0)
+    most = need.travel + slack
+    if min(-low, high) >= most - _ROUNDING:
+        return ""
+    unsure = f", and its backlash leaves the start uncertain by {0.5 * axis.backlash:.6g}" if slack else ""
+    return f"must include {-most:.6g} to {most:.6g}: {need.reason}{unsure}"
 
 
 def _speed_problems(axis: Axis, scenario: Scenario, need: AxisNeed) -> Iterator[Problem]:
@@ -185,34 +181,6 @@ def _speed_problems(axis: Axis, scenario: Scenario, need: AxisNeed) -> Iterator[
         advance = "setup.max_advance_mm at setup.insertion_speed_mm_s"
         rule = f"must be at most {axis.speed * time:g}: axes.{need.axis}.speed_mm_s is {axis.speed:g}, and a step lasts"
         yield Problem(need.step_key, need.step, f"{rule} {time:g} s ({advance})")
-
-
-def _room_lines(axis: Axis, need: AxisNeed, position: float) -> Iterator[str]:
-    low, high = axis.limits
-    for end, at, travel, room in (
-        ("low", low, need.back, position - low),
-        ("high", high, need.travel, high - position),
-    ):
-        left = max(room, 0.0)
-        if travel > left + axis.tolerance:
-            limit = f"{left:.6g} mm to the {end} end of range_mm ({at:g})"
-            yield f"at {position:.6g} mm, {limit}: {need.reason}{_describe_remedy(axis, need)}"
-
-
-def _describe_remedy(axis: Axis, need: AxisNeed) -> str:
-    """Return the positions to which an axis with too little room can be jogged, and found with its backlash, or "".
-
-    The insertion axis has none: it must advance again after a jog back.
-    """
-    low, high = axis.limits[0] + need.back, axis.limits[1] - need.travel
-    if not need.both or low > high + _ROUNDING:
-        return ""
-    unsure = axis.uncertainty - axis.tolerance
-    if 0.5 * (high - low) < unsure - axis.tolerance:
-        width = need.width + 2.0 * (unsure - axis.tolerance)
-        return f"; range_mm must be {width:.6g} mm wide: with its backlash the position is uncertain by {unsure:.6g} mm"
-    where = f"to {low:.6g} mm" if high - low <= _ROUNDING else f"between {low:.6g} and {high:.6g} mm"
-    return f"; jog it {where}"
 
 
 def _base_turn_problems(scenario: Scenario, strategy: str) -> Iterator[Problem]:
@@ -253,31 +221,7 @@ def _rate_problems(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
         yield Problem("loop.rate_hz", loop, rule)
 
 
-# The start
-
-
-def check_start(scenario: Scenario, tip: Point | None) -> Point:
-    """Return the measured tip if it is at the scenario's start, so that nothing moves from an unexpected position.
-
-    It may differ from the start by the limit of a first reading's innovation. Raises RigError.
-    """
-    control, x = scenario.control, scenario.setup.start_tip_x
-    at = scenario.entry.lateral(x)
-    expected = (x, at.real, at.imag)
-    if tip is None:
-        raise RigError(f"tip: not measured for {control.hold_limit_s:g} s: measure it before anything moves")
-    turned = 1e-3 * control.start_angle_sd_mrad * scenario.needle.length_mm
-    sd = math.hypot(control.start_axial_sd_mm, control.start_offset_sd_mm, turned)
-    off, limit = math.dist(tip, expected), innovation_limit(scenario, sd)
-    if off > limit:
-        rule = f"must be within {limit:.1f} mm of the scenario's start, {_format_point(expected)}"
-        remedy = "retract the needle, jog the guide, or check the registration"
-        raise RigError(f"tip = {_format_point(tip)}: {rule} (setup.tip_to_skin_mm): {remedy}")
-    return tip
-
-
-def _format_point(point: Point) -> str:
-    return ", ".join(f"{one:.1f}" for one in point) + " mm"
+# The advance
 
 
 def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> float:
@@ -286,7 +230,7 @@ def deepest_advance(scenario: Scenario, target: float, tip: float | None) -> flo
     target: depth (mm) of the target, which the needle may pass by guard.past_target_mm; tip: measured depth of the tip
     at the start (mm); None: three standard deviations behind the start of the scenario.
     """
-    start = scenario.setup.start_tip_x - _SDS * scenario.control.start_axial_sd_mm if tip is None else tip
+    start = scenario.setup.start_tip_x - SDS * scenario.control.start_axial_sd_mm if tip is None else tip
     return (target + scenario.guard.past_target_mm - start) * axis_stretch(scenario.entry.slope)
 
 

@@ -2,23 +2,26 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from statistics import median
 from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
-from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, limits_problem, room_problems
+from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, limits_problem, room_problem
 from flexneedle.lab.rig.preflight.moves import describe_uncertainty
 from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
+from flexneedle.lab.rig.preflight.start import axis_start_problem, tip_problems, with_registration
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import active_switches, resting_switch_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
+from flexneedle.loop.virtual import to_stage
+from flexneedle.phantom.tracking.stage import median_pose, tip_on_stage
 from flexneedle.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import TIP, VISIBLE, Frame, is_reference
+from flexneedle.types import TIP, VISIBLE, Frame, Point, is_reference
 
 _PAUSE_S = 0.01
 _READINGS = 5  # of the motors, for the time of a reply
@@ -51,19 +54,26 @@ def check_rig(
 ) -> list[Finding]:
     """Return the findings at each device. seconds: for which frames of the tracker are counted; clock: real time.
 
-    A device that cannot be reached is a finding, too.
+    A device that cannot be reached is a finding, too. A registration in the rig file replaces the scenario's.
     """
+    if wanted is not None:
+        wanted = replace(wanted, scenario=with_registration(rig, wanted.scenario))
+    rolls = [0.0]
+
+    def read_motors(device: Motors) -> list[Finding]:
+        findings = check_motors(rig, device, clock, wanted)
+        rolls.append(_read_roll(rig, device))
+        return findings
+
     found = [Finding(name, "queued motion", distance) for name, distance in describe_queues(rig)]
     found += [Finding(name, "speed", speed) for name, speed in describe_speeds(rig)]
     found += _scenario_findings(rig, wanted) if wanted is not None else ()
-    found += check_device(
-        "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: check_motors(rig, m, clock, wanted)
-    )
+    found += check_device("driver", rig.driver.kind, lambda: open_motors(rig), read_motors)
     found += check_device(
         "tracker",
         rig.tracker.kind,
         lambda: open_tracker(rig, clock),
-        lambda t: check_tracker(t, clock, seconds, wanted),
+        lambda t: check_tracker(t, clock, seconds, wanted, rolls[-1]),
     )
     return found
 
@@ -112,7 +122,6 @@ def check_motors(
     found = [Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)]
     # Not every driver reports the setup of its controller.
     setups: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
-    positions: dict[str, float] = {}
     for name, axis in rig.axes.items():
         state = states.get(axis.channel)
         if state is None:
@@ -122,9 +131,26 @@ def check_motors(
         found += _axis_findings(name, axis, state)
         if axis.channel in setups:
             found += _setup_findings(name, axis, setups[axis.channel])
-        positions[name] = state.position / axis.scale
-    rooms = [] if wanted is None else room_problems(rig, wanted.scenario, positions, wanted.strategy)
-    return [*found, *(Finding(name, "room", "from here", line) for name, line in rooms)]
+        if wanted is not None:
+            found.append(_start_finding(rig, name, axis, state.position / axis.scale, wanted.scenario))
+    return found
+
+
+def _start_finding(rig: RigFile, name: str, axis: Axis, position: float, scenario: Scenario) -> Finding:
+    """Return the finding of an axis (position: mm or rad) as the start of an insertion."""
+    shown = f"at {axis.to_text(position)} {axis.unit}"
+    if name == "insertion":
+        return Finding(name, "room", shown, room_problem(rig, scenario, position))
+    if name == "rotation":
+        return Finding(name, "start", f"{shown}, rolled to the plan's angle before the insertion")
+    return Finding(name, "start", shown, axis_start_problem(name, axis, position))
+
+
+def _read_roll(rig: RigFile, device: Motors) -> float:
+    """Return the angle of the needle (rad), 0 without its motor."""
+    axis = rig.axes.rotation
+    state = None if axis is None else device.read().get(axis.channel)
+    return 0.0 if axis is None or state is None else state.position / axis.scale
 
 
 def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
@@ -200,9 +226,13 @@ def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
 
 
 def check_tracker(
-    device: OpenTracker, clock: Clock, seconds: float, wanted: IntendedInsertion | None = None
+    device: OpenTracker,
+    clock: Clock,
+    seconds: float,
+    wanted: IntendedInsertion | None = None,
+    roll: float = 0.0,
 ) -> list[Finding]:
-    """Return the findings of the frames of `seconds`. Raises RunError if the tracker fails."""
+    """Return the findings of the frames of `seconds`. roll: of the needle (rad). Raises RunError after a failure."""
     frames = _collect_frames(device, clock, seconds)
     if not frames:
         reason = "no frame" if device.status == VISIBLE else f"no frame: {device.status}"
@@ -213,6 +243,7 @@ def check_tracker(
         Finding("tracker", "status", status, "" if status == VISIBLE else "must be ok while frames arrive"),
         *_sensor_findings(frames),
         *_needed_sensor_findings(frames, wanted),
+        *_tip_findings(frames, wanted, roll),
     ]
 
 
@@ -264,3 +295,27 @@ def _needed_sensor_findings(frames: Sequence[Frame], wanted: IntendedInsertion |
     if references < needed:
         rule = f"monitor.references of the scenario is {needed}: references have names that begin with ref"
         yield Finding("tracker", "reference sensors", str(references), rule)
+
+
+def _tip_findings(
+    frames: Sequence[Frame], wanted: IntendedInsertion | None, roll: float
+) -> Iterator[Finding]:
+    """Yield the findings of the tip as the start of an insertion."""
+    if wanted is None:
+        return
+    settings = wanted.scenario.tracker
+    to, offset = to_stage(settings.registration), settings.tip_offset_mm
+    measured = [one for one in frames if TIP in one.readings and _is_finite(one.readings[TIP].position)]
+    tip = median_pose(tip_on_stage(frame, to, offset) for frame in measured)
+    if tip is None:
+        if measured:
+            rule = f"tracker.tip_offset_mm is {offset:g}: the sensor must have an orientation"
+            yield Finding("tip", "start", "not known", rule)
+        return
+    place = "{:.2f}, {:.2f}, {:.2f} mm in the frame of the insertion".format(*tip.point)
+    for line in tip_problems(wanted.scenario, tip, roll) or [""]:
+        yield Finding("tip", "start", place, line)
+
+
+def _is_finite(position: Point | None) -> bool:
+    return position is not None and all(map(isfinite, position))

@@ -1,8 +1,7 @@
 """Client of the supervisor, which it starts: requests of an insertion and of an operator, and their results."""
 
 from collections.abc import Callable, Mapping
-from math import inf, isfinite
-from statistics import median
+from math import inf
 from time import monotonic
 from typing import Self
 
@@ -12,8 +11,9 @@ from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor import protocol
 from flexneedle.lab.rig.supervisor.connection import END_S, SupervisorConnection
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
+from flexneedle.phantom.tracking.stage import has_position, median_pose
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Measurement, Point
+from flexneedle.types import Measurement, Pose
 
 CONTROLLER = "the controller"
 """Source of the stop at the end of an insertion."""
@@ -39,22 +39,19 @@ class SupervisorClient(SupervisorConnection):
         self._raise_end_state(found.state, found.why)
         return {name: axis.position for name, axis in found.axes.items()}
 
-    def tip(self, within: float) -> Point | None:
-        """Return the position (mm) of the tip at rest, None if it is not measured.
+    def tip(self, within: float) -> Pose | None:
+        """Return the pose of the tip at rest, None if it is not measured; slopes that are not measured are NaN.
 
         It is the median of at least 9 measurements or of all within a time (s). `read` still returns them.
         """
-        until, found = monotonic() + within, list[Point]()
+        until, found = monotonic() + within, list[Measurement]()
 
         def enough() -> bool:
-            found[:] = filter(None, map(_position, self._measurements))
+            found[:] = filter(has_position, self._measurements)
             return len(found) >= _ENOUGH or monotonic() >= until
 
         self._wait(enough, within + 1.0, "the clock does not advance")
-        if not found:
-            return None
-        x, y, z = (median(values) for values in zip(*found, strict=True))
-        return x, y, z
+        return median_pose(found)
 
     def arm(self, deepest: float = inf) -> str:
         """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop.
@@ -178,9 +175,3 @@ class SupervisorClient(SupervisorConnection):
             and report.at_rest
             and report.state in (SupervisorState.STOPPED, SupervisorState.FAULT)
         )
-
-
-def _position(measurement: Measurement) -> Point | None:
-    """Return the position (mm) of a measurement, z = 0 in the plane; None if it is not measured."""
-    x, y, z = measurement.x, measurement.y, 0.0 if measurement.z is None else measurement.z
-    return None if x is None or y is None or not all(map(isfinite, (x, y, z))) else (x, y, z)
