@@ -212,7 +212,10 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
     need = needed_advance(scenario, depth, tip)
     if problems := [
         *start_problems(supervisor.rig, scenario, positions, need),
-        *tip_problems(scenario, measured, positions.get("rotation", 0.0)),
+        *(
+            f"tip = {', '.join(f'{one:.1f}' for one in measured.point)} mm: {line}"
+            for line in tip_problems(scenario, measured, positions.get("rotation", 0.0))
+        ),
     ]:
         raise RigError(*problems)
     return deepest_advance(scenario, depth, tip)

@@ -29,12 +29,12 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
     ("changes", "name", "position", "problem"),
     [
         ({}, "guide_y", 0.02, ""),  # the tolerance
-        ({}, "guide_y", -0.03, "at -0.03 mm: must be within 0.02 mm of 0, on the needle's axis: jog it to 0"),
-        ({}, "guide_z", 1.5, "at 1.5 mm: must be within 0.02 mm"),
-        ({}, "base_y", 0.3, "at 0.3 mm: must be within 0.02 mm"),
-        ({}, "base_z", math.nan, "at nan mm"),
+        ({}, "guide_y", -0.03, "must be within 0.02 mm of 0, on the needle's axis: jog it to 0"),
+        ({}, "guide_z", 1.5, "must be within 0.02 mm"),
+        ({}, "base_y", 0.3, "must be within 0.02 mm"),
+        ({}, "base_z", math.nan, "must"),
         (BACKLASH, "guide_y", 0.07, ""),
-        (BACKLASH, "guide_y", 0.08, "at 0.08 mm: must be within 0.07 mm"),
+        (BACKLASH, "guide_y", 0.08, "must be within 0.07 mm"),
         ({}, "insertion", 20.0, ""),  # anywhere
         ({}, "rotation", 1.0, ""),  # rolled before the insertion
     ],
@@ -101,12 +101,12 @@ def start_of(scenario, x=0.0, y=0.0, z=0.0, theta=0.0, psi=0.0):
     [
         ({}, ""),
         ({"x": -2.9, "y": 0.5}, ""),
-        ({"x": 3.2}, ": x must be within 3.0 mm of -28.5: retract"),
-        ({"y": -3.6}, ": y must be within"),
-        ({"z": 1.7}, ": z must be within"),
+        ({"x": 3.2}, "x must be within 3.0 mm of -28.5: retract"),
+        ({"y": -3.6}, "y must be within"),
+        ({"z": 1.7}, "z must be within"),
         ({"theta": 0.02, "psi": 0.02}, ""),
-        ({"theta": 0.1}, "tip's direction: dy/dx = "),
-        ({"psi": -0.1}, "tip's direction: dz/dx = -100 mrad"),
+        ({"theta": 0.1}, "dy/dx = "),
+        ({"psi": -0.1}, "dz/dx = -100 mrad"),
         ({"theta": math.nan, "psi": math.nan}, ""),  # a tracker without directions
     ],
 )

@@ -74,10 +74,11 @@ def start_problems(
     """
     found = list[str]()
     for name, axis in rig.axes.items():
+        at = f"{name}: at {axis.to_text(positions[name])} {axis.unit}"
         if problem := limits_problem(axis, positions[name]):
-            found.append(f"{name}: at {axis.to_text(positions[name])} {axis.unit}: {problem}: jog it back")
+            found.append(f"{at}: {problem}: jog it back")
         elif problem := axis_start_problem(name, axis, positions[name]):
-            found.append(f"{name}: {problem}")
+            found.append(f"{at}: {problem}")
     room = _room_problem(rig, scenario, positions["insertion"], advance)
     return [*found, *([f"insertion: {room}"] if room else [])]
 

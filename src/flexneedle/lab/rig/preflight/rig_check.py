@@ -140,7 +140,7 @@ def _start_finding(rig: RigFile, name: str, axis: Axis, position: float, scenari
     """Return the finding of an axis (position: mm or rad) as the start of an insertion."""
     shown = f"at {axis.to_text(position)} {axis.unit}"
     if name == "insertion":
-        return Finding(name, "room", shown, room_problem(rig, scenario, position))
+        return Finding(name, "room", "from here", room_problem(rig, scenario, position))
     if name == "rotation":
         return Finding(name, "start", f"{shown}, rolled to the plan's angle before the insertion")
     return Finding(name, "start", shown, axis_start_problem(name, axis, position))

@@ -27,8 +27,7 @@ def axis_start_problem(name: str, axis: Axis, position: float) -> str:
     """
     if name not in LINEAR_AXES[1:] or abs(position) <= axis.uncertainty:
         return ""
-    rule = f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis"
-    return f"at {axis.to_text(position)} mm: {rule}: jog it to 0"
+    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: jog it to 0"
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
@@ -162,19 +161,13 @@ def tip_problems(scenario: Scenario, tip: Pose, roll: float = 0.0) -> list[str]:
     ]
     remedies = {"x": "retract or jog the insertion axis (setup.tip_to_skin_mm)"}
     found = [
-        f"tip = {_format_point(tip)}: {name} must be within {limit:.1f} mm of {start:.1f}: "
-        f"{remedies.get(name, _MOUNT)}"
+        f"{name} must be within {limit:.1f} mm of {start:.1f}: {remedies.get(name, _MOUNT)}"
         for name, value, start, limit in places
         if not abs(value - start) <= limit
     ]
     known = [one for one in slopes if not math.isnan(one[1])]
     return found + [
-        f"tip's direction: {name} = {value:.0f} mrad: must be within {limit:.0f} of {start:.0f}, the needle's axis: "
-        f"{_MOUNT}"
+        f"{name} = {value:.0f} mrad: must be within {limit:.0f} of {start:.0f}, the needle's axis: {_MOUNT}"
         for name, value, start, limit in known
         if not abs(value - start) <= limit
     ]
-
-
-def _format_point(tip: Pose) -> str:
-    return ", ".join(f"{one:.1f}" for one in tip.point) + " mm"
