@@ -152,14 +152,16 @@ def random_json(random: Random, depth: int) -> Any:
 
 def random_message(random: Random, feeding: Feeding) -> list[Any]:
     """A message, most of them as the link would send it next."""
-    ready = ["ready", {"10": ["01", "00"], "11": ["02", "00"]}]
+    ready = ["ready", {"10": ["01", "00"], "11": ["02", "00"]}, {}]
     if random.random() < 0.2:
         return random.choice(
             (
                 ready,
-                ["ready", {}],
-                ["ready", {"10": ["01", "00"], "11": ["01", "00"]}],
-                ["ready", {"10": ["\u00b2", "00"]}],
+                ["ready", {}, {}],
+                ["ready", {"10": ["01", "00"], "11": ["01", "00"]}, {}],
+                ["ready", {"10": ["\u00b2", "00"]}, {}],
+                ["ready", {"10": ["01", "00"]}, {"11": [["02", "00"], "worn"], "12": [None, "odd"]}],
+                ["plugged"],
                 [
                     "error",
                     random.choice(("garbled", "no reply", "x", [], {})),
@@ -214,7 +216,9 @@ def is_no_message(line: bytes) -> bool:
         found = json.loads(line)
     except (ValueError, RecursionError):
         return True
-    return not (isinstance(found, list) and found and found[0] in ("ready", "frame", "error", "end"))
+    return not (
+        isinstance(found, list) and found and found[0] in ("ready", "plugged", "frame", "error", "end")
+    )
 
 
 def check_incoming(feeding: Feeding, line: bytes) -> None:

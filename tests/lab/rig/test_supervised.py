@@ -154,6 +154,7 @@ class Resting:
     """A supervisor of a rig at rest, with positions of axes and tip; records its calls."""
 
     status = "ok"
+    tip_problem = "port 1 cannot be initialised: worn"
 
     def __init__(self, tips=((-28.5, 0.0, 0.0),), **positions):
         emulated = load_rig("emulated")
@@ -175,7 +176,7 @@ class Resting:
         self.calls.append("read")
 
     def tip(self, _within):
-        return Pose(*(self.tips.pop(0) if len(self.tips) > 1 else self.tips[0]), *UNKNOWN)
+        return self.tips[0] and Pose(*(self.tips.pop(0) if len(self.tips) > 1 else self.tips[0]), *UNKNOWN)
 
     def arm(self, deepest):
         self.calls.append(("armed", round(deepest, 6)))
@@ -228,6 +229,7 @@ def test_the_needle_rolls_at_the_scenarios_speed(opened):
         (Resting(insertion=39.6), "insertion: at 39.6 mm, 70.4 mm to the high end of range_mm (110)"),
         (Resting(rotation=math.radians(1090)), "rotation: at 1090 deg: beyond the soft limits"),
         (Resting(tips=[(-20.0, 0.0, 0.0)]), "tip = -20.0, 0.0, 0.0 mm: x must be within 3.0 mm of -28.5"),
+        (Resting(tips=[None]), "tip: not measured for 1 s (port 1 cannot be initialised: worn): measure it"),
         (Resting(guide_z=1.5), "guide_z: at 1.5 mm: must be within 0.02 mm of 0, on the needle's axis"),
     ],
 )

@@ -44,11 +44,14 @@ FAULTS = {
     "nan": _fault_of_sensor("the values of a sensor are not numbers (tip, or nan=SENSOR)"),
     "jump": FaultKind("the tip is reported 5 mm from its position (along y, or jump=MM)", "5", MM),
     "indicator": FaultKind("all indicators are high (0.2, or indicator=VALUE)", "0.2", RATIO),
+    "unusable": _fault_of_sensor("a sensor cannot be initialised (tip, or unusable=SENSOR)"),
+    "pulled": _fault_of_sensor("a sensor is unplugged during the fault (tip, or pulled=SENSOR)"),
     "unplug": FaultKind("the cable is pulled, and plugged in again after the duration"),
 }
 """The kinds of fault of the tracker; their times are since tracking first began."""
 
 _FIRST_HANDLE, _LAST_HANDLE = 0x0A, 0xFF
+_PLUGGED = 0x40
 _OCCUPIED, _INITIALIZED, _ENABLED = 0x01, 0x10, 0x20
 _OUT_OF_VOLUME, _PARTLY_OUT, _BROKEN = 0x40, 0x80, 0x100
 _VALID, _MISSING, _DISABLED = 1, 2, 4
@@ -59,18 +62,28 @@ _OFF, _SETUP, _TRACKING = "off", "setup", "tracking"
 
 @dataclass(frozen=True)
 class PortState:
-    """A port handle; sensor is None for a requested handle (PHRQ) with nothing plugged in."""
+    """A port handle; sensor is None for a requested handle (PHRQ) with nothing plugged in.
+
+    pulled: its sensor is unplugged; usable: it can be initialised.
+    """
 
     number: int
     sensor: str | None
     initialized: bool = False
     enabled: bool = False
+    pulled: bool = False
+    usable: bool = True
+
+    @property
+    def occupied(self) -> bool:
+        """Whether a sensor is plugged in."""
+        return self.sensor is not None and not self.pulled
 
     @property
     def status(self) -> int:
         """Status bits in PHSR, PHINF, TX and BX."""
         return (
-            (_OCCUPIED if self.sensor else 0)
+            (_OCCUPIED if self.occupied else 0)
             | (_INITIALIZED if self.initialized else 0)
             | (_ENABLED if self.enabled else 0)
         )
@@ -78,12 +91,16 @@ class PortState:
 
 @dataclass(frozen=True)
 class AuroraState:
-    """State of the device: mode, port handles, firmware, and whether it supports BX (old firmware does not)."""
+    """State of the device: mode, port handles, firmware, and whether it supports BX (old firmware does not).
+
+    plugged: a sensor was plugged in since the ports were listed.
+    """
 
     ports: Mapping[int, PortState]
     mode: str = _OFF
     firmware: str = FIRMWARE
     has_bx: bool = True
+    plugged: bool = False
 
 
 @dataclass(frozen=True)
@@ -108,13 +125,25 @@ def power_on(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, has_bx: b
 
 def reply(aurora: AuroraState, line: bytes, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     """Return the state after a command (a line without its end) and the complete reply."""
-    command = codec.parse_command(line)
+    command, aurora = codec.parse_command(line), _with_plugs(aurora, frame.faults)
     try:
         if not command.intact:
             raise _Refusal("04")
         return _execute(aurora, command, frame)
     except _Refusal as refusal:
         return aurora, codec.encode_text(f"ERROR{refusal}")
+
+
+def _with_plugs(aurora: AuroraState, faults: Mapping[str, str]) -> AuroraState:
+    """Return the device after its sensors were plugged in or out."""
+    ports, plugged = dict(aurora.ports), aurora.plugged
+    for handle, port in aurora.ports.items():
+        fault = faults.get(port.sensor or "", "")
+        pulled, usable = fault == "pulled", fault != "unusable"
+        if port.pulled and not pulled:
+            plugged, port = True, replace(port, initialized=False, enabled=False)
+        ports[handle] = replace(port, pulled=pulled, usable=usable)
+    return replace(aurora, ports=ports, plugged=plugged)
 
 
 def _execute(aurora: AuroraState, command: AuroraCommand, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
@@ -233,8 +262,8 @@ def _with_port(aurora: AuroraState, handle: int, port: PortState) -> tuple[Auror
 
 _LISTED: dict[int, Callable[[PortState], bool]] = {
     0x00: lambda _: True,
-    0x01: lambda _: False,
-    0x02: lambda port: port.sensor is not None and not port.initialized,
+    0x01: lambda port: port.pulled and port.initialized,
+    0x02: lambda port: port.occupied and not port.initialized,
     0x03: lambda port: port.initialized and not port.enabled,
     0x04: lambda port: port.enabled,
 }
@@ -246,7 +275,7 @@ def _list_ports(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes
         raise _Refusal("23")
     found = [(handle, port) for handle, port in aurora.ports.items() if _LISTED[option](port)]
     listed = "".join(f"{handle:02X}{port.status:03X}" for handle, port in found)
-    return aurora, codec.encode_text(f"{len(found):02X}{listed}")
+    return replace(aurora, plugged=False), codec.encode_text(f"{len(found):02X}{listed}")
 
 
 def _add_port(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
@@ -258,7 +287,9 @@ def _add_port(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]
 
 
 def _free_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    freed, _ = _find_port(aurora, arguments)
+    freed, port = _find_port(aurora, arguments)
+    if port.pulled:  # its sensor may come back
+        return _with_port(aurora, freed, PortState(port.number, port.sensor, pulled=True))
     ports = {handle: port for handle, port in aurora.ports.items() if handle != freed}
     return replace(aurora, ports=ports), codec.encode_text("OKAY")
 
@@ -271,8 +302,10 @@ def _accept_definition(aurora: AuroraState, arguments: str) -> tuple[AuroraState
 
 def _initialize_port(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     handle, port = _find_port(aurora, arguments)
-    if port.sensor is None:
+    if not port.occupied:
         raise _Refusal("0D")
+    if not port.usable:
+        raise _Refusal("13")
     return _with_port(aurora, handle, replace(port, initialized=True))
 
 
@@ -349,7 +382,7 @@ def _text_readings(aurora: AuroraState, options: int, frame: EmulatedFrame) -> b
         f"{handle:02X}{words[kind] if pose is None else codec.encode_pose_text(pose)}{bits:08X}{frame.number:08X}\n"
         for handle, kind, bits, pose in rows
     )
-    return codec.encode_text(f"{len(rows):02X}{readings}{frame.system:04X}")
+    return codec.encode_text(f"{len(rows):02X}{readings}{_system_status(aurora, frame):04X}")
 
 
 def _binary_readings(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
@@ -361,7 +394,11 @@ def _binary_readings(aurora: AuroraState, options: int, frame: EmulatedFrame) ->
             continue  # no further data
         body += b"" if pose is None else codec.encode_pose_binary(pose)
         body += bits.to_bytes(4, "little") + frame.number.to_bytes(4, "little")
-    return codec.encode_binary(bytes(body) + frame.system.to_bytes(2, "little"))
+    return codec.encode_binary(bytes(body) + _system_status(aurora, frame).to_bytes(2, "little"))
+
+
+def _system_status(aurora: AuroraState, frame: EmulatedFrame) -> int:
+    return frame.system | (_PLUGGED if aurora.plugged else 0)
 
 
 def _initialized_ports(aurora: AuroraState) -> list[tuple[int, PortState]]:
@@ -375,12 +412,12 @@ def _read_port(port: PortState, options: int, frame: EmulatedFrame) -> tuple[int
     if not port.enabled or fault == "disabled":
         return _DISABLED, bits & ~_ENABLED, None
     hidden = fault == "out-of-volume" and not options & _ALSO_OUT_OF_VOLUME
-    if fault in ("missing", "broken") or hidden:
+    if fault in ("missing", "broken", "pulled") or hidden:
         return _MISSING, bits, None
     return _VALID, bits, frame.poses[port.sensor or ""]
 
 
-OF_STATUS = ("missing", "out-of-volume", "partly-out", "broken", "disabled")
-"""Faults of a sensor that its status reports."""
+OF_STATUS = ("missing", "out-of-volume", "partly-out", "broken", "disabled", "unusable", "pulled")
+"""Faults of a sensor that its status or its set-up reports."""
 
 _FAULT_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}

@@ -207,7 +207,8 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
     supervisor.read()  # earlier measurements may be of a needle that was moved since
     within = scenario.control.hold_limit_s
     if (measured := supervisor.tip(within)) is None:
-        raise RigError(f"tip: not measured for {within:g} s: measure it before anything moves")
+        why = f"not measured for {within:g} s ({supervisor.tip_problem})"
+        raise RigError(f"tip: {why}: measure it before anything moves")
     depth, tip, positions = plan.target[0], None if dry else measured.x, supervisor.positions
     need = needed_advance(scenario, depth, tip)
     if problems := [

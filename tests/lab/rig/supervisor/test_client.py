@@ -4,6 +4,7 @@ import math
 import socket
 import threading
 from threading import Thread
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,7 @@ from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.ports import MotorState
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement
+from flexneedle.types import Frame, Measurement, SensorReading
 from stages import rig_file
 
 
@@ -150,6 +151,22 @@ def test_after_a_stop_a_reset_is_accepted_and_a_tip_without_measured_positions_i
     assert supervisor.report.state is SupervisorState.IDLE
     assert supervisor.tip(0.0) is None
     assert len(supervisor.read()) == 2
+
+
+@pytest.mark.parametrize(
+    ("readings", "problem"),
+    [
+        ({"ref1": SensorReading((1.0, 2.0, 3.0))}, "the tracker has no sensor tip, only ref1"),
+        ({"tip": SensorReading(None, status="port 1 is worn")}, "port 1 is worn"),
+        ({"tip": SensorReading((1.0, 2.0, 3.0))}, "its position or orientation is not known"),
+        ({}, "the tracker has no sensor tip, only none"),
+        (None, "the tracker's status is ok"),
+    ],
+)
+def test_the_reason_why_the_tip_is_not_measured_is_its_sensors(readings, problem):
+    frame = None if readings is None else Frame(0.0, 1, readings)
+    client = SimpleNamespace(status="ok", _measurements=[Measurement(0.0, None, None, None, frame)])
+    assert SupervisorClient.tip_problem.fget(client) == problem
 
 
 def test_a_refused_request_has_its_reason(supervisor):

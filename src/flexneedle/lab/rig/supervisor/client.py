@@ -13,7 +13,7 @@ from flexneedle.lab.rig.supervisor.connection import END_S, SupervisorConnection
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.phantom.tracking.stage import has_position, median_pose
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Measurement, Pose
+from flexneedle.types import TIP, VISIBLE, Measurement, Pose
 
 CONTROLLER = "the controller"
 """Source of the stop at the end of an insertion."""
@@ -52,6 +52,21 @@ class SupervisorClient(SupervisorConnection):
 
         self._wait(enough, within + 1.0, "the clock does not advance")
         return median_pose(found)
+
+    @property
+    def tip_problem(self) -> str:
+        """Reason in the newest measurement for which the tip is not measured, otherwise the tracker's status."""
+        newest = self._measurements[-1] if self._measurements else None
+        if newest is None or newest.frame is None:
+            return f"the tracker's status is {self.status}"
+        sensors = newest.frame.readings
+        if TIP not in sensors:
+            return f"the tracker has no sensor {TIP}, only {', '.join(sensors) or 'none'}"
+        return (
+            sensors[TIP].status
+            if sensors[TIP].status != VISIBLE
+            else "its position or orientation is not known"
+        )
 
     def arm(self, deepest: float = inf) -> str:
         """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop.

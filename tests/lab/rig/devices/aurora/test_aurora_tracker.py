@@ -216,7 +216,7 @@ BAD_LINK = """
 import signal, socket, sys, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 channel = socket.socket(fileno=int(sys.argv[1]))
-for data in (b'["ready", {"10": ["01", "00"]}]', b'no JSON'):
+for data in (b'["ready", {"10": ["01", "00"]}, {}]', b'no JSON'):
     channel.sendall(len(data).to_bytes(4, "little") + data)
 while True: time.sleep(60)
 """
@@ -291,25 +291,81 @@ def test_a_link_that_cannot_be_started_at_first_is_an_error(terminal, monkeypatc
 
 
 class FakeDevice:
-    """A device with the handle 0B of an unplugged sensor and 0A of a present one."""
+    """A device with the handle 0B of an unplugged sensor and others of present ones; errors: codes by command."""
 
-    def __init__(self):
-        self.sent, self.listed = [], {"PHSR:01": [[0x0B]], "PHSR:02": [[0x0A], []]}
+    def __init__(self, present=(0x0A,), **errors):
+        self.sent, self.errors = [], {key.replace("_", ":"): code for key, code in errors.items()}
+        self.listed = {"PHSR:01": [[0x0B]], "PHSR:02": [[*present], [*present][len(present) :]]}
 
     def command(self, text):
         self.sent.append(text)
-        return 0
+        return self.errors.get(text, 0)
 
     def port_handles(self):
         return self.listed[self.sent[-1]].pop(0)
 
     def location(self):
-        return "01", "00"
+        handle = int(self.sent[-1][6:8], 16)
+        if handle == self.errors.get("location"):
+            raise ValueError("not a port location: 'x'")
+        return f"{handle - 9:02d}", "00"
+
+    def explain(self, code):
+        return f"error {code:02X}"
+
+
+@pytest.mark.parametrize(
+    ("errors", "failed"),
+    [
+        ({"PINIT_0C": 0x13}, {"12": (("03", "00"), "port 3 cannot be initialised: error 13")}),
+        ({"PENA_0CD": 0x28}, {"12": (("03", "00"), "port 3 cannot be enabled: error 28")}),
+        ({"PHINF_0C0020": 0x0E}, {"12": (None, "port handle 0C cannot be described: error 0E")}),
+        (
+            {"PINIT_0C": 0x1E, "PHINF_0C0020": 0x0E},
+            {"12": (None, "port handle 0C cannot be initialised: error 1E")},
+        ),
+        ({"location": 0x0C}, {"12": (None, "port handle 0C cannot be described: not a port location: 'x'")}),
+        ({"PHF_0B": 0x08}, {}),
+    ],
+)
+def test_a_sensor_that_cannot_be_set_up_is_left_out_with_its_port_and_reason(errors, failed):
+    found = link.set_up(FakeDevice((0x0A, 0x0C), **errors))
+    assert found.failed == failed
+    left = {"12": ("03", "00")} if not failed else {}
+    assert found.ports == {"10": ("01", "00"), **left}
+
+
+@pytest.mark.parametrize(
+    ("errors", "reason"),
+    [
+        ({"PINIT_0A": 0x13}, "port 1 cannot be initialised: error 13"),
+        ({"PINIT_0A": 0x103}, "PINIT:0A: no reply"),
+        ({"PENA_0AD": 0x100}, "PENA:0AD: replies are garbled"),
+    ],
+)
+def test_without_a_sensor_or_a_line_the_connection_ends(errors, reason):
+    with pytest.raises(link._End, match=reason):
+        link.set_up(FakeDevice(**errors))
+
+
+def test_a_sensor_that_cannot_be_initialised_does_not_affect_the_others_and_may_come_back(path, order):
+    order("fault unusable=ref1")
+    order("fault pulled=ref3")
+    with Aurora(path, WallClock()) as aurora:
+        frames, _ = read_until(aurora, at_least(3))
+        assert set(frames[-1].readings) == {"tip", "ref1", "ref2"}
+        words = "port 2 cannot be initialised: Unable to initialize Tool-in-Port"
+        assert statuses_of(frames, "ref1") == [words]
+        assert statuses_of(frames, "ref2") == [VISIBLE]
+        order("clear")
+        again, _ = read_until(aurora, lambda f: f and set(f[-1].readings) == ALL)
+        assert {reading.status for reading in again[-1].readings.values()} == {VISIBLE}
+        assert (aurora.counts.reconnections, aurora.counts.errors) == (0, {})
 
 
 def test_handles_of_unplugged_sensors_are_freed_before_set_up():
     device = FakeDevice()
-    assert link.set_up(device) == {str(0x0A): ("01", "00")}
+    assert link.set_up(device).ports == {str(0x0A): ("01", "00")}
     assert device.sent[:3] == ["PHSR:01", "PHF:0B", "PHSR:02"]
     assert [text for text in device.sent if "0B" in text] == ["PHF:0B"]
 

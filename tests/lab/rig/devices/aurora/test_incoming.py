@@ -11,7 +11,7 @@ from flexneedle.lab.rig.devices.aurora.readings import NAMES
 from flexneedle.types import VISIBLE
 
 POSE = (1.0, 0.0, 0.0, 0.0, 10.0, -20.0, -200.0, 0.024)
-READY = ["ready", {"10": ["01", "00"]}]
+READY = ["ready", {"10": ["01", "00"]}, {}]
 NOW = 100.0
 
 
@@ -43,6 +43,30 @@ def test_frames_after_ready_are_delivered_once():
     assert found.counts.missed == 0
 
 
+def test_a_sensor_that_cannot_be_used_has_a_status_in_each_frame():
+    failed = {
+        "11": [["02", "00"], "port 2 cannot be initialised: worn"],
+        "12": [None, "port handle 0C is odd"],
+    }
+    found = incoming(["ready", READY[1], failed], frame(7, 99.9))
+    (one,) = found.read()
+    assert {name: reading.status for name, reading in one.readings.items()} == {
+        "tip": VISIBLE,
+        "ref1": "port 2 cannot be initialised: worn",
+        "handle0C": "port handle 0C is odd",
+    }
+
+
+def test_sensors_are_set_up_again_after_one_was_plugged_in():
+    """The tracker may restart its frame numbers; the connection is the same."""
+    both = ["ready", {"10": ["01", "00"], "11": ["02", "00"]}, {}]
+    found = incoming(READY, frame(7, 99.9), ["plugged"], both, frame(2, 99.95, ("10", "11")))
+    first, second = found.read()
+    assert (set(first.readings), set(second.readings)) == ({"tip"}, {"tip", "ref1"})
+    assert second.number > first.number
+    assert (found.counts.reconnections, found.connections, found.status) == (0, 1, VISIBLE)
+
+
 @pytest.mark.parametrize(
     ("sent", "wrong", "text"),
     [
@@ -58,7 +82,10 @@ def test_frames_after_ready_are_delivered_once():
         ([READY], frame(7, 100.1), "requested"),
         ([READY], frame(7, handles=("11",)), "has sensors 11, not 10"),
         ([READY], frame(7, handles=("10", "11")), "has sensors 10, 11, not 10"),
-        ([], ["ready", {"10": ["01", "00"], "11": ["01", "00"]}], "two sensors with one name"),
+        ([], ["ready", {"10": ["01", "00"], "11": ["01", "00"]}, {}], "two sensors with one name"),
+        ([], ["ready", {"10": ["01", "00"]}, {"11": [["01", "00"], "broken"]}], "two sensors with one name"),
+        ([], ["plugged"], "out of order"),
+        ([READY, ["plugged"]], frame(7), "out of order"),
     ],
 )
 def test_a_message_out_of_order_or_a_frame_that_is_not_new_is_refused(sent, wrong, text):
@@ -110,8 +137,10 @@ def test_no_time_is_after_the_request_of_its_frame_though_numbers_are_huge():
 @pytest.mark.parametrize(
     "line",
     [
-        b'["ready", {}]',
-        b'["ready", {"10": ["01", "00"], "11": ["01"]}]',
+        b'["ready", {}, {}]',
+        b'["ready", {"10": ["01", "00"]}]',
+        b'["ready", {"10": ["01", "00"], "11": ["01"]}, {}]',
+        b'["ready", {"10": ["01", "00"]}, {"11": ["01", "broken"]}]',
         b'["frame", 4294967296, 0.0, {}]',
         b'["frame", 1, NaN, {}]',
         b'["frame", 1, 0.0, {"10": [0, 49, 1, [0, 0, 0]]}]',

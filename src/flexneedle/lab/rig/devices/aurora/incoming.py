@@ -10,10 +10,13 @@ from typing import Any
 from flexneedle.lab.rig.devices.aurora.messages import Message, to_one_line
 from flexneedle.lab.rig.devices.aurora.readings import make_readings, sensor_name
 from flexneedle.lab.rig.devices.aurora.timing import Numbering, Timeline
-from flexneedle.types import VISIBLE, Frame
+from flexneedle.types import VISIBLE, Frame, SensorReading
 
 RATE_HZ = 40.0
 """Frame rate of an Aurora."""
+
+Location = tuple[str, str]
+"""Port and channel of a sensor."""
 
 _QUEUE = 4000  # frames: 100 s without a call of `read`
 _LATE_S = 0.15  # six frames
@@ -57,6 +60,8 @@ class LinkReceiver:
     def begin_link(self) -> None:
         """Reset the state of the link, for a new one."""
         self._named: dict[str, str] = {}
+        self._failed: dict[str, SensorReading] = {}
+        self._again = False
         self._newest = -1, self._now()
         self._ended = False
         self._timeline = Timeline(RATE_HZ)
@@ -65,8 +70,11 @@ class LinkReceiver:
         """Take a message of the link. Raises ValueError for one out of order, after which the link is not trusted."""
         tracks = bool(self._named) and not self._ended
         match message:
-            case ("ready", ports) if not (self._named or self._ended):
-                self._set_names(ports)
+            case ("ready", ports, failed) if not (self._named or self._ended):
+                self._set_names(ports, failed)
+            case ("plugged",) if tracks:  # the sensors are set up again
+                self._named, self._newest = {}, (-1, self._newest[1])
+                self.set_reason("a sensor was plugged in")
             case ("frame", number, requested, found) if tracks:
                 self._add_frame(number, requested, found)
             case ("error", kind, description) if tracks:
@@ -126,20 +134,29 @@ class LinkReceiver:
             again = max(0, self._connections - 1)
             return AuroraCounts(self._received, self._missed, self._dropped, again, dict(self._errors))
 
-    def _set_names(self, ports: Mapping[str, tuple[str, str]]) -> None:
-        named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
-        if len(set(named.values())) < len(named):
-            raise ValueError(f"two sensors with one name: {', '.join(named.values())}")
+    def _set_names(
+        self, ports: Mapping[str, Location], failed: Mapping[str, tuple[Location | None, str]]
+    ) -> None:
+        named = {h: sensor_name(*location, self._names) for h, location in ports.items()}
+        without = {
+            f"handle{int(h):02X}" if location is None else sensor_name(*location, self._names): why
+            for h, (location, why) in failed.items()
+        }
+        if len({*named.values(), *without}) < len(named) + len(failed):
+            raise ValueError(f"two sensors with one name: {', '.join((*named.values(), *without))}")
         self._named = named
+        self._failed = {name: SensorReading(None, status=to_one_line(why)) for name, why in without.items()}
         with self._lock:
-            self._connections += 1
+            self._connections += not self._again
+        self._again = True
 
     def _add_frame(self, device_number: int, requested: float, found: Mapping[str, Sequence[Any]]) -> None:
         self._check_frame(device_number, requested, found)
         self._newest = device_number, requested
         number = self._numbering.count(device_number, requested)
         time = self._timeline.stamp(number, requested) + self._offset
-        frame = Frame(time, number, make_readings(found, device_number, self._named))
+        readings = make_readings(found, device_number, self._named) | self._failed
+        frame = Frame(time, number, readings)
         with self._lock:
             self._missed += 0 if self._last is None else number - self._last[0] - 1
             self._dropped += len(self._frames) == _QUEUE

@@ -4,7 +4,8 @@
 
 It finds the tracker, enables every sensor, and polls; each message is a JSON list:
 
-    ["ready", {handle: [port, channel], …}]
+    ["ready", {handle: [port, channel], …}, {handle of a sensor without readings: [[port, channel] or null, reason], …}]
+    ["plugged"]: a sensor was plugged in; another "ready" follows
     ["frame", number, time of the request (s, monotonic clock), {handle: [kind, port status, frame, pose]}]
     ["error", kind, description]
     ["end", reason]
@@ -16,6 +17,8 @@ it, and because a planner that holds Python's lock for a frame or two would lose
 import json
 import signal
 import sys
+from dataclasses import dataclass, field
+from enum import Enum
 from time import monotonic, sleep
 from typing import NoReturn
 
@@ -41,7 +44,8 @@ _SYSTEM = {
     0x10: "hardware failure",
     0x20: "hardware change: is the field generator connected?",
 }
-"""Bits of the system status that invalidate all readings. Other bits report that sensors were plugged in or out."""
+"""Bits of the system status that invalidate all readings."""
+_PLUGGED = 0x40  # a sensor was plugged in
 _MOST_FRAMES_PER_S = 200  # more than any tracker of this type
 _ROUNDS = 4  # of initialisation: the second sensor of a port is listed after the first was initialised
 
@@ -105,40 +109,96 @@ def _require(device: AuroraDevice, command: str | None, problem: str) -> None:
 
 
 def _read(device: AuroraDevice, channel: MessageChannel) -> None:
-    """Enable the sensors and track; restore the tracker's state at the end if it still replies."""
-    ports = set_up(device)
+    """Track, and set up the sensors again when one is plugged in."""
+    while _track(device, channel):
+        device.set_timeout(_SET_UP_S)
+        _require(device, "INIT:", "initialisation failed after a sensor was plugged in")
+        _report(channel, "plugged")
+
+
+def _track(device: AuroraDevice, channel: MessageChannel) -> bool:
+    """Enable the sensors and track until the end, or until a sensor is plugged in: then return True.
+
+    At the end the tracker's state is restored if it still replies.
+    """
+    sensors = set_up(device)
     _require(device, "TSTART:", "tracking cannot be started")
-    replies = True
+    polled = Polled.ENDED
     try:
         command = _read_command(device)
-        _report(channel, "ready", ports)
-        replies = _poll(device, channel, command, [int(handle) for handle in ports])
+        _report(channel, "ready", sensors.ports, sensors.failed)
+        polled = _poll(device, channel, command, [int(handle) for handle in sensors.ports])
     finally:
-        if replies:
+        if polled is not Polled.LOST:
             device.set_timeout(_INIT_S)
             device.command("TSTOP:")
+        if polled is Polled.ENDED:
             device.command(_TO_SLOW)
+    return polled is Polled.PLUGGED
 
 
-def set_up(device: AuroraDevice) -> dict[str, tuple[str, str]]:
-    """Initialise and enable every sensor; return port and channel by port handle."""
+Location = tuple[str, str]
+"""Port and channel of a sensor."""
+
+
+@dataclass
+class SensorSetUp:
+    """Locations of the sensors in use, and of the others with the reason, by port handle."""
+
+    ports: dict[str, Location] = field(default_factory=dict)
+    failed: dict[str, tuple[Location | None, str]] = field(default_factory=dict)
+
+    def fail(self, handle: int, problem: str) -> None:
+        """Leave a sensor out: the others are not affected."""
+        location = self.ports.pop(str(handle), None)
+        where = f"port handle {handle:02X}" if location is None else f"port {location[0].lstrip('0')}"
+        self.failed[str(handle)] = location, f"{where} {problem}"
+
+
+def set_up(device: AuroraDevice) -> SensorSetUp:
+    """Initialise and enable every sensor that lets itself be; one that does not is left out, with the reason."""
     for handle in _list_ports(device, "01"):  # of sensors that were unplugged
-        _require(device, f"PHF:{handle:02X}", f"port handle {handle:02X} cannot be freed")
-    ports: dict[str, tuple[str, str]] = {}
+        _refusal(device, f"PHF:{handle:02X}")  # one that stays assigned takes no sensor from the others
+    found = SensorSetUp()
     for _ in range(_ROUNDS):
-        waiting = [handle for handle in _list_ports(device, "02") if str(handle) not in ports]
+        waiting = [
+            handle for handle in _list_ports(device, "02") if str(handle) not in found.ports | found.failed
+        ]
         for handle in waiting:
-            _require(device, f"PINIT:{handle:02X}", f"port handle {handle:02X} cannot be initialised")
-            ports[str(handle)] = _locate_port(device, handle)
+            _initialise(device, handle, found)
         if not waiting:
             break
-    if not ports:
-        raise _End("no sensor is plugged in")
-    if len(set(ports.values())) < len(ports):  # their sensors could not be distinguished
+    if len(set(found.ports.values())) < len(found.ports):  # their sensors could not be distinguished
         raise _End("two port handles report the same port")
-    for handle in map(int, ports):
-        _require(device, f"PENA:{handle:02X}D", f"port handle {handle:02X} cannot be enabled")
-    return ports
+    for handle in list(map(int, found.ports)):
+        if problem := _refusal(device, f"PENA:{handle:02X}D"):
+            found.fail(handle, f"cannot be enabled: {problem}")
+    if not found.ports:
+        raise _End("; ".join(why for _, why in found.failed.values()) or "no sensor is plugged in")
+    return found
+
+
+def _initialise(device: AuroraDevice, handle: int, found: SensorSetUp) -> None:
+    """Initialise the sensor of a port handle and find its location."""
+    initialised = _refusal(device, f"PINIT:{handle:02X}")
+    located = _refusal(device, f"PHINF:{handle:02X}0020")
+    if not located:
+        try:
+            found.ports[str(handle)] = device.location()
+        except ValueError as error:
+            located = str(error)
+    if initialised:
+        found.fail(handle, f"cannot be initialised: {initialised}")
+    elif located:
+        found.fail(handle, f"cannot be described: {located}")
+
+
+def _refusal(device: AuroraDevice, command: str) -> str:
+    """Return the reason for which the tracker refuses a command, or "". Raises _End if the line has failed."""
+    code = device.command(command)
+    if code in (TIMEOUT, CHECKSUM, *LOST):
+        raise _End(f"{command}: {_describe_error(device, code)[1]}")
+    return device.explain(code) if code else ""
 
 
 def _list_ports(device: AuroraDevice, which: str) -> list[int]:
@@ -146,15 +206,6 @@ def _list_ports(device: AuroraDevice, which: str) -> list[int]:
     _require(device, f"PHSR:{which}", problem)
     try:
         return device.port_handles()
-    except ValueError as error:
-        raise _End(f"{problem}: {error}") from None
-
-
-def _locate_port(device: AuroraDevice, handle: int) -> tuple[str, str]:
-    problem = f"port handle {handle:02X} cannot be described"
-    _require(device, f"PHINF:{handle:02X}0020", problem)
-    try:
-        return device.location()
     except ValueError as error:
         raise _End(f"{problem}: {error}") from None
 
@@ -168,13 +219,22 @@ def _read_command(device: AuroraDevice) -> str:
     return "TX" if code == _UNKNOWN_COMMAND else "BX"
 
 
-def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: list[int]) -> bool:
-    """Send each new frame until there are none; return whether the tracker still replies. read: BX or TX.
+class Polled(Enum):
+    """End of tracking: the tracker replies, does not reply, or replies that a sensor was plugged in."""
+
+    ENDED = "ended"
+    LOST = "lost"
+    PLUGGED = "plugged"
+
+
+def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: list[int]) -> Polled:
+    """Send each new frame until there are none, or until a sensor is plugged in. read: BX or TX.
 
     A frame is new if its number increased; the first one is only the reference for the next. Its time is the time of
     the request, since a reply may be delayed.
     """
     last, last_new, reason = -1, monotonic(), "no frame"
+    plugged = True  # a bit that was set before this set-up is not news
     while (requested := monotonic()) - last_new < GIVE_UP_S:
         code = device.command(f"{read}:{_OPTIONS}")
         if code:
@@ -186,6 +246,9 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
             reason = f"the tracker reports: {_SYSTEM[bits & -bits]}"  # by its lowest bit
             _report(channel, "error", "system", reason)
         else:
+            before, plugged = plugged, bool(device.system_status(read) & _PLUGGED)
+            if plugged and not before:
+                return Polled.PLUGGED
             found = {handle: device.reading(read, handle) for handle in handles}
             number = max(frame for frame, *_ in found.values())
             if last >= 0 and not last <= number <= last + _MOST_FRAMES_PER_S * (1.0 + requested - last_new):
@@ -201,7 +264,7 @@ def _poll(device: AuroraDevice, channel: MessageChannel, read: str, handles: lis
             last = number
         sleep(_POLL_S)
     channel.send(("end", reason))
-    return code not in (TIMEOUT, *LOST)
+    return Polled.LOST if code in (TIMEOUT, *LOST) else Polled.ENDED
 
 
 def _describe_error(device: AuroraDevice, code: int) -> tuple[str, str]:

@@ -14,11 +14,14 @@ _Pose = tuple[float, float, float, float, float, float, float, float]
 _Time = Annotated[float, Field(allow_inf_nan=False)]
 _Sensor = tuple[_Number, _Number, _Number, _Pose]
 
-Ready = tuple[Literal["ready"], Annotated[dict[_Handle, _Location], Field(min_length=1)]]
+_Failed = dict[_Handle, tuple[_Location | None, str]]
+
+Ready = tuple[Literal["ready"], Annotated[dict[_Handle, _Location], Field(min_length=1)], _Failed]
+Plugged = tuple[Literal["plugged"]]
 Sample = tuple[Literal["frame"], _Number, _Time, dict[_Handle, _Sensor]]
 Problem = tuple[Literal["error"], Literal["garbled", "no reply", "error", "system", "unplugged"], str]
 End = tuple[Literal["end"], str]
-Message = Ready | Sample | Problem | End
+Message = Ready | Plugged | Sample | Problem | End
 """As the link describes them. Numbers of a pose need not be finite: such a sensor has no position."""
 
 LONGEST = 65536
