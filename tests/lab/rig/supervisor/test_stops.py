@@ -1,6 +1,7 @@
 """Stops: faults of motors, limit switches, late ticks, a silent client, the operator. Nothing starts by itself."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -141,6 +142,62 @@ def test_a_lost_controller_is_reconnected_and_stopped_before_a_reset_is_accepted
     assert bench.state is SupervisorState.IDLE
 
 
+LAST = "may still move to their last targets: "
+
+
+@pytest.mark.parametrize(
+    ("step", "ticks", "moves"),
+    [
+        ({}, 4, LAST + "insertion by 0.4"),  # 5 mm/s for 75 ms, and the lag of a tick
+        ({"guide_y": 0.2}, 4, LAST + "guide_y by 0.0"),
+        ({"insertion": 1.0, "guide_y": 0.2}, 4, LAST + "insertion by 0.4"),
+        ({"rotation": 0.5}, 2, LAST + "rotation by "),
+        (None, 4, "nothing had a target ahead"),
+    ],
+)
+def test_a_controller_that_dies_leaves_what_may_still_move_and_what_to_do(bench, step, ticks, moves):
+    if step is not None:
+        bench.step(**step)
+    bench.tick(ticks)
+    leg = bench.core._motion and bench.core._motion.leg
+    bench.stage.lost = True
+    bench.tick()
+    start, _, rest = bench.why.partition("; no stop could be sent: ")
+    assert (bench.state, start) == (SupervisorState.FAULT, "no reply within 100 ms")
+    assert rest.startswith(moves)
+    assert "press the emergency stop if an axis moves on" in rest
+    assert rest.endswith("home insertion, rotation, guide_y again")
+    assert (step is None) == (leg is None)
+    if step is not None:
+        assert bench.sent[-1].why == bench.why
+    bench.tick(40)
+    assert bench.why.count("no stop could be sent") == 1
+
+
+def test_the_motion_left_to_a_dead_controller_is_bounded_by_distance_and_time(bench):
+    """The motors of this stage continue to their last targets."""
+    bench.step(duration=1.0, insertion=5.0)
+    bench.tick(12)
+    at = bench.position("insertion")
+    bench.stage.lost = True
+    bench.tick()
+    way, seconds = re.search(r"insertion by ([\d.]+) mm within ([\d.]+) s", bench.why).groups()
+    begun, motor = bench.clock.now() - TICK_S, bench.stage.motors["A"]
+    while motor.moving:
+        bench.clock.wait(1e-3)
+        bench.stage._up_to_now()
+    assert motor.position / 1000.0 - at == pytest.approx(float(way), abs=2e-3)
+    assert 0.5 * float(seconds) < bench.clock.now() - begun <= float(seconds) + 2e-3
+
+
+def test_a_stop_that_still_reaches_the_motors_leaves_nothing_to_warn_of(bench):
+    bench.step()
+    bench.tick(2)
+    bench.stage.refuses = True
+    bench.tick(5)
+    assert bench.why == "PAA=5: ? 22 Begin not possible due to limit switch"
+
+
 # Motors that do not stop
 
 
@@ -183,7 +240,7 @@ def test_motors_that_do_not_stop_are_a_fault(bench, every):
     for _ in range(60 // every):
         bench.stop()
         bench.tick(every)
-    assert (bench.state, bench.why) == (SupervisorState.FAULT, "the motors do not stop")
+    assert (bench.state, bench.why) == (SupervisorState.FAULT, "the motors do not stop: press the emergency stop")
     assert (bench.until(1).state, bench.until(1).why) == (SupervisorState.FAULT, "the test")
 
 

@@ -14,7 +14,7 @@ from flexneedle.lab.rig.supervisor.axes import RigAxes
 from flexneedle.lab.rig.supervisor.checks import stuck_problem
 from flexneedle.lab.rig.supervisor.drives import Drive
 from flexneedle.lab.rig.supervisor.machine import RigEvent, SupervisorState, next_state, refusal_reason
-from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay
+from flexneedle.lab.rig.supervisor.motion import SETTLE_S, CommandedMotion, Leg, StopUnderWay, warn_unstopped
 from flexneedle.lab.rig.supervisor.requests import (
     RequestRules,
     end_leaving_switch,
@@ -238,8 +238,7 @@ class Supervisor:
             self._halt_motors(why)
 
     def _check_motors(self) -> None:
-        axes = self._axes
-        if axes.lost:
+        if (axes := self._axes).lost:
             return
         try:
             axes.read()
@@ -275,9 +274,7 @@ class Supervisor:
     def _handle_lost_motors(self, why: str) -> None:
         """Enter the fault state after a failed call of the motors, and stop them as soon as they can be reached."""
         self._enter_fault(why)
-        if self._stopping is None:
-            now = self._clock.now()
-            self._stopping = StopUnderWay(now, now)
+        self._stopping = self._stopping or StopUnderWay(now := self._clock.now(), now)
 
     def _halt_motors(self, why: str) -> None:
         """Stop the motors now, and end the motion under way once they rest."""
@@ -299,20 +296,23 @@ class Supervisor:
             return
         stopping.repeat(now)
         if stopping.has_failed(now, self._axes.slowing):
-            self._enter_fault("the motors do not stop")
+            self._enter_fault("the motors do not stop: press the emergency stop")
             self._finish_motion(now)
         try:
             self._axes.stop()
         except DriverError as error:
             self._enter_fault(str(error))
+            leg = None if self._motion is None else self._motion.leg
+            self.why = warn_unstopped(self.why, leg, self._axes.drives, self._axes.states)
+            if self._motion is not None:
+                self._motion.why = self.why
             self._finish_motion(now)
 
     # Motions
 
     def _begin_next_leg(self, now: float) -> None:
         """Begin the next leg that moves anything, or end the motion."""
-        motion = self._motion
-        if motion is None:
+        if (motion := self._motion) is None:
             return
         motion.leg = None
         while motion.legs and motion.leg is None:

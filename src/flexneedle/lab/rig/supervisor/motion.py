@@ -74,6 +74,16 @@ class Leg:
             if name in self.sent
         }
 
+    def describe_queue(self, states: Mapping[str, MotorState]) -> str:
+        """Return the distance of each axis to its last target and the time to come to rest there, for messages."""
+        parts, speeds = [], self.trajectory.speeds
+        for channel, drive in self.drives.items():
+            speed = speeds[channel] / abs(drive.axis.scale)
+            if (way := self.queued_distances(states).get(drive.name, 0.0)) and speed:
+                seconds = way / speed + speed / drive.axis.acceleration
+                parts.append(f"{drive.name} by {drive.to_text(way)} within {seconds:.2f} s")
+        return ", ".join(parts)
+
     def record_progress(self, states: Mapping[str, MotorState], now: float) -> None:
         """Record the fraction of the travel that is done, and the time of the last progress.
 
@@ -198,6 +208,27 @@ def make_leg(
         for name, drive in moved.items()
     }
     return Leg(by_channel, plan_trajectory(by_channel, start, goal, duration), now)
+
+
+_UNSTOPPED = "no stop could be sent"
+
+
+def warn_unstopped(
+    why: str, leg: Leg | None, drives: Mapping[str, Drive], states: Mapping[str, MotorState]
+) -> str:
+    """Return the reason of a fault with what may still move since no stop could be sent, and what to do.
+
+    leg: under way; drives: by axis; states: the last that are known. Targets are absolute: a controller that works ends
+    each motion there, with any driver.
+    """
+    if _UNSTOPPED in why:
+        return why
+    queue = "" if leg is None else leg.describe_queue(states)
+    moves = f"may still move to their last targets: {queue}" if queue else "nothing had a target ahead"
+    homed = ", ".join(name for name, drive in drives.items() if drive.axis.home != "absolute")
+    home = f"; after a restart of the controller home {homed} again" if homed else ""
+    remedy = "press the emergency stop if an axis moves on, support a vertical axis, wait until all rest"
+    return f"{why}; {_UNSTOPPED}: {moves}; a controller that fails may do anything else: {remedy}{home}"
 
 
 _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
