@@ -37,7 +37,6 @@ from flexneedle.lab.ros.records import (
     RosRefusal,
     RosStop,
     RosTarget,
-    ShapeReading,
     TipReading,
 )
 from flexneedle.lab.ros.tracker import RosTracker
@@ -160,16 +159,13 @@ def problem(key: str, data: bytes, record: Received | None) -> str:
             return "" if reason and reason.isprintable() and len(reason) < 300 else f"reason {reason!r}"
         case RosTarget(point=point):
             return _far([point])
-        case ShapeReading(points=points, tip=tip):
-            return _far(points) or problem("tip", data, tip)
         case TipReading(position=position, orientation=turn, status=status):
             if (position is None) is (status == VISIBLE):
                 return f"position {position}, status {status}"
             unit = turn is None or abs(math.hypot(*turn) - 1.0) < 1e-6
             return _far([position] if position else []) or ("" if unit else f"orientation {turn}")
         case JointReading(positions=positions):
-            values = list(positions.values())
-            return "" if all(map(math.isfinite, values)) else f"joints {values}"
+            return "" if positions else "no joint"
     return f"a record of type {type(record).__name__}"
 
 

@@ -215,6 +215,21 @@ def test_old_states_are_an_error_and_a_stop_is_still_sent(connected, motors, joi
     until(hold)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e9])
+def test_an_impossible_position_of_a_joint_of_the_rig_is_refused_and_of_another_is_not(
+    joints, motors, monkeypatch, connected, value
+):
+    joints.positions["gripper"] = value
+    motors.read()
+    until(lambda: not motors.read()["roll"].repeated)
+    joints.positions["roll"] = value
+    monkeypatch.setattr(connected[1], "_stale", 0.1)
+    reason = rf"s old: joint roll: {value:g} is not a position".replace("+", r"\+")
+    with pytest.raises(DriverError, match=reason):
+        follow_until(motors, lambda _: False)
+    del joints.positions["gripper"]
+
+
 # Reconnecting
 
 

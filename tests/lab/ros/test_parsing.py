@@ -17,7 +17,6 @@ from flexneedle.lab.ros.records import (
     RosRefusal,
     RosStop,
     RosTarget,
-    ShapeReading,
     TipReading,
 )
 from flexneedle.types import VISIBLE
@@ -52,9 +51,8 @@ def test_a_tip_of_a_needle_straight_along_the_insertion(profile, message, positi
 def test_a_shape_may_have_any_spacing(spacing):
     depths = np.arange(0.0, 40.0, spacing)
     found = read("shape", shape(5.0, [(-1.0, 2.0, z) for z in depths], frame="needle"), FIBRE)
-    assert isinstance(found, ShapeReading)
-    np.testing.assert_allclose(found.points, [(z, 2.0, 1.0) for z in depths], atol=1e-12)
-    np.testing.assert_allclose(found.tip.position, (depths[-1], 2.0, 1.0), atol=1e-12)
+    assert isinstance(found, TipReading)
+    np.testing.assert_allclose(found.position, (depths[-1], 2.0, 1.0), atol=1e-12)
 
 
 def test_targets_stops_arms_and_joints():
@@ -66,9 +64,31 @@ def test_targets_stops_arms_and_joints():
     assert read("stop", Bool(False)) is None
     assert read("arm", Bool(True)) == RosArm(100.0, "/flexneedle/arm")
     assert isinstance(read("arm", Bool(False)), RosStop)
-    positions = {"a": 0.01, "b": -3.0}
-    for velocities in ((), (0.0, 1.0)):
-        assert read("joint_states", joints(5.0, positions, velocities)) == JointReading(100.0, positions)
+
+
+NAN = (math.nan, math.nan)
+
+
+@pytest.mark.parametrize(
+    ("velocities", "efforts"),
+    [
+        ((), ()),
+        ((0.0, 1.0), ()),
+        (NAN, NAN),
+        ((0.0, math.nan), ()),
+        ((math.inf,), NAN),
+        ((), (1.0, 2.0, 3.0)),
+    ],
+)
+@pytest.mark.parametrize("other", [-3.0, math.nan, math.inf, 1e300])
+def test_of_joint_states_only_positions_of_used_joints_count(velocities, efforts, other):
+    """As ros2_control sends them where an interface is missing, and of joints that are not the rig's."""
+    message = joints(5.0, {"a": 0.01, "b": other}, velocities)
+    message.effort = np.array(efforts, dtype=float)
+    found = read("joint_states", message)
+    assert isinstance(found, JointReading)
+    assert (found.time, list(found.positions)) == (100.0, ["a", "b"])
+    np.testing.assert_equal(list(found.positions.values()), [0.01, other])
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"\x00\x01\x00\x00", b"\x07\x01\x00\x00\x01", b"\xff" * 40])
@@ -84,6 +104,12 @@ def with_twice_the_name():
     return message
 
 
+def without_a_position():
+    message = joints(5.0, {"a": 1.0, "b": 2.0})
+    message.position = message.position[:1]
+    return message
+
+
 @pytest.mark.parametrize(
     ("key", "message", "subject"),
     [
@@ -95,12 +121,9 @@ def with_twice_the_name():
         ("target", target(5.0, (0.0, 0.0, math.inf)), "position (0, 0, inf)"),
         ("shape", shape(5.0, []), "0 poses: must be 1 to 10000"),
         ("shape", shape(5.0, [(0.0, 0.0, 0.0)] * (MOST_POSES + 1)), "10001 poses"),
-        ("shape", shape(5.0, [(0.0, 0.0, 0.0), (0.0, math.nan, 0.0)]), "position (0, nan, 0)"),
         ("joint_states", joints(5.0, {}), "0 joints"),
         ("joint_states", with_twice_the_name(), "2 joints: must be 1 to 64, each once"),
-        ("joint_states", joints(5.0, {"a": math.nan}), "joint 'a': nan"),
-        ("joint_states", joints(5.0, {"a": 1.0}, (math.inf,)), "joint 'a': inf"),
-        ("joint_states", joints(5.0, {"a": 1.0, "b": 2.0}, (1.0,)), "2 names, 2 positions, 1 velocities"),
+        ("joint_states", without_a_position(), "2 names, 1 positions: must be as many"),
         ("tip", b"\x00" * (LARGEST_BYTES + 1), "1000001 bytes"),
         ("tip", cdr(tip(5.0))[:-1], "not a geometry_msgs/msg/PoseStamped: "),
         ("tip", cdr(tip(5.0)) + bytes(8), "not a geometry_msgs/msg/PoseStamped: "),
@@ -119,6 +142,15 @@ def test_measurements_of_two_publishers_and_repeated_messages_are_refused():
     again = subscription.read(data, 100.1)
     assert again.reason.startswith("old data")
     assert (subscription.number, again.count) == (2, 1)
+
+
+@pytest.mark.parametrize(("which", "status"), [(0, VISIBLE), (1, "position (0, nan, 0)")])
+def test_of_a_shape_only_the_last_pose_counts(which, status):
+    places = [(0.0, 0.0, 0.0), (0.01, 0.0, 0.0)]
+    places[which] = (0.0, math.nan, 0.0)
+    found = read("shape", shape(5.0, places))
+    assert found.status.startswith(status)
+    assert (found.position is None) == (which == 1)
 
 
 def test_a_tip_without_a_position_is_missing_and_one_without_an_orientation_keeps_its_position():

@@ -11,7 +11,7 @@ from flexneedle.errors import RigError
 from flexneedle.geometry.rigid import identity
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.lab.ros.profile import load_profile
-from flexneedle.lab.ros.records import NodeLoss, RosRefusal, ShapeReading, TipReading
+from flexneedle.lab.ros.records import NodeLoss, RosRefusal, TipReading
 from flexneedle.lab.ros.tracker import RosTracker, make_tracker
 from flexneedle.phantom.tracking.stage import OnStage
 from flexneedle.types import VISIBLE
@@ -56,7 +56,7 @@ def test_a_reading_is_a_frame_once_on_the_clock_of_the_run(node, tracker):
     (frame,) = late.read()
     assert 11.99 - (after - before) - 1e-9 <= frame.time <= 11.99 + 1e-9
     assert frame.readings["tip"].status == "position (nan, 0, 0): not a number"
-    node.records = [reading(7), ShapeReading(((0.0, 0.0, 0.0), (4.0, 5.0, 6.0)), reading(9))]
+    node.records = [reading(7), reading(9)]
     frames = tracker.read()
     assert [frame.number for frame in frames] == [7, 9]
     assert [frame.readings["tip"].position for frame in frames] == [(1.0, 2.0, 3.0)] * 2

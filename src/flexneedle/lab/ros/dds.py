@@ -2,12 +2,14 @@
 
 ROS 2 names the DDS type of `geometry_msgs/msg/Pose` `geometry_msgs::msg::dds_::Pose_` and the DDS topic of `/tip`
 `rt/tip`, and announces the hash of a type (REP 2011) in the user data of each writer and reader. Samples are CDR, as in
-a trace; DDS needs the type for discovery only. The domain is ROS_DOMAIN_ID (default: 0); CYCLONEDDS_URI sets network
-interfaces and discovery.
+a trace; DDS needs the type for discovery only. The domain is ROS_DOMAIN_ID (default: 0). ROS's variables set the
+discovery of other nodes; CYCLONEDDS_URI sets network interfaces, and wins where both set something.
 """
 
 import os
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Self
 
@@ -22,6 +24,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from rosbags.interfaces import Nodetype
 
+from flexneedle.arguments import shorten
 from flexneedle.errors import InputError, RunError
 from flexneedle.record.messages import STORE
 
@@ -109,18 +112,93 @@ class CdrSample:
         return cls(bytes(data))
 
 
+# Discovery
+
+_URI, _RANGE, _PEERS, _LOCAL = (
+    "CYCLONEDDS_URI",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_LOCALHOST_ONLY",
+)
+_RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+_MOST_PARTICIPANTS = 32  # of one machine that are searched there
+_ADDRESS = re.compile(r"[\w.:%\[\]-]+", re.ASCII)
+_QUIET = "<General><AllowMulticast>false</AllowMulticast></General>"
+
+
+def discovery_settings(environment: Mapping[str, str]) -> str:
+    """Return Cyclone DDS settings for ROS's discovery variables, as rcl and rmw_cyclonedds set them since Iron.
+
+    ROS_LOCALHOST_ONLY = 1 wins over the others. Unlike there, this machine is searched with SUBNET, too: its nodes with
+    LOCALHOST ignore multicast, and would be found by their own next search only.
+
+    Raises:
+        InputError: A value is unknown.
+    """
+    given, peers = _find_range(environment)
+    if given == "SYSTEM_DEFAULT":
+        return ""
+    if given == "OFF":  # another process cannot have this tag
+        discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
+        return _wrap_settings(f"{_QUIET}<Discovery>{discovery}</Discovery>")
+    listed = "".join(f'<Peer Address="{peer}"/>' for peer in ("localhost", *peers))
+    # Nodes of this machine without multicast search the ports of the participants up to this index.
+    index = f"<MaxAutoParticipantIndex>{_MOST_PARTICIPANTS}</MaxAutoParticipantIndex>"
+    discovery = f"<ParticipantIndex>auto</ParticipantIndex>{index}<Peers>{listed}</Peers>"
+    general = _QUIET if given == "LOCALHOST" else ""
+    return _wrap_settings(f"{general}<Discovery>{discovery}</Discovery>")
+
+
+def _wrap_settings(settings: str) -> str:
+    return f"<CycloneDDS><Domain>{settings}</Domain></CycloneDDS>"
+
+
+def _find_range(environment: Mapping[str, str]) -> tuple[str, list[str]]:
+    """Return the range of discovery and the addresses of static peers. Raises InputError."""
+    local, given = environment.get(_LOCAL, ""), environment.get(_RANGE) or _RANGES[0]
+    if local not in ("", "0", "1"):
+        raise InputError(f"{_LOCAL} = {shorten(local)}: must be 0 or 1")
+    if given not in _RANGES:
+        raise InputError(f"{_RANGE} = {shorten(given)}: must be one of {', '.join(_RANGES)}")
+    peers = [peer.strip() for peer in environment.get(_PEERS, "").split(";") if peer.strip()]
+    for peer in peers:
+        if not _ADDRESS.fullmatch(peer):
+            raise InputError(
+                f"{_PEERS}: {shorten(peer)}: must be addresses or names of hosts, separated by ;"
+            )
+    return ("LOCALHOST", []) if local == "1" else (given, peers)
+
+
 # Endpoints
 
 
 def join_domain() -> DomainParticipant:
-    """Join the domain. Raises InputError for an invalid ROS_DOMAIN_ID, RunError if DDS cannot be started."""
+    """Join the domain, with the discovery that ROS's environment variables set.
+
+    Raises InputError for an invalid variable, RunError if DDS cannot be started.
+    """
     given = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not given.isdecimal() or int(given) > _HIGHEST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID = {given!r}: must be a whole number from 0 to {_HIGHEST_DOMAIN}")
     try:
-        return DomainParticipant(int(given))
+        with _cyclone_settings(discovery_settings(os.environ)):
+            return DomainParticipant(int(given))
     except DDSException as error:
         raise RunError(f"ROS 2: no DDS participant in domain {given}: {error.msg or error}") from error
+
+
+@contextmanager
+def _cyclone_settings(settings: str) -> Iterator[None]:
+    """Put settings before the user's in CYCLONEDDS_URI, where Cyclone DDS reads them, within the block only."""
+    given = os.environ.get(_URI)
+    os.environ[_URI] = ",".join(filter(None, (settings, given)))
+    try:
+        yield
+    finally:
+        if given is None:
+            del os.environ[_URI]
+        else:
+            os.environ[_URI] = given
 
 
 class TopicWriter:

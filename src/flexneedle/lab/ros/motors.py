@@ -25,6 +25,7 @@ from flexneedle.scenario.sections.fields import Section
 
 CONNECTING = "the ROS node is connecting"
 _CONNECT_S = 5.0
+_LARGEST = 1e9  # position, in any unit
 _LONGEST = 200  # characters of a list of joints
 
 
@@ -84,7 +85,8 @@ class JointLink:
         """Take received records. Raises DriverError if the node is lost."""
         for record in self._node.poll():
             if isinstance(record, JointReading):
-                self._reading, self._refused = record, ""
+                self._refused = self._position_problem(record)
+                self._reading = self._reading if self._refused else record
             elif isinstance(record, RosRefusal):
                 self._refused = f": {record.reason}"
             elif isinstance(record, NodeLoss):
@@ -106,6 +108,17 @@ class JointLink:
             found = make_printable(", ".join(reading.positions))[:_LONGEST]
             raise DriverError(f"{name}: no joint {', '.join(missing)}; joints: {found}")
         return reading
+
+    def _position_problem(self, reading: JointReading) -> str:
+        """Return the problem of the first joint of the rig without a possible position, or ""."""
+        return next(
+            (
+                f": joint {channel}: {reading.positions[channel]:g} is not a position"
+                for channel in self._channels
+                if not abs(reading.positions.get(channel, 0.0)) < _LARGEST
+            ),
+            "",
+        )
 
     def send(self, positions: Mapping[str, float]) -> None:
         """Send goals of joints, in their units."""

@@ -17,7 +17,6 @@ from flexneedle.lab.ros.records import (
     RosRefusal,
     RosStop,
     RosTarget,
-    ShapeReading,
     TipReading,
 )
 from flexneedle.record.messages import STORE, Header
@@ -29,7 +28,6 @@ MOST_POSES = 10_000
 _BOOL, _HEADER = "std_msgs/msg/Bool", 4  # bytes before the value
 _OF_ONE = ("tip", "shape", "joint_states")
 _MOST_JOINTS = 64
-_LARGEST_JOINT = 1e9  # in any unit
 _LONGEST_TEXT = 60
 _WINDOW_S = 10.0
 _MOST_IN_WINDOW = 1000
@@ -151,13 +149,12 @@ def _parse_tip(subscription: Subscription, message: Any, arrival: float) -> TipR
     return _make_reading(subscription, message.header, message.pose, arrival)
 
 
-def _parse_shape(subscription: Subscription, message: Any, arrival: float) -> ShapeReading:
+def _parse_shape(subscription: Subscription, message: Any, arrival: float) -> TipReading:
+    """Return the last pose, the tip; the others are not used."""
     count = len(message.poses)
     if not 1 <= count <= MOST_POSES:
         raise InputError(f"{count} poses: must be 1 to {MOST_POSES}")
-    frame = subscription.check_frame(message.header)
-    points = tuple(frame.to_point(one.position) for one in message.poses)
-    return ShapeReading(points, _make_reading(subscription, message.header, message.poses[-1], arrival))
+    return _make_reading(subscription, message.header, message.poses[-1], arrival)
 
 
 def _make_reading(subscription: Subscription, header: Header, pose: Any, arrival: float) -> TipReading:
@@ -175,15 +172,14 @@ def _make_reading(subscription: Subscription, header: Header, pose: Any, arrival
 
 
 def _parse_joints(subscription: Subscription, message: Any, arrival: float) -> JointReading:
-    names, positions, velocities = message.name, message.position.tolist(), message.velocity.tolist()
+    """Return the positions; velocities and efforts, which are NaN where an interface is missing, are not used."""
+    names, positions = message.name, message.position.tolist()
     if not 1 <= len(names) <= _MOST_JOINTS or len(set(names)) != len(names):
         raise InputError(f"{len(names)} joints: must be 1 to {_MOST_JOINTS}, each once")
-    if len(positions) != len(names) or len(velocities) not in (0, len(names)):
-        counts = f"{len(names)} names, {len(positions)} positions, {len(velocities)} velocities"
-        raise InputError(f"{counts}: must be as many positions as names, and as many velocities or none")
-    for name, value in (*zip(names, positions, strict=True), *zip(names, velocities, strict=False)):
-        if not abs(value) < _LARGEST_JOINT:
-            raise InputError(f"joint {_quote(name)}: {value:g} is not a position or speed")
+    if len(positions) != len(names):
+        raise InputError(
+            f"{len(names)} names, {len(positions)} positions: must be as many positions as names"
+        )
     time = subscription.check_stamp(message.header, arrival)
     return JointReading(time, dict(zip(names, positions, strict=True)))
 

@@ -75,16 +75,8 @@ class TipReading:
 
 
 @dataclass(frozen=True)
-class ShapeReading:
-    """Points along the needle from base to tip, at any distances. tip: the last one as a reading of the tip."""
-
-    points: tuple[Point, ...]
-    tip: TipReading
-
-
-@dataclass(frozen=True)
 class JointReading:
-    """Positions of joints by name, in the unit of the joint (m or rad)."""
+    """Positions of joints by name, in the unit of the joint (m or rad); those of unused joints may be any number."""
 
     time: float
     positions: Mapping[str, float]
@@ -132,4 +124,4 @@ class NodeHeartbeat:
 
 
 Published = RosState | RosTarget | JointTargets
-Received = RosStop | RosArm | RosTarget | TipReading | ShapeReading | JointReading | RosRefusal | NodeLoss
+Received = RosStop | RosArm | RosTarget | TipReading | JointReading | RosRefusal | NodeLoss

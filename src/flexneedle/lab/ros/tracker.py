@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 from flexneedle.lab.rig.rig_file import check_settings
 from flexneedle.lab.ros.client import NodeClient
 from flexneedle.lab.ros.profile import DeviceAge, load_part
-from flexneedle.lab.ros.records import Received, RosRefusal, ShapeReading, TipReading
+from flexneedle.lab.ros.records import Received, RosRefusal, TipReading
 from flexneedle.ports import Clock
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.types import TIP, VISIBLE, Frame, SensorReading
@@ -65,8 +65,6 @@ class RosTracker:
     def _take_tip(self, record: Received) -> TipReading | None:
         if isinstance(record, RosRefusal):
             self._refused = f"{record.topic}: {record.reason}"
-        if isinstance(record, ShapeReading):
-            return record.tip
         return record if isinstance(record, TipReading) else None
 
     def _to_frame(self, tip: TipReading) -> Frame:

@@ -240,7 +240,10 @@ def test_motors_that_do_not_stop_are_a_fault(bench, every):
     for _ in range(60 // every):
         bench.stop()
         bench.tick(every)
-    assert (bench.state, bench.why) == (SupervisorState.FAULT, "the motors do not stop: press the emergency stop")
+    assert (bench.state, bench.why) == (
+        SupervisorState.FAULT,
+        "the motors do not stop: press the emergency stop",
+    )
     assert (bench.until(1).state, bench.until(1).why) == (SupervisorState.FAULT, "the test")
 
 
