@@ -76,7 +76,7 @@ class TipReading:
 
 @dataclass(frozen=True)
 class JointReading:
-    """Positions of joints by name, in the unit of the joint (m or rad); those of unused joints may be any number."""
+    """Positions of joints by name, in the unit of the joint (m or rad); an unused joint may have any."""
 
     time: float
     positions: Mapping[str, float]
