@@ -80,6 +80,8 @@ def test_an_axis_starts_at_its_home_and_a_switch_is_where_it_is_homed():
     assert (here.start, here.switches) == (10.0, (-22_000.0, 202_000.0))
     at_switch = carriages_of(axes(home="reverse-limit", home_mm=-0.5), PHANTOM)["insertion"]
     assert (at_switch.start, at_switch.switches) == (0.0, (-1000.0, 222_000.0))
+    lateral = Axes.model_validate({"insertion": LINEAR, "guide_y": LINEAR | {"channel": "B", "home_mm": 3.0}})
+    assert carriages_of(lateral, PHANTOM)["guide_y"].start == 0.0  # on the needle's axis
 
 
 def test_an_axis_beyond_the_emulated_channels_is_refused():

@@ -53,14 +53,14 @@ class Carriage:
 def carriages_of(axes: Axes, scenario: Scenario) -> Mapping[str, Carriage]:
     """Return the carriages of a rig by name of the axis.
 
-    They start where the scenario begins: axes that are homed `here` at their home, the others at 0. Raises RigError if
-    the controller has no such channel, or an axis starts beyond its soft limits.
+    They start where the scenario begins: an insertion axis that is homed `here` at its home, others at 0. Raises
+    RigError if the controller has no such channel, or an axis starts beyond its soft limits.
     """
     return {name: _carriage(name, axis, scenario) for name, axis in axes.items()}
 
 
 def _carriage(name: str, axis: Axis, scenario: Scenario) -> Carriage:
-    start = axis.at_home if axis.home == "here" else 0.0
+    start = axis.at_home if name == "insertion" and axis.home == "here" else 0.0
     low, high = axis.limits
     _check(name, axis, start)
     switch, stop = (_SWITCH_RAD, _STOP_RAD) if isinstance(axis, RotaryAxis) else (_SWITCH_MM, _STOP_MM)
