@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import tomli_w
@@ -244,3 +245,23 @@ def test_a_driver_without_the_channel_is_an_error(capsys, file, monkeypatch, sup
     status, _, err = run(capsys, "rig", "jog", file(), "insertion", "1", "--yes")
     assert (status, supervisor.calls) == (1, [])
     assert "the driver has no channel B, C; it has A" in err
+
+
+@pytest.mark.parametrize(
+    ("failure", "first"),
+    [
+        (DriverError("lost: insertion may still move"), "lost: insertion may"),
+        (KeyboardInterrupt(), "from the tick"),
+    ],
+)
+def test_motors_that_cannot_be_stopped_hide_no_reason(file, supervisor, capsys, failure, first):
+    def fail():
+        raise DriverError("the motors do not come to rest: waited for 5 s")
+
+    supervisor.failure, supervisor.stop = failure, fail
+    supervisor.report = SimpleNamespace(why="from the tick: insertion may still move")
+    status, _, err = run(capsys, "rig", "jog", file(), "insertion", "-5", "--yes")
+    line = err.splitlines()[-1]
+    assert status == 1
+    assert line.startswith(f"flexneedle: {first}")
+    assert line.endswith("may still move; the motors do not come to rest: waited for 5 s")

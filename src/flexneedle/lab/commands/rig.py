@@ -12,7 +12,7 @@ from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_strategy, print_json
 from flexneedle.cli.progress import print_line, print_note
 from flexneedle.cli.values import finite, positive
-from flexneedle.errors import DriverError
+from flexneedle.errors import DriverError, FlexneedleError
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 
 if TYPE_CHECKING:
@@ -323,12 +323,19 @@ def _arm(operator: SupervisorClient) -> None:
 
 @contextmanager
 def _stop_on_error(operator: SupervisorClient) -> Iterator[None]:
-    """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
+    """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped.
+
+    Raises DriverError with both reasons if they cannot be stopped.
+    """
     from flexneedle.interrupts import delay_signals
 
     try:
         yield
-    except BaseException:
+    except BaseException as error:
         with delay_signals():
-            operator.stop()
+            try:
+                operator.stop()
+            except DriverError as unstopped:
+                why = str(error) if isinstance(error, FlexneedleError) else operator.report.why
+                raise DriverError("; ".join(filter(None, (why, str(unstopped))))) from error
         raise
