@@ -256,7 +256,7 @@ def test_a_driver_without_the_channel_is_an_error(capsys, file, monkeypatch, sup
 )
 def test_motors_that_cannot_be_stopped_hide_no_reason(file, supervisor, capsys, failure, first):
     def fail():
-        raise DriverError("the motors do not come to rest: waited for 5 s")
+        raise DriverError("the motors are not known to rest: waited for 5 s")
 
     supervisor.failure, supervisor.stop = failure, fail
     supervisor.report = SimpleNamespace(why="from the tick: insertion may still move")
@@ -264,4 +264,4 @@ def test_motors_that_cannot_be_stopped_hide_no_reason(file, supervisor, capsys, 
     line = err.splitlines()[-1]
     assert status == 1
     assert line.startswith(f"flexneedle: {first}")
-    assert line.endswith("may still move; the motors do not come to rest: waited for 5 s")
+    assert line.endswith("may still move; the motors are not known to rest: waited for 5 s")

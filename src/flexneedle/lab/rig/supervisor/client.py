@@ -95,7 +95,7 @@ class SupervisorClient(SupervisorConnection):
         if self._ended is not None:
             return
         sent = self._send(protocol.StopCommand(who))
-        self._wait(lambda: self._has_stopped(sent), END_S, "the motors do not come to rest", stopped=True)
+        self._wait(lambda: self._has_stopped(sent), END_S, "the motors are not known to rest", stopped=True)
 
     def off(self) -> None:
         """Stop all motors, and switch them off. Raises DriverError, with the reason, if one is still on."""
