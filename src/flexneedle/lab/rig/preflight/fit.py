@@ -35,14 +35,10 @@ class AxisNeed:
     why: str
 
 
-def axis_needs(scenario: Scenario, strategy: str, advance: float) -> tuple[AxisNeed, ...]:
-    """Return the requirements for each linear axis, with the strategy of the plan and this advance (mm)."""
+def _needs(scenario: Scenario, strategy: str) -> tuple[AxisNeed, ...]:
+    """Return the requirements for each linear axis, before the tip is measured."""
+    advance = needed_advance(scenario, scenario.target.depth_mm)
     return _insertion_need(scenario, advance), *_lateral_needs(scenario, strategy)
-
-
-def _needs_before_start(scenario: Scenario, strategy: str) -> tuple[AxisNeed, ...]:
-    """Return the requirements before the tip is measured."""
-    return axis_needs(scenario, strategy, needed_advance(scenario, scenario.target.depth_mm))
 
 
 def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation") -> list[str]:
@@ -50,7 +46,7 @@ def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation
     found = [
         *(
             problem
-            for need in _needs_before_start(scenario, strategy)
+            for need in _needs(scenario, strategy)
             for problem in _linear_problems(rig, scenario, need)
         ),
         *_base_turn_problems(scenario, strategy),
