@@ -152,7 +152,7 @@ MUTANTS = [
     (of_camera(with_values(Camera, lag=1.0)), "test_times_increase_and_are_past"),
     (of_camera(with_values(Camera, order=-1)), "test_times_increase_and_are_past"),
     (of_camera(with_values(Camera, rate=0.5)), "test_readings_arrive_before_they_are_stale"),
-    (of_camera(with_values(Camera, late=1)), "test_tip_is_measured_before_the_needle_moves"),
+    (of_camera(with_values(Camera, late=100)), "test_tip_is_measured_before_the_needle_moves"),
     (of_camera(with_values(Camera, image=lambda *_: (0.0, 1.0))), "test_read_returns_measurements"),
     (of_camera(with_values(Camera, status=None)), "test_has_the_parts_of_the_port"),
     (of_camera(Repeats), "test_each_reading_is_returned_once"),
