@@ -124,7 +124,7 @@ class Camera:
 
     def read(self):
         due = math.floor(self.phantom.now() * self.rate + 1e-6) + 1 - self.late
-        taken, self.next = range(self.next, due), due
+        taken, self.next = range(self.next, due), max(self.next, due)
         return tuple(map(self.image, taken))[:: self.order]
 
     def image(self, number):
