@@ -1,4 +1,4 @@
-"""Layout of a CSV file: separator, decimal mark, column names, and the lines before them."""
+"""Layout of a CSV file: encoding, separator, decimal mark, column names, and the lines before them."""
 
 import csv
 import re
@@ -6,15 +6,20 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TextIO
 
 from flexneedle.errors import InputError
 
 SHOWN = 60
 """Number of characters of a line or field in a message."""
+BLANKS = " "
+"""The separator of a file with blanks between the columns, any number of them."""
 _SEPARATORS = ",;\t"
-_SEPARATOR_LINE = re.compile(r"sep=([,;\t])")  # written by Excel
+_SEPARATOR_LINE = re.compile(r'"?sep=([,;\t])"?', re.IGNORECASE)  # written by Excel
+_COMMENT = ("#", "%", "//")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _DECIMAL = re.compile(r"\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*")
-_LONGEST_LINE = 1 << 20  # bytes
+_LONGEST_LINE = 1 << 20  # characters
 _FIRST_LINES = 1000  # searched for the decimal mark
 
 
@@ -27,56 +32,65 @@ class CsvLayout:
     skipped: int
 
 
+def open_text(path: Path) -> TextIO:
+    """Open a CSV file in UTF-8, or in UTF-16 with a byte order mark; all kinds of line ends are read as LF."""
+    with path.open("rb") as file:
+        wide = file.read(2) in _UTF_16
+    return path.open(encoding="utf-16" if wide else "utf-8-sig", errors="replace")
+
+
 def read_layout(path: Path) -> CsvLayout:
-    """Return the layout of a CSV file; lines before the header may be blank, comments (#) or `sep=;`.
+    """Return the layout of a CSV file; lines before the header may be blank, comments (#, %, //) or `sep=;`.
 
     Raises InputError if there are no column names or no row.
     """
     separator, skipped = "", 0
-    with path.open("rb") as file:
-        for line in iter(lambda: file.readline(_LONGEST_LINE), b""):
-            text = _decode_line(line, first=skipped == 0)
+    with open_text(path) as file:
+        for line in iter(lambda: file.readline(_LONGEST_LINE), ""):
+            text = _check_line(line).strip(" \n")
             found = _SEPARATOR_LINE.fullmatch(text)
             separator = found[1] if found else separator
-            if text and not found and not text.startswith("#"):
+            if text and not found and not text.startswith(_COMMENT):
                 break
             skipped += 1
         else:
             raise InputError("has no line with column names")
         if not file.read(1):
             raise InputError(f"has no rows, only the header {text[:SHOWN]!r}")
-    separator = separator or max(_SEPARATORS, key=lambda each: len(_split_line(text, each)))
-    return CsvLayout(tuple(name.strip() for name in _split_line(text, separator)), separator, skipped)
+    separator = separator or _find_separator(text)
+    return CsvLayout(tuple(name.strip() for name in _split_loosely(text, separator)), separator, skipped)
 
 
 def has_decimal_commas(path: Path, layout: CsvLayout, columns: Container[str]) -> bool:
     """Return whether the first number with a decimal mark in these columns has a comma.
 
-    Only files with semicolons or tabs between the columns can have decimal commas.
+    Only files with semicolons, tabs or blanks between the columns can have decimal commas.
     """
     if layout.separator == ",":
         return False
     chosen = [number for number, name in enumerate(layout.header) if name in columns]
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+    with open_text(path) as file:
         rows = csv.reader(islice(file, layout.skipped + 1, _FIRST_LINES), delimiter=layout.separator)
         fields = (row[number] for row in rows for number in chosen if number < len(row))
         marks = (found[1] for field in fields if (found := _DECIMAL.fullmatch(field)))
         return next(marks, ".") == ","
 
 
-def find_line(path: Path, layout: CsvLayout, row: int) -> int:
-    """Return the number of the line with a row; rows count from 1, and blank lines are no rows."""
-    with path.open("rb") as file:
-        rows = (k for k, line in enumerate(file, 1) if k > layout.skipped + 1 and line.rstrip(b"\r\n"))
-        return next(islice(rows, row - 1, None))
+def split_line(text: str, separator: str) -> Sequence[str]:
+    """Return the fields of a line, which may be quoted, also after blanks. Raises csv.Error."""
+    return next(csv.reader([text], delimiter=separator, skipinitialspace=True, strict=True), [])
 
 
-def _split_line(text: str, separator: str) -> Sequence[str]:
-    return next(csv.reader([text], delimiter=separator), [])
+def _find_separator(text: str) -> str:
+    best = max(_SEPARATORS, key=lambda each: len(_split_loosely(text, each)))
+    return best if len(_split_loosely(text, best)) > 1 else BLANKS
 
 
-def _decode_line(line: bytes, first: bool) -> str:
-    text = line.decode("utf-8-sig" if first else "utf-8", errors="replace")
-    if "\0" in text or (len(line) == _LONGEST_LINE and not line.endswith(b"\n")):
+def _split_loosely(text: str, separator: str) -> Sequence[str]:
+    return next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])
+
+
+def _check_line(line: str) -> str:
+    if "\0" in line or (len(line) == _LONGEST_LINE and not line.endswith("\n")):
         raise InputError("is neither CSV nor Parquet")
-    return text.strip(" \r\n")
+    return line

@@ -1,6 +1,7 @@
 """Rules for the rows of a table: SQL conditions that invalid rows of `samples` meet, each with its message."""
 
-from flexneedle.lab.tables.sample_table import EMPTY, Rule
+from flexneedle.lab.tables.plain_copy import EMPTY
+from flexneedle.lab.tables.sample_table import Rule
 
 SAME_POSITION_MM = 1e-3
 """Largest difference between the true positions of a grid point (read-back of a stage, rounding)."""

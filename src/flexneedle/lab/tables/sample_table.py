@@ -4,7 +4,6 @@ The first bytes of the file, not its name, decide its format. No rows are held i
 """
 
 import os
-import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,15 +18,14 @@ from numpy.typing import NDArray
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError
 from flexneedle.lab.tables.columns import choose_columns
-from flexneedle.lab.tables.layout import SHOWN, find_line, has_decimal_commas, read_layout
+from flexneedle.lab.tables.layout import CsvLayout, has_decimal_commas, read_layout
+from flexneedle.lab.tables.plain_copy import is_regular, write_copy
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 TEXT = ("point_id", "sensor", "environment", "status")
 """Columns of text; numbers in them are converted, so that 1 and "1" are the same. All other columns hold numbers."""
-EMPTY = ("", "nan", "-nan", "na", "n/a", "#n/a", "null", "none", "missing")
-"""Spellings of an empty value, in lower case."""
 MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
 Rule = tuple[str, str]
 """An SQL condition that invalid rows of `samples` meet, and the message."""
@@ -35,15 +33,18 @@ Rule = tuple[str, str]
 _MAGIC = b"PAR1"
 _THREADS = 4  # at most; each buffers 32 MB of a CSV file
 _NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
-_EMPTY_FIELDS = ["", "NA", "N/A", "#N/A", "null", "NULL", "None", "missing", "MISSING"]  # and nan
-_MOST_REJECTED = 10_000
-_REASONS = {
-    "MISSING COLUMNS": "has fewer fields than the header",
-    "TOO MANY COLUMNS": "has more fields than the header",
-}
-_FIELD = re.compile('string "(.*)" to', re.DOTALL)
+_EMPTY_FIELDS = [
+    "",
+    "NA",
+    "N/A",
+    "#N/A",
+    "null",
+    "NULL",
+    "None",
+    "missing",
+    "MISSING",
+]  # and nan; others are slower
 _Choose = Callable[[Sequence[str]], dict[str, str]]
-_Opened = tuple[dict[str, str], Callable[[int], str]]
 
 
 @dataclass(frozen=True)
@@ -52,20 +53,30 @@ class SampleTable:
 
     Text is without surrounding blanks, empty in any of the spellings `EMPTY`. Numbers are DOUBLE with lengths in mm,
     NULL if empty or if the table lacks the column. fields: the requested columns that the table has, with their SQL
-    names in the file; find_row: "line 5" of a row.
+    names in the file.
     """
 
     connection: "DuckDBPyConnection"
     fields: Mapping[str, str]
-    find_row: Callable[[int], str]
+    source: "_Source"
+
+    def find_row(self, row: int) -> str:
+        """Return the place of a row, such as "line 5"; rows count from 1."""
+        return self.source.find_row(row)
 
     def arrays(self, query: str, **values: Any) -> dict[str, NDArray[Any]]:
         """Return the columns (r,) of the result of a query, with NaN for NULL.
 
-        Raises InputError for the first row of the file that is no CSV, or has text in a column of numbers.
+        Raises InputError for the first malformed line of the file.
         """
-        found = self.connection.execute(query, values or None).fetchnumpy()
-        self._refuse_rejected()
+        from duckdb import ConversionException, InvalidInputException
+
+        try:
+            found = self.connection.execute(query, values or None).fetchnumpy()
+        except (ConversionException, InvalidInputException):
+            if not self.source.reopen(self.connection):
+                raise
+            found = self.connection.execute(query, values or None).fetchnumpy()
         return {name: _fill(column) for name, column in found.items()}
 
     def refuse(self, rules: Sequence[Rule], chosen: str = "true", **values: Any) -> None:
@@ -78,20 +89,6 @@ class SampleTable:
         found = self.arrays(query, **values)
         for row, rule in zip(found["row"], found["rule"], strict=True):
             raise InputError(f"{self.find_row(int(row))}: {rules[int(rule)][1]}")
-
-    def _refuse_rejected(self) -> None:
-        """Raise InputError for the first row that DuckDB rejected."""
-        tables = "SELECT table_name FROM duckdb_tables() WHERE table_name = 'reject_errors'"
-        if self.connection.execute(tables).fetchone() is None:
-            return
-        query = "SELECT line, error_type, column_name, csv_line, error_message FROM reject_errors ORDER BY line LIMIT 1"
-        rejected = self.connection.execute(query).fetchone()
-        if rejected is not None:
-            line, kind, field, text, message = rejected
-            reason = f"{_REASONS.get(kind, kind.lower())}: {text.strip()[:SHOWN]!r}"
-            if kind == "CAST":
-                reason = _explain_field(next(c for c, f in self.fields.items() if f == field), message)
-            raise InputError(f"line {line}: {reason}")
 
 
 def first_violation(rules: Sequence[Rule]) -> str:
@@ -125,15 +122,12 @@ def open_table(
     }
     requested, scale = (tuple(required), tuple(optional)), MILLIMETRES_IN[unit]
     try:
-        with connect(config=settings) as connection:
-            yield _open(connection, path, requested, mapping, labels or {}, scale)
+        with connect(config=settings) as connection, tempfile.TemporaryDirectory() as folder:
+            yield _open(connection, path, Path(folder), requested, mapping, labels or {}, scale)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Error as error:
-        reason = str(error).splitlines()[0]
-        if "state machine" in reason:
-            reason = "lines end in LF and in CRLF, or a quoted field is not closed"
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+        raise InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -141,6 +135,7 @@ def open_table(
 def _open(
     connection: "DuckDBPyConnection",
     path: Path,
+    folder: Path,
     requested: tuple[tuple[str, ...], tuple[str, ...]],
     mapping: Mapping[str, str] | None,
     labels: Mapping[str, str],
@@ -150,15 +145,15 @@ def _open(
         start = file.read(len(_MAGIC))
     if not start:
         raise InputError("is empty")
-    opened = _open_parquet if start == _MAGIC else _open_csv
-    fields, find_row = opened(connection, path, lambda header: choose_columns(header, mapping, *requested))
+    source: _Source = _Parquet(path) if start == _MAGIC else _Csv(path, folder / "copy.csv")
+    fields = source.open(connection, lambda header: choose_columns(header, mapping, *requested))
     given = [name for name in labels if name in fields]
     if given:
         raise InputError(f"has a column {given[0]}: --{given[0]} is only for a table without it")
     names = dict.fromkeys((*requested[0], *requested[1], *labels))
     values = (f"{_value(name, fields.get(name), labels.get(name, ''), scale)} AS {name}" for name in names)
     connection.execute(f"CREATE TEMP VIEW samples AS SELECT {', '.join(values)} FROM file")
-    return SampleTable(connection, fields, find_row)
+    return SampleTable(connection, fields, source)
 
 
 def _value(name: str, field: str | None, label: str, scale: float) -> str:
@@ -171,44 +166,89 @@ def _value(name: str, field: str | None, label: str, scale: float) -> str:
     return f"CASE WHEN NOT isnan({field}::DOUBLE) THEN {field}::DOUBLE{factor} END"
 
 
-def _open_csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> _Opened:
-    layout = read_layout(path)
-    chosen = choose(layout.header)
-    numbers = {text for name, text in chosen.items() if name not in TEXT}
-    kinds = {f"c{k}": "DOUBLE" if text in numbers else "VARCHAR" for k, text in enumerate(layout.header)}
-    mark = "," if has_decimal_commas(path, layout, numbers) else "."
-    connection.execute(
-        f"CREATE TEMP VIEW file AS SELECT * FROM read_csv({_literal(escape(str(path)))}, columns={kinds}, "
-        f"auto_detect=false, header=true, skip={layout.skipped}, delim={_literal(layout.separator)}, quote='\"', "
-        f"escape='\"', nullstr={_EMPTY_FIELDS}, decimal_separator='{mark}', store_rejects=true, "
-        f"rejects_limit={_MOST_REJECTED})"
-    )
-    fields = {name: f"c{layout.header.index(text)}" for name, text in chosen.items()}
-    return fields, lambda row: f"line {find_line(path, layout, row)}"
+class _Csv:
+    """A CSV file, or its plain copy if DuckDB cannot read the file."""
+
+    def __init__(self, path: Path, copy: Path) -> None:
+        self._path, self._copy, self._layout = path, copy, read_layout(path)
+        self._chosen: dict[int, str] = {}  # types in SQL by column number
+        self._lines: Sequence[int] = ()
+
+    def open(self, connection: "DuckDBPyConnection", choose: _Choose) -> dict[str, str]:
+        """Create the view `file` and return the SQL names of the requested columns."""
+        layout = self._layout
+        columns = {name: layout.header.index(text) for name, text in choose(layout.header).items()}
+        self._chosen = {k: "VARCHAR" if name in TEXT else "DOUBLE" for name, k in columns.items()}
+        if is_regular(self._path, layout):
+            kinds = {f"c{k}": self._chosen.get(k, "VARCHAR") for k in range(len(layout.header))}
+            numbers = {layout.header[k] for k, kind in self._chosen.items() if kind == "DOUBLE"}
+            mark = "," if has_decimal_commas(self._path, layout, numbers) else "."
+            self._create_view(connection, self._path, kinds, layout, mark)
+        else:
+            self.reopen(connection)
+        return {name: f"c{k}" for name, k in columns.items()}
+
+    def reopen(self, connection: "DuckDBPyConnection") -> bool:
+        """Replace the view by one of a plain copy; False if it is one. Raises InputError for a malformed line."""
+        if self._lines:
+            return False
+        chosen = sorted(self._chosen)
+        numbers = [k for k in chosen if self._chosen[k] == "DOUBLE"]
+        self._lines = write_copy(self._path, self._layout, chosen, numbers, self._copy)
+        if not self._lines:
+            raise InputError("has no rows, only the header")
+        kinds = {f"c{k}": self._chosen[k] for k in chosen}
+        self._create_view(connection, self._copy, kinds, CsvLayout((), ",", 0), ".")
+        return True
+
+    def find_row(self, row: int) -> str:
+        """Return "line 5" of a row."""
+        return f"line {self._lines[row - 1] if self._lines else self._layout.skipped + 1 + row}"
+
+    @staticmethod
+    def _create_view(
+        connection: "DuckDBPyConnection", path: Path, kinds: Mapping[str, str], layout: CsvLayout, mark: str
+    ) -> None:
+        connection.execute(
+            f"CREATE OR REPLACE TEMP VIEW file AS SELECT * FROM read_csv({_literal(escape(str(path)))}, "
+            f"columns={dict(kinds)}, auto_detect=false, header=true, skip={layout.skipped}, "
+            f"delim={_literal(layout.separator)}, quote='\"', escape='\"', nullstr={_EMPTY_FIELDS}, "
+            f"decimal_separator='{mark}')"
+        )
 
 
-def _open_parquet(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> _Opened:
-    from duckdb import InvalidInputException
+class _Parquet:
+    """A Parquet file."""
 
-    source = f"read_parquet({_literal(escape(str(path)))}, binary_as_string=true)"
-    try:
-        connection.execute(f"CREATE TEMP VIEW file AS SELECT * FROM {source}")
-    except InvalidInputException:
-        raise InputError("is a truncated or damaged Parquet file") from None
-    types = {name: str(kind) for name, kind, *_ in connection.execute("DESCRIBE file").fetchall()}
-    chosen = choose(list(types))
-    for name, text in chosen.items():
-        if name not in TEXT and types[text].startswith(_NOT_NUMERIC):
-            raise InputError(f"{name}: must be a column of numbers, not of {types[text]}")
-    fields = {name: '"' + text.replace('"', '""') + '"' for name, text in chosen.items()}
-    return fields, lambda row: f"row {row}"
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def open(self, connection: "DuckDBPyConnection", choose: _Choose) -> dict[str, str]:
+        """Create the view `file` and return the SQL names of the requested columns."""
+        from duckdb import InvalidInputException
+
+        source = f"read_parquet({_literal(escape(str(self._path)))}, binary_as_string=true)"
+        try:
+            connection.execute(f"CREATE TEMP VIEW file AS SELECT * FROM {source}")
+        except InvalidInputException:
+            raise InputError("is a truncated or damaged Parquet file") from None
+        types = {name: str(kind) for name, kind, *_ in connection.execute("DESCRIBE file").fetchall()}
+        chosen = choose(list(types))
+        for name, text in chosen.items():
+            if name not in TEXT and types[text].startswith(_NOT_NUMERIC):
+                raise InputError(f"{name}: must be a column of numbers, not of {types[text]}")
+        return {name: '"' + text.replace('"', '""') + '"' for name, text in chosen.items()}
+
+    def reopen(self, _connection: "DuckDBPyConnection") -> bool:
+        """Return False: there is no other way to read the file."""
+        return False
+
+    def find_row(self, row: int) -> str:
+        """Return "row 5" of a row."""
+        return f"row {row}"
 
 
-def _explain_field(column: str, message: str) -> str:
-    found = _FIELD.search(message)
-    text = found[1].strip()[:SHOWN] if found else ""
-    remedy = ": use a decimal point, not a comma" if "," in text else ""
-    return f"{column}: {text!r} is not a number{remedy}"
+_Source = _Csv | _Parquet
 
 
 def _literal(value: str) -> str:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.row_rules import ORIENTATIONS, POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.sample_table import EMPTY, SampleTable, open_table
+from flexneedle.lab.tables.plain_copy import EMPTY
+from flexneedle.lab.tables.row_rules import INDICATORS, ORIENTATIONS, POSITIONS, require_numbers, require_text
+from flexneedle.lab.tables.sample_table import SampleTable, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
@@ -20,7 +21,13 @@ frame numbers can be read as a recording, too: `status` is optional."""
 
 _REQUIRED = ("time_s", "frame_number", "sensor", "x_mm", "y_mm", "z_mm")
 _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
-_RULES = (*require_numbers("time_s", "frame_number"), *require_text("sensor"), *POSITIONS, *ORIENTATIONS)
+_RULES = (
+    *require_numbers("time_s", "frame_number"),
+    *require_text("sensor"),
+    *POSITIONS,
+    *ORIENTATIONS,
+    *INDICATORS,
+)
 
 _Row = dict[str, Any]
 

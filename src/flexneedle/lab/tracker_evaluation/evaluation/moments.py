@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flexneedle.errors import InputError
 from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.tables.columns import REFERENCE
+from flexneedle.lab.tables.plain_copy import EMPTY
 from flexneedle.lab.tables.row_rules import (
     INDICATORS,
     ORIENTATIONS,
@@ -22,7 +23,7 @@ from flexneedle.lab.tables.row_rules import (
     TRUE_POSITIONS,
     require_text,
 )
-from flexneedle.lab.tables.sample_table import EMPTY, Rule, SampleTable, first_violation
+from flexneedle.lab.tables.sample_table import Rule, SampleTable, first_violation
 from flexneedle.lab.tracker_evaluation.evaluation.published import THRESHOLD
 from flexneedle.types import TIP
 
