@@ -15,10 +15,6 @@ from flexneedle.types import Floats, Point
 
 _COLLINEAR = 1e-6  # second singular value over the first, below which points are collinear
 _LEAST = 3
-_SIZE_RATIO = 3.0  # largest ratio of the sizes of both sets of points
-_SMALLEST = 0.5  # mm: smaller sets of points are in metres, or useless
-_LOOSE = 0.1  # residual over size above which the fit is rejected
-_MIRRORED = 0.3  # residual of a mirrored fit over the best rotation's, below which a frame is mirrored
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,46 +56,6 @@ def fit_rigid(moving: Floats, fixed: Floats) -> Rigid:
     mirrored = np.linalg.det(left @ right) < 0.0
     rotation = right.T @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ left.T
     return Rigid(rotation, target - rotation @ center)
-
-
-def check_pairs(moving: Floats, fixed: Floats) -> None:
-    """Raise InputError for pairs (n, 3) not of one rigid body: different units, a mirrored frame, a poor fit."""
-    moving_size, fixed_size = _radius(moving), _radius(fixed)
-    if fixed_size < _SMALLEST:
-        raise InputError(
-            f"the stage's points are within {fixed_size:.3g} mm (RMS) of their center, at least {_SMALLEST:g} mm "
-            "are needed: are they in metres?"
-        )
-    if not 1.0 / _SIZE_RATIO < fixed_size / moving_size < _SIZE_RATIO:
-        raise InputError(
-            f"the tracker's points are within {moving_size:.3g} mm (RMS) of their center, the stage's within "
-            f"{fixed_size:.3g} mm: both must be in mm, and the sensor must have moved with the stage"
-        )
-    if (problem := misfit(moving, fixed)) is not None:
-        raise InputError(problem)
-
-
-def misfit(moving: Floats, fixed: Floats) -> str | None:
-    """Return one line on why no rotation fits pairs (n, 3): a mirrored frame, or a large residual. None if one fits."""
-    size = _radius(fixed)
-    error = fiducial_error(fit_rigid(moving, fixed), moving, fixed)
-    mirror = moving * np.array([1.0, 1.0, -1.0])
-    mirrored = fiducial_error(fit_rigid(mirror, fixed), mirror, fixed)
-    if mirrored < _MIRRORED * error and error > _LOOSE * size:
-        return (
-            f"a mirrored frame fits far better (residual {mirrored:.3g} mm, not {error:.3g} mm): "
-            "one of the two frames is left-handed, or an axis has the wrong sign"
-        )
-    if error > _LOOSE * size:
-        return (
-            f"the fit has a residual of {error:.3g} mm (RMS) for points within {size:.3g} mm of their center: "
-            "are points swapped, axes exchanged, or did the sensor not move?"
-        )
-    return None
-
-
-def _radius(points: Floats) -> float:
-    return math.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
 
 
 def fiducial_error(rigid: Rigid, moving: Floats, fixed: Floats) -> float:

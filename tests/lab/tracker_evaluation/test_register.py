@@ -100,7 +100,7 @@ REFUSED = {
     "mirrored": ([(*row[:4], -row[4], *row[5:]) for row in rows()], "one of the two frames is left-handed"),
     "swapped": (
         [(*a[:4], *b[4:]) for a, b in zip(rows(), rows()[1:] + rows()[:1], strict=True)],
-        "are points swapped",
+        "the list shifted by one (the first point of the stage is the tracker's p1)",
     ),
     "not moved": (
         [(*r[:4], 1.0 + 1e-3 * k, 2.0, 3.0 + 1e-6 * k**2, "ref1") for k, r in enumerate(rows())],

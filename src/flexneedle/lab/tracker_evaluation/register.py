@@ -1,6 +1,6 @@
 """`flexneedle em register`: the rigid transform from the tracker's frame to the stage's, from pairs of points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.figures.style import save
+from flexneedle.geometry.pair_checks import check_pairs, find_order, unknown_side
 from flexneedle.geometry.quaternion import from_matrix
 from flexneedle.geometry.rigid import (
     Rigid,
-    check_pairs,
     fiducial_error,
     fit_rigid,
     localisation_error,
@@ -56,7 +56,8 @@ class RegistrationResult:
     """A registration and its errors (mm).
 
     residuals (n,): of each fiducial; leave_one_out (n,): of each fiducial with a registration from all others; fre: RMS
-    residual; fle: estimated RMS localisation error of a fiducial; tre (k,): expected RMS error at the targets (k, 3).
+    residual; fle: estimated RMS localisation error of a fiducial; tre (k,): expected RMS error at the targets (k, 3);
+    notes: one line on each doubt.
     """
 
     pairs: PointPairs
@@ -67,6 +68,7 @@ class RegistrationResult:
     fle: float
     targets: Floats
     tre: Floats
+    notes: tuple[str, ...] = ()
 
     @property
     def registration(self) -> Registration:
@@ -92,6 +94,7 @@ class RegistrationResult:
             "max_residual_mm": float(self.residuals.max()),
             "worst_point": names[int(self.residuals.argmax())],
             "left_out_rms_mm": float(np.sqrt(np.mean(self.leave_one_out**2))),
+            "notes": list(self.notes),
             "tre": [
                 {"target_mm": target, "tre_mm": error}
                 for target, error in zip(self.targets.tolist(), self.tre.tolist(), strict=True)
@@ -121,13 +124,19 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
     Raises InputError for pairs that no rigid transform can map.
     """
     rigid = fit_rigid(pairs.tracker, pairs.stage)
-    check_pairs(pairs.tracker, pairs.stage)
+    check_pairs(pairs.tracker, pairs.stage, pairs.names)
     residuals = np.linalg.norm(rigid.apply(pairs.tracker) - pairs.stage, axis=1)
     fre = fiducial_error(rigid, pairs.tracker, pairs.stage)
     fle = localisation_error(fre, len(pairs.names))
     points = np.array(targets, dtype=float) if targets else pairs.stage.mean(axis=0, keepdims=True)
     tre = target_error(pairs.stage, fle, points)
-    return RegistrationResult(pairs, rigid, residuals, _leave_one_out(pairs), fre, fle, points, tre)
+    notes = tuple(note for note in _find_notes(pairs, points) if note is not None)
+    return RegistrationResult(pairs, rigid, residuals, _leave_one_out(pairs), fre, fle, points, tre, notes)
+
+
+def _find_notes(pairs: PointPairs, targets: Floats) -> Iterator[str | None]:
+    yield unknown_side(pairs.tracker, pairs.stage, targets)
+    yield find_order(pairs.tracker, pairs.stage, pairs.names)
 
 
 def write_registration(registered: RegistrationResult, path: Path) -> None:

@@ -61,8 +61,8 @@ def test_the_note_on_the_frame_appears_from_five_times_the_residual(tmp_path, ti
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: p * (1, 1, -1), "a mirrored frame fits far better"),
-        (lambda p: p[:, [0, 2, 1]] * (1, 1, 2.0), "the fit has a residual of"),
+        (lambda p: p * (1, 1, 2.0), "the fit has a residual of"),
+        (lambda p: p[[1, 0, *range(2, 27)]] * (1, 1, 1.0), "the fit has a residual of"),
     ],
 )
 def test_a_note_reports_a_poor_rigid_fit(tmp_path, change, message):
@@ -71,6 +71,15 @@ def test_a_note_reports_a_poor_rigid_fit(tmp_path, change, message):
     (found,) = notes(tmp_path, rows, register=True)
     assert found.startswith(f"tip, ideal: {message}")
     assert notes(tmp_path, rows) == notes(tmp_path, random_rows(0), register=True) == []
+
+
+def test_a_mirrored_frame_is_refused_with_register_and_noted_without(tmp_path):
+    positions = (GRID + np.random.default_rng(0).normal(0.0, 0.1, GRID.shape)) * (1, 1, -1)
+    rows = rows_of(GRID, np.repeat(positions[:, None], 2, axis=1))
+    (found,) = notes(tmp_path, rows)
+    assert found.startswith("tip, ideal: a mirrored frame fits far better")
+    with pytest.raises(InputError, match="a mirrored frame fits far better"):
+        notes(tmp_path, rows, register=True)
 
 
 @pytest.mark.parametrize("option", ["ideal", "noisy"])

@@ -115,7 +115,7 @@ def test_a_row_that_violates_a_rule_is_named(tmp_path, rows, change, expected):
 
 
 def test_equal_rows_are_separate_samples_and_point_ids_may_be_any_text(tmp_path, rows):
-    for name in ("--1", "²", "-"):
+    for name in ("--1", "²", "- 1"):
         renamed = [row | {"point_id": name if row["point_id"] == 0 else row["point_id"]} for row in rows]
         found = one(write_csv(tmp_path / "t.csv", [*renamed, *renamed]))
         assert found["n_samples"] == 2 * len(rows)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json, print_table
+from flexneedle.cli.progress import print_line
 from flexneedle.cli.values import finite
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns
 
@@ -89,4 +90,6 @@ def _table(registered: RegistrationResult, path: Path) -> None:
     rows.append(("rotation w, x, y, z", f"{w:.6f}, {i:.6f}, {j:.6f}, {k:.6f}"))
     rows.append(("translation", ", ".join(f"{value:.3f}" for value in values["translation_mm"]) + " mm"))
     print_table("Tracker registered to stage", ("", ""), rows)
+    for note in registered.notes:
+        print_line(f"note: {note}")
     print(f"Record and figures: {path}")

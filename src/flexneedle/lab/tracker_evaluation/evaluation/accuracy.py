@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
+from flexneedle.geometry.pair_checks import mirrored_frame
 from flexneedle.geometry.rigid import Rigid, fiducial_error, fit_rigid
 from flexneedle.lab.tracker_evaluation.evaluation.intervals import (
     CONFIDENCE,
@@ -145,11 +146,13 @@ def _pool_scatter(scatter: Floats, count: Floats, axis: int) -> Floats:
 def register_grid(grid: MeasuredGrid) -> tuple[MeasuredGrid, RigidFit]:
     """Return the grid after a rigid least-squares fit of its mean to its true positions, and the fit.
 
-    Raises InputError for fewer than three points or collinear points.
+    Raises InputError for fewer than three points, collinear points, or a mirrored frame.
     """
     measured = grid.measured
     try:
         rigid = fit_rigid(measured.position, measured.true)
+        if (problem := mirrored_frame(measured.position, measured.true)) is not None:
+            raise InputError(problem)
     except InputError as error:
         raise InputError(
             f"--register: sensor {grid.sensor!r}, environment {grid.environment!r}: {error}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.geometry.rigid import misfit
+from flexneedle.geometry.pair_checks import find_order, mirrored_frame, misfit, unknown_side
 from flexneedle.lab.tables.columns import OPTIONAL, REFERENCE, REQUIRED, map_columns
 from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tracker_evaluation.evaluation import published
@@ -146,9 +146,21 @@ def _find_notes(grid: MeasuredGrid) -> Iterator[str]:
             f"{missing} of {missing + int(count.sum())} samples have no position (left out), "
             f"all samples at {int((count == 0).sum())} of {len(count)} grid points"
         )
+    try:
+        yield from (note for note in _check_frames(grid) if note is not None)
+    except InputError:  # too few points, or collinear ones: no fit to compare with
+        return
+
+
+def _check_frames(grid: MeasuredGrid) -> Iterator[str | None]:
     measured = grid.measured
-    if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
-        yield wrong
+    pairs = (measured.position, measured.true)
+    if grid.rigid is None:
+        yield mirrored_frame(*pairs)
+        return
+    names = tuple(grid.name_of(k) for k in range(len(measured)))
+    yield misfit(*pairs, names) or find_order(*pairs, names)
+    yield unknown_side(*pairs, measured.true)
 
 
 def _note_frames(grids: Sequence[MeasuredGrid]) -> Iterator[str]:
