@@ -201,18 +201,45 @@ VISIBLE = "ok"
 """Status of a sensor that the tracker measures, and of a tracker that sends frames."""
 
 
+FARTHEST_MM = 1e4
+"""Largest coordinate of a position: 10 m, beyond any tracker and below their codes for "no value"."""
+ORIGIN = (0.0, 0.0, 0.0)
+"""The position that some devices report for a missing one."""
+
+
 @dataclass(frozen=True)
 class SensorReading:
     """One sensor in one frame of a tracker, in the tracker's coordinates; unknown values are None.
 
     indicator: disagreement of the two coils of a 6-DOF sensor (paper, section IV-B); 5-DOF sensors may have one, too.
     status: VISIBLE, or a short reason for the missing position.
+
+    A device's codes for "no value" become None: positions that are not finite or beyond `FARTHEST_MM`, orientations of
+    length 0, and with such an orientation the position `ORIGIN`.
     """
 
     position: Point | None
     orientation: Quaternion | None = None
     indicator: float | None = None
     status: str = VISIBLE
+
+    def __post_init__(self) -> None:
+        position, orientation = read_numbers(self.position, 3), read_numbers(self.orientation, 4)
+        no_orientation = orientation is not None and not any(orientation)
+        if no_orientation:
+            object.__setattr__(self, "orientation", None)
+        if position is None:
+            return
+        if not all(-FARTHEST_MM <= value <= FARTHEST_MM for value in position):
+            shown = ", ".join(f"{value:.6g}" for value in position)
+            self._drop_position(f"position {shown} mm: a code for missing")
+        elif no_orientation and position == ORIGIN:
+            self._drop_position("missing (position and orientation are 0)")
+
+    def _drop_position(self, reason: str) -> None:
+        object.__setattr__(self, "position", None)
+        if self.status == VISIBLE:
+            object.__setattr__(self, "status", reason)
 
 
 def is_reference(sensor: str) -> bool:

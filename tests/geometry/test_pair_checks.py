@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from flexneedle.geometry.rigid import Rigid
 
 from flexneedle.errors import InputError
 from flexneedle.geometry.pair_checks import (
@@ -13,6 +12,8 @@ from flexneedle.geometry.pair_checks import (
     misfit,
     unknown_side,
 )
+from flexneedle.geometry.rigid import Rigid
+
 
 def random_map(rng):
     """A random rigid map."""

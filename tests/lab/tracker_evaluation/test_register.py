@@ -73,8 +73,41 @@ def test_rows_of_a_point_are_averaged_and_missing_ones_ignored(tmp_path):
     assert found.pairs.missing == 3
 
 
+def test_ndis_code_is_a_missing_reading_and_zeros_are_noted(tmp_path):
+    first, *others = rows()
+    found = register(read_pairs(table(tmp_path, [(*first[:4], *[-3.697314e28] * 3, "ref1"), *others])))
+    assert (found.pairs.missing, len(found.pairs.names), found.fre < 1e-9) == (1, 7, True)
+    zeros = [(*row[:4], 0, 0, 0, "ref1") for row in rows()[:1]]
+    found = read_pairs(table(tmp_path, [*rows(), *zeros]))
+    assert found.zero == 1
+    with pytest.raises(InputError, match="the fit has a residual of"):
+        register(found)
+
+
+def test_points_in_a_plane_get_a_note_and_a_mirrored_plate_is_refused(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    stage = np.column_stack([rng.uniform(-50, 50, (8, 2)), np.tile([-1.0, 1.0], 4)])
+    for thick, mirrored, expected in (
+        (1, True, "a mirrored frame fits far better (residual 0.1"),
+        (
+            0,
+            False,
+            "the side of the plane is unknown. If one frame is left-handed, the error is twice the distance",
+        ),
+    ):
+        plate = stage * (1, 1, thick)
+        measured = TRUE.inverse().apply(plate + rng.normal(0, 0.08, (8, 3))) * (1, 1, -1 if mirrored else 1)
+        data = table(tmp_path, [(k, *plate[k], *measured[k], "ref1") for k in range(8)], name=f"{thick}.csv")
+        out = tmp_path / f"{thick}.toml"
+        assert (
+            main(["em", "register", str(data), "--target", "0", "0", "20", "--out", str(out)]) == 2 * mirrored
+        )
+        assert expected in " ".join("".join(capsys.readouterr()).split())
+        assert out.exists() is not mirrored
+
+
 def test_rows_of_other_sensors_and_missing_samples_are_not_checked(tmp_path):
-    code = -3.697314e28
+    code = 1e30
     others = [("p0", 1, 2, 3, code, code, code, "tip"), ("p1", "", 2, 3, 4, 5, 6, "tip")]
     data = [*others, *rows(0.3), ("p2", "", "", "", "", "", "", "ref1")]
     found = read_pairs(table(tmp_path, data), sensor="ref1")
@@ -84,7 +117,7 @@ def test_rows_of_other_sensors_and_missing_samples_are_not_checked(tmp_path):
     assert (found.names, found.missing) == (alone.names, 1)
 
 
-CODE = -3.697314e28  # of a tracker, for a missing position
+CODE = 1e30  # of a tracker, for a missing position
 REFUSED = {
     "empty": ([], "has no rows"),
     "two": (rows()[:2], "2 pairs of points"),

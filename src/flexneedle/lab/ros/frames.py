@@ -15,10 +15,8 @@ from flexneedle.geometry.quaternion import from_matrix, product
 from flexneedle.lab.ros.profile import PlacedTopic, TopicProfile
 from flexneedle.record.messages import PointMessage, PoseMessage
 from flexneedle.record.messages import Quaternion as QuaternionMessage
-from flexneedle.types import Floats, Point, Quaternion
+from flexneedle.types import FARTHEST_MM, Floats, Point, Quaternion
 
-FARTHEST_MM = 1e4
-"""Positions beyond 10 m are refused."""
 _UNIT_LENGTH = 1e-2  # tolerance; the quaternion of an unfilled message has length 0
 _OVERFLOW = 1e100
 _PER_METRE = {"m": 1.0, "mm": 1e3}

@@ -162,6 +162,9 @@ def _make_reading(subscription: Subscription, header: Header, pose: Any, arrival
     frame, time = subscription.check_frame(header), subscription.check_stamp(header, arrival)
     position: Point | None = None
     orientation, status = None, VISIBLE
+    numbers = (pose.position, pose.orientation)
+    if not any(getattr(part, axis, 0.0) for part in numbers for axis in "xyzw"):
+        return TipReading(time, subscription.number, None, None, "missing (position and orientation are 0)")
     try:
         position = frame.to_point(pose.position)
         orientation = frame.to_orientation(pose.orientation)

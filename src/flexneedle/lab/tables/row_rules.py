@@ -2,13 +2,15 @@
 
 from flexneedle.lab.tables.plain_copy import EMPTY
 from flexneedle.lab.tables.sample_table import Rule
+from flexneedle.types import FARTHEST_MM
 
 SAME_POSITION_MM = 1e-3
 """Largest difference between the true positions of a grid point (read-back of a stage, rounding)."""
-LARGEST = 1e6
-"""Largest accepted number (mm): beyond any room, below a tracker's code for "no value" (−3.7e28 in NDI's replies)."""
+_LARGEST_INDICATOR = 1e6
 UNIT_TOLERANCE = 0.01  # devices round quaternions to 4 digits
 
+AT_ORIGIN = "x_mm = 0 AND y_mm = 0 AND z_mm = 0"
+"""SQL condition of samples exactly at the origin."""
 _TRUE, _MEASURED, _QUATERNION = "true_x_mm, true_y_mm, true_z_mm", "x_mm, y_mm, z_mm", "qw, qx, qy, qz"
 
 
@@ -22,6 +24,16 @@ def require_numbers(*columns: str) -> tuple[Rule, ...]:
     return tuple((f"{name} IS NULL OR isinf({name})", f"{name}: must be a finite number") for name in columns)
 
 
+def note_origin(count: int, total: int) -> str | None:
+    """Return one line on `count` of `total` samples exactly at the origin, None without any."""
+    if not count:
+        return None
+    return (
+        f"{count} of {total} positions are exactly (0, 0, 0), a code for missing? They count as measured: if they are "
+        "missing, leave them empty"
+    )
+
+
 def _count_absent(columns: str) -> str:
     """Return the SQL for the number of columns that are NULL in a row."""
     return " + ".join(f"({name} IS NULL)::INTEGER" for name in columns.split(", "))
@@ -30,8 +42,8 @@ def _count_absent(columns: str) -> str:
 def _at_most(columns: str) -> Rule:
     sizes = ", ".join(f"abs({name})" for name in columns.split(", "))
     return (
-        f"greatest({sizes}) > {LARGEST}",
-        f"{columns}: must be at most {LARGEST:g} mm (a code for a missing position?)",
+        f"greatest({sizes}) > {FARTHEST_MM}",
+        f"{columns}: must be at most {FARTHEST_MM:g} mm (a code for a missing position? Leave it empty)",
     )
 
 
@@ -47,12 +59,15 @@ TRUE_POSITIONS: tuple[Rule, ...] = (
     _at_most(_TRUE),
 )
 INDICATORS: tuple[Rule, ...] = (
-    (f"indicator < 0 OR indicator > {LARGEST}", f"indicator: must be from 0 to {LARGEST:g}, or empty"),
+    (
+        f"indicator < 0 OR indicator > {_LARGEST_INDICATOR}",
+        f"indicator: must be from 0 to {_LARGEST_INDICATOR:g}, or empty",
+    ),
 )
 ORIENTATIONS: tuple[Rule, ...] = (
     (f"{_count_absent(_QUATERNION)} IN (1, 2, 3)", f"{_QUATERNION}: must all have values, or all be empty"),
     (
         f"abs(sqrt(qw * qw + qx * qx + qy * qy + qz * qz) - 1) > {UNIT_TOLERANCE}",
-        f"{_QUATERNION}: must be a unit quaternion (norm within 1 %)",
+        f"{_QUATERNION}: must be a unit quaternion (norm within 1 %), or empty",
     ),
 )

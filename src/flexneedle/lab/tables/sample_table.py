@@ -32,6 +32,8 @@ Rule = tuple[str, str]
 
 _MAGIC = b"PAR1"
 _THREADS = 4  # at most; each buffers 32 MB of a CSV file
+_BAD_FLOAT = -3.697314e28  # in NDI's files and replies, for a missing number
+_POSE = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 _NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
 _EMPTY_FIELDS = [
     "",
@@ -52,8 +54,8 @@ class SampleTable:
     """An open table. Its view `samples` has the requested columns and a row for each row of the file.
 
     Text is without surrounding blanks, empty in any of the spellings `EMPTY`. Numbers are DOUBLE with lengths in mm,
-    NULL if empty or if the table lacks the column. fields: the requested columns that the table has, with their SQL
-    names in the file.
+    NULL if empty, if a known code for a missing number or sample, or if the table lacks the column. fields: the
+    requested columns that the table has, with their SQL names in the file.
     """
 
     connection: "DuckDBPyConnection"
@@ -152,8 +154,19 @@ def _open(
         raise InputError(f"has a column {given[0]}: --{given[0]} is only for a table without it")
     names = dict.fromkeys((*requested[0], *requested[1], *labels))
     values = (f"{_value(name, fields.get(name), labels.get(name, ''), scale)} AS {name}" for name in names)
-    connection.execute(f"CREATE TEMP VIEW samples AS SELECT {', '.join(values)} FROM file")
+    query = f"SELECT {', '.join(values)} FROM file"
+    if fields.keys() >= {*_POSE[0], *_POSE[1]}:
+        query = f"SELECT * REPLACE ({_drop_zeros()}) FROM ({query})"
+    connection.execute(f"CREATE TEMP VIEW samples AS {query}")
     return SampleTable(connection, fields, source)
+
+
+def _drop_zeros() -> str:
+    """Return the SQL for poses without some devices' missing samples: all numbers 0, also of an empty position."""
+    columns = [name for part in _POSE for name in part]
+    position, orientation = (" AND ".join(f"{name} = 0" for name in part) for part in _POSE)
+    zero = f"coalesce({orientation}, false) AND coalesce({position}, x_mm IS NULL)"
+    return ", ".join(f"CASE WHEN NOT ({zero}) THEN {name} END AS {name}" for name in columns)
 
 
 def _value(name: str, field: str | None, label: str, scale: float) -> str:
@@ -163,7 +176,8 @@ def _value(name: str, field: str | None, label: str, scale: float) -> str:
     if field is None:
         return "NULL::DOUBLE"
     factor = f" * {scale}" if scale != 1.0 and name.endswith("_mm") else ""
-    return f"CASE WHEN NOT isnan({field}::DOUBLE) THEN {field}::DOUBLE{factor} END"
+    missing = f"isnan({field}::DOUBLE) OR abs({field}::DOUBLE - {_BAD_FLOAT!r}) < {-1e-6 * _BAD_FLOAT!r}"
+    return f"CASE WHEN NOT ({missing}) THEN {field}::DOUBLE{factor} END"
 
 
 class _Csv:

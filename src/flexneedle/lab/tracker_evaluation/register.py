@@ -21,7 +21,13 @@ from flexneedle.geometry.rigid import (
     target_error,
 )
 from flexneedle.lab.tables.columns import REQUIRED, map_columns
-from flexneedle.lab.tables.row_rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS
+from flexneedle.lab.tables.row_rules import (
+    AT_ORIGIN,
+    POSITIONS,
+    SAME_POSITION_MM,
+    TRUE_POSITIONS,
+    note_origin,
+)
 from flexneedle.lab.tables.sample_table import SampleTable, open_table
 from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
 from flexneedle.scenario.sections.registration import Registration
@@ -41,7 +47,8 @@ _HEAD = """\
 class PointPairs:
     """n fiducials: names, and positions (n, 3) in the frames of stage and tracker (mm).
 
-    samples (n,): number of averaged readings; missing: number of readings without a position, which are ignored.
+    samples (n,): number of averaged readings; missing: number of readings without a position, which are ignored; zero:
+    exactly at (0, 0, 0).
     """
 
     names: tuple[str, ...]
@@ -49,6 +56,7 @@ class PointPairs:
     tracker: Floats
     samples: NDArray[np.int64]
     missing: int
+    zero: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +143,7 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
 
 
 def _find_notes(pairs: PointPairs, targets: Floats) -> Iterator[str | None]:
+    yield note_origin(pairs.zero, int(pairs.samples.sum()))
     yield unknown_side(pairs.tracker, pairs.stage, targets)
     yield find_order(pairs.tracker, pairs.stage, pairs.names)
 
@@ -176,7 +185,8 @@ def _draw(registered: RegistrationResult, path: Path) -> None:
 _POINTS = """
     WITH named AS (SELECT row_number() OVER () AS row, * FROM samples)
     SELECT CASE WHEN point_id = '' THEN 'row ' || row ELSE point_id END AS name, count(x_mm) AS n,
-        count(*) - count(x_mm) AS missing, favg(x_mm) AS x, favg(y_mm) AS y, favg(z_mm) AS z,
+        count(*) - count(x_mm) AS missing, count(*) FILTER ({origin}) AS zero,
+        favg(x_mm) AS x, favg(y_mm) AS y, favg(z_mm) AS z,
         first(true_x_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_x,
         first(true_y_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_y,
         first(true_z_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_z,
@@ -194,7 +204,7 @@ def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
     chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in given)])
     table.refuse(POSITIONS, chosen, **given)
     table.refuse(TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **given)
-    found = table.arrays(_POINTS.format(chosen=chosen), **given)
+    found = table.arrays(_POINTS.format(chosen=chosen, origin=AT_ORIGIN), **given)
     known = found["n"] > 0
     if not known.any():
         raise InputError("no reading has a position")
@@ -208,7 +218,12 @@ def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
         np.column_stack([points[f"{kind}{axis}"] for axis in "xyz"]).astype(float) for kind in ("true_", "")
     )
     return PointPairs(
-        tuple(points["name"].tolist()), stage, tracker, points["n"], int(found["missing"].sum())
+        tuple(points["name"].tolist()),
+        stage,
+        tracker,
+        points["n"],
+        int(found["missing"].sum()),
+        int(found["zero"].sum()),
     )
 
 

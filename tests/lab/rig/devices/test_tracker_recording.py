@@ -37,6 +37,16 @@ def table(tmp_path):
 
 
 ROWS = [row for frame in FRAMES for row in rows_of(frame)]
+ZEROS = dict.fromkeys(("qw", "qx", "qy", "qz"), 0.0)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("code", [dict.fromkeys(ZEROS, 0.0), {"x_mm": -3.697314e28}])
+def test_codes_for_missing_samples_are_missing(table, suffix, code):
+    rows = [row | dict.fromkeys(("x_mm", "y_mm", "z_mm"), code.get("x_mm", 0.0)) | code for row in ROWS[:1]]
+    (frame,) = read_frames(table(rows, suffix))
+    assert frame.readings["tip"].position is None
+    assert frame.readings["tip"].status == "missing"
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -60,6 +70,9 @@ def test_a_position_with_a_bad_status_is_not_used(table):
     ("change", "message"),
     [
         ({"x_mm": 1.0}, "line 3: x_mm, y_mm, z_mm: must all have values"),
+        (dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1e30), "line 3: x_mm, y_mm, z_mm: must be at most 10000 mm"),
+        (dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1.0) | ZEROS, "line 3: qw, qx, qy, qz: must be a unit"),
+        ({"indicator": "inf"}, "line 3: indicator: must be from 0"),
         ({"qx": 1.0}, "line 3: qw, qx, qy, qz: must all have values"),
         ({"sensor": "tip"}, "line 3: duplicate sensor tip in frame 4"),
         ({"time_s": 0.01}, "frame 4: time_s must not decrease"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from em_tables import GRID, random_rows, rows_of, write_csv
+from em_tables import GRID, one, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
 from flexneedle.lab.tracker_evaluation.evaluation.evaluate import EvaluationOptions, evaluate_table
 
@@ -80,6 +80,40 @@ def test_a_mirrored_frame_is_refused_with_register_and_noted_without(tmp_path):
     assert found.startswith("tip, ideal: a mirrored frame fits far better")
     with pytest.raises(InputError, match="a mirrored frame fits far better"):
         notes(tmp_path, rows, register=True)
+
+
+ZEROS = dict.fromkeys(("x_mm", "y_mm", "z_mm"), 0.0)
+NO_TURN = dict.fromkeys(("qw", "qx", "qy", "qz"), 0.0)
+BAD_FLOAT = dict.fromkeys(("x_mm", "y_mm", "z_mm"), -3.697314e28)
+
+
+@pytest.mark.parametrize(
+    ("code", "note"),
+    [
+        (BAD_FLOAT, "27 of 540 samples have no position (left out)"),
+        (BAD_FLOAT | NO_TURN, "27 of 540 samples have no position (left out)"),
+        (ZEROS | NO_TURN, "27 of 540 samples have no position (left out)"),
+        (ZEROS, "27 of 540 positions are exactly (0, 0, 0), a code for missing?"),
+    ],
+)
+def test_codes_for_missing_samples_are_left_out_or_noted(tmp_path, code, note):
+    rows = [
+        row | dict(zip(NO_TURN, (1.0, 0.0, 0.0, 0.0), strict=True)) for row in random_rows(0, offset=100.0)
+    ]
+    expected = one(write_csv(tmp_path / "all.csv", [row for k, row in enumerate(rows) if k % 20]))
+    rows = [row if k % 20 else row | code for k, row in enumerate(rows)]
+    found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions())
+    assert found.notes[0].startswith(f"tip, ideal: {note}")
+    if code is not ZEROS:
+        assert found.results[0].accuracy.rmse_mm == pytest.approx(expected["rmse_mm"], rel=1e-9)
+
+
+@pytest.mark.parametrize("code", [1e30, -3.6e28, -99999.0, 10_001.0])
+def test_other_positions_beyond_10_m_are_refused(tmp_path, code):
+    rows = random_rows(0)
+    rows[7] |= {"z_mm": code}
+    with pytest.raises(InputError, match="line 9: x_mm, y_mm, z_mm: must be at most 10000 mm"):
+        notes(tmp_path, rows)
 
 
 @pytest.mark.parametrize("option", ["ideal", "noisy"])

@@ -94,8 +94,8 @@ UNSEEN = {"x_mm": None, "y_mm": None, "z_mm": None}
     ("change", "expected"),
     [
         ({"x_mm": None}, "line 9: x_mm, y_mm, z_mm: must all have values, or all be empty"),
-        ({"z_mm": float("inf")}, "line 9: x_mm, y_mm, z_mm: must be at most 1e+06 mm"),
-        ({"y_mm": -3.697314e28}, "line 9: x_mm, y_mm, z_mm: must be at most 1e+06 mm"),
+        ({"z_mm": float("inf")}, "line 9: x_mm, y_mm, z_mm: must be at most 10000 mm"),
+        ({"y_mm": -3.697314e28}, "line 9: x_mm, y_mm, z_mm: must all have values"),
         ({"true_y_mm": None}, "line 9: true_x_mm, true_y_mm, true_z_mm: must have values"),
         ({"true_y_mm": 7.5}, "line 9: the true position of a point_id changes by more than 0.001 mm"),
         (UNSEEN | {"true_x_mm": 99.0}, "line 9: the true position of a point_id changes"),

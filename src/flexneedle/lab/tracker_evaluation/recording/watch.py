@@ -14,7 +14,7 @@ from flexneedle.lab.rig.devices.tracker_recording import COLUMNS, rows_of
 from flexneedle.loop.monitor.monitor import field_verdict, is_distorted
 from flexneedle.ports import Clock, Tracker
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import VISIBLE, Frame, is_reference
+from flexneedle.types import ORIGIN, VISIBLE, Frame, SensorReading, is_reference
 
 FieldCheck = Callable[[Sequence[Frame], bool], tuple[str, bool]]
 """Function of the frames of the last seconds, oldest first, and whether the field was distorted before; returns the
@@ -77,6 +77,12 @@ def _without_new(now: float, history: Sequence[Frame], status: str) -> TrackerSn
     return TrackerSnapshot(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
+def _find_fault(reading: SensorReading) -> str:
+    if reading.status == VISIBLE and reading.position == ORIGIN:
+        return "exactly (0, 0, 0), a code for missing?"
+    return "" if reading.status == VISIBLE else reading.status
+
+
 def check_field(
     frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False
 ) -> tuple[str, bool]:
@@ -86,7 +92,8 @@ def check_field(
     monitor, a distorted field remains distorted until it is known to be good. distorted: the state before.
     """
     field = field_verdict(frames, settings, distorted)
-    fault = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
+    faults = ((name, _find_fault(reading)) for name, reading in frames[-1].readings.items())
+    fault = "; ".join(f"{name}: {reason}" for name, reason in faults if reason)
     return fault or str(field), is_distorted(field, distorted)
 
 

@@ -5,7 +5,7 @@ from math import hypot, isfinite
 from typing import Any
 
 from flexneedle.lab.rig.devices.aurora.library import DISABLED
-from flexneedle.types import VISIBLE, SensorReading
+from flexneedle.types import FARTHEST_MM, VISIBLE, SensorReading
 
 NAMES = ("tip", "ref1", "ref2", "ref3")
 """Sensors at the ports 1 to 4 (default)."""
@@ -23,7 +23,6 @@ _BITS = {
     0x0080: "partly out of volume",
 }
 _OCCUPIED = 0x01
-_FARTHEST_MM = 10_000.0
 _POSE = 8
 _UNIT_WITHIN = 1e-2  # TX rounds to 1e-4
 
@@ -80,5 +79,5 @@ def _is_valid(pose: Sequence[float]) -> bool:
         len(pose) == _POSE
         and all(map(isfinite, pose))
         and abs(hypot(*pose[:4]) - 1) < _UNIT_WITHIN
-        and max(map(abs, pose[4:7])) < _FARTHEST_MM
+        and max(map(abs, pose[4:7])) <= FARTHEST_MM
     )
