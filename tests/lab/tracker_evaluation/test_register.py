@@ -88,7 +88,7 @@ def test_points_in_a_plane_get_a_note_and_a_mirrored_plate_is_refused(tmp_path, 
     rng = np.random.default_rng(0)
     stage = np.column_stack([rng.uniform(-50, 50, (8, 2)), np.tile([-1.0, 1.0], 4)])
     for thick, mirrored, expected in (
-        (1, True, "a mirrored frame fits far better (residual 0.1"),
+        (1, True, "a mirrored frame fits far better (residual 0.08"),
         (
             0,
             False,
