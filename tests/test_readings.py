@@ -9,14 +9,23 @@ from flexneedle.types import VISIBLE, SensorReading
 UNIT, ZERO = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("code", [nan, inf, -inf, -3.697314e28, 1e30, 10_001.0, -99_999.0])
 @pytest.mark.parametrize("axes", [(0,), (2,), (0, 1, 2)])
-def test_a_position_beyond_10_m_is_missing(code, axes):
-    position = tuple(code if axis in axes else 5.0 for axis in range(3))
-    found = SensorReading(position, UNIT, 0.02)
-    assert (found.position, found.orientation, found.indicator) == (None, UNIT, 0.02)
-    assert "a code for missing" in found.status
-    assert SensorReading(position, status="disturbed").status == "disturbed"
+def test_ndis_code_is_missing_and_a_position_that_cannot_be_has_a_fault(axes):
+    def read(code, **more):
+        return SensorReading(tuple(code if axis in axes else 5.0 for axis in range(3)), UNIT, 0.02, **more)
+
+    for code in (-3.697314e28, -3.6973140286e28):  # in digits, and as a float of four bytes
+        assert read(code) == SensorReading(None, UNIT, 0.02, "missing")
+        assert read(code, status="disturbed") == SensorReading(None, UNIT, 0.02, "disturbed")
+    for code, fault in (
+        (nan, "not a number"),
+        (inf, "not a number"),
+        (1e30, "beyond 10 m"),
+        (-10_001.0, "beyond 10 m"),
+    ):
+        assert read(code).fault == f"its position is {fault}"
+        assert read(code).position is not None
+    assert (read(-10_000.0).fault, read(5.0, status="stale").fault) == ("", "stale")
 
 
 def test_an_orientation_of_length_0_is_none_and_with_a_position_of_zeros_a_missing_sample():
@@ -26,4 +35,3 @@ def test_an_orientation_of_length_0_is_none_and_with_a_position_of_zeros_a_missi
     assert lost.status == "missing (position and orientation are 0)"
     for reading in (SensorReading((0.0, 0.0, 0.0)), SensorReading((0.0, 0.0, 0.0), UNIT)):
         assert (reading.position, reading.status) == ((0.0, 0.0, 0.0), VISIBLE)
-    assert SensorReading((-10_000.0, 0.0, 10_000.0)).status == VISIBLE

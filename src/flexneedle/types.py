@@ -203,6 +203,8 @@ VISIBLE = "ok"
 
 FARTHEST_MM = 1e4
 """Largest coordinate of a position: 10 m, beyond any tracker and below their codes for "no value"."""
+BAD_FLOAT = -3.697314e28
+"""NDI's code for a missing number."""
 ORIGIN = (0.0, 0.0, 0.0)
 """The position that some devices report for a missing one."""
 
@@ -214,8 +216,8 @@ class SensorReading:
     indicator: disagreement of the two coils of a 6-DOF sensor (paper, section IV-B); 5-DOF sensors may have one, too.
     status: VISIBLE, or a short reason for the missing position.
 
-    A device's codes for "no value" become None: positions that are not finite or beyond `FARTHEST_MM`, orientations of
-    length 0, and with such an orientation the position `ORIGIN`.
+    Codes of devices for "no value" become None: `BAD_FLOAT`, orientations of length 0, and with such an orientation the
+    position `ORIGIN`. Other positions that cannot be remain, and the monitor rejects them: see `fault`.
     """
 
     position: Point | None
@@ -230,11 +232,19 @@ class SensorReading:
             object.__setattr__(self, "orientation", None)
         if position is None:
             return
-        if not all(-FARTHEST_MM <= value <= FARTHEST_MM for value in position):
-            shown = ", ".join(f"{value:.6g}" for value in position)
-            self._drop_position(f"position {shown} mm: a code for missing")
+        if any(math.isclose(value, BAD_FLOAT, rel_tol=1e-6) for value in position):
+            self._drop_position("missing")
         elif no_orientation and position == ORIGIN:
             self._drop_position("missing (position and orientation are 0)")
+
+    @property
+    def fault(self) -> str:
+        """The reason why there is no valid position, or ""."""
+        if self.status != VISIBLE or self.position is None:
+            return self.status if self.status != VISIBLE else "no position"
+        if not all(map(math.isfinite, self.position)):
+            return "its position is not a number"
+        return "" if max(map(abs, self.position)) <= FARTHEST_MM else "its position is beyond 10 m"
 
     def _drop_position(self, reason: str) -> None:
         object.__setattr__(self, "position", None)

@@ -160,6 +160,8 @@ def test_a_tip_without_a_position_is_missing_and_one_without_an_orientation_keep
     found = read("tip", tip(5.0, (0.01, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
     assert found.position == pytest.approx((10.0, 0.0, 0.0))
     assert (found.orientation, found.status) == (None, VISIBLE)
+    unfilled = read("tip", tip(5.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+    assert (unfilled.position, unfilled.status) == (None, "missing (position and orientation are 0)")
 
 
 # Times of measurement

@@ -20,6 +20,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.tables.columns import choose_columns
 from flexneedle.lab.tables.layout import CsvLayout, has_decimal_commas, read_layout
 from flexneedle.lab.tables.plain_copy import is_regular, write_copy
+from flexneedle.types import BAD_FLOAT
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -32,7 +33,6 @@ Rule = tuple[str, str]
 
 _MAGIC = b"PAR1"
 _THREADS = 4  # at most; each buffers 32 MB of a CSV file
-_BAD_FLOAT = -3.697314e28  # in NDI's files and replies, for a missing number
 _POSE = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 _NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
 _EMPTY_FIELDS = [
@@ -176,7 +176,7 @@ def _value(name: str, field: str | None, label: str, scale: float) -> str:
     if field is None:
         return "NULL::DOUBLE"
     factor = f" * {scale}" if scale != 1.0 and name.endswith("_mm") else ""
-    missing = f"isnan({field}::DOUBLE) OR abs({field}::DOUBLE - {_BAD_FLOAT!r}) < {-1e-6 * _BAD_FLOAT!r}"
+    missing = f"isnan({field}::DOUBLE) OR abs({field}::DOUBLE - {BAD_FLOAT!r}) < {-1e-6 * BAD_FLOAT!r}"
     return f"CASE WHEN NOT ({missing}) THEN {field}::DOUBLE{factor} END"
 
 

@@ -106,7 +106,13 @@ def test_the_field_is_judged_from_the_last_second_at_the_references():
 def test_the_verdict_names_a_missing_sensor_and_too_few_references():
     lost = SensorReading(None, status="out of volume")
     assert verdict(frames(5, ref2=lost)) == "ref2: out of volume"
-    alone = [Frame(0.0, 1, {"tip": SensorReading((0.0, 0.0, 0.0), None, 0.02)})]
+    for position, fault in (
+        ((0.0, 0.0, 0.0), "exactly (0, 0, 0)"),
+        ((1e30, 0.0, 0.0), "its position is beyond 10 m"),
+    ):
+        (frame,) = frames(1, tip=SensorReading(position))
+        assert check_field([frame], MonitorSettings())[0].startswith(f"tip: {fault}")
+    alone = [Frame(0.0, 1, {"tip": SensorReading((1.0, 2.0, 3.0), None, 0.02)})]
     assert "field not known: 0 of 3" in verdict(alone)
     assert verdict(alone, MonitorSettings(references=0)) == VISIBLE
 
@@ -162,6 +168,6 @@ def test_the_verdict_follows_the_monitor_of_a_held_insertion():
     ],
 )
 def test_without_a_given_number_all_present_references_are_used(names, indicator, references, expected):
-    readings = {name: SensorReading((0.0, 0.0, 0.0), None, indicator) for name in names}
+    readings = {name: SensorReading((1.0, 2.0, 3.0), None, indicator) for name in names}
     found = make_field_check(references)([Frame(n / 40, n, readings) for n in range(40)], False)[0]
     assert found.startswith(expected)

@@ -271,11 +271,11 @@ def _sensor_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
     names = dict.fromkeys(name for frame in frames for name in frame.readings)
     for name in names:
         readings = [frame.readings[name] for frame in frames if name in frame.readings]
-        measured = [reading for reading in readings if reading.position is not None]
+        measured = [reading for reading in readings if not reading.fault]
         share, unmeasured, at = len(measured) / len(frames), len(frames) - len(measured), ""
         if measured and (position := measured[-1].position) is not None:
             at = " at {:.2f}, {:.2f}, {:.2f} mm".format(*position)
-        last = next((r.status for r in reversed(readings) if r.status != VISIBLE), "not in every frame")
+        last = next((r.fault for r in reversed(readings) if r.fault), "not in every frame")
         enough = measured and unmeasured <= max(1.0, _MOST_UNMEASURED * len(frames))
         problem = "" if enough else f"measured in too few frames: {last}"
         yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)

@@ -212,9 +212,7 @@ def _collect_samples(
 def _find_faults(frame: Frame, sensors: Sequence[str]) -> str:
     absent = SensorReading(None, status="no such sensor")
     found = {name: frame.readings.get(name, absent) for name in sensors}
-    return "; ".join(
-        f"{name}: {reading.status}" for name, reading in found.items() if reading.position is None
-    )
+    return "; ".join(f"{name}: {reading.fault}" for name, reading in found.items() if reading.fault)
 
 
 def _find_drift(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:

@@ -78,9 +78,7 @@ def _without_new(now: float, history: Sequence[Frame], status: str) -> TrackerSn
 
 
 def _find_fault(reading: SensorReading) -> str:
-    if reading.status == VISIBLE and reading.position == ORIGIN:
-        return "exactly (0, 0, 0), a code for missing?"
-    return "" if reading.status == VISIBLE else reading.status
+    return "exactly (0, 0, 0), a code for missing?" if reading.position == ORIGIN else reading.fault
 
 
 def check_field(
