@@ -165,7 +165,7 @@ def test_points_in_their_order_get_no_note(points, noise):
         assert find_order(measure(rng, true, noise), true) is None
 
 
-def test_the_order_of_100_points_is_found_and_of_1000_is_not_looked_for():
+def test_the_order_of_100_points_is_found_and_1000_are_not_searched():
     rng = np.random.default_rng(8)
     points = rng.uniform(-200.0, 200.0, (1000, 3))
     measured = measure(rng, points, 0.05)[::-1]

@@ -16,7 +16,7 @@ _LOOSE = 0.1  # residual over size above which the fit is rejected
 _FALSE_ALARM = 1e-4  # probability that the test rejects a true hypothesis on the handedness of the frames
 _NEARER = -2.0 / 3.0  # slope at which a mirrored frame is five times as near as the frame
 _ROUNDING = 1e-9  # of sizes
-_UNIQUE = 0.25  # largest residual over smallest distance of two points for which no other order is looked for
+_UNIQUE = 0.25  # largest residual over smallest distance of two points up to which no other order is searched
 _BETTER = 3.0  # ratio of residuals
 _MOST_ORDERED = 300  # points; the time grows with their number to the third power
 _STEPS = 10  # of the search for an order
@@ -143,7 +143,7 @@ def unknown_side(moving: Floats, fixed: Floats, targets: Floats) -> str | None:
 def find_order(moving: Floats, fixed: Floats, names: Names = None) -> str | None:
     """Return one line on an order of `moving` (n, 3) that fits `fixed` (n, 3) far better than the given one, or None.
 
-    No other order is looked for if each residual is below a quarter of the smallest distance of two points. names: of
+    There is no search if each residual is below a quarter of the smallest distance of two points. names: of
     the points (default: their numbers from 1).
     """
     if len(fixed) > _MOST_ORDERED:
