@@ -88,10 +88,9 @@ def test_the_side_is_unknown_for_points_in_a_plane_within_their_errors(count, th
     for mirrored in (False, True):
         measured = measure(rng, points, 0.1, mirrored)
         assert mirrored_frame(measured, points) is None
-        if thickness == 0.0:
-            assert "side of the plane is unknown" in (note := unknown_side(measured, points, targets))
-            assert "40 mm at the farthest target" in note
-            assert "20 mm for a target 10 mm off" in unknown_side(measured, points, points)
+        assert "side of the plane is unknown" in (note := unknown_side(measured, points, targets))
+        assert "40 mm at the farthest target" in note
+        assert "20 mm for a target 10 mm off" in unknown_side(measured, points, points)
 
 
 def test_exact_pairs_have_a_handedness():
