@@ -79,7 +79,7 @@ class RefusedError(InputError):
 
 
 class ScenarioWarning(UserWarning):
-    """A scenario has a deprecated or unused key. The message is one line."""
+    """A scenario has a deprecated or unused key, or a study a module without source. The message is one line."""
 
 
 def one_line(error: FlexneedleError) -> str:

@@ -4,9 +4,7 @@
 `python -m`.
 """
 
-import hashlib
 import inspect
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -17,10 +15,9 @@ from typing import Any, TypeVar
 
 from flexneedle.arguments import shorten
 from flexneedle.errors import DriverError, FlexneedleError, InputError, describe_error, make_printable
+from flexneedle.module_files import digest_files, has_record, search_current_folder
 
 OWN = "module:NAME of your own"
-
-_DIGITS = 12
 
 Part = TypeVar("Part")
 
@@ -79,10 +76,11 @@ def load_part(given: str, names: Iterable[str], group: str = "") -> Any:
         raise InputError(f"must be one of {', '.join(names)}, or {OWN}")
     if not all(part.isidentifier() for part in (*module.split("."), name)):
         raise InputError("must be module:NAME, such as mymodule:MINE")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    return load_attribute(module, name)
+    search_current_folder()
+    found = load_attribute(module, name)
+    if not has_record(module):
+        digest_files(module)  # read now, while the files are still those that were loaded
+    return found
 
 
 def _package_of(point: EntryPoint) -> str:
@@ -164,15 +162,10 @@ def name_kind(found: object) -> str:
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
-def digest_modules(given: Iterable[object]) -> dict[str, str]:
-    """Return a digest of the module's source for each `module:NAME`, by that name; "" without a source."""
-    names = sorted({str(name) for name in given if is_own(name)})
-    return {name: _digest(sys.modules.get(name.partition(":")[0])) for name in names}
-
-
-def _digest(module: Any) -> str:
-    path = Path(getattr(module, "__file__", None) or "")
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS] if path.is_file() else ""
+def digest_modules(given: Iterable[object]) -> dict[str, dict[str, str]]:
+    """Return the digests of the files of each custom part (`module:NAME`), by the name of its module."""
+    modules = sorted({str(name).partition(":")[0] for name in given if is_own(name)})
+    return {module: digest_files(module) for module in modules}
 
 
 @contextmanager

@@ -9,6 +9,7 @@ date and the wall-clock times, is the same for the same seed.
 import hashlib
 import json
 import platform
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -114,15 +115,19 @@ class Folder:
 def versions() -> dict[str, str]:
     """Return the versions on which the numbers of a run depend.
 
-    source: digest of the code and data of this package, to tell an edited copy from the release.
+    Of packages, as loaded, even if others have been installed since; source: digest of the code and data of this
+    package, to tell an edited copy from the release.
     """
     return {
         "flexneedle": version("flexneedle"),
         "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "numba": version("numba"),
+        **{name: _loaded_version(name) for name in ("numpy", "numba", "scipy")},
         "source": source_digest(_PACKAGE),
     }
+
+
+def _loaded_version(package: str) -> str:
+    return str(getattr(sys.modules.get(package), "__version__", None) or version(package))
 
 
 @cache

@@ -4,23 +4,28 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Timer
 
 import pyarrow.parquet as pq
 import pytest
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RunError
 from flexneedle.lab.study import pools
+from flexneedle.lab.study.provenance import StudyCode
 from flexneedle.lab.study.runner import run_study
+from flexneedle.record.folder import versions
+
+CODE = StudyCode(versions(), {})
 
 distributed = pytest.importorskip("distributed")
 
 
 @contextmanager
-def process(part, *argv):
-    """Run a Dask scheduler or worker in a separate process, with its log on stderr."""
+def process(part, *argv, folder=None):
+    """Run a Dask scheduler or worker in a separate process (default: in this folder), with its log on stderr."""
     command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *argv, "--no-dashboard"]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder)
     try:
         yield running
     finally:
@@ -40,9 +45,10 @@ def scheduler():
             watchdog.cancel()
 
 
-def worker(address):
+def worker(address, folder=None):
     """Run a worker with one thread that is not restarted."""
-    return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
+    options = ("--nthreads", "1", "--no-nanny", "--death-timeout", "60")
+    return process("worker", address, *options, folder=folder)
 
 
 @pytest.mark.slow
@@ -69,12 +75,93 @@ def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp
 def test_only_a_scheduler_without_workers_is_reported():
     calls = []
     with scheduler() as address:
-        with pools.open_cluster(address, lambda: calls.append("none")):
+        with pools.open_cluster(address, CODE, lambda: calls.append("none")):
             assert calls == ["none"]
         with worker(address), distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=30)
-            with pools.open_cluster(address, lambda: calls.append("none")):
+            with pools.open_cluster(address, CODE, lambda: calls.append("none")):
                 assert calls == ["none"]
+
+
+CONTROLLER = """
+from dataclasses import replace
+from flexneedle.control.controllers import CONTROLLERS
+from mine_gains import GAIN
+
+MINE = replace(CONTROLLERS["open-loop"], name="mine")
+"""
+STUDY = """
+name = "mine"
+repeats = 3
+[values]
+controller = "mine_pid:MINE"
+plan = { samples = 16, iterations = 2 }
+setup.tip_to_skin_mm = 4.0
+phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
+target = [8, 0.5]
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Return a function that makes a folder with a study of an own controller, whose module imports a gain."""
+
+    def make(name, gain):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        (folder / "mine_pid.py").write_text(CONTROLLER)
+        (folder / "mine_gains.py").write_text(f"GAIN = {gain}\n")
+        (folder / "mine.toml").write_text(STUDY)
+        return folder
+
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(make("here", 1.0))
+    yield make
+    for name in ("mine_pid", "mine_gains"):
+        sys.modules.pop(name, None)
+
+
+DIFFERENT = r"module mine_pid: mine_gains\.py is [0-9a-f]{12} there, [0-9a-f]{12} here: give the worker"
+
+
+def test_a_worker_with_another_version_of_a_module_is_refused_before_the_first_row(own):
+    """With its address, although another worker has the same version; no folder is created."""
+    with scheduler() as address, worker(address, own("same", 1.0)), worker(address, own("there", 2.0)):
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+        with pytest.raises(InputError, match=f"^worker tcp://127.0.0.1:[0-9]+: {DIFFERENT}"):
+            run_study("mine.toml", "out", scheduler=address)
+    assert not (Path.cwd() / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_worker_with_another_version_that_joins_late_or_keeps_an_old_one_computes_no_row(own):
+    """The first study of a worker loads the module; after an edit both its memory and the files are compared."""
+    there, here = own("there", 2.0), Path.cwd()
+    with scheduler() as address:
+        joined = []
+
+        def join():
+            joined.append(worker(address, there))
+            joined[-1].__enter__()
+
+        try:
+            with pytest.raises(RunError, match=f"^worker tcp://127.0.0.1:[0-9]+: {DIFFERENT}"):
+                run_study("mine.toml", "late", scheduler=address, on_advance=lambda _: joined or join())
+        finally:
+            joined[0].__exit__(None, None, None)
+        assert len(pq.read_table(here / "late" / "runs.parquet")) == 0
+        own("there", 1.0)
+        with worker(address, there), distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=30)
+            run_study("mine.toml", "good", scheduler=address)
+            own("there", 3.0)
+            own("here", 3.0)
+            for name in ("mine_pid", "mine_gains"):
+                del sys.modules[name]
+            with pytest.raises(InputError, match=DIFFERENT):
+                run_study("mine.toml", "old", scheduler=address)
+    assert len(pq.read_table(here / "good" / "runs.parquet")) == 3
 
 
 def refusal(quick, tmp_path, address):

@@ -29,7 +29,7 @@ def plan(point):
 
 
 def only_row(job):
-    (row,) = run_job(job).rows
+    (row,) = run_job(job)
     return row
 
 
@@ -77,7 +77,7 @@ def test_an_error_in_one_insertion_is_recorded_and_the_others_continue(point, pl
         return flexneedle.insert(scenario, made, seed, **options)
 
     monkeypatch.setattr(jobs, "insert", insert)
-    broken, fine = run_job(InsertionJob(point, plan, "", ((0, 11), (1, 12)))).rows
+    broken, fine = run_job(InsertionJob(point, plan, "", ((0, 11), (1, 12))))
     assert (broken["outcome"], broken["reason"]) == ("error", "ZeroDivisionError: no where to go")
     assert broken["true_error_mm"] is None
     assert broken["planned_periods"] == len(plan.controls)

@@ -130,6 +130,8 @@ def test_a_failed_insertion_of_an_own_controller_is_the_same_while_its_module_is
     assert agrees(again.insertion, journalled(folder)[0])
     assert (again.insertion.controller, again.note) == ("breaking:BREAKS", "")
     own_module.write_text(f"{OWN}# edited\n")
+    assert recompute(folder, 0).note == ""  # the loaded module is still the study's
+    del sys.modules["breaking"]
     assert recompute(folder, 0).note == "recomputed with other code than the study's: the same result"
     own_module.unlink()
     del sys.modules["breaking"]

@@ -13,7 +13,7 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.study import jobs, pools, runner
+from flexneedle.lab.study import jobs, pools, provenance, runner
 from flexneedle.lab.study.grid import load_study
 from flexneedle.lab.study.runner import run_study
 from flexneedle.lab.study.tables import sum_times
@@ -193,14 +193,26 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
     assert {(a.all_plans, a.all_insertions) for a in reports} == {(2, SIZE)}
 
 
+@pytest.mark.parametrize(("name", "there"), [("numpy", "1.0"), ("source", "0"), ("scipy", None)])
 @pytest.mark.usefixtures("in_threads")
-def test_a_worker_with_other_package_versions_is_rejected(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs, "versions", lambda: {**versions(), "numpy": "1.0"})
-    with pytest.raises(
-        RunError, match=r"package versions of a worker differ from this process: .*'numpy': '1.0'"
-    ):
+def test_a_worker_with_other_package_versions_makes_neither_plan_nor_row(
+    quick, tmp_path, monkeypatch, name, there
+):
+    others = {key: value for key, value in {**versions(), name: there}.items() if value}
+    compared = provenance.find_difference
+
+    def compare_in_worker(code):
+        monkeypatch.setattr(provenance, "versions", lambda: others)
+        return compared(code)
+
+    monkeypatch.setattr(provenance, "find_difference", compare_in_worker)
+    message = (
+        f"^worker process [0-9]+: version of {name} is {there or 'missing'} there, {versions()[name]} here: "
+    )
+    with pytest.raises(RunError, match=message):
         run_study(quick, tmp_path / "a")
     assert runs(tmp_path / "a") == []
+    assert not (tmp_path / "a" / "plans").exists()
 
 
 class Dying(Executor):

@@ -69,7 +69,7 @@ def test_json_is_one_object_and_a_study_is_only_resumed_on_request(capsys):
     assert set(result["time"]) == {"plan_s", "control_s", "plant_s", "rest_s", "wall_s"}
     record = json.loads(Path("a/study.json").read_text())
     assert record["command"] == "flexneedle study my.toml --workers 2 --out a"
-    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "source"}
+    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "scipy", "source"}
     status, out, err = run(capsys, "study", "my.toml", "--out", "a")
     assert (status, out) == (2, "")
     assert "a: already contains a study: add --resume" in err.splitlines()[-1]
@@ -167,7 +167,7 @@ def test_rate_and_remaining_time_are_of_this_run(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_a_cluster_without_workers_is_reported(capsys, monkeypatch):
-    def cluster(_address, on_no_workers):
+    def cluster(_address, _code, on_no_workers):
         on_no_workers()
         return pools.open_processes(1)
 

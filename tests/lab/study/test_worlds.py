@@ -162,7 +162,7 @@ def test_a_job_computes_the_reach_if_requested(load, monkeypatch):
         ),
     )
     for with_reach, expected in ((True, 0.5), (False, None)):
-        (row,) = run_job(InsertionJob(point, None, "no plan", ((0, 5),), with_reach)).rows
+        (row,) = run_job(InsertionJob(point, None, "no plan", ((0, 5),), with_reach))
         assert row["reach_mm"] == expected
         assert row["outcome"] == "error"
 
@@ -176,7 +176,7 @@ def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkey
     monkeypatch.setattr(jobs, "compute_reach", reach)
     monkeypatch.setattr(jobs, "insert_at", lambda *_args, **_options: done)
     monkeypatch.setattr(jobs, "_sum_times", lambda _insertion: {})
-    (row,) = run_job(InsertionJob(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    (row,) = run_job(InsertionJob(load().points[0], done.plan, "", ((0, 5),), True))
     assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
     assert row["reach_mm"] is None
 

@@ -13,26 +13,28 @@ from flexneedle.errors import InputError, describe_error, make_printable, one_li
 from flexneedle.files import replace_file
 from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion, restore_study
 from flexneedle.lab.study.journal import StudyJournal, read_rows
+from flexneedle.lab.study.provenance import compare_modules
 from flexneedle.record.folder import STUDY_FILE, versions
 from flexneedle.record.plain import to_text
 from flexneedle.scenario.dotted import flatten
 
 JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
-_SOURCE = "versions.source"
+_SOURCE, _OWN = "versions.source", "study.own."
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedStudy:
     """A study in its folder, finished or not.
 
-    versions: of the packages that made it; own: digests of custom modules; rows: finished rows by index.
+    versions: of the packages that made it; own: digests of the files of custom modules, by module and file; rows:
+    finished rows by index.
     """
 
     folder: Path
     study: ExpandedStudy
     versions: Mapping[str, str]
-    own: Mapping[str, str]
+    own: Mapping[str, Mapping[str, str]]
     rows: Mapping[int, Mapping[str, Any]]
 
     def insertion(self, index: int) -> StudyInsertion:
@@ -110,10 +112,12 @@ def _read_identity(path: Path) -> dict[str, Any]:
     """Return the recorded result of `_identify` for the study in a folder."""
     try:
         values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
+        if not all(isinstance(files, dict) for files in values["study"]["own"].values()):
+            raise ValueError("study.own: must be tables of files")
         return {name: values[name] for name in ("format", "versions", "study")}
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: contains no study: {STUDY_FILE} is missing") from None
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path / STUDY_FILE}: cannot be read: {error}") from None
 
 
@@ -121,6 +125,9 @@ def _find_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> s
     there, here = flatten(stored), flatten(json.loads(json.dumps(current)))
     for key in there | here:
         if there.get(key) != here.get(key):
+            if key.startswith(_OWN):
+                changed = compare_modules(stored["study"]["own"], current["study"]["own"])
+                return f"a module has changed since the start of the study: {changed}"
             name = key.removeprefix("study.")
             before, now = (_format_value(values, key) for values in (there, here))
             edited = (

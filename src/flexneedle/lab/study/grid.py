@@ -63,6 +63,8 @@ _CHOICES = {
 }
 _DEFAULT_TARGET: dict[str, Any] = dict(zip(TARGET_KEYS, Target().position, strict=True))
 _OWN = {"controller": find_controller, "plant": find_plant, "tracker": find_tracker}
+_CUSTOM = {*_OWN, "law", "term"}
+"""Keys, and last parts of keys, that name a custom part."""
 _MAX_INSERTIONS = 1_000_000
 _KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
 _FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {WORLD}"
@@ -217,7 +219,7 @@ def _make_study(settings: Mapping[str, Any], base: Scenario) -> ExpandedStudy:
         **settings,
         "scenario": base.values(),
         "insertions": len(grid) * repeats,
-        "own": digest_modules(name for of_key in names.values() for name in of_key),
+        "own": digest_modules(_find_custom_names("", settings)),
     }
     return ExpandedStudy(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 
@@ -230,6 +232,18 @@ def _collect_values(
 ) -> list[Any]:
     """Return all values of a key in a study."""
     return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
+
+
+def _find_custom_names(key: str, value: Any) -> Iterator[str]:
+    """Yield the names of all custom parts in the settings of a study: of runs, layers and cost terms."""
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _find_custom_names(name, inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _find_custom_names(key, inner)
+    elif is_own(value) and key.rpartition(".")[2] in _CUSTOM:
+        yield value
 
 
 def _list_values(axis: StudyAxis) -> list[Any]:

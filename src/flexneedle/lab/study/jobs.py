@@ -15,7 +15,6 @@ from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.kernels import compile_kernels
 from flexneedle.planning.events import Listener
 from flexneedle.planning.planner import plan
-from flexneedle.record.folder import versions
 from flexneedle.record.plain import plain, plan_values
 from flexneedle.record.results import RESULT_COLUMNS, insertion_row, plan_row
 from flexneedle.results import Insertion, Plan
@@ -47,14 +46,6 @@ class PlanResult:
     refusal: str = ""
 
 
-@dataclass(frozen=True)
-class JobRows:
-    """Rows of a job, each with index, results and times, and the package versions of the worker."""
-
-    rows: list[dict[str, Any]]
-    versions: dict[str, str]
-
-
 def make_plan(point: StudyPoint) -> PlanResult:
     """Plan for a point, on one thread."""
     _compile_once(point.scenario.setup.axes)
@@ -65,10 +56,10 @@ def make_plan(point: StudyPoint) -> PlanResult:
     return PlanResult(plan_values(made), made.seconds)
 
 
-def run_job(job: InsertionJob) -> JobRows:
-    """Run the insertions of a job, on one thread."""
+def run_job(job: InsertionJob) -> list[dict[str, Any]]:
+    """Run the insertions of a job, on one thread, and return their rows: index, results and times."""
     _compile_once(job.point.scenario.setup.axes)
-    return JobRows([{"index": index, **_make_row(job, seed)} for index, seed in job.insertions], versions())
+    return [{"index": index, **_make_row(job, seed)} for index, seed in job.insertions]
 
 
 def _make_row(job: InsertionJob, seed: int) -> dict[str, Any]:
@@ -137,5 +128,4 @@ def _sum_times(insertion: Insertion) -> dict[str, float]:
 @cache
 def _compile_once(axes: int) -> None:
     """Compile the kernels once per process."""
-    versions()  # digest of the source, read now while the files are still those that were imported
     compile_kernels(axes)

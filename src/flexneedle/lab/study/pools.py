@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError, describe_error
+from flexneedle.lab.study.provenance import REMEDY, StudyCode, find_difference
 from flexneedle.lab.study.worker import set_up_worker
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator.simulator import count_cores
@@ -48,18 +49,32 @@ def check_address(address: str) -> None:
 
 
 @contextmanager
-def open_cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
+def open_cluster(
+    address: str, code: StudyCode, on_no_workers: Callable[[], None] = lambda: None
+) -> Iterator[Executor]:
     """Yield the workers of the Dask scheduler at `address` (`tcp://host:8786`) as an executor.
 
     Tasks are submitted as impure, so that equal tasks are all executed. `on_no_workers` is called if there are no
-    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `open_cluster` is not
-    installed, or if no scheduler responds.
+    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `cluster` is not
+    installed, if no scheduler responds, or if a worker has other code.
     """
     check_address(address)
     with _connect(address) as client:
         if not client.nthreads():
             on_no_workers()
+        _check_workers(client, code)
         yield client.get_executor(pure=False)
+
+
+def _check_workers(client: Any, code: StudyCode) -> None:
+    """Raise InputError, with the first difference, if a worker has other code than this process."""
+    found = client.run(find_difference, code, on_error="return")
+    differing = {address: problem for address, problem in found.items() if problem}
+    for address, problem in differing.items():
+        if isinstance(problem, Exception):
+            problem = f"its flexneedle cannot be compared ({describe_error(problem)}): {REMEDY}"
+        others = f" ({len(differing)} of {len(found)} workers)" if len(differing) > 1 else ""
+        raise InputError(f"worker {address}: {problem}{others}")
 
 
 def _connect(address: str) -> Any:

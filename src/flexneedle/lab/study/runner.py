@@ -1,6 +1,7 @@
 """Run a study: submit plans and insertions, record the results; the tables are written however it ends."""
 
 import math
+import pickle
 from collections.abc import Callable, Container, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
@@ -16,11 +17,11 @@ from flexneedle.files import create_folder
 from flexneedle.lab.study import pools
 from flexneedle.lab.study.folder import PLANS_FOLDER, open_folder
 from flexneedle.lab.study.grid import ExpandedStudy, StudyPoint, load_study
-from flexneedle.lab.study.jobs import InsertionJob, JobRows, PlanResult, make_plan, run_job
+from flexneedle.lab.study.jobs import InsertionJob, PlanResult, make_plan, run_job
 from flexneedle.lab.study.journal import StudyJournal
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
+from flexneedle.lab.study.provenance import StudyCode, run_checked
 from flexneedle.phantom.kernels import compile_kernels
-from flexneedle.record.folder import versions
 
 _Pending = dict[str, list[tuple[StudyPoint, tuple[tuple[int, int], ...]]]]
 _CLUSTER_JOBS = 1000  # at most: each job carries its plan, about 100 kB in the memory of the scheduler
@@ -56,9 +57,9 @@ def run_study(
     any number of workers and interruptions. `command` is recorded in `study.json`. A script that calls this needs an
     `if __name__ == "__main__"` guard, since workers import it.
 
-    Raises InputError for an invalid study, folder or scheduler, or without the extra `study`; RunError if a worker
-    dies or its package versions differ from this process; KeyboardInterrupt, after the
-    tables are written, if the user interrupts it.
+    Raises InputError for an invalid study, folder or scheduler, without the extra `study`, or, before the first row, if
+    a worker has other package versions or custom modules than this process; RunError if a worker dies or a later worker
+    has others; KeyboardInterrupt, after the tables are written, if the user interrupts it.
     """
     require_extra("study", "pyarrow")
     from flexneedle.lab.study.tables import write_tables
@@ -72,8 +73,12 @@ def run_study(
         workers = check_whole("workers", workers, 1, "omit it for one per core")
     given = None if out is None else check_path("out", out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
+    code = StudyCode.of(study)
+    code.check(on_cluster=scheduler is not None)
     opened = (
-        pools.open_processes(workers) if scheduler is None else pools.open_cluster(scheduler, on_no_workers)
+        pools.open_processes(workers)
+        if scheduler is None
+        else pools.open_cluster(scheduler, code, on_no_workers)
     )
     # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
     # script.
@@ -85,7 +90,7 @@ def run_study(
                 if len(journal.rows) < len(study):
                     for axes in study.axes:
                         compile_kernels(axes)  # before the workers, which would wait for each other
-                    engine.run(pool, chunk)
+                    engine.run(pool, code, chunk)
             finally:
                 write_tables(folder, study, journal.rows, engine.plans)
     return folder
@@ -103,15 +108,14 @@ class _Engine:
     ) -> None:
         self.plans = StudyPlans(folder / PLANS_FOLDER)
         self._study, self._journal, self._on_advance = study, journal, on_advance
-        self._versions = versions()
         self._pending = _find_pending(study, journal.rows)
         self._reach_points = _find_reach_points(study)
         self._all_plans = len(self._pending)
         self._unfinished = sum(map(_is_unfinished, journal.rows.values()))
 
-    def run(self, executor: Executor, chunk: int) -> None:
+    def run(self, executor: Executor, code: StudyCode, chunk: int) -> None:
         """Run the missing insertions, `chunk` insertions of a point in a job."""
-        calls = _PendingCalls(executor)
+        calls = _PendingCalls(executor, code)
         self._report_progress()
         try:
             for key, points in self._pending.items():
@@ -137,13 +141,9 @@ class _Engine:
                 job = InsertionJob(point, made, refusal, chosen, id(point) in self._reach_points)
                 calls.submit(run_job, job, self._keep_rows)
 
-    def _keep_rows(self, done: JobRows) -> None:
-        if done.versions != self._versions:
-            raise RunError(
-                f"package versions of a worker differ from this process: {done.versions}, {self._versions}"
-            )
-        self._journal.add(done.rows)
-        self._unfinished += sum(map(_is_unfinished, done.rows))
+    def _keep_rows(self, rows: list[dict[str, Any]]) -> None:
+        self._journal.add(rows)
+        self._unfinished += sum(map(_is_unfinished, rows))
         self._report_progress()
 
     def _report_progress(self) -> None:
@@ -182,8 +182,8 @@ def _is_unfinished(row: Mapping[str, Any]) -> bool:
 class _PendingCalls:
     """Pending calls on an executor, each with the function that handles its result."""
 
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
+    def __init__(self, executor: Executor, code: StudyCode) -> None:
+        self._executor, self._code = executor, code
         self._open: dict[Future[Any], Callable[[Any], None]] = {}
         self._done: SimpleQueue[Future[Any]] = SimpleQueue()
         self._abandoned = False
@@ -193,7 +193,7 @@ class _PendingCalls:
         if self._abandoned:
             return
         with _report_worker_loss():
-            future = self._executor.submit(function, argument)
+            future = self._executor.submit(run_checked, self._code, function, pickle.dumps(argument))
         self._open[future] = then
         future.add_done_callback(self._done.put)
 
@@ -217,9 +217,14 @@ class _PendingCalls:
 
 @contextmanager
 def _report_worker_loss() -> Iterator[None]:
-    """Convert exceptions to RunError: jobs catch errors of an insertion, so others come from a lost worker."""
+    """Convert exceptions to RunError: jobs catch errors of an insertion, so others come from a lost worker.
+
+    A worker with other code raises RunError.
+    """
     try:
         yield
+    except RunError as error:
+        raise RunError(f"{error}; finished rows are kept; resume with --resume") from None
     except Exception as error:
         raise RunError(
             f"workers were lost ({describe_error(error)}); finished rows are kept; resume with --resume; "

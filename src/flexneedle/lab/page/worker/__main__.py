@@ -18,6 +18,7 @@ from flexneedle.lab.page.worker.rig_insertion import check
 from flexneedle.lab.page.worker.study_jobs import ShownRows, list_rows
 from flexneedle.lab.page.worker.task import Cancelled, TaskQueue, WorkerTask
 from flexneedle.lab.process import open_channel
+from flexneedle.record.folder import versions
 
 Actions = Mapping[Action, Callable[[WorkerTask], None]]
 _NICE = 10
@@ -35,6 +36,7 @@ def main() -> int:
     channel = open_channel(int(sys.argv[1]), most_waiting=_MOST_WAITING)
     tasks = TaskQueue(channel)
     warm_up()
+    versions()  # read now, while the files are still those that were imported
     channel.send(WorkerReady())
     insertions, rows = InsertionJobs(), ShownRows()
     actions: Actions = {
