@@ -89,6 +89,8 @@ def carry_out(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) 
     with choices.rig.open(scenario, plan, choices.seed, stream) as ports:
         insertion = run(steering, ports)
     insertion = replace(insertion, **choices.rig.names, **choices.rig.results())
+    reason = "; ".join(filter(None, (insertion.reason, choices.rig.explain(insertion))))
+    insertion = replace(insertion, reason=reason)
     stream.send(Ended(insertion))
     return insertion
 

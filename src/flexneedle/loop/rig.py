@@ -11,7 +11,7 @@ from flexneedle.estimation.estimate import Estimate
 from flexneedle.loop.events import Stream
 from flexneedle.phantom.phantom import Condition
 from flexneedle.ports import Clock, Driver, TipTracker
-from flexneedle.results import Plan
+from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Control
 
@@ -40,6 +40,10 @@ class RigSource:
     def results(self) -> dict[str, Any]:
         """Return fields of `Insertion` that are known at its end (default: none)."""
         return {}
+
+    def explain(self, insertion: Insertion) -> str:
+        """Return the fault of the rig that the record of an insertion shows, in words (default: "", none)."""
+        return ""
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,13 @@ import pytest
 import tomli_w
 
 import bench_rig
+from bench_axes import AirRig
 from bench_rig import Motors, values
 from commands import run
 from flexneedle.errors import DriverError
 from flexneedle.lab.commands import rig as command
+from flexneedle.lab.rig.rig_file import load_rig
+from flexneedle.types import Pose
 from rooms import ManualClock
 
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
@@ -119,9 +122,9 @@ def test_a_plan_that_steers_needs_no_guide(capsys, file):
     assert "missing" not in run(capsys, *words, "--strategy", "steering")[1]
 
 
-@pytest.mark.parametrize("name", ["check", "jog", "home", "retract", "off"])
+@pytest.mark.parametrize("name", ["show", "check", "test", "ready", "jog", "home", "retract", "off"])
 def test_rigs_are_given_by_path_or_name(capsys, tmp_path, name):
-    words = ("insertion", "1") if name == "jog" else ()
+    words = {"jog": ("insertion", "1"), "ready": ("--scenario", "phantom")}.get(name, ())
     path = tmp_path / "rig.toml"
     path.write_text("name = 3")
     for rig, line in ((str(path), f"{path}: name = 3: "), ("nonesuch", "no such rig (choices: emulated)")):
@@ -141,6 +144,12 @@ MOTIONS = [
         ("jog", "rotation", "-9deg", "--speed", "36"),
         ("move_to", "rotation", -math.pi / 20, math.pi / 5),
         "rotation: from 0 to -9 deg (-9 deg), at most at 36 deg/s",
+    ),
+    (("jog", "insertion", "--to", "0mm"), ("move_to", "insertion", 0.0, 2.0), "insertion: from 30 to 0 mm"),
+    (
+        ("jog", "rotation", "--to", "-9deg"),
+        ("move_to", "rotation", -math.pi / 20, 0.4 * math.pi),
+        "rotation: from 0 to -9 deg",
     ),
     (("retract", "--to", "12.5", "--speed", "0.5"), ("retract", 12.5, 0.5), "insertion: from 30 to 12.5 mm"),
 ]
@@ -265,3 +274,84 @@ def test_motors_that_cannot_be_stopped_hide_no_reason(file, supervisor, capsys, 
     assert status == 1
     assert line.startswith(f"flexneedle: {first}")
     assert line.endswith("may still move; the motors are not known to rest: waited for 5 s")
+
+
+@pytest.mark.usefixtures("device")
+def test_an_axis_that_is_at_its_goal_is_not_moved(capsys, file, supervisor):
+    status, _, err = run(capsys, "rig", "jog", file(), "guide_y", "--to", "0mm")
+    assert (status, err) == (0, "flexneedle: guide_y is at 0 mm: nothing to move\n")
+    assert supervisor.calls == []
+
+
+@pytest.mark.parametrize("words", [(), ("5", "--to", "3")])
+def test_a_jog_needs_a_distance_or_a_position(capsys, file, words):
+    with pytest.raises(SystemExit):
+        run(capsys, "rig", "jog", file(), "insertion", *words)
+
+
+def test_a_rig_is_shown_with_its_units_and_what_follows_from_it(capsys):
+    status, out, _ = run(capsys, "rig", "show", "emulated")
+    assert status == 0
+    for part in ("galil, address = 127.0.0.1:2323", "0 to 110 mm", "100/deg", "27 deg", "with 4 fiducials"):
+        assert part in out
+
+
+# Start
+
+
+@pytest.fixture
+def tracked(monkeypatch, supervisor):
+    """A supervisor that measures the tip 20 mm before the skin."""
+    supervisor.tip = lambda _within: Pose(-20.0, 0.0, 0.0, 0.0, 0.0)
+    supervisor.read = lambda: ()
+    monkeypatch.setattr("flexneedle.lab.rig.tracked.open_tracked", lambda *_: supervisor)
+    return supervisor
+
+
+READY = ("--scenario", "phantom")
+
+
+def test_ready_brings_the_axes_to_the_start_once_it_is_confirmed(capsys, file, tracked, answer):
+    tracked.positions["guide_y"] = 2.0
+    answer("y\n")
+    assert run(capsys, "rig", "ready", file(), *READY)[0] == 0
+    moves = [call[1:3] for call in tracked.calls if call[0] == "move_to"]
+    assert moves == [("insertion", pytest.approx(21.5)), ("guide_y", 0.0)]
+    assert [call[0] for call in tracked.calls].index("arm") < [call[0] for call in tracked.calls].index(
+        "move_to"
+    )
+
+
+def test_ready_moves_nothing_that_is_not_confirmed_or_in_tissue(capsys, file, tracked, answer):
+    answer("n\n")
+    assert run(capsys, "rig", "ready", file(), *READY)[0] == 1
+    tracked.tip = lambda _within: Pose(5.0, 0.0, 0.0, 0.0, 0.0)
+    status, _, err = run(capsys, "rig", "ready", file(), *READY, "--yes")
+    assert status == 2
+    assert "tip: 5.0 mm deep" in err
+    assert {call[0] for call in tracked.calls} <= {"wait", "stop", "closed"}
+
+
+def test_a_test_of_the_axes_asks_first_and_only_in_air(capsys, file, monkeypatch, answer, in_tmp):  # noqa: ARG001
+    class Opened(AirRig):
+        def arm(self):
+            return ""
+
+        def stop(self):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_exception):
+            pass
+
+    rig = Opened(load_rig("emulated"))
+    monkeypatch.setattr("flexneedle.lab.rig.tracked.open_tracked", lambda *_: rig)
+    answer("n\n")
+    assert run(capsys, "rig", "test", "emulated")[0] == 1
+    rig.load["insertion"] = 27.0  # the tip is 1.5 mm before the skin
+    status, _, err = run(capsys, "rig", "test", "emulated", "--scenario", "phantom", "--yes")
+    assert status == 2
+    assert "mm or more before the skin: withdraw it first: flexneedle rig retract RIG" in err
+    assert rig.moves == []

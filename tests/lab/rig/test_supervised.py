@@ -18,8 +18,9 @@ from emulated_rig import emulated_rig, rig_file
 from flexneedle.control.interface import Decision
 from flexneedle.errors import CommandError, DriverError, RefusedError, RigError
 from flexneedle.lab.emulators.emulated_rig.truth import read_truth
+from flexneedle.lab.rig.axis_columns import AxisColumns
 from flexneedle.lab.rig.rig_file import load_rig
-from flexneedle.lab.rig.supervised import AxisColumns, SupervisedDriver, SupervisedRig, Tick
+from flexneedle.lab.rig.supervised import SupervisedDriver, SupervisedRig, Tick
 from flexneedle.lab.rig.supervisor.client import SupervisorClient
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
 from flexneedle.lab.rig.supervisor.protocol import MotionResult, TickReport

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command, add_group
-from flexneedle.cli.common import add_strategy, print_json
+from flexneedle.cli.common import add_strategy, print_json, print_table
 from flexneedle.cli.progress import print_line, print_note
 from flexneedle.cli.values import finite, positive
-from flexneedle.errors import DriverError, FlexneedleError
+from flexneedle.errors import DriverError
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
+from flexneedle.lab.commands.rig_parts import add_rig, add_yes, arm, print_findings, stop_on_error
+from flexneedle.lab.commands.rig_start import add_ready, add_test
 
 if TYPE_CHECKING:
     from flexneedle.lab.rig.preflight.moves import AxisHoming, AxisMove
-    from flexneedle.lab.rig.preflight.rig_check import Finding, IntendedInsertion
+    from flexneedle.lab.rig.preflight.rig_check import IntendedInsertion
     from flexneedle.lab.rig.rig_file import RigFile
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
 
@@ -39,10 +41,24 @@ def add_parser(commands: Commands) -> None:
         commands,
         "rig",
         "check the motors and the tracker of a rig, and move its axes",
-        (_add_check, _add_jog, _add_home, _add_retract, _add_off),
+        (_add_show, _add_check, add_test, _add_jog, _add_home, add_ready, _add_retract, _add_off),
         "flexneedle rig check rig.toml --scenario phantom",
         "flexneedle rig jog rig.toml insertion -5mm",
     )
+
+
+def _add_show(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "show",
+        "print a rig file with its units, defaults and derived limits",
+        _show,
+        "flexneedle rig show rig.toml",
+        "flexneedle rig show emulated",
+        about="Print the values of a rig file with their units, the limits that follow from them, and the devices. "
+        "Connects to nothing.",
+    )
+    add_rig(parser)
 
 
 def _add_check(commands: Commands) -> None:
@@ -57,7 +73,7 @@ def _add_check(commands: Commands) -> None:
         "tracker frames and sensors, ROS publishers. Moves, powers, publishes and changes nothing. "
         "Exit status 1 if there is a problem.",
     )
-    _add_rig(parser)
+    add_rig(parser)
     parser.add_argument(
         "--scenario",
         metavar="S",
@@ -78,21 +94,26 @@ def _add_jog(commands: Commands) -> None:
     parser = add_command(
         commands,
         "jog",
-        "move one axis by a distance",
+        "move one axis by a distance or to a position",
         _jog,
         "flexneedle rig jog rig.toml insertion -5mm",
-        "flexneedle rig jog rig.toml rotation 180deg --speed 90",
-        about="Move one axis by a distance within its soft limits. Asks for confirmation; Ctrl-C stops.",
+        "flexneedle rig jog rig.toml rotation --to 0deg --speed 90",
+        about="Move one axis by a distance, or to a position, within its soft limits. Asks for confirmation; Ctrl-C "
+        "stops.",
     )
-    _add_rig(parser)
+    add_rig(parser)
     parser.add_argument(
         "axis", metavar="AXIS", help="axis of the rig file, such as insertion, rotation or guide_y"
     )
-    parser.add_argument(
-        "distance", metavar="DISTANCE", help="distance with its sign, such as 5, -2.5mm or 90deg"
+    goal = parser.add_mutually_exclusive_group(required=True)
+    goal.add_argument(
+        "distance", metavar="DISTANCE", nargs="?", help="distance with its sign, such as 5, -2.5mm or 90deg"
+    )
+    goal.add_argument(
+        "--to", metavar="POSITION", help="position in place of a distance, such as 0mm or 180deg"
     )
     _add_speed(parser, "mm/s or deg/s")
-    _add_yes(parser)
+    add_yes(parser)
     # With this pattern argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
 
@@ -108,11 +129,11 @@ def _add_home(commands: Commands) -> None:
         about="Home axes as set by home in the rig file, one after another, insertion first. Use "
         "only without a needle in tissue. Asks for confirmation; Ctrl-C stops.",
     )
-    _add_rig(parser)
+    add_rig(parser)
     parser.add_argument(
         "axes", nargs="*", metavar="AXIS", help="axes (default: all but those with an absolute encoder)"
     )
-    _add_yes(parser)
+    add_yes(parser)
 
 
 def _add_retract(commands: Commands) -> None:
@@ -126,7 +147,7 @@ def _add_retract(commands: Commands) -> None:
         about="Move the insertion axis backwards, within its soft limits and short of its home switch; "
         "rotation and guide rest. Asks for confirmation; Ctrl-C stops.",
     )
-    _add_rig(parser)
+    add_rig(parser)
     parser.add_argument(
         "--to",
         type=finite,
@@ -135,7 +156,7 @@ def _add_retract(commands: Commands) -> None:
         "of range_mm)",
     )
     _add_speed(parser, "mm/s")
-    _add_yes(parser)
+    add_yes(parser)
 
 
 def _add_speed(parser: argparse.ArgumentParser, unit: str) -> None:
@@ -158,21 +179,21 @@ def _add_off(commands: Commands) -> None:
         about="Stop all axes and switch their motors off. A vertical axis may fall. Asks for confirmation; "
         "the next motion switches the motors on.",
     )
-    _add_rig(parser)
-    _add_yes(parser, "switch off")
+    add_rig(parser)
+    add_yes(parser, "switch off")
 
 
-def _add_rig(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
+# Show and check
 
 
-def _add_yes(parser: argparse.ArgumentParser, action: str = "move") -> None:
-    parser.add_argument(
-        "--yes", action="store_true", help=f"{action} without asking; needed without a terminal"
-    )
+def _show(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.preflight.describe_rig import AXIS_HEADS, describe_axes, describe_devices
+    from flexneedle.lab.rig.rig_file import load_rig
 
-
-# Check
+    rig = load_rig(args.rig)
+    print_table(rig.name, ("", ""), describe_devices(rig))
+    print_table("Axes", AXIS_HEADS, describe_axes(rig))
+    return 0
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -194,9 +215,7 @@ def _check(args: argparse.Namespace) -> int:
         ]
         print_json({"rig": rig.name, "ok": not problems, "findings": lines})
     else:
-        _print_findings(findings)
-        counted = f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
-        print(f"\n{args.rig}: {counted}")
+        print_findings(args.rig, findings)
     return 1 if problems else 0
 
 
@@ -207,14 +226,6 @@ def _load_intended(args: argparse.Namespace) -> IntendedInsertion | None:
     return None if args.scenario is None else IntendedInsertion(load_scenario(args.scenario), args.strategy)
 
 
-def _print_findings(findings: Sequence[Finding]) -> None:
-    parts = max(len(one.part) for one in findings)
-    items = max(len(one.item) for one in findings)
-    for one in findings:
-        verdict, found = "PROBLEM" if one.problem else "ok", "; ".join(filter(None, (one.found, one.problem)))
-        print(f"{verdict:7}  {one.part:{parts}}  {one.item:{items}}  {found}")
-
-
 # Motions
 
 
@@ -223,8 +234,12 @@ def _jog(args: argparse.Namespace) -> int:
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    find_axis(rig, args.axis)
-    move = plan_jog(rig, args.axis, args.distance, _read_positions(rig)[args.axis], args.speed)
+    axis = find_axis(rig, args.axis)
+    at, to = _read_positions(rig)[args.axis], args.to is not None
+    move = plan_jog(rig, args.axis, args.to if to else args.distance, at, args.speed, to=to)
+    if move is None:
+        print_note(f"{args.axis} is at {axis.to_text(at)} {axis.unit}: nothing to move")
+        return 0
     return _confirm_and_move(
         rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
     )
@@ -243,7 +258,7 @@ def _home(args: argparse.Namespace) -> int:
     def home(operator: SupervisorClient) -> None:
         for number, homing in enumerate(chosen):
             if number > 0:
-                _arm(operator)
+                arm(operator)
             operator.home(homing.name)
 
     return _confirm_and_move(rig, chosen, args.yes, home, "Only without a needle in tissue.")
@@ -271,7 +286,7 @@ def _off(args: argparse.Namespace) -> int:
     confirm_motions(
         [*describe_power_off(rig, _read_positions(rig)), _FALLS], "" if args.yes else "Switch off?"
     )
-    with open_supervisor(rig) as operator, _stop_on_error(operator):
+    with open_supervisor(rig) as operator, stop_on_error(operator):
         operator.off()
     print_line("done")
     return 0
@@ -305,37 +320,11 @@ def _confirm_and_move(
     from flexneedle.lab.rig.preflight.moves import AxisMove, require_start
 
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
-    with open_supervisor(rig) as operator, _stop_on_error(operator):
+    with open_supervisor(rig) as operator, stop_on_error(operator):
         for move in moves:
             if isinstance(move, AxisMove):
                 require_start(move, operator.positions[move.name])
-        _arm(operator)
+        arm(operator)
         command(operator)
     print_line("done")
     return 0
-
-
-def _arm(operator: SupervisorClient) -> None:
-    """Switch the motors on, and print what else has changed."""
-    if changed := operator.arm():
-        print_note(changed)
-
-
-@contextmanager
-def _stop_on_error(operator: SupervisorClient) -> Iterator[None]:
-    """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped.
-
-    Raises DriverError with both reasons if they cannot be stopped.
-    """
-    from flexneedle.interrupts import delay_signals
-
-    try:
-        yield
-    except BaseException as error:
-        with delay_signals():
-            try:
-                operator.stop()
-            except DriverError as unstopped:
-                why = str(error) if isinstance(error, FlexneedleError) else operator.report.why
-                raise DriverError("; ".join(filter(None, (why, str(unstopped))))) from error
-        raise

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +13,10 @@ import numpy as np
 
 from flexneedle.errors import DriverError, RefusedError, RigError
 from flexneedle.estimation.estimate import Estimate, carry_out
+from flexneedle.lab.rig.axis_columns import AxisColumns
+from flexneedle.lab.rig.diagnosis import explain_record
 from flexneedle.lab.rig.dry_run import dry_run_ports
 from flexneedle.lab.rig.preflight.fit import (
-    axis_stretch,
     deepest_advance,
     fit_problems,
     needed_advance,
@@ -30,52 +31,13 @@ from flexneedle.loop.measuring import innovation_limit
 from flexneedle.loop.rig import Rig, RigSource
 from flexneedle.loop.virtual import Seeds, to_stage, virtual_rig
 from flexneedle.planning.events import Event
-from flexneedle.results import Plan
+from flexneedle.results import Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import MOVES, ROUNDING_S, Limits, limit_half_turn, roll_time, travel_time
-from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN, STILL, Control, Motion, Pose, Z
+from flexneedle.types import Control, Motion, Pose, Z
 
 _MOST_TICKS = 200_000  # an hour and more
 _MOST_KEPT = 10_000
-_GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
-
-
-@dataclass(frozen=True)
-class AxisColumns:
-    """Conversion between columns of a control and travel of the rig's axes.
-
-    slope: dy/dx + i dz/dx of the axis on which the base moves.
-    """
-
-    slope: complex
-
-    def to_travel(self, row: Control) -> dict[str, float]:
-        """Return the travel (mm or rad) by axis, of the axes that move."""
-        base_y, base_z = row.db_y - self.slope.real * row.db_x, row.db_z - self.slope.imag * row.db_x
-        travel = {
-            "insertion": axis_stretch(self.slope) * row.db_x,
-            "base_y": base_y,
-            "base_z": base_z,
-            "rotation": row.spin,
-            "base_theta": row.db_theta,  # turns of the base: no rig has them, and the supervisor refuses them
-            "base_psi": row.db_psi,
-            **{name: row[column] for name, column in _GUIDE.items()},
-        }
-        return {name: way for name, way in travel.items() if abs(way) > 1e-12}
-
-    def to_control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
-        """Return the control that travelled axes have carried out.
-
-        roll, spin: parts of the rotation (rad).
-        """
-        row = np.zeros(len(STILL))
-        row[DB_X] = travelled.get("insertion", 0.0) / axis_stretch(self.slope)
-        row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
-        row[DB_Z] = travelled.get("base_z", 0.0) + self.slope.imag * row[DB_X]
-        for name, column in _GUIDE.items():
-            row[column] = travelled.get(name, 0.0)
-        row[ROLL], row[SPIN] = roll, spin
-        return Control.of(row.tolist())
 
 
 @dataclass
@@ -252,6 +214,10 @@ class SupervisedRig(RigSource):
     def results(self) -> dict[str, Any]:
         """Return the summary of the ticks."""
         return {"ticks": self.ticks.summarize()}
+
+    def explain(self, insertion: Insertion) -> str:
+        """Return the fault of the rig file that fits the record far better than the file does; "" if there is none."""
+        return "" if self.dry_run else explain_record(self.file, insertion)
 
     @contextmanager
     def open(self, scenario: Scenario, plan: Plan, seed: int, stream: Stream) -> Iterator[Rig]:

@@ -131,25 +131,25 @@ def parse_distance(text: str, name: str, axis: Axis) -> float:
     return float(found[1]) * axis.size
 
 
-def plan_jog(rig: RigFile, name: str, distance: str, position: float, speed: float | None = None) -> AxisMove:
-    """Return the motion of one axis by a distance from its position (mm or rad). speed: in the unit of the axis, per s.
+def plan_jog(
+    rig: RigFile, name: str, text: str, position: float, speed: float | None = None, *, to: bool = False
+) -> AxisMove | None:
+    """Return the motion of one axis by a distance from its position (mm or rad), or to a position; None if it is there.
 
-    Raises InputError for another axis or unit, no distance, a goal beyond the soft limits, a speed above the axis's.
+    text: the distance, or with `to` the position, such as "-2.5mm"; speed: in the unit of the axis, per s. Raises
+    InputError for another axis or unit, no distance, a goal beyond the soft limits, a speed above the axis's.
     """
     axis = find_axis(rig, name)
+    given = parse_distance(text, name, axis)
     move = _check_move(
-        AxisMove(
-            name,
-            axis,
-            position,
-            position + parse_distance(distance, name, axis),
-            _parse_speed(name, axis, speed),
-        )
+        AxisMove(name, axis, position, given if to else position + given, _parse_speed(name, axis, speed))
     )
     # Counts that are no steps of an encoder, such as m, have a finer resolution.
-    if abs(move.distance) < min(1.0 / abs(axis.scale), axis.tolerance):
-        raise InputError(f"distance {text_of(distance)}: must be at least one count of {name}")
-    return move
+    if abs(move.distance) >= min(1.0 / abs(axis.scale), axis.tolerance):
+        return move
+    if not to:
+        raise InputError(f"distance {text_of(text)}: must be at least one count of {name}")
+    return None
 
 
 def withdrawn_position(rig: RigFile) -> float:

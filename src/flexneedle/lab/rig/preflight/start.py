@@ -17,7 +17,7 @@ from flexneedle.types import Lateral, Pose
 SDS = 3.0
 """Standard deviations by which a start may be off."""
 _FAR = 1e6  # mm, where the error of a registration is its rotation's
-_MOUNT = "jog base or guide, check the mount of the needle, or register the tracker again"
+_MOUNT = "rig ready RIG --scenario S, check the mount of the needle, or register the tracker again"
 
 
 def axis_start_problem(name: str, axis: Axis, position: float) -> str:
@@ -27,7 +27,7 @@ def axis_start_problem(name: str, axis: Axis, position: float) -> str:
     """
     if name not in LINEAR_AXES[1:] or abs(position) <= axis.uncertainty:
         return ""
-    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: jog it to 0"
+    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: rig jog RIG {name} --to 0mm"
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
@@ -159,7 +159,7 @@ def tip_problems(scenario: Scenario, tip: Pose, roll: float = 0.0) -> list[str]:
         ("dy/dx", 1e3 * tip.theta, 1e3 * slope.real, 1e3 * limits.slope[0]),
         ("dz/dx", 1e3 * tip.psi, 1e3 * slope.imag, 1e3 * limits.slope[1]),
     ]
-    remedies = {"x": "retract or jog the insertion axis (setup.tip_to_skin_mm)"}
+    remedies = {"x": "rig ready RIG --scenario S (setup.tip_to_skin_mm)"}
     found = [
         f"{name} must be within {limit:.1f} mm of {start:.1f}: {remedies.get(name, _MOUNT)}"
         for name, value, start, limit in places

@@ -1,0 +1,283 @@
+"""Findings of the test of the axes: scale, direction, axis, lost motion and delay, and the value that would fit.
+
+The insertion first moves to a probe, which takes up the lost motion; its scale is measured from there to the goal, and
+the lost motion on the way back.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexneedle.lab.rig.preflight.axis_test import SCALE_SD, AxisRun, MotorHistory
+from flexneedle.lab.rig.preflight.rig_check import Finding
+from flexneedle.lab.rig.rig_axes import Axis
+from flexneedle.lab.rig.rig_file import RigFile
+from flexneedle.types import Floats
+
+_SDS = 4.0  # standard deviations beyond which a difference is certain
+_MOST_TILT = math.radians(10.0)  # of a motion from its axis, beyond the noise
+_OTHER = math.cos(math.radians(25.0))  # a motion along another axis
+_MOST_SCALE = 3.0  # of an axis that continues after its probe
+_LEAST_SHARE = 0.5
+_SWAPPED = 0.25  # relative difference of a motion from another axis's
+_MOST_GAP = 0.31  # mm
+_AFTER_S = 0.4  # of rest after the way out, in which late readings show the motion
+_DELAYS = np.arange(-0.2, 0.8, 0.001)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Measured motion of an axis: the axis that moved ("" if none was measured), and its scale with standard deviation.
+
+    scale: measured over commanded travel, negative if reversed, None if unknown; tilt: angle from the expected
+    direction (rad); lost: motion lost on reversal (mm or rad), with standard deviation; delay: of the readings (s).
+    """
+
+    moved: str
+    scale: float | None = None
+    sd: float = 0.0
+    tilt: float = 0.0
+    lost: tuple[float, float] | None = None
+    delay: float | None = None
+
+
+def share_after_probe(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> float:
+    """Return the share of the way to its goal to which an axis continues after its probe.
+
+    An axis that moves too far goes less far, so that the tip moves by the planned way; it is 0 if another axis or none
+    moved.
+    """
+    seen, noise = run.moved(0, 1), run.noise(0, 1)
+    if _other_axis(rig, responses, run) is not None:
+        return 0.0
+    if run.name == "rotation":
+        return 1.0
+    size = float(np.linalg.norm(seen))
+    if run.name not in responses or size <= _SDS * math.sqrt(3.0) * noise:
+        return 0.0
+    scale = size / float(np.linalg.norm(run.travel(0, 1) * responses[run.name]))
+    return 0.0 if scale > _MOST_SCALE else min(1.0, max(_LEAST_SHARE, 1.0 / scale))
+
+
+def measure_motion(
+    rig: RigFile, responses: Mapping[str, Floats], run: AxisRun, motors: MotorHistory
+) -> Motion:
+    """Return the measured motion of an axis."""
+    if run.name == "rotation":
+        return _measure_rotation(rig, responses, run)
+    first, last = (1, -2) if run.complete else (0, 1)
+    seen, travel, noise = run.moved(first, last), run.travel(first, last), run.noise(first, last)
+    size = float(np.linalg.norm(seen))
+    if size <= _SDS * math.sqrt(3.0) * noise:
+        turned = run.rests[last].turned_since(run.rests[first])
+        turns = turned is not None and abs(turned) > math.radians(2.0) and rig.axes.rotation is not None
+        return Motion("rotation" if turns else "")
+    if (other := _other_axis(rig, responses, run)) is not None:
+        return Motion(other)
+    response = responses.get(run.name)
+    if response is None:
+        return Motion(run.name)
+    gain, along = float(np.linalg.norm(response)), float(seen @ response) / float(np.linalg.norm(response))
+    scale, sd = math.copysign(size, along * travel) / (gain * abs(travel)), noise / (gain * abs(travel))
+    tilt = math.acos(min(1.0, abs(along) / size))
+    if not run.complete:
+        back = run.moved(1, 2)
+        size = 0.5 * (size + float(np.linalg.norm(back)))
+        return Motion(run.name, math.copysign(size, scale) / (gain * abs(travel)), sd, tilt)
+    delay = _measure_delay(run, motors, noise)
+    if run.name == "insertion":
+        return Motion(run.name, scale, sd, tilt, _lost_motion(run, gain, abs(scale)), delay)
+    at = motors.at(run.name, run.times - (delay or 0.0)) - run.rests[0].positions[run.name]
+    along_axis = (run.tips - run.rests[0].tip) @ response / gain**2
+    scale, sd, gap = _fit_with_clearance(at, along_axis, float(run.rests[0].spread.max()) / gain)
+    return Motion(run.name, scale, sd, tilt, (gap, sd * abs(travel)), delay)
+
+
+def _fit_with_clearance(at: Floats, along: Floats, noise: float) -> tuple[float, float, float]:
+    """Return scale, its standard deviation, and the clearance (mm) of an axis that moves the needle through a guide.
+
+    at: positions of the axis (mm) from its start; along: measured (mm), with this noise (mm). A needle that rests on
+    one side of the guide passes to the other one somewhere on the way, and does not move meanwhile.
+    """
+    way, found = np.abs(at), list[tuple[float, float, float]]()
+    places = np.linspace(0.0, way.max(), 25)
+    for gap in np.arange(0.0, _MOST_GAP, 0.02):
+        for place in places if gap else places[:1]:
+            path = np.sign(at) * (way - np.clip(way - place, 0.0, gap))
+            columns = np.stack([np.ones(len(path)), path], axis=1)
+            solution = np.linalg.lstsq(columns, along, rcond=None)[0]
+            residual = along - columns @ solution
+            found.append((float(residual @ residual) / noise**2, float(solution[1]), float(gap)))
+    misfit, scale, gap = min(found)
+    near = [other for one, other, _ in found if one < misfit + 4.0]
+    least = noise / (float(at.std()) * math.sqrt(len(at)))
+    return scale, max(least, 0.25 * (max(near) - min(near))), gap
+
+
+def _lost_motion(run: AxisRun, gain: float, scale: float) -> tuple[float, float]:
+    """Return the motion lost on the way back (mm), and its standard deviation."""
+    back = float(np.linalg.norm(run.moved(-2, -1))) / gain
+    return scale * abs(run.travel(-2, -1)) - back, 2.0 * run.noise(-2, -1) / gain
+
+
+def _other_axis(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> str | None:
+    """Return the axis whose motor moved instead, by direction and, for a rotation, by distance; None for none."""
+    last = 2 if run.complete else 1
+    seen = run.moved(0, last)
+    size, axes = float(np.linalg.norm(seen)), dict(rig.axes.items())
+    if size <= _SDS * math.sqrt(3.0) * run.noise(0, last):
+        return None
+    found = dict[str, float]()
+    for name, response in responses.items():
+        cosine = abs(float(seen @ response)) / (size * float(np.linalg.norm(response)))
+        ratio = axes[run.name].scale / axes[name].scale
+        fits = abs(size / (abs(run.travel(0, last) * ratio) * float(np.linalg.norm(response))) - 1.0)
+        if cosine > _OTHER and (run.name != "rotation" or fits < _SWAPPED):
+            found[name] = fits
+    if run.name in found or not found:
+        return None
+    return min(found, key=lambda name: found[name])
+
+
+def _measure_rotation(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> Motion:
+    if (other := _other_axis(rig, responses, run)) is not None:
+        return Motion(other)
+    if not run.complete:
+        return Motion("")
+    turned = run.rests[2].turned_since(run.rests[1])
+    if turned is not None and abs(turned) > math.radians(5.0):
+        return Motion("rotation", turned / run.travel(1, 2), 0.01)
+    return _fit_run_out(run)
+
+
+def _fit_run_out(run: AxisRun) -> Motion:
+    """Return the scale of a rotation from the circle of the tip; no axis if the circle is too small to be seen.
+
+    The tip is at c + r e^(i s φ) for motor angles φ; c and r follow from least squares for each scale s.
+    """
+    at = np.array([rest.tip[1] + 1j * rest.tip[2] for rest in run.rests])
+    angles = np.array([rest.positions["rotation"] for rest in run.rests])
+    noise = run.noise(0, 2)
+    scales = np.arange(-2.5, 2.5, 0.01)
+    fits = [_fit_circle(at, scale * angles) for scale in scales]
+    misfit = np.array([residual for residual, _ in fits])
+    best = int(misfit.argmin())
+    near = scales[misfit < misfit[best] + (_SDS * noise) ** 2]
+    if fits[best][1] < _SDS * noise or near.max() - near.min() > 0.5:
+        return Motion("")
+    return Motion("rotation", float(scales[best]), float(near.max() - near.min()) / (2.0 * _SDS))
+
+
+def _fit_circle(
+    at: "np.ndarray[tuple[int, ...], np.dtype[np.complex128]]", angles: Floats
+) -> tuple[float, float]:
+    """Return the sum of squared residuals (mm²) and the radius (mm) of a circle through positions at angles."""
+    columns = np.stack([np.ones(len(at)), np.exp(1j * angles)], axis=1)
+    solution = np.linalg.lstsq(columns, at, rcond=None)[0]
+    return float(np.sum(np.abs(at - columns @ solution) ** 2)), float(abs(solution[1]))
+
+
+def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> float | None:
+    """Return the delay (s) of the readings behind the motor: the shift of the motor's path that fits them best."""
+    if len(motors.times) < 2:
+        return None
+    way = run.moved(0, -2)
+    along = (run.tips - run.rests[0].tip) @ way / float(np.linalg.norm(way))
+    if float(np.linalg.norm(way)) < 10.0 * noise:
+        return None
+    # On the way out only: beyond a reversal lost motion would look like a delay.
+    gone = np.abs(motors.at(run.name, run.times) - run.plan.move.start)
+    chosen = run.times <= run.times[int(np.argmax(gone > 0.999 * gone.max()))] + _AFTER_S
+    misfit = []
+    for delay in _DELAYS:
+        path = motors.at(run.name, run.times[chosen] - delay)
+        columns = np.stack([np.ones(len(path)), path], axis=1)
+        residual = along[chosen] - columns @ np.linalg.lstsq(columns, along[chosen], rcond=None)[0]
+        misfit.append(float(residual @ residual))
+    return float(_DELAYS[int(np.argmin(misfit))])
+
+
+def describe_motions(rig: RigFile, motions: Mapping[str, Motion], most_delay: float | None) -> list[Finding]:
+    """Return the findings of all axes; most_delay: age (s) from which readings are stale, None if unknown."""
+    axes = dict(rig.axes.items())
+    return [
+        finding
+        for name, motion in motions.items()
+        for finding in _describe_motion(name, axes[name], motion, motions, axes, most_delay)
+    ]
+
+
+def _describe_motion(
+    name: str,
+    axis: Axis,
+    motion: Motion,
+    motions: Mapping[str, Motion],
+    axes: Mapping[str, Axis],
+    most_delay: float | None,
+) -> Iterator[Finding]:
+    if motion.moved == "":
+        yield _unseen(name, axis)
+        return
+    if motion.moved != name:
+        fits = next((other for other, one in motions.items() if one.moved == name), None)
+        remedy = f'must be "{axes[fits].channel}"' if fits else f"is the motor of {motion.moved}"
+        problem = f'moves {motion.moved}: axes.{name}.channel = "{axis.channel}": {remedy}'
+        yield Finding(name, "axis", motion.moved, problem)
+        return
+    if motion.scale is None:
+        yield Finding(name, "scale", "not checked: depends on needle and guide; give --scenario")
+        return
+    yield from _scale_findings(name, axis, motion, motion.scale)
+    if axis.unit == "mm":
+        rule = (
+            f"must be within {math.degrees(_MOST_TILT):g}°: check registration"
+            if motion.tilt > _MOST_TILT
+            else ""
+        )
+        yield Finding(name, "direction", f"{math.degrees(motion.tilt):.1f}° from its axis", rule)
+    if motion.lost is not None:
+        yield _lost_finding(name, axis, *motion.lost)
+    if motion.delay is not None:
+        late = most_delay is not None and abs(motion.delay) > most_delay
+        rule = f"must be at most {most_delay:g} s, control.stale_after_s" if late else ""
+        yield Finding(name, "delay", f"readings are {1e3 * motion.delay:.0f} ms behind the motor", rule)
+
+
+def _unseen(name: str, axis: Axis) -> Finding:
+    if axis.unit == "deg":
+        return Finding(
+            name, "motion", "not seen: the sensor shows no roll, and the tip has too little run-out"
+        )
+    rule = f'axes.{name}.channel = "{axis.channel}": must be the motor of this axis, with axes.{name}.counts_per_mm'
+    return Finding(name, "motion", "no motion of the tip", f"{rule}, and its motor must drive the axis")
+
+
+def _scale_findings(name: str, axis: Axis, motion: Motion, scale: float) -> Iterator[Finding]:
+    if scale < 0.0:
+        key = f"axes.{name}.direction = {axis.direction}"
+        yield Finding(name, "sign", "reversed", f"{key}: must be {-axis.direction}")
+    else:
+        yield Finding(name, "sign", "positive")
+    size, unit = abs(scale), axis.unit
+    counts = abs(axis.scale) * axis.size
+    off = abs(size - 1.0) > max(_SDS * SCALE_SD, _SDS * motion.sd)
+    shown = f"{size:.4g} ± {motion.sd:.2g}"
+    rule = f"axes.{name}.counts_per_{unit} = {counts:.6g}: must be about {counts / size:.4g}" if off else ""
+    yield Finding(name, "scale", shown, rule)
+
+
+def _lost_finding(name: str, axis: Axis, lost: float, sd: float) -> Finding:
+    """Return the lost motion; a guide may also have clearance, which the file does not describe."""
+    unit = axis.unit
+    shown = f"{axis.to_text(round(lost, 3))} ± {sd / axis.size:.2g} {unit}"
+    certain = lost > _SDS * sd + 2.0 * axis.tolerance
+    if not certain or name.startswith("guide"):
+        return Finding(
+            name, "lost motion", shown + (" (clearance of the guide, or backlash)" if certain else "")
+        )
+    more = f"axes.{name}.backlash_{unit} = {axis.to_text(axis.backlash)}"
+    return Finding(
+        name, "lost motion", shown, f"{more}: must be about {axis.to_text(round(axis.backlash + lost, 2))}"
+    )
