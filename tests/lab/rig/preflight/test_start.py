@@ -29,7 +29,7 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
     ("changes", "name", "position", "problem"),
     [
         ({}, "guide_y", 0.02, ""),  # the tolerance
-        ({}, "guide_y", -0.03, "must be within 0.02 mm of 0, on the needle's axis: jog it to 0"),
+        ({}, "guide_y", -0.03, "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_y --to 0mm"),
         ({}, "guide_z", 1.5, "must be within 0.02 mm"),
         ({}, "base_y", 0.3, "must be within 0.02 mm"),
         ({}, "base_z", math.nan, "must"),
@@ -101,7 +101,7 @@ def start_of(scenario, x=0.0, y=0.0, z=0.0, theta=0.0, psi=0.0):
     [
         ({}, ""),
         ({"x": -2.9, "y": 0.5}, ""),
-        ({"x": 3.2}, "x must be within 3.0 mm of -28.5: retract"),
+        ({"x": 3.2}, "x must be within 3.0 mm of -28.5: rig ready RIG"),
         ({"y": -3.6}, "y must be within"),
         ({"z": 1.7}, "z must be within"),
         ({"theta": 0.02, "psi": 0.02}, ""),
