@@ -183,7 +183,10 @@ def test_an_axis_off_its_start_is_a_problem_whether_or_not_the_scenario_moves_it
     device.set("D", position=-750.0, commanded=-750.0)
     findings = check_motors(made, device, ManualClock(), PLANE)
     assert problems(findings) == {
-        ("guide_z", "start"): "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_z --to 0mm"
+        (
+            "guide_z",
+            "start",
+        ): "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_z --to 0mm"
     }
     assert found_of(findings, "rotation", "start").startswith("at 30 deg, rolled to the plan's angle")
     assert ("guide_z", "start") not in problems(check_motors(made, device, ManualClock()))

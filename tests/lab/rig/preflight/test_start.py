@@ -29,7 +29,12 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
     ("changes", "name", "position", "problem"),
     [
         ({}, "guide_y", 0.02, ""),  # the tolerance
-        ({}, "guide_y", -0.03, "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_y --to 0mm"),
+        (
+            {},
+            "guide_y",
+            -0.03,
+            "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_y --to 0mm",
+        ),
         ({}, "guide_z", 1.5, "must be within 0.02 mm"),
         ({}, "base_y", 0.3, "must be within 0.02 mm"),
         ({}, "base_z", math.nan, "must"),
