@@ -7,7 +7,8 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import codec
-from flexneedle.lab.emulators.aurora import FAULTS, power_on
+from flexneedle.lab.emulators.aurora import power_on
+from flexneedle.lab.emulators.aurora_faults import FAULTS
 from flexneedle.lab.emulators.aurora_server import EmulatorSession, execute
 from flexneedle.lab.emulators.faults import (
     Fault,

@@ -128,7 +128,8 @@ def _add_fault(parser: argparse.ArgumentParser, fault: str, page: str, *, device
 def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
-    from flexneedle.lab.emulators.aurora import FAULTS, FIRMWARE, power_on
+    from flexneedle.lab.emulators.aurora import FIRMWARE, power_on
+    from flexneedle.lab.emulators.aurora_faults import FAULTS
     from flexneedle.lab.emulators.aurora_server import EmulatorSession, SerialPort, execute, serve
     from flexneedle.lab.emulators.faults import parse_fault
     from flexneedle.lab.emulators.motion import CENTRE, CIRCLE, RestingTip

@@ -18,6 +18,7 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.lab.emulators import aurora, codec
 from flexneedle.lab.emulators.aurora import AuroraState, EmulatedFrame
+from flexneedle.lab.emulators.aurora_faults import FAULTS
 from flexneedle.lab.emulators.faults import Fault, FaultSchedule, damage_reply, is_order, reply_time
 from flexneedle.lab.emulators.motion import (
     CIRCLE,
@@ -58,7 +59,7 @@ class EmulatorSession:
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
         self._repeated: dict[Fault, EmulatedPose] = {}
-        self.schedule = FaultSchedule(aurora.FAULTS, self.faults)
+        self.schedule = FaultSchedule(FAULTS, self.faults)
 
     def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
         """Return time and data of the reply to a command (b"": no reply)."""

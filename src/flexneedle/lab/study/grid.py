@@ -395,7 +395,5 @@ def _vary(base: Scenario, settings: Mapping[str, Any], own: tuple[Controller, ..
         return check_tables(base.with_values(settings), *own)
     except ScenarioError as error:
         further = (_FURTHER_KEYS if "unknown key" in problem else "" for problem in error.problems)
-        lines = (
-            problem + more + _format_place(at) for problem, more in zip(error.problems, further, strict=True)
-        )
-        raise InputError("\n".join(lines)) from None
+        lines = map("".join, zip(error.problems, further, strict=True))
+        raise InputError("\n".join(line + _format_place(at) for line in lines)) from None

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flexneedle.cli.main import build_parser
-from flexneedle.lab.emulators.aurora import FAULTS
+from flexneedle.lab.emulators.aurora_faults import FAULTS
 from flexneedle.lab.emulators.faults import parse_fault
 from flexneedle.lab.rig.devices.aurora.readings import make_reading
 

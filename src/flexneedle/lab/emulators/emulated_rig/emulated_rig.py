@@ -8,7 +8,7 @@ from time import monotonic
 from typing import Any, NoReturn, Self
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.lab.emulators import aurora
+from flexneedle.lab.emulators import aurora_faults
 from flexneedle.lab.emulators.aurora_server import SerialPort
 from flexneedle.lab.emulators.emulated_rig.job import EmulationJob
 from flexneedle.lab.emulators.emulated_rig.motors_part import address_of
@@ -19,7 +19,7 @@ from flexneedle.lab.emulators.orders import Orders
 from flexneedle.lab.process import ChildProcess
 from flexneedle.lab.rig.rig_file import RigFile
 
-DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "galil": galil.FAULTS}
+DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora_faults.FAULTS, "galil": galil.FAULTS}
 """Kinds of fault by device."""
 
 _PHANTOM, _GALIL, _AURORA = "phantom", "galil", "aurora"

@@ -9,7 +9,8 @@ from pathlib import Path
 from time import monotonic
 
 from flexneedle.errors import RigError
-from flexneedle.lab.emulators.aurora import FAULTS, power_on
+from flexneedle.lab.emulators.aurora import power_on
+from flexneedle.lab.emulators.aurora_faults import FAULTS
 from flexneedle.lab.emulators.aurora_server import EmulatorSession, SerialPort, serve
 from flexneedle.lab.emulators.emulated_rig.child import Parent, run
 from flexneedle.lab.emulators.emulated_rig.following import TipHistory
