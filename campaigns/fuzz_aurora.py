@@ -86,7 +86,7 @@ def check_reading(
     good = (
         all(map(math.isfinite, values))
         and len(values) == 8
-        and max(map(abs, found.position)) < FARTHEST_MM
+        and max(map(abs, found.position)) <= FARTHEST_MM
         and abs(math.hypot(*values[3:7]) - 1.0) < 1e-6
     )
     if not (measured and good and found.status == VISIBLE):
