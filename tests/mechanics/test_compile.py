@@ -1,6 +1,8 @@
 """The cache of compiled kernels: a folder for the sources of each package that has some."""
 
 import importlib.util
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -87,9 +89,31 @@ def test_packages_have_separate_folders_and_depend_on_the_shared_sources(package
     assert not compiled(package.home)
 
 
-def test_the_cache_is_beside_the_code_or_with_the_user(package, monkeypatch, tmp_path):
-    monkeypatch.setattr(config, "CACHE_DIR", "")
-    assert Path(compiling.cache_folder(package.home)).parent == package.home / "__pycache__"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
-    monkeypatch.setattr(compiling.os, "access", lambda *_: False)
-    assert Path(compiling.cache_folder(package.home)).parent == tmp_path / "user" / "flexneedle"
+@pytest.mark.parametrize("part", ["cache_tag", "numba", "processor"])
+def test_another_python_numba_or_processor_needs_other_kernels(package, monkeypatch, part):
+    before, machine = compiling.cache_folder(package.home), list(compiling._machine())
+    machine[("cache_tag", "numba", "processor").index(part)] = "another"
+    monkeypatch.setattr(compiling, "_machine", lambda: tuple(machine))
+    assert compiling.cache_folder(package.home) != before
+
+
+def test_the_processor_is_the_one_that_numba_compiles_for():
+    """Name and features, as in the key of Numba's own cache."""
+    compiled = compiling.kernel(lambda x: x)
+    compiled(1.0)
+    assert compiling._machine()[2] == compiled.targetctx.codegen().magic_tuple()
+
+
+def test_the_stamp_of_the_sources_has_their_times(package):
+    package(2.0)
+    before = compiling.source_stamp(package.home)
+    os.utime(package.home / "twice.py", (0, 0))
+    assert compiling.source_stamp(package.home) != before
+
+
+def test_without_compilation_one_line_says_what_to_do():
+    command = [sys.executable, "-m", "flexneedle", "plan", "phantom"]
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    rule = "NUMBA_DISABLE_JIT=1: an insertion would take hours without compiled kernels; unset it"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"flexneedle: {rule}\n")

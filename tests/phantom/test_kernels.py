@@ -81,6 +81,14 @@ def test_kernels_are_compiled_for_their_sources_and_axes(cache, monkeypatch):
     assert not all_compiled(1)
 
 
+@pytest.mark.usefixtures("_one_process", "cache")
+def test_sources_written_again_are_not_compiled(monkeypatch):
+    """Numba compares their time."""
+    compile_kernels(1)
+    monkeypatch.setattr(kernels, "source_stamp", lambda _home: "later")
+    assert not all_compiled(1)
+
+
 @pytest.mark.usefixtures("_one_process")
 def test_one_process_compiles_at_a_time(cache, monkeypatch):
     held = []

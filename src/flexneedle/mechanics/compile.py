@@ -5,35 +5,55 @@ the old law. Here the cache folder is named after the sources of all kernels and
 """
 
 import hashlib
-import os
+import sys
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba as nb
 from numba.core import config as _numba_config
+from numba.core.registry import cpu_target
 
 from flexneedle import types
+from flexneedle.caches import kernel_folder
+from flexneedle.errors import InputError
 
 _Function = TypeVar("_Function")  # compiled functions keep their signature
 _njit: Any = nb.njit
 _config: Any = _numba_config  # its settings are not declared
 HERE = Path(__file__).parent
 
+if _config.DISABLE_JIT:
+    raise InputError("NUMBA_DISABLE_JIT=1: an insertion would take hours without compiled kernels; unset it")
+
 
 def cache_folder(home: Path) -> str:
-    """Return the cache folder for the exact sources of `home` and of this folder.
+    """Return the cache folder for the exact sources of `home` and of this folder, and for this machine.
 
-    It is under NUMBA_CACHE_DIR, beside the code, or in the user's cache.
+    It is in NUMBA_CACHE_DIR, beside the code, in the user's cache or in a temporary folder.
     """
-    digest = hashlib.sha256(repr(_columns()).encode())
-    for folder in dict.fromkeys((HERE, home)):  # in this order, whatever their paths
-        for source in sorted(folder.glob("*.py")):
-            digest.update(source.read_bytes())
-    beside = home / "__pycache__"
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flexneedle"
-    writable = os.access(beside if beside.exists() else home, os.W_OK)
-    base = Path(_config.CACHE_DIR) if _config.CACHE_DIR else (beside if writable else user)
-    return str(base / f"kernels-{digest.hexdigest()[:16]}")
+    digest = hashlib.sha256(repr((_columns(), _machine())).encode())
+    for source in _sources(home):
+        digest.update(source.read_bytes())
+    return str(kernel_folder(f"kernels-{digest.hexdigest()[:16]}", home, _config.CACHE_DIR))
+
+
+def source_stamp(home: Path) -> str:
+    """Return a text that changes where Numba compiles again: path and time of the sources of `home`."""
+    stamps = [(str(source), source.stat().st_mtime_ns) for source in _sources(home)]
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()[:8]
+
+
+def _sources(home: Path) -> list[Path]:
+    folders = dict.fromkeys((HERE, home))  # in this order, whatever their paths
+    return [source for folder in folders for source in sorted(folder.glob("*.py"))]
+
+
+@cache
+def _machine() -> tuple[object, ...]:
+    """Return versions of Python and Numba, and the processor with its features, as Numba's cache compares them."""
+    target: Any = cpu_target
+    return sys.implementation.cache_tag, nb.__version__, target.target_context.codegen().magic_tuple()
 
 
 def _columns() -> list[tuple[str, int]]:

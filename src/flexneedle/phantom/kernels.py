@@ -8,7 +8,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from flexneedle import phantom
-from flexneedle.mechanics.compile import cache_folder
+from flexneedle.mechanics.compile import cache_folder, source_stamp
 from flexneedle.phantom.draw import Truth
 from flexneedle.phantom.phantom import Phantom
 from flexneedle.phantom.plants import PLANTS
@@ -58,8 +58,9 @@ def _compiling_exact_plant() -> Iterator[None]:
 
 
 def _mark(axes: int) -> Path:
-    """Return a file beside the kernels of the phantoms, whose folder is named after the sources of all kernels."""
-    return Path(cache_folder(Path(str(phantom.__file__)).parent)) / f"axes-{axes}"
+    """Return a file beside the kernels of the phantoms; names of folder and file change where Numba compiles again."""
+    home = Path(str(phantom.__file__)).parent
+    return Path(cache_folder(home)) / f"axes-{axes}-{source_stamp(home)}"
 
 
 @contextmanager

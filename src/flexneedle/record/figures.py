@@ -1,9 +1,10 @@
 """The figures of plans and insertions. Figures of a run are drawn from its folder, so that `view` reproduces them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from flexneedle.errors import RunError
 from flexneedle.figures.insertion import insertion_figure
@@ -12,6 +13,9 @@ from flexneedle.figures.style import save
 from flexneedle.record.folder import TRACE_FILE, read_run
 from flexneedle.record.loading import insertion_of, unfinished_note
 from flexneedle.results import Insertion, Plan, scenario_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -> list[Path]:

@@ -1,14 +1,15 @@
 """The figures of a report: a table of entries, each with condition, caption and drawing function."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import inf, isnan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from flexneedle.figures.layout import Floats, Look, look
 from flexneedle.figures.style import INK, save
@@ -24,6 +25,9 @@ from flexneedle.lab.study.findings.findings import Findings
 from flexneedle.lab.study.findings.groups import Difference, find_finished, group_depths
 from flexneedle.lab.study.findings.rows import TARGET_COLUMNS, Flags
 from flexneedle.lab.study.findings.worlds import find_failures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MOST_LEVELS = 40  # of an axis in a figure
 _LOGARITHMIC = "Errors are on a logarithmic scale."
