@@ -133,6 +133,7 @@ def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch)
     assert [p.true_tip for p in by_object.periods] == [p.true_tip for p in by_name.periods]
     assert (by_object.controller, by_object.phantom) == ("follow-path", "Unicycle")
     assert (by_name.controller, by_name.phantom) == (PARTS["controller"], PARTS["phantom"])
+    assert by_name.controller_name == by_object.controller_name == "follow-path"
     stiff = scenario.with_values({"control.follow_path.gain": 2.0})
     other = insert(stiff, plan, **own)
     assert other.periods[-1].guide != by_object.periods[-1].guide

@@ -31,6 +31,11 @@ from flexneedle.types import (
     X,
 )
 
+TARGET_RADIUS_MM = 1.0
+"""Radius of the paper's target circles: a plan or an insertion that ends outside has missed."""
+
+_THIN_MM = 0.5  # diameter of a needle that is unknown: thin, 25G
+
 _MAKE_ONE = "make one with flexneedle.plan or flexneedle.insert"
 _GIVE_ONE = "give one with dataclasses.replace(record, scenario=scenario)"
 
@@ -95,7 +100,12 @@ class Plan:
     @property
     def reached(self) -> bool:
         """Whether the plan ends within 1 mm of the target, the radius of the paper's target circles."""
-        return self.error_mm <= 1.0
+        return self.error_mm <= TARGET_RADIUS_MM
+
+    @property
+    def hit(self) -> bool:
+        """Whether no limit binds and the target is inside the planned needle: see `is_hit`."""
+        return not self.limit and is_hit(self.error_mm, self.scenario)
 
     @property
     def entry_angle(self) -> float:
@@ -118,9 +128,12 @@ class Plan:
     def summary(self) -> str:
         """One line: distance of the plan's end from the target, and the limit that binds if it misses."""
         binding = f", limited by {self.limit}" if self.limit else ""
+        distance = format_mm(self.error_mm)
+        if self.hit:
+            return f"reaches the target to {distance}"
         if self.reached:
-            return f"reaches the target to {self.error_mm:.3f} mm{binding}"
-        return f"MISSES the target: best distance {self.error_mm:.3f} mm, more than 1 mm{binding}"
+            return f"ends {distance} from the target{binding}"
+        return f"MISSES the target: best distance {distance}, more than {TARGET_RADIUS_MM:g} mm{binding}"
 
     @property
     def flips(self) -> int:
@@ -129,7 +142,7 @@ class Plan:
 
     def __repr__(self) -> str:
         to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
-        ends = f"ends {self.error_mm:.3f} mm off, {self.strain_energy_mj:.3g} mJ"
+        ends = f"ends {format_mm(self.error_mm)} off, {self.strain_energy_mj:.3g} mJ"
         return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
 
 
@@ -203,7 +216,7 @@ class Insertion:
     periods: tuple[Period, ...]
     outcome: Outcome
     reason: str  # one line; "" if done within 1 mm of the target, or with unknown error
-    controller: str = ""  # name
+    controller: str = ""  # name, or module:NAME
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
     tracker: str = ""  # name, "" on a rig
     scenario: Scenario | None = None  # of the insertion
@@ -211,6 +224,7 @@ class Insertion:
     ticks: Mapping[str, Any] = field(default_factory=dict, compare=False)  # of the rig: number, times, states
     dry_run: bool = False  # the rig did not move: the needle was the virtual phantom's
     disturbed: str = ""  # disturbances by a person, with times: the seed alone does not repeat this insertion
+    controller_name: str = ""  # in figures and tables
 
     @property
     def target(self) -> Point:
@@ -269,7 +283,12 @@ class Insertion:
     @property
     def reached(self) -> bool:
         """Whether the outcome is done and the tip ended within 1 mm of the target, by `error_mm`."""
-        return self.outcome is Outcome.DONE and self.error_mm <= 1.0
+        return self.outcome is Outcome.DONE and self.error_mm <= TARGET_RADIUS_MM
+
+    @property
+    def hit(self) -> bool:
+        """Whether the outcome is done and the target is inside the needle: see `is_hit`."""
+        return self.outcome is Outcome.DONE and is_hit(self.error_mm, self.scenario or self.plan.scenario)
 
     @property
     def summary(self) -> str:
@@ -280,18 +299,41 @@ class Insertion:
     @property
     def _ending(self) -> str:
         if self.outcome is not Outcome.DONE:
-            after = f"{self.outcome} after {len(self.periods)} periods"
+            after = f"{self.outcome}{self._depth} after {len(self.periods)} periods"
             return f"{after}: {self.reason}" if self.reason else after
         if math.isnan(self.error_mm):
             return "done: neither the true tip nor a reading of it is known"
         by = "" if self._has_truth else " by the tracker"
+        ended = f"the tip ended {format_mm(self.error_mm)} from the target{by}"
         if self.reached:
-            return f"reached: the tip ended {self.error_mm:.3f} mm from the target{by}"
-        return f"MISSED: the tip ended {self.error_mm:.3f} mm from the target{by}, more than 1 mm"
+            return f"{'reached' if self.hit else 'done'}: {ended}"
+        return f"MISSED: {ended}, more than {TARGET_RADIUS_MM:g} mm"
+
+    @property
+    def _depth(self) -> str:
+        """Estimated depth of the tip at the end, "" without a period."""
+        if not self.periods:
+            return ""
+        depth = self.periods[-1].estimate.x
+        return f" {depth:.1f} mm deep" if depth >= 0.0 else f" {-depth:.1f} mm before the skin"
 
     def __repr__(self) -> str:
         to = f"to {_mm(self.target)}, {len(self.periods)} periods, seed {self.seed}"
         return f"<Insertion {to}{self.controller and f', {self.controller}'}; {self.summary}>"
+
+
+def format_mm(distance: float) -> str:
+    """Return the distance of a tip (mm) as text, rounded alike in every message."""
+    return f"{distance:.3f} mm"
+
+
+def is_hit(error_mm: float, scenario: Scenario | None) -> bool:
+    """Return whether a target is inside the needle, not only near it.
+
+    The distance from the tip must be at most half the needle's outer diameter, and at most 1 mm.
+    """
+    diameter = _THIN_MM if scenario is None else scenario.needle.outer_diameter
+    return error_mm <= min(0.5 * diameter, TARGET_RADIUS_MM)
 
 
 def scenario_of(record: Plan | Insertion) -> Scenario:

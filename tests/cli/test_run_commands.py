@@ -134,7 +134,7 @@ def test_a_target_in_space_has_two_lateral_offsets_and_two_entry_angles(engine, 
     ("options", "line", "status"),
     [
         ({"miss": 1.4}, "MISSED: the tip ended 1.410 mm from the target, more than 1 mm", "done"),
-        ({"outcome": "held"}, "Held after 23 periods: no sample for 1.00 s", "held"),
+        ({"outcome": "held"}, "Held 40.0 mm deep after 23 periods: no sample for 1.00 s", "held"),
     ],
 )
 def test_an_insertion_that_does_not_reach_its_target_fails(engine, capsys, options, line, status):
@@ -217,7 +217,8 @@ def test_ctrl_c_keeps_and_marks_the_record(engine, capsys, monkeypatch):
     engine(stop=(12, interrupt))
     status, out, err = run(capsys, "insert", "--json", "--out", "here")
     assert (status, out) == (130, "")
-    assert err.splitlines()[-1] == "flexneedle: interrupted; record: here"
+    summary = "interrupted 7.5 mm deep after 12 periods: stopped by the user"
+    assert err.splitlines()[-1] == f"flexneedle: {summary}; record: here"
     assert (read("here")["status"], read("here")["result"]["steps"]) == ("interrupted", 12)
     assert names(Path("here")) == INSERTION_FILES
     monkeypatch.setattr("flexneedle.record.recording.make_plan", interrupt)

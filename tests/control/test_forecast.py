@@ -63,7 +63,7 @@ def test_the_needle_is_held_from_the_confidence_on(side, sd):
     bound = LIMIT + SURE * sd
     assert reason_to_hold(predicting(side * (bound - 1e-6), sd), CONTROL) == ""
     held = reason_to_hold(predicting(side * (bound + 1e-6), sd), CONTROL)
-    assert f"{side * bound:+.2f} ± {sd:.2f} mm" in held
+    assert f"{side * bound:+.3f} ± {sd:.3f} mm" in held
     assert "control.miss_limit_mm = 2 " in held
     assert "0.95" in held
     assert "--force" in held
@@ -92,7 +92,7 @@ def test_several_likely_misses_in_a_row_make_a_warning():
     lines = warned([bad] * 5)
     first = next(k for k, line in enumerate(lines) if line)
     assert first > 0
-    assert all("+3.00 ± 0.50 mm" in line for line in lines[first:])
+    assert all("+3.000 ± 0.500 mm" in line for line in lines[first:])
     assert warned(([bad] * first + [good]) * 4) == [""] * (4 * (first + 1))
 
 
@@ -117,7 +117,7 @@ def test_a_miss_that_holds_also_counts_towards_a_warning(miss, sd):
 
 @pytest.mark.parametrize(
     ("true", "estimated", "shown"),
-    [(1.1, 0.3, "1.10 mm"), (0.9, 1.3, ""), (math.nan, 2.5, "2.50 mm"), (math.nan, 0.9, "")],
+    [(1.1, 0.3, "1.100 mm"), (0.9, 1.3, ""), (math.nan, 2.5, "2.500 mm"), (math.nan, 0.9, "")],
 )
 def test_an_end_beyond_a_millimetre_of_the_target_is_a_miss(true, estimated, shown):
     """The true tip counts where it is known."""

@@ -14,7 +14,7 @@ from matplotlib.text import Text
 from drawn import axes, lines, names, overlapping, texts, unarranged
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
-from flexneedle.figures.style import save
+from flexneedle.figures.style import BAD, INK, TARGET, save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import ROLL, THETA
@@ -146,9 +146,12 @@ def test_an_unfinished_insertion_is_drawn_up_to_its_end(case):
     [
         ("reached", "reached: the tip ended 0.070 mm from the target"),
         ("missed", "MISSED: the tip ended 1.410 mm from the target, more than 1 mm"),
-        ("interrupted", "interrupted after 40 periods: stopped by the user"),
-        ("without truth", "held after 69 periods: held for 1.00 s"),
-        ("held from the start", f"held after 20 periods: held for 10.00 s (limit 10 s): {DISTORTED}"),
+        ("interrupted", "interrupted 11.5 mm deep after 40 periods: stopped by the user"),
+        ("without truth", "held 40.0 mm deep after 69 periods: held for 1.00 s"),
+        (
+            "held from the start",
+            f"held 27.5 mm before the skin after 20 periods: held for 10.00 s (limit 10 s): {DISTORTED}",
+        ),
     ],
 )
 def test_the_verdict_is_given_in_full(case, verdict):
@@ -384,3 +387,19 @@ def test_a_saved_figure_has_rounded_positions(saved):
     found = np.array([ax.get_position(original=True).get_points() for ax in figure.axes])
     np.testing.assert_array_equal(found, np.round(found, 6))
     assert len(np.unique(found)) > 10
+
+
+@pytest.mark.parametrize(("off", "color"), [(0.01, TARGET), (0.9, INK), (1.1, BAD)])
+def test_only_a_plan_within_the_needle_has_a_green_title(off, color):
+    x, y, z = PLANS[0].tip_mm
+    figure = plan_figure(PHANTOM, [replace(PLANS[0], target=(x, y, z + off), scenario=PHANTOM)])
+    (title,) = figure.findobj(lambda part: isinstance(part, Text) and "manipulation:" in part.get_text())
+    assert title.get_color() == color
+
+
+def test_an_insertion_shows_the_name_of_a_custom_controller():
+    own = replace(INSERTION, controller="mypid:METHOD", controller_name="my-pid", phantom="own:Gel")
+    shown = " ".join(texts(insertion_figure(PHANTOM, own)))
+    assert "my-pid" in shown
+    assert "Gel phantom" in shown
+    assert not {"mypid:", "own:"} & set(shown.replace(":", ": ").split())

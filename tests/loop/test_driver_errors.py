@@ -44,7 +44,10 @@ def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, par
     assert len(done.periods) == kept
     expected = first_periods(kept, plan, RecordedPhantom(plan.roll).rig())
     assert [facts(period) for period in done.periods] == [facts(period) for period in expected]
-    assert done.summary == f"failed after {kept} periods: {LOST}"
+    assert (
+        done.summary
+        == f"failed {-done.periods[-1].estimate.x:.1f} mm before the skin after {kept} periods: {LOST}"
+    )
     assert not done.reached
 
 

@@ -35,7 +35,7 @@ def missing_by(plan, miss):
 def test_a_plan_that_misses_by_more_than_a_millimetre_is_rejected_unless_forced(plan):
     recorded = RecordedPhantom(plan.roll)
     with pytest.raises(
-        RunError, match=r"misses the target by 1\.01 mm .*limited by setup\.max_guide_step_mm"
+        RunError, match=r"misses the target by 1\.010 mm .*limited by setup\.max_guide_step_mm"
     ):
         run(missing_by(plan, 1.01), recorded.rig(), controller="open-loop")
     assert recorded.moves == []
@@ -121,7 +121,7 @@ def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
     done = run(of_any_scenario(plan), recorded.rig(), short)
     assert sum(command.db_x for _, command in recorded.moves) == pytest.approx(40.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate.x
-    assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
+    assert done.reason.startswith(f"stroke ends {left:.3f} mm before the target depth; missed the target by ")
     assert not done.reached
 
 

@@ -93,7 +93,7 @@ def test_a_command_within_the_limits_is_not_refused(plan):
         ({"guide_force_n": 0.05}, r"guard: guide force 0\.\d+ N > 0\.05 N", Control(dg_y=-0.5)),
         ({"needle_strain_percent": 0.01}, r"guard: needle strain 0\.\d{3} % > 0\.01 %", Control(dg_y=-0.5)),
         ({"least_stretch": 0.99}, r"guard: tissue stretch 0\.\d{3} < 0\.990", Control(dg_y=-0.5)),
-        ({"past_target_mm": 0.1}, r"guard: tip \d\.\d\d mm past the target > 0\.1 mm", Control(db_x=-1.0)),
+        ({"past_target_mm": 0.1}, r"guard: tip \d\.\d{3} mm past the target > 0\.1 mm", Control(db_x=-1.0)),
     ],
 )
 def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, back):

@@ -97,11 +97,11 @@ def test_beyond_the_hull_the_range_is_named_and_beyond_the_disc_the_bevel():
         for off in (0.3 * reach() + 0j, 0.8j * reach(), 2.0 * reach() + 0j)
     )
     assert near.startswith("setup.max_rotation_deg = 60")
-    assert f"{0.5 * reach():.2f} to {reach():.2f} mm" in near
+    assert f"{0.5 * reach():.3f} to {reach():.3f} mm" in near
     assert side.startswith("setup.max_rotation_deg = 60")
     assert "nothing" in side
     assert far.startswith(f"needle.bevel.offset_mm = {SPACE.needle.bevel.offset_mm:g}")
-    assert f"at most {reach():.2f} mm" in far
+    assert f"at most {reach():.3f} mm" in far
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_a_range_that_keeps_the_bevel_from_z_is_named():
     plan = flexneedle.plan(scenario, (40.0, 1.0, 1.6), MOVE, threads=1)
     assert plan.error_mm > 1.0
     assert plan.limit.startswith("setup.max_rotation_deg = 10")
-    assert "0.31 mm" in plan.limit
+    assert "0.312 mm" in plan.limit
 
 
 @pytest.mark.parametrize(

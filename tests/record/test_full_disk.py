@@ -84,7 +84,9 @@ def test_a_run_whose_end_cannot_be_written_is_shown_as_one_without_an_end(tmp_pa
         loaded = flexneedle.load(folder)
     made = read_trace(folder / "trace.mcap").periods
     assert (loaded.outcome, loaded.reason, len(loaded.periods)) == (Outcome.INTERRUPTED, reason, len(made))
-    assert loaded.summary == f"interrupted after {len(made)} periods: {reason}"
+    assert (
+        loaded.summary == f"interrupted {made[-1].estimate.x:.1f} mm deep after {len(made)} periods: {reason}"
+    )
 
 
 @pytest.mark.usefixtures("empty_figures")

@@ -42,12 +42,43 @@ UNKNOWN_TIP = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Ou
         ),
         (make_insertion(), "reached: the tip ended 0.070 mm from the target"),
         (make_insertion(miss=1.0), "MISSED: the tip ended 1.010 mm from the target, more than 1 mm"),
-        (make_insertion(outcome="held", reason="no sample", periods=3), "held after 3 periods: no sample"),
+        (
+            make_insertion(outcome="held", reason="no sample", periods=3),
+            "held 25.5 mm before the skin after 3 periods: no sample",
+        ),
         (UNKNOWN_TIP, "done: neither the true tip nor a reading of it is known"),
     ],
 )
 def test_the_summary_is_one_line(record, summary):
     assert record.summary == summary
+
+
+@pytest.mark.parametrize(
+    ("diameter", "miss", "words"),
+    [
+        (0.819, 0.4, "reaches the target to 0.400 mm"),
+        (0.819, 0.42, "ends 0.420 mm from the target"),
+        (0.819, 0.9, "ends 0.900 mm from the target"),
+        (0.3, 0.2, "ends 0.200 mm from the target"),
+        (3.0, 0.99, "reaches the target to 0.990 mm"),
+        (3.0, 1.2, "MISSES the target: best distance 1.200 mm, more than 1 mm"),
+    ],
+)
+def test_a_target_is_reached_only_within_the_needle(diameter, miss, words):
+    needle = {"needle.outer_diameter_mm": diameter, "needle.inner_diameter_mm": 0.5 * diameter}
+    scenario = flexneedle.load_scenario("phantom").with_values(needle)
+    x, y, z = PLAN.tip_mm
+    plan = replace(PLAN, target=(x, y, z + miss), scenario=scenario)
+    assert plan.summary == words
+    assert (plan.hit, plan.reached) == (words.startswith("reaches"), miss < 1.0)
+    insertion = replace(make_insertion(miss=miss - 0.01), scenario=scenario)
+    assert insertion.hit == plan.hit
+    assert insertion.summary.startswith("reached" if plan.hit else "done" if miss < 1.0 else "MISSED")
+
+
+def test_a_plan_that_a_limit_binds_does_not_reach_its_target():
+    summary = replace(PLAN, limit="setup.stroke_mm = 60").summary
+    assert summary == "ends 0.010 mm from the target, limited by setup.stroke_mm = 60"
 
 
 def test_missing_values_are_null():

@@ -16,13 +16,11 @@ if TYPE_CHECKING:
 
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     """Print how an insertion ended and the folder of its record; return the exit status."""
-    from flexneedle.record.recording import BY_USER
     from flexneedle.record.results import insertion_result, insertion_timing
     from flexneedle.results import Outcome
 
     if insertion.outcome is Outcome.INTERRUPTED:
-        why = "" if insertion.reason == BY_USER else f": {insertion.reason}"
-        print_note(f"interrupted{why}; record: {folder}")
+        print_note(f"{insertion.summary}; record: {folder}")
         return 130
     if as_json:
         result, timing = insertion_result(insertion), insertion_timing(insertion)
@@ -39,7 +37,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
 
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
-        ("controller", insertion.controller),
+        ("controller", insertion.controller_name or insertion.controller),
         _needle(insertion),
         target_row(scenario, insertion.target),
         *entry_rows(scenario, insertion.plan),

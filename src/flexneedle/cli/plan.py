@@ -80,10 +80,12 @@ def _report(scenario: Scenario, plans: dict[str, Plan], as_json: bool, folder: P
 
 
 def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
+    from flexneedle.results import format_mm
+
     angles = ", ".join(f"{degrees(angle):+.2f}°" for angle in plan.entry_angles[: scenario.setup.axes])
     return {
         **dict([target_row(scenario, plan.target), *entry_rows(scenario, plan)]),
-        "planned tip to target": f"{plan.error_mm:.3f} mm",
+        "planned tip to target": format_mm(plan.error_mm),
         f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
         scenario.setup.turns: str(plan.flips),
         "strain energy of the tissue": f"{plan.strain_energy[-1]:.3f} mJ",

@@ -6,9 +6,9 @@ import math
 from scipy.special import chndtr
 
 from flexneedle.control.interface import Decision
+from flexneedle.results import TARGET_RADIUS_MM, format_mm
 from flexneedle.scenario.sections.settings import ControlSettings
 
-_RADIUS_MM = 1.0  # radius of the paper's target circles: an insertion that ends outside has missed
 _LIKELY = 0.5  # probability of a miss from which a decision counts towards a warning
 _IN_A_ROW = 3  # such decisions make one: a single prediction, right after the skin for example, may be wrong
 
@@ -28,9 +28,9 @@ def probability_beyond(limit: float, miss: float | complex, sd: float) -> float:
     return 0.5 * (math.erfc((limit - miss) / scale) + math.erfc((limit + miss) / scale))
 
 
-def format_miss(miss: float | complex, digits: int = 3) -> str:
+def format_miss(miss: float | complex) -> str:
     """Return a miss (mm) as text: with its sign in the plane, its size in space."""
-    return f"{abs(miss):.{digits}f}" if isinstance(miss, complex) else f"{miss:+.{digits}f}"
+    return f"{abs(miss):.3f}" if isinstance(miss, complex) else f"{miss:+.3f}"
 
 
 def reason_to_hold(decision: Decision, control: ControlSettings) -> str:
@@ -53,7 +53,7 @@ def count_likely_misses(decision: Decision, before: int) -> int:
 
     before: the number before this decision.
     """
-    probability = probability_beyond(_RADIUS_MM, decision.miss, decision.miss_sd)
+    probability = probability_beyond(TARGET_RADIUS_MM, decision.miss, decision.miss_sd)
     return before + 1 if probability >= _LIKELY else 0
 
 
@@ -61,11 +61,11 @@ def warn_of_miss(decision: Decision, in_a_row: int) -> str:
     """Return a warning after enough successive decisions that predict a miss of more than 1 mm, else ""."""
     if in_a_row < _IN_A_ROW or cmath.isnan(decision.miss):
         return ""
-    return f"predicted miss {_format_prediction(decision)}: likely beyond {_RADIUS_MM:g} mm"
+    return f"predicted miss {_format_prediction(decision)}: likely beyond {TARGET_RADIUS_MM:g} mm"
 
 
 def _format_prediction(decision: Decision) -> str:
-    return f"{format_miss(decision.miss, 2)} ± {decision.miss_sd:.2f} mm"
+    return f"{format_miss(decision.miss)} ± {format_mm(decision.miss_sd)}"
 
 
 def describe_miss(true: float, estimated: float) -> str:
@@ -74,5 +74,9 @@ def describe_miss(true: float, estimated: float) -> str:
     true, estimated: distances of the true and the estimated tip (mm), true NaN if unknown.
     """
     if not math.isnan(true):
-        return f"missed the target by {true:.2f} mm" if true > _RADIUS_MM else ""
-    return f"the estimated tip ended {estimated:.2f} mm from the target" if estimated > _RADIUS_MM else ""
+        return f"missed the target by {format_mm(true)}" if true > TARGET_RADIUS_MM else ""
+    return (
+        f"the estimated tip ended {format_mm(estimated)} from the target"
+        if estimated > TARGET_RADIUS_MM
+        else ""
+    )

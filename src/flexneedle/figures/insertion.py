@@ -16,8 +16,8 @@ from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import COLUMNS, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, apply_style, tone
-from flexneedle.results import Insertion
+from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TRUE, apply_style, tone
+from flexneedle.results import Insertion, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, X
 
@@ -37,7 +37,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         for ax, view in zip(scenes, sections.values(), strict=True):
             _scene(ax, scenario, insertion, view)
         verdict = fill(insertion.summary, _LINES[scenario.setup.axes])
-        scene.name_scenes(scenes, verdict, TARGET if insertion.reached else BAD)
+        scene.name_scenes(scenes, verdict, scene.color_of(insertion))
         if scenario.setup.axes == 2:
             _along(axes["along"], scenario, insertion)
         draw_depths([axes[name] for name in shown], scenario, list(shown.values()))
@@ -220,11 +220,11 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
     ax.set(aspect="equal", anchor="N")
     seen = "" if scenario.setup.axes == 1 else f" in x–{'xyz'[up]}"
     whole = f"The end{seen}, magnified (mm)"
-    ax.set_title(whole if near else f"The tip{seen}, {distance:.1f} mm from the target")
+    ax.set_title(whole if near else f"The tip{seen}, {format_mm(distance)} off")
     scene.tint_layers(ax, scenario)
     _paths(ax, insertion, view, scale=1.6)
     scene.draw_target(ax, target, view)
-    if near and not insertion.reached:
+    if near and not insertion.hit:
         miss = np.array([tip, target])[:, view]
         ax.plot(*miss.T, color=BAD, linewidth=1.0, zorder=6, label="miss")
     end: dict[str, Any] = {"color": TRUE, "markersize": 6, "markeredgecolor": "white", "zorder": 9}
@@ -243,7 +243,11 @@ def _known_path(insertion: Insertion) -> Floats:
 def _facts(scenario: Scenario, insertion: Insertion) -> list[str]:
     """Return errors, bevel flips or rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
-    errors = [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
+    errors = [f"{name} {format_mm(value)}" for name, value in values if not np.isnan(value)]
     flips = f"{scenario.setup.turns}: {insertion.flips} (planned {insertion.plan.flips})"
-    phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
-    return [*errors, flips, ", ".join(filter(None, (insertion.controller, phantom)))]
+    phantom = f"{insertion.phantom.rpartition(':')[2]} phantom" if insertion.phantom else ""
+    return [
+        *errors,
+        flips,
+        ", ".join(filter(None, (insertion.controller_name or insertion.controller, phantom))),
+    ]

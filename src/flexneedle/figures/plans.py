@@ -13,7 +13,7 @@ from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, INK, STRATEGIES, TARGET, apply_style, format_signed, tone
+from flexneedle.figures.style import INK, STRATEGIES, apply_style, format_signed, tone
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import X, Y
@@ -36,7 +36,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
                 scene.draw_tissue(ax, scenario, known, view)
                 _draw_plan(ax, scenario, plan, color, view)
             title = fill(_result(scenario, plan), _LINES[scenario.setup.axes])
-            scene.name_scenes(drawn, title, TARGET if plan.reached else BAD, 9.5)
+            scene.name_scenes(drawn, title, scene.color_of(plan), 9.5)
             scenes += drawn
             if scenario.setup.axes == 2:
                 _draw_along(axes[f"{plan.strategy} along"], scenario, plan)

@@ -12,7 +12,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
-from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, format_signed
+from flexneedle.figures.style import BAD, GUIDE, INK, NEEDLE, QUIET, TARGET, format_signed
+from flexneedle.results import TARGET_RADIUS_MM, Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.types import THETA, Floats, Point, X, Y, Z
@@ -49,6 +50,11 @@ def name_scenes(scenes: Sequence[Axes], title: str, color: str, size: float = 10
     for ax in scenes[:-1]:
         ax.tick_params(labelbottom=False)
         ax.set_xlabel("")
+
+
+def color_of(record: Plan | Insertion) -> str:
+    """Return the color of a verdict: green for a hit, red beyond 1 mm, neutral between."""
+    return TARGET if record.hit else INK if record.reached else BAD
 
 
 def place(scenario: Scenario, target: Point) -> str:
@@ -151,9 +157,9 @@ def draw_needle(
 
 
 def draw_target(ax: Axes, target: Point, view: View = SIDE) -> None:
-    """Draw the target with the circle of 1 mm within which it counts as reached."""
+    """Draw the target with the circle of 1 mm outside of which it counts as missed."""
     centre = target[view[0]], target[view[1]]
-    circle = Circle(centre, 1.0, facecolor="none", edgecolor=TARGET, linewidth=1.4, zorder=6)
+    circle = Circle(centre, TARGET_RADIUS_MM, facecolor="none", edgecolor=TARGET, linewidth=1.4, zorder=6)
     circle.set_gid("target")
     ax.add_patch(circle)
     cross: dict[str, Any] = {"marker": "+", "markersize": 6, "markeredgewidth": 1.2, "linestyle": "none"}

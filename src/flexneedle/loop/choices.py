@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexneedle.arguments import check_instance, check_whole
-from flexneedle.control.controllers import DEFAULT, find_controller
+from flexneedle.control.controllers import CONTROLLERS, DEFAULT, find_controller
 from flexneedle.control.interface import Controller
 from flexneedle.loop.rig import RigSource
 from flexneedle.loop.virtual import VirtualRig
@@ -40,4 +40,6 @@ class Choices:
     @property
     def parts(self) -> dict[str, Any]:
         """Fields of `Insertion` that name controller, phantom, tracker and rig."""
-        return {"controller": self.name, **self.rig.names}
+        own = self.controller.name
+        shown = self.name if own in CONTROLLERS else own  # another one's name would mislead
+        return {"controller": self.name, "controller_name": shown, **self.rig.names}

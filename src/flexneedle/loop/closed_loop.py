@@ -23,7 +23,7 @@ from flexneedle.loop.monitor.monitor import Monitor
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.step import Steering, Step
 from flexneedle.ports import Driver
-from flexneedle.results import Action, Insertion, Outcome, Period, Plan
+from flexneedle.results import Action, Insertion, Outcome, Period, Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import ROUNDING_S, travel_time
 from flexneedle.types import STILL, UNKNOWN, Control, Lateral, Motion, Pose, X
@@ -187,7 +187,7 @@ def _ending(task: Task, state: LoopState) -> _Ending | None:
         return _hold_ending(task.scenario, state)
     short = task.plan.target[0] - float(estimate.tip[X])
     if short > task.scenario.control.depth_tolerance_mm and is_at_depth(task, None, estimate):
-        return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
+        return Outcome.DONE, f"stroke ends {format_mm(short)} before the target depth"
     return Outcome.DONE, ""
 
 

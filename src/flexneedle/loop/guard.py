@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.estimation.estimate import Estimate, carry_out
-from flexneedle.results import Plan
+from flexneedle.results import Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.state import State
@@ -73,7 +73,7 @@ class Guard:
         force = math.hypot(*state.reactions.guide_force)
         yield Excess(force - self.force, f"guide force {force:.3g} N > {self.force:.3g} N")
         past = float(state.tip[X]) - self.depth
-        yield Excess(past - self.past, f"tip {past:.2f} mm past the target > {self.past:g} mm")
+        yield Excess(past - self.past, f"tip {format_mm(past)} past the target > {self.past:g} mm")
 
     def _compression_excess(self, state: State) -> Excess:
         """Return the excess of the contact that is farthest beyond the limit of its law."""

@@ -19,7 +19,7 @@ from flexneedle.loop.step import Steering
 from flexneedle.loop.virtual import Seeds
 from flexneedle.planning.events import Listener
 from flexneedle.planning.origin import check_origin, with_planned_entry
-from flexneedle.results import Insertion, Plan
+from flexneedle.results import TARGET_RADIUS_MM, Insertion, Plan, format_mm
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
@@ -88,7 +88,7 @@ def carry_out(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) 
     steering = prepare(scenario, plan, choices, stream)
     with choices.rig.open(scenario, plan, choices.seed, stream) as ports:
         insertion = run(steering, ports)
-    insertion = replace(insertion, **choices.rig.names, **choices.rig.results())
+    insertion = replace(insertion, **choices.parts, **choices.rig.results())
     reason = "; ".join(filter(None, (insertion.reason, choices.rig.explain(insertion))))
     insertion = replace(insertion, reason=reason)
     stream.send(Ended(insertion))
@@ -102,8 +102,8 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
     check_choices(scenario, plan.strategy, choices)
     if not (plan.reached or choices.force or chosen.predicts):
         raise RunError(
-            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
-            "to insert anyway: flexneedle insert --force (force=True)"
+            f"plan misses the target by {format_mm(plan.error_mm)} (limit {TARGET_RADIUS_MM:g} mm), "
+            f"limited by {plan.limit}; to insert anyway: flexneedle insert --force (force=True)"
         )
     task = controller_tables.make_task(
         chosen, Simulator(with_controller_defaults(scenario, chosen), choices.threads), plan

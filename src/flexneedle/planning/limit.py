@@ -8,6 +8,7 @@ from flexneedle.costs.terms import PLAN
 from flexneedle.costs.weighted_sum import RolloutFunction
 from flexneedle.planning.problem import LATERAL, PlanProblem
 from flexneedle.planning.steering import radius, reach
+from flexneedle.results import TARGET_RADIUS_MM, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.simulator.state import State
@@ -32,11 +33,11 @@ def find_limit(
     missed = not problem.narrow or off > _REACHED_MM
     if problem.bevel_alone and missed and (beyond := _limit_of_bevel(scenario, problem, rollout)):
         return beyond
-    if off <= 1.0:
+    if off <= TARGET_RADIUS_MM:
         return ""
     if (
         setup.axes == 2
-        and abs(end[Z] - problem.target[2]) > 1.0
+        and abs(end[Z] - problem.target[2]) > TARGET_RADIUS_MM
         and (key := _limit_along_z(setup, problem, rollout))
     ):
         return key
@@ -61,16 +62,18 @@ def _limit_of_bevel(scenario: Scenario, problem: PlanProblem, rollout: RolloutFu
     least, greatest = reach(rollout, problem)
     if least <= problem.lateral <= greatest:
         return ""
-    from_axis = f" from the needle's axis, the target is at {problem.lateral:.2f} mm" if problem.axis else ""
+    from_axis = (
+        f" from the needle's axis, the target is at {format_mm(problem.lateral)}" if problem.axis else ""
+    )
     anywhere = " in any direction" if problem.axes == 2 and not problem.half_turns else ""
-    why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral{anywhere}{from_axis}"
+    why = f"the bevel alone reaches {least:.3f} to {format_mm(greatest)} lateral{anywhere}{from_axis}"
     if problem.narrow:
         size, most = radius(rollout, problem), scenario.setup.max_rotation_deg
         if problem.lateral <= size:
-            there = f"{least:.2f} to {greatest:.2f} mm" if least <= greatest else "nothing"
-            line = f"on the line from the needle's axis to the target at {problem.lateral:.2f} mm"
+            there = f"{least:.3f} to {format_mm(greatest)}" if least <= greatest else "nothing"
+            line = f"on the line from the needle's axis to the target at {format_mm(problem.lateral)}"
             return f"setup.max_rotation_deg = {most:g} ({line} the bevel alone reaches {there})"
-        why = f"the bevel alone reaches at most {size:.2f} mm lateral{from_axis}"
+        why = f"the bevel alone reaches at most {format_mm(size)} lateral{from_axis}"
     return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
 
 
@@ -86,7 +89,7 @@ def _limit_along_z(setup: Setup, problem: PlanProblem, rollout: RolloutFunction)
     most = size * math.sin(min(problem.rotation, 0.5 * math.pi))
     if problem.bevel_alone or abs(problem.across.imag) <= most:
         return ""
-    why = f"along z only the bevel steers, by up to {most:.2f} mm"
+    why = f"along z only the bevel steers, by up to {format_mm(most)}"
     limited = problem.narrow and abs(problem.across.imag) <= size
     key = f"max_rotation_deg = {setup.max_rotation_deg:g}" if limited else "guide_axes = 1"
     return f"setup.{key} ({why})"

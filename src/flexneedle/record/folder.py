@@ -1,9 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and plans;
-for an insertion also controller, phantom, tracker, rig, dry_run and disturbed. A plan that chose where the needle
-enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All except `timing`, the
-date and the wall-clock times, is the same for the same seed.
+for an insertion also controller, controller_name, phantom, tracker, rig, dry_run and disturbed. A plan that chose where
+the needle enters has its own section `entry`; the scenario of an insertion has the entry of its plan. All except
+`timing`, the date and the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -54,6 +54,7 @@ class RunFile:
     rig: str = ""
     dry_run: bool = False
     disturbed: str = ""
+    controller_name: str = ""
 
 
 @dataclass(eq=False)
@@ -169,7 +170,8 @@ def _check_run(path: Path, values: Any) -> RunFile:
         read = values["plans"].items()
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
         named |= {
-            name: values.get(name, "") for name in ("controller", "phantom", "tracker", "rig", "disturbed")
+            name: values.get(name, "")
+            for name in ("controller", "controller_name", "phantom", "tracker", "rig", "disturbed")
         }
         named["dry_run"] = values.get("dry_run", False) is True
         scenario = Scenario.from_values(values["scenario"])

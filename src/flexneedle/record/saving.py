@@ -15,7 +15,7 @@ from flexneedle.record.writer import TraceWriter
 from flexneedle.results import Insertion, Plan, scenario_of
 from flexneedle.scenario.model import Scenario
 
-PARTS = ("controller", "phantom", "tracker", "rig", "dry_run", "disturbed")
+PARTS = ("controller", "controller_name", "phantom", "tracker", "rig", "dry_run", "disturbed")
 """Fields of `Insertion` that name its parts, in `run.json` and `trace.mcap`."""
 
 

@@ -68,7 +68,10 @@ def test_a_run_is_named_by_its_folder_and_two_are_compared(capsys, in_tmp, monke
 def test_a_held_insertion_and_an_incomplete_trace_are_replayed(capsys, in_tmp):
     change("one", status="held", reason="no sample for 1.00 s")
     shown = replay(capsys, "one")[1][0]
-    assert (shown["state"], shown["summary"]) == ("held", "held after 69 periods: no sample for 1.00 s")
+    assert (shown["state"], shown["summary"]) == (
+        "held",
+        "held 40.0 mm deep after 69 periods: no sample for 1.00 s",
+    )
     trace = in_tmp / "two/trace.mcap"
     trace.write_bytes(trace.read_bytes()[:-2000])
     status, out, err = run(capsys, "view", "two", "--html", "-")

@@ -170,6 +170,17 @@ def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp
     assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
 
 
+def test_a_leave_one_out_of_three_points_is_unknown_with_what_it_needs(tmp_path, capsys):
+    data, out = (
+        table(tmp_path, [row for row in rows() if row[0] in ("p0", "p1", "p2")]),
+        tmp_path / "rig.toml",
+    )
+    assert main(["em", "register", str(data), "--out", str(out)]) == 0
+    assert "unknown: needs four points, no three of them on a line" in capsys.readouterr().out
+    assert "nan" not in out.read_text()
+    assert register(read_pairs(data)).values()["left_out_rms_mm"] is None
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -31,6 +31,7 @@ from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Found, Variables, find_best
+from flexneedle.results import format_mm
 from flexneedle.scenario.sections.fields import NonNegative, count
 from flexneedle.scenario.sections.weights import with_weights
 from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
@@ -106,7 +107,7 @@ def decide(
     path = ahead.correct(found.z)
     command, rolled = ahead.first_command(path)
     rest, rests = _rest_time(task, memory, fitted, ahead.left)
-    why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {sd:.3f} mm"
+    why = f"{_describe_rolls(rolled, fitted.axes)}; predicted miss {format_miss(miss)} ± {format_mm(sd)}"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
     after = Memory(
         path,

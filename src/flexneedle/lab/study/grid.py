@@ -220,6 +220,7 @@ def _make_study(settings: Mapping[str, Any], base: Scenario) -> ExpandedStudy:
         "scenario": base.values(),
         "insertions": len(grid) * repeats,
         "own": digest_modules(_find_custom_names("", settings)),
+        "names": {name: find_controller(name)[1].name for name in names["controller"] if is_own(name)},
     }
     return ExpandedStudy(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 

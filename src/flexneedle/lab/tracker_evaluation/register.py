@@ -89,8 +89,9 @@ class RegistrationResult:
         )
 
     def values(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        names = self.pairs.names
+        """Return the result as plain values; `left_out_rms_mm` is None where the other points lie on a line."""
+        names, errors = self.pairs.names, self.leave_one_out
+        left_out = None if np.isnan(errors).any() else float(np.sqrt(np.mean(errors**2)))
         return {
             "points": len(names),
             "samples": int(self.pairs.samples.sum()),
@@ -101,7 +102,7 @@ class RegistrationResult:
             "fle_mm": self.fle,
             "max_residual_mm": float(self.residuals.max()),
             "worst_point": names[int(self.residuals.argmax())],
-            "left_out_rms_mm": float(np.sqrt(np.mean(self.leave_one_out**2))),
+            "left_out_rms_mm": left_out,
             "notes": list(self.notes),
             "tre": [
                 {"target_mm": target, "tre_mm": error}
@@ -160,7 +161,7 @@ def write_registration(registered: RegistrationResult, path: Path) -> None:
     _draw(registered, path)
     values = {
         "tracker": {"registration": registered.registration.model_dump(mode="json")},
-        "result": registered.values(),
+        "result": {name: value for name, value in registered.values().items() if value is not None},
     }
     try:
         with path.open("x", encoding="utf-8") as file:

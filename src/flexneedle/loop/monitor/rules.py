@@ -73,7 +73,7 @@ def check_innovation(measured: Position, predicted: Position, limit: float) -> V
     distance = math.dist(measured, predicted)
     if distance <= limit:
         return OK
-    return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:g} mm")
+    return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:.3g} mm")
 
 
 def check_out_of_plane(z: float | None, limit: float) -> Verdict:

@@ -54,6 +54,19 @@ def test_the_controllers_are_a_factor_with_the_default_first_and_draws_seeds_and
     assert described(design(rows, axes=axes)) == {"controller": (OURS, "ce-mpc", "open-loop")}
 
 
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        ({"a:PID": "pid", "b:PID": "flat"}, (OURS, "pid", "flat")),
+        ({"a:PID": "pid", "b:PID": "pid"}, (OURS, "a:PID", "b:PID")),
+        ({"a:PID": "ce-mpc", "b:PID": "pid"}, (OURS, "a:PID", "pid")),
+    ],
+)
+def test_custom_controllers_have_their_names_unless_another_has_the_same(design, names, shown):
+    rows = make_rows((OURS, *names), targets=TARGETS, repeats=1)
+    assert design(rows, names=names).controller.names == shown
+
+
 def test_a_number_that_varies_is_an_axis_in_ascending_order(along):
     (axis,) = along({"contact.spacing_mm": [2.0, 0.5, 1.0]}).axes
     assert (axis.key, axis.label) == ("contact.spacing_mm", "contact: spacing (mm)")

@@ -1,6 +1,7 @@
 """Factors of a study: controllers, cases and axes of `study.json`, with the level of each row."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -79,13 +80,21 @@ def find_design(study: StudyTables) -> StudyDesign:
     if case_axis is not None:
         axes, cases = [case_axis, *axes], _make_factor("case", [""] * len(rows))
     return StudyDesign(
-        _make_factor("controller", rows.text("controller"), first=list_controllers()),
+        _make_factor("controller", _name_controllers(study), first=list_controllers()),
         cases,
         tuple(axis for axis in axes if axis.varies),
         _make_factor(
             "guide", [""] * len(rows) if "world_rig" in keys else _read_guides(rows), first=["with a guide"]
         ),
     )
+
+
+def _name_controllers(study: StudyTables) -> list[str]:
+    """Return the name of each row's controller (n,): as module:NAME where another controller has its name."""
+    given = study.rows.text("controller")
+    names = {one: study.names.get(one, one) for one in dict.fromkeys(given)}
+    taken = Counter([*names.values(), *set(CONTROLLERS).difference(names)])
+    return [names[one] if taken[names[one]] == 1 else one for one in given]
 
 
 def list_controllers() -> list[str]:

@@ -22,12 +22,16 @@ _REQUIRED = (
 
 @dataclass(frozen=True, eq=False)
 class StudyTables:
-    """A study folder: title, cases, axes, number of insertions and command of `study.json`; rows ordered by index."""
+    """A study folder: title, cases, axes, number of insertions and command of `study.json`; rows ordered by index.
+
+    names: of controllers given as module:NAME.
+    """
 
     folder: Path
     title: str
     cases: Mapping[str, Mapping[str, Any]]
     axes: Mapping[str, Sequence[Any]]
+    names: Mapping[str, str]
     insertions: int
     command: str
     rows: InsertionRows
@@ -44,7 +48,8 @@ def read_study_folder(folder: Path) -> StudyTables:
     try:
         stored = json.loads(header.read_text(encoding="utf-8"))
         study, command = stored["study"], str(stored.get("command", ""))
-        known = study["title"], dict(study["cases"]), dict(study["axes"]), int(study["insertions"])
+        parts = (dict(part) for part in (study["cases"], study["axes"], study.get("names", {})))
+        known = study["title"], *parts, int(study["insertions"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{header}: damaged: {describe_error(error)}") from None
     return StudyTables(folder, *known, command, _read_rows(table))

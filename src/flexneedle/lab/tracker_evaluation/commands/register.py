@@ -80,7 +80,7 @@ def _table(registered: RegistrationResult, path: Path) -> None:
         ("  readings, missing", f"{values['samples']}, {values['missing']}"),
         ("residual (FRE), RMS", f"{values['fre_mm']:.3f} mm"),
         ("  largest", f"{values['max_residual_mm']:.3f} mm, point {values['worst_point']}"),
-        ("  leave-one-out, RMS", f"{values['left_out_rms_mm']:.3f} mm"),
+        ("  leave-one-out, RMS", _left_out(values["left_out_rms_mm"])),
         ("error of a fiducial (FLE), RMS", f"{values['fle_mm']:.3f} mm"),
     ]
     for target in values["tre"]:
@@ -93,3 +93,10 @@ def _table(registered: RegistrationResult, path: Path) -> None:
     for note in registered.notes:
         print_line(f"note: {note}")
     print(f"Record and figures: {path}")
+
+
+def _left_out(error: float | None) -> str:
+    """Return the leave-one-out error as text, or what it needs."""
+    return (
+        f"{error:.3f} mm" if error is not None else "unknown: needs four points, no three of them on a line"
+    )
