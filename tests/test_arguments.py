@@ -1,13 +1,15 @@
 """An invalid argument is one line with value, rule and remedy, in all public functions."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.arguments import check_point, check_whole
+from flexneedle.arguments import check_point, check_whole, expand_home
+from flexneedle.cli.main import main
 from flexneedle.errors import FlexneedleError, InputError
 from flexneedle.loop.virtual import Seeds, virtual_rig
 from flexneedle.scenario.files import dump_scenario
@@ -125,3 +127,41 @@ def test_insert_executes_a_plan_on_the_ports_of_any_rig():
     same = flexneedle.insert("phantom", replace(plan, scenario=None), 4, **options)
     assert [period.true_tip for period in done.periods] == [period.true_tip for period in same.periods]
     assert (done.phantom, done.tracker, same.phantom, same.tracker) == ("", "", "exact", "scenario")
+
+
+@pytest.mark.parametrize(
+    ("given", "home", "expected"),
+    [
+        ("~/x", "/home/me", "/home/me/x"),
+        ("~", "/home/me", "/home/me"),
+        ("~nobody_here/x", "/home/me", "~nobody_here/x"),
+        ("x/~/y", "/home/me", "x/~/y"),
+        ("x", None, "x"),
+    ],
+)
+def test_the_home_in_a_path_is_expanded(given, home, expected, monkeypatch):
+    monkeypatch.setenv("HOME", home) if home else monkeypatch.delenv("HOME", raising=False)
+    assert str(expand_home(given)) == str(expand_home(Path(given))) == expected
+
+
+def test_a_home_that_is_not_known_is_refused_in_one_line(monkeypatch):
+    def no_entry(_uid):
+        raise KeyError
+
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr("pwd.getpwuid", no_entry)
+    with pytest.raises(InputError, match=r"^~/x: no home folder is known: give the whole path$"):
+        expand_home("~/x")
+
+
+def test_records_and_commands_take_the_home(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    plan = replace(PLAN, scenario=PHANTOM)
+    assert flexneedle.save(plan, "~/one") == tmp_path / "one"
+    assert flexneedle.load("~/one").target == plan.target
+    (tmp_path / "mine.toml").write_text(dump_scenario(PHANTOM))
+    assert flexneedle.load_scenario("~/mine.toml") == PHANTOM
+    for command in (["view", "~/one"], ["scenario", "check", "~/mine.toml"]):
+        assert main(command) == 0, capsys.readouterr().err
+    assert not (tmp_path / "~").exists()

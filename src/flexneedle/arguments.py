@@ -1,5 +1,6 @@
 """Checks of arguments. The error of an invalid argument is one line with value, rule and remedy."""
 
+import os
 import reprlib
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -96,7 +97,16 @@ def check_path(name: str, value: Any) -> Path:
     """Return the path of a file or folder. Raises InputError unless the value is a text or a path."""
     if not isinstance(value, str | PathLike):
         raise make_refusal(name, value, "must be a path")
-    return Path(value)
+    return expand_home(value)
+
+
+def expand_home(path: str | PathLike[str]) -> Path:
+    """Return a path with `~` and `~user` replaced by the home. Raises InputError for `~` where there is no home."""
+    given = Path(path)
+    whole = Path(os.path.expanduser(given))  # noqa: PTH111  pathlib's raises for a file called ~name
+    if whole.parts[:1] == ("~",):
+        raise InputError(f"{given}: no home folder is known: give the whole path")
+    return whole
 
 
 def shorten(value: object) -> str:

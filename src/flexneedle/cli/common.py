@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import seed
 from flexneedle.planning import STRATEGIES
@@ -60,7 +61,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_seed(parser, "random seed")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<date>-<scenario>-<seed>)"
+        "--out",
+        type=expand_home,
+        metavar="DIR",
+        help="folder of the run (default: runs/<date>-<scenario>-<seed>)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 

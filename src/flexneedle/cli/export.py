@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_note
 from flexneedle.errors import InputError
@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
         "flexneedle export runs/mine --readings - | head",
         notes=_COLUMN_HELP,
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
+    parser.add_argument("run", metavar="RUN", type=expand_home, help="folder of the run")
     what = parser.add_mutually_exclusive_group(required=True)
     for option, rows, default in (
         ("--csv", "control periods", _PERIODS),
@@ -72,7 +72,7 @@ def _export(args: argparse.Namespace) -> int:
     if name == _STDOUT:
         write(sys.stdout, insertion)
         return 0
-    path = Path(name) if name else args.run / default
+    path = expand_home(name) if name else args.run / default
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
             write(file, insertion)

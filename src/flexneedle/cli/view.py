@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_note
 
@@ -19,7 +19,9 @@ def add_parser(commands: Commands) -> None:
         "flexneedle view runs/mine --html",
         "flexneedle view runs/accuracy --row 17",
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run, or of a study with --row")
+    parser.add_argument(
+        "run", metavar="RUN", type=expand_home, help="folder of the run, or of a study with --row"
+    )
 
 
 def draw(args: argparse.Namespace) -> int:

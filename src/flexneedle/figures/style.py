@@ -1,8 +1,12 @@
 """Style and saving of all figures: the same bytes for the same data, whatever the user's settings."""
 
+import os
+import sys
 import warnings
+from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,9 +17,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from flexneedle.errors import InputError, describe_error
 from flexneedle.files import replace_file
 from flexneedle.types import Z
 
+_WINDOWS = ("macosx", "qtagg", "gtk4agg", "gtk3agg", "tkagg", "wxagg")  # backends, in the order of pyplot
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
@@ -61,7 +67,10 @@ _SETTINGS: Any = {
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
     "svg.hashsalt": "flexneedle",
-    "svg.fonttype": "path",
+    # Text stays text, and fonts of PDF files are TrueType, as journals require.
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
 }
 
 
@@ -85,9 +94,57 @@ def apply_style() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float) -> Figure:
+class StyledFigure(Figure):
+    """A figure without pyplot, which is saved in this module's style and shown by notebooks."""
+
+    def savefig(self, *given: Any, **options: Any) -> None:
+        """Save the figure as matplotlib does, with this module's fonts."""
+        with apply_style():
+            super().savefig(*given, **options)
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture for a notebook."""
+        sink = BytesIO()
+        self.savefig(sink, format="png")
+        return sink.getvalue()
+
+    def show(self, warn: bool = True) -> None:  # noqa: ARG002  as matplotlib's
+        """Show the figure in the notebook, or in a window until it is closed.
+
+        Raises InputError where no window can be opened.
+        """
+        if (shell := _notebook()) is not None:
+            shell.display_pub.publish({"image/png": b64encode(self._repr_png_()).decode()})
+            return
+        why = "neither Qt, GTK, Tk nor wx is installed" if _has_display() else "no display"
+        for name in _WINDOWS if _has_display() else ():
+            try:
+                canvas: Any = import_module(f"matplotlib.backends.backend_{name}").FigureCanvas
+                canvas.new_manager(self, 1).show()
+            except ImportError:
+                continue
+            except Exception as error:  # noqa: BLE001  whatever a toolkit raises without a display
+                why = describe_error(error)
+                continue
+            canvas.manager_class.start_main_loop()
+            FigureCanvasAgg(self)
+            return
+        raise InputError(f'no window can be opened ({why}): save the figure, as figure.savefig("needle.png")')
+
+
+def _notebook() -> Any:
+    """Return the shell of the notebook in which this process runs, or None."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return shell if hasattr(shell, "kernel") else None
+
+
+def _has_display() -> bool:
+    return sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def new_figure(height: float) -> StyledFigure:
     """Return an empty figure of this height (inches), with automatic layout."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = StyledFigure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

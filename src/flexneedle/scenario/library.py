@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from flexneedle.arguments import expand_home
 from flexneedle.errors import FileError, ScenarioError, make_printable
 from flexneedle.scenario.problems import describe
 
@@ -67,7 +68,7 @@ class Library:
     def _bytes(self, source: str | Path) -> bytes:
         opening = label(source)
         try:
-            with Path(source).open("rb") as file:
+            with expand_home(source).open("rb") as file:
                 data = file.read(_LARGEST_FILE + 1)
         except FileNotFoundError:
             known = f", and no such {self.noun} (choices: {', '.join(self.names())})" if self.noun else ""

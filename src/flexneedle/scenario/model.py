@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 from flexneedle.arguments import make_refusal
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.dotted import flatten, set_value, split_key
-from flexneedle.scenario.problems import describe, key_path, refuse, to_line
+from flexneedle.scenario.problems import SHEAR, YOUNG, describe, key_path, refuse, to_line
 from flexneedle.scenario.rules import (
     entry_problems,
     geometry_problems,
@@ -117,6 +117,9 @@ class Scenario(Section):
         values = self.values()
         for key, value in changes.items():
             set_value(values, key, _expand_environment(key, value))
+            if key.startswith("tissue") and key.endswith(f".{YOUNG}") and value is not None:
+                shear = key.removesuffix(YOUNG) + SHEAR
+                set_value(values, shear, changes.get(shear))  # unless it is given, too
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

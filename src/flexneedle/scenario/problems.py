@@ -11,6 +11,9 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from flexneedle.errors import make_printable
 from flexneedle.scenario.dotted import split_key
 
+SHEAR, YOUNG = "shear_modulus_kpa", "youngs_modulus_kpa"
+"""Keys of a layer of which one is given."""
+
 _BROKEN = "broken_rules"
 _LONGEST_VALUE = 60
 
@@ -141,12 +144,15 @@ def unknown_key(key: str, valid: Sequence[str]) -> str:
     """Return the rule that an unknown key breaks, with the closest valid key and the list of valid keys."""
     close = get_close_matches(key, valid, n=1)
     hint = f"did you mean {close[0]}? " if close else ""
+    if close and close[0] in (SHEAR, YOUNG) and SHEAR in valid:  # a factor of 3
+        hint = f"did you mean {SHEAR} (μ) or {YOUNG} (E = 3μ)? "
     return f"unknown key; {hint}valid keys: {', '.join(valid)}"
 
 
 def _unknown(loc: tuple[int | str, ...], model: type[BaseModel]) -> str:
     section = _section_at(loc[:-1], model)
-    return unknown_key(str(loc[-1]), list(section.model_fields) if section else [])
+    valid = list(section.model_fields) if section else []
+    return unknown_key(str(loc[-1]), [*valid, *([YOUNG] if SHEAR in valid else [])])
 
 
 def _section_at(loc: Sequence[str | int], model: type[BaseModel]) -> type[BaseModel] | None:

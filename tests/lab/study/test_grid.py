@@ -207,6 +207,7 @@ BAD = [  # text and key named
     (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
     (axis("controler", '["ce-mpc"]'), "as an axis also seed, world"),
     (axis("plan.samples", "[]"), "axes[0].values = []"),
+    (axis("tissue.0.youngs_modulus_kpa", "[6, 12]"), "vary shear_modulus_kpa (μ = E/3)"),
     (axis("plan.samples", "'all'"), 'axes[0].values = "all"'),
     (axis("setup.stroke_mm", "[100, 100.0]"), "contains 100 twice"),
     (axis("target", "[[30, 0], [30.0, -0.0]]"), "contains [30, 0] twice"),

@@ -7,9 +7,9 @@ import json
 import signal
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_seed
 from flexneedle.cli.progress import print_line, print_note
@@ -46,7 +46,7 @@ def _add_aurora(commands: Commands) -> None:
     )
     aurora.add_argument(
         "--link",
-        type=Path,
+        type=expand_home,
         metavar="PATH",
         help="path of the device (default: one in a new folder under /tmp)",
     )
@@ -102,11 +102,13 @@ def _add_rig(commands: Commands) -> None:
     add_seed(rig, "seed of phantom and noise, as in flexneedle insert --seed N")
     rig.add_argument(
         "--plan",
-        type=Path,
+        type=expand_home,
         metavar="DIR",
         help="folder of a plan, if the scenario has a free entry",
     )
-    rig.add_argument("--truth", type=Path, metavar="FILE", help="write the true states to a new CSV file")
+    rig.add_argument(
+        "--truth", type=expand_home, metavar="FILE", help="write the true states to a new CSV file"
+    )
     _add_fault(
         rig,
         "a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
 
@@ -21,9 +21,9 @@ def add_parser(commands: Commands) -> None:
         about="Write the report of a study: an HTML page and its figures. The study may be unfinished;  "
         "after kill -9, run `flexneedle study` with --resume first.",
     )
-    parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
+    parser.add_argument("study", metavar="STUDY_DIR", type=expand_home, help="folder of the study")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)"
+        "--out", type=expand_home, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)"
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
 

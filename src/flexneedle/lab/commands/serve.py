@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_note
 from flexneedle.cli.values import port
@@ -50,7 +51,11 @@ def add_parser(commands: Commands) -> None:
         "virtual phantom)",
     )
     parser.add_argument(
-        "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
+        "--runs",
+        type=expand_home,
+        default=RUNS,
+        metavar="DIR",
+        help=f"folder of recorded runs (default: {RUNS})",
     )
     parser.add_argument(
         "--host",

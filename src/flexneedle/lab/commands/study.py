@@ -10,6 +10,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import compile_first, print_json, print_table
 from flexneedle.cli.progress import print_note
@@ -54,7 +55,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="resume the study in --out")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
+        "--out",
+        type=expand_home,
+        metavar="DIR",
+        help="folder of the study (default: runs/<date>-study-<name>)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands
 from flexneedle.cli.progress import print_note
 from flexneedle.cli.view import draw
@@ -33,7 +34,7 @@ def add_options(commands: Commands) -> None:
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=expand_home,
         metavar="DIR",
         help="with --row: folder of the new run (default: RUN/rows/row-INDEX)",
     )
@@ -48,7 +49,7 @@ def add_options(commands: Commands) -> None:
     parser.add_argument(
         "--compare",
         metavar="RUN",
-        type=Path,
+        type=expand_home,
         help="with --html: folder of a second insertion, shown beside the first",
     )
 
@@ -119,7 +120,7 @@ def _replay(folder: Path, html: str, compare: Path | None) -> int:
     if html == _STDOUT:
         sys.stdout.buffer.write(data)
         return 0
-    path = Path(html) if html else folder / _REPLAY
+    path = expand_home(html) if html else folder / _REPLAY
     replace_file(path, data)
     print(path)
     return 0

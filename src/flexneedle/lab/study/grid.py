@@ -42,7 +42,7 @@ from flexneedle.planning import STRATEGIES
 from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.problems import SHEAR, YOUNG, Problem, to_line
 from flexneedle.scenario.sections.settings import Target
 from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
 
@@ -186,6 +186,8 @@ def _expand(file: StudyFile, base: Scenario) -> ExpandedStudy:
     total = math.prod((of_cases, repeats, *map(len, axes.values())))
     if total > _MAX_INSERTIONS:
         raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
+    if youngs := [key for key in axes if key.endswith(f".{YOUNG}")]:
+        raise InputError(f"axis {youngs[0]}: is not a column of the results: vary {SHEAR} (μ = E/3)")
     settings = {
         "name": file.name,
         "title": file.title,

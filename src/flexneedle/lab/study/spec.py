@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
+from flexneedle.arguments import expand_home
 from flexneedle.errors import InputError
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.files import load_scenario
@@ -117,12 +118,14 @@ def read_study_file(source: str | Path) -> tuple[StudyFile, Path, str]:
     Raises FileError with one line for each problem: file, key, value, rule.
     """
     shipped = isinstance(source, str) and source in STUDIES.names()
-    return STUDIES.load(source, StudyFile), Path() if shipped else Path(source).parent, label(source)
+    return STUDIES.load(source, StudyFile), Path() if shipped else expand_home(source).parent, label(source)
 
 
 def load_base(file: StudyFile, home: Path) -> Scenario:
     """Return the base scenario of a study; home: folder of the study file. Raises ScenarioError."""
-    return load_scenario(file.scenario if file.scenario in PRESETS.names() else home / file.scenario)
+    return load_scenario(
+        file.scenario if file.scenario in PRESETS.names() else home / expand_home(file.scenario)
+    )
 
 
 def with_worlds(file: StudyFile, first: int, count: int) -> StudyFile:

@@ -1,9 +1,12 @@
 """A layer of tissue: the common part of all laws, and the contact points between tissue and needle."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from pydantic import ValidationError, model_validator
+
+from flexneedle.scenario.problems import SHEAR, YOUNG, Problem, problems_of, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
 
 if TYPE_CHECKING:
@@ -13,6 +16,13 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _BEVEL_MARGIN = 0.001
+_SHEARS_IN_YOUNGS = 3.0  # E = 3μ of an incompressible solid
+
+
+class _Young(Section):
+    """The key of a layer that is converted."""
+
+    youngs_modulus_kpa: Positive
 
 
 class Layer(Section):
@@ -34,13 +44,29 @@ class Layer(Section):
     thickness_mm: Positive | None = None
     """Thickness, required for every layer but the last, for which it is ignored."""
     shear_modulus_kpa: Positive
-    """μ, shear modulus at small strain."""
+    """μ, shear modulus at small strain; or instead `youngs_modulus_kpa`, Young's modulus E = 3μ."""
     compression_length_mm: Positive
     """h, length of tissue compressed by a lateral displacement u of the needle: stretch 1 − |u|/h."""
     engaged_width_mm: Positive
     """w, width of tissue displaced by the needle."""
     energy_weight: NonNegative = 1.0
     """w_c, weight of the layer in the strain energy."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_youngs_modulus(cls, values: Any) -> Any:
+        """Convert `youngs_modulus_kpa` to the shear modulus."""
+        if not isinstance(values, Mapping) or YOUNG not in values:
+            return values
+        given = values[YOUNG]
+        if SHEAR in values:
+            refuse([Problem(YOUNG, given, f"leave it out: {SHEAR} gives it (E = 3μ)")])
+        try:
+            youngs = _Young.model_validate({YOUNG: given}).youngs_modulus_kpa
+        except ValidationError as error:
+            refuse(problems_of(error, _Young))
+        others = {key: value for key, value in values.items() if key != YOUNG}
+        return others | {SHEAR: youngs / _SHEARS_IN_YOUNGS}
 
     @property
     def shear_modulus(self) -> float:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from flexneedle.arguments import expand_home
 from flexneedle.errors import InputError
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.aurora.readings import NAMES
@@ -54,7 +55,7 @@ def aurora(settings: Mapping[str, Any], clock: Clock) -> Aurora:
 def replay(settings: Mapping[str, Any], clock: Clock) -> Replay:
     """Return a replay that starts now. Raises RigError for invalid settings, InputError for an invalid recording."""
     chosen = check_settings(ReplaySettings, settings)
-    path = Path(chosen.file)
+    path = expand_home(chosen.file)
     frames = read_run_frames(path) if path.is_dir() else read_frames(path)
     if chosen.speed != 1.0:
         frames = tuple(replace(one, time=one.time / chosen.speed) for one in frames)

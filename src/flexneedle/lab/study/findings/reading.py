@@ -48,8 +48,8 @@ def read_study_folder(folder: Path) -> StudyTables:
     try:
         stored = json.loads(header.read_text(encoding="utf-8"))
         study, command = stored["study"], str(stored.get("command", ""))
-        parts = (dict(part) for part in (study["cases"], study["axes"], study.get("names", {})))
-        known = study["title"], *parts, int(study["insertions"])
+        names = dict(study.get("names", {}))
+        known = study["title"], dict(study["cases"]), dict(study["axes"]), names, int(study["insertions"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{header}: damaged: {describe_error(error)}") from None
     return StudyTables(folder, *known, command, _read_rows(table))

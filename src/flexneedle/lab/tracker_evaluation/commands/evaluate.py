@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
 from flexneedle.lab.tracker_evaluation.commands.arguments import add_columns, add_labels
@@ -23,7 +24,9 @@ def add_parser(commands: Commands) -> None:
         about="Compute a tracker's errors, jitter and distortion indicator from repeated measurements on a grid, one "
         "row per sample (docs/tracking/evaluate.md).",
     )
-    parser.add_argument("data", metavar="DATA", type=Path, help="table of measurements (CSV or Parquet)")
+    parser.add_argument(
+        "data", metavar="DATA", type=expand_home, help="table of measurements (CSV or Parquet)"
+    )
     parser.add_argument(
         "--register",
         action="store_true",
@@ -38,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         "--noisy", metavar="NAME", help="environment to be detected by the threshold (default: noisy)"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="output folder (default: runs/<date>-em-<name>)"
+        "--out", type=expand_home, metavar="DIR", help="output folder (default: runs/<date>-em-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
 

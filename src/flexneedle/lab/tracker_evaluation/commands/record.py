@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_line
 from flexneedle.cli.values import make_number_type
@@ -40,7 +40,7 @@ def add_parser(commands: Commands) -> None:
         help="TOML file or name of the grid (example: cube)",
     )
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="CSV table to write or resume"
+        "--out", required=True, type=expand_home, metavar="FILE", help="CSV table to write or resume"
     )
     parser.add_argument(
         "--dwell",

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json, print_table
 from flexneedle.cli.progress import print_line
@@ -30,7 +31,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "data",
-        type=Path,
+        type=expand_home,
         metavar="PAIRS",
         help="CSV or Parquet with true_x_mm, …, x_mm, …; rows with the same point_id are averaged",
     )
@@ -52,7 +53,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=expand_home,
         default=Path("registration.toml"),
         metavar="FILE",
         help="new file; its figure is written to the same folder (default: registration.toml)",

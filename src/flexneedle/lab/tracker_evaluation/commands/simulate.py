@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import add_seed
 from flexneedle.cli.values import make_number_type, seed
@@ -51,7 +52,7 @@ def add_parser(commands: Commands) -> None:
         )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=expand_home,
         default=Path("measurements.csv"),
         metavar="FILE",
         help="new file, CSV or Parquet by its suffix (default: measurements.csv)",

@@ -7,9 +7,9 @@ import json
 import sys
 from contextlib import ExitStack
 from math import inf
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.values import positive
 
@@ -40,7 +40,9 @@ def add_parser(commands: Commands) -> None:
         metavar="SPEC",
         help="tracker, such as aurora:/dev/ttyUSB0 or replay:FILE",
     )
-    parser.add_argument("--record", type=Path, metavar="FILE", help="save all frames to a new CSV file")
+    parser.add_argument(
+        "--record", type=expand_home, metavar="FILE", help="save all frames to a new CSV file"
+    )
     parser.add_argument(
         "--seconds", type=positive, default=inf, metavar="S", help="stop after S seconds (default: never)"
     )
