@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 from flexneedle.errors import InputError
 
 _Kind = TypeVar("_Kind")
+NARROWEST_MM, WIDEST_MM = 60.0, 600.0
+"""Widths of a figure that can be read."""
 _LONGEST = 60  # characters of a value in a message
 _ROUNDING = 1e-6  # of the largest entry: rounding of a product of matrices in single precision
 

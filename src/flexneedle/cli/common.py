@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexneedle.arguments import expand_home
 from flexneedle.cli.progress import print_note
-from flexneedle.cli.values import seed
+from flexneedle.cli.values import length, seed
 from flexneedle.planning import STRATEGIES
 
 if TYPE_CHECKING:
@@ -67,6 +67,17 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the run (default: runs/<date>-<scenario>-<seed>)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_width(parser)
+
+
+def add_width(parser: argparse.ArgumentParser) -> None:
+    """Add the width of the figures; `main` applies it to every command that has it."""
+    parser.add_argument(
+        "--width",
+        type=length,
+        metavar="WIDTH",
+        help="width of the figures, such as 88mm for a journal's column; also cm, in (default: 9in)",
+    )
 
 
 def add_seed(parser: argparse.ArgumentParser, meaning: str) -> None:

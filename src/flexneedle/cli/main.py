@@ -87,11 +87,23 @@ def _run(argv: Sequence[str] | None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = build_parser().parse_args(argv)
-        with _print_warnings():
+        with _print_warnings(), _figures_of_width(getattr(args, "width", None)):
             status: int = args.handler(args)
         return status
     finally:
         sys.stdout.flush()  # here, where a closed pipe is still handled, also for --help
+
+
+@contextmanager
+def _figures_of_width(inches: float | None) -> Iterator[None]:
+    """Make the figures of a command that wide, if a width is given."""
+    if inches is None:
+        yield
+        return
+    from flexneedle.figures.style import figures_of_width
+
+    with figures_of_width(inches):
+        yield
 
 
 @contextmanager

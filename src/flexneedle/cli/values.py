@@ -5,6 +5,8 @@ from collections.abc import Callable
 from math import inf, isfinite
 from typing import TypeVar
 
+from flexneedle.arguments import NARROWEST_MM, WIDEST_MM
+
 Number = TypeVar("Number", int, float)
 _KINDS = {"int": "whole", "float": "finite"}
 
@@ -28,6 +30,22 @@ def make_number_type(
         return value
 
     return read
+
+
+_INCHES = {"mm": 1.0 / 25.4, "cm": 1.0 / 2.54, "in": 1.0}
+
+
+def length(text: str) -> float:
+    """Return the width of a figure in inches, from text such as 88mm."""
+    number, unit = text.strip()[:-2], text.strip()[-2:]
+    try:
+        inches = float(number) * _INCHES[unit]
+    except (ValueError, KeyError):
+        inches = 0.0
+    if not NARROWEST_MM <= round(25.4 * inches, 6) <= WIDEST_MM:
+        rule = f"must be a width with its unit, such as 88mm, 8.8cm or 3.5in, from {NARROWEST_MM:g} to {WIDEST_MM:g} mm"
+        raise argparse.ArgumentTypeError(f"{text}: {rule}")
+    return inches
 
 
 seed = make_number_type(int, 0)

@@ -6,6 +6,7 @@ import argparse
 
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
+from flexneedle.cli.common import add_width
 from flexneedle.cli.progress import print_note
 
 
@@ -22,6 +23,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "run", metavar="RUN", type=expand_home, help="folder of the run, or of a study with --row"
     )
+    add_width(parser)
 
 
 def draw(args: argparse.Namespace) -> int:

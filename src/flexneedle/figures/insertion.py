@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flexneedle.figures import curves, scene, space
-from flexneedle.figures.layout import COLUMNS, legend_of, mosaic, short
+from flexneedle.figures.layout import COLUMNS, fit, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TRUE, apply_style, tone
+from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TRUE, apply_style, is_column, tone
 from flexneedle.results import Insertion, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, X
@@ -36,7 +36,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         scenes = [axes[f"scene{end}"] for end in sections]
         for ax, view in zip(scenes, sections.values(), strict=True):
             _scene(ax, scenario, insertion, view)
-        verdict = fill(insertion.summary, _LINES[scenario.setup.axes])
+        verdict = fill(insertion.summary, fit(_LINES[1 if is_column() else scenario.setup.axes]))
         scene.name_scenes(scenes, verdict, scene.color_of(insertion))
         if scenario.setup.axes == 2:
             _along(axes["along"], scenario, insertion)
@@ -219,7 +219,7 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
     ax.set_ylim(centre[up] - half, centre[up] + half)
     ax.set(aspect="equal", anchor="N")
     seen = "" if scenario.setup.axes == 1 else f" in x–{'xyz'[up]}"
-    whole = f"The end{seen}, magnified (mm)"
+    whole = f"The end{seen} (mm)" if is_column() else f"The end{seen}, magnified (mm)"
     ax.set_title(whole if near else f"The tip{seen}, {format_mm(distance)} off")
     scene.tint_layers(ax, scenario)
     _paths(ax, insertion, view, scale=1.6)

@@ -15,7 +15,8 @@ from matplotlib.legend_handler import HandlerBase, HandlerLine2D, HandlerPatch
 from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
 
-from flexneedle.figures.style import new_figure
+from flexneedle.figures.style import WIDTH, is_column, new_figure, width
+from flexneedle.planning import STRATEGIES
 
 Floats = NDArray[np.float64]
 COLUMNS: tuple[float, ...] = (1.8, 1.0)
@@ -30,6 +31,11 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#4
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 _TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
+
+# Parts of a figure in a column, inches: all others are low.
+_HEIGHTS = {"along": 3.0, "end": 2.1, "cost": 2.7} | dict.fromkeys(("scene", *STRATEGIES), 1.3)
+_LOW, _OUTSIDE = 1.1, 1.1
+_SMALLER = 1.25  # characters in a column for each at full width: of the sizes of fonts
 
 
 @dataclass(frozen=True)
@@ -54,12 +60,32 @@ def mosaic(
     widths: Sequence[float] = COLUMNS,
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure with its title and the axes named in `rows`; heights, widths: relative to each other."""
+    if is_column():
+        rows, heights, widths = _stack(rows)
+        height = sum(heights) + _OUTSIDE
     figure = new_figure(height)
     figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
-    figure.suptitle(fill(title, _TITLE), x=0.01, ha="left", fontsize=11, weight="bold")
+    figure.suptitle(
+        fill(title, fit(_TITLE)), x=0.01, ha="left", fontsize=8 if is_column() else 11, weight="bold"
+    )
     return figure, figure.subplot_mosaic(
         [list(row) for row in rows], height_ratios=heights, width_ratios=widths
     )
+
+
+def _stack(rows: Sequence[Sequence[str]]) -> tuple[list[list[str]], list[float], list[float]]:
+    """Return rows, heights (inches) and widths with each part in its own row, close-ups side by side."""
+    names = dict.fromkeys(row[k] for k in range(len(rows[0])) for row in rows)  # column by column
+    ends = [name for name in names if name.split()[0] == "end"]
+    alone = [name for name in names if name not in (*ends, ".")]
+    stacked = [*([name] * max(1, len(ends)) for name in alone), *([ends] if ends else [])]
+    heights = [max(_HEIGHTS.get(word, _LOW) for word in row[0].split()) for row in stacked]
+    return stacked, heights, [1.0] * len(stacked[0])
+
+
+def fit(characters: int) -> int:
+    """Return the number of characters in a line that has this many in a figure of full width."""
+    return round(characters * width() / WIDTH * (_SMALLER if is_column() else 1.0))
 
 
 class _Upright(HandlerLine2D):
@@ -105,7 +131,7 @@ def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = 
     """Name marks at the foot of the figure: the given ones, and `handles` whose label an artist has."""
     drawn = {artist.get_label() for ax in figure.axes for artist in ax.get_children()}
     shown = [*named, *(handle for handle in handles if handle.get_label() in drawn)]
-    rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / _ROW)
+    rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / fit(_ROW))
     columns = ceil(len(shown) / max(1, rows)) or 1
     made = _legend(figure, shown, columns)
     while columns > 1 and made.get_window_extent().width > figure.bbox.width:
@@ -119,8 +145,8 @@ def _legend(figure: Figure, shown: Sequence[Artist], columns: int) -> Legend:
         handles=shown,
         loc="outside lower center",
         ncols=columns,
-        columnspacing=1.6,
-        handlelength=1.8,
+        columnspacing=1.0 if is_column() else 1.6,
+        handlelength=1.4 if is_column() else 1.8,
         handler_map={handle: _MARKS[handle.get_gid()] for handle in shown if handle.get_gid() in _MARKS},
     )
 

@@ -9,12 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
 from flexneedle.figures.scene import tint_layers
-from flexneedle.figures.style import BAD, QUIET
+from flexneedle.figures.style import BAD, QUIET, is_column, small
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 _ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
 _TICKS = 4
+_ROW, _HANDLE = 56, 6  # characters: of a line of names above a panel, of the mark of a name
 _VISIBLE = 0.008  # least extent of a visible line, as a share of the panel's width
 
 
@@ -70,7 +71,7 @@ def _draw_panel(ax: Axes, scenario: Scenario, panel: DepthPanel) -> None:
     if not any(_is_visible(line, float(np.ptp(ax.get_xlim()))) for line in panel.lines):
         middle: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "va": "center"}
         middle["bbox"] = {"facecolor": "white", "linewidth": 0.0, "pad": 1.5}
-        ax.text(0.5, 0.75, _why_empty(panel.lines), color=QUIET, fontsize=8, **middle)
+        ax.text(0.5, 0.75, _why_empty(panel.lines), color=QUIET, fontsize=small(), **middle)
 
 
 def draw_timeline(
@@ -91,8 +92,25 @@ def _draw_lines(ax: Axes, title: str, lines: Sequence[Line]) -> None:
         ax.plot(line.x, line.y, line.style, color=line.color, markersize=2.4, zorder=3, label=line.name)
     ax.set_title(title)
     ax.locator_params(axis="y", nbins=4)
-    if drawn:
+    if drawn and is_column():
+        _name_above(ax)
+    elif drawn:
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4)
+
+
+def _name_above(ax: Axes) -> None:
+    """Name the lines of a panel of a column between title and panel."""
+    names = ax.get_legend_handles_labels()[1]
+    columns = len(names) if sum(len(name) + _HANDLE for name in names) <= _ROW else 2
+    rows = -(-len(names) // columns)
+    beside: dict[str, Any] = {
+        "handlelength": 1.4,
+        "columnspacing": 1.0,
+        "borderaxespad": 0.0,
+        "borderpad": 0.2,
+    }
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, **beside)
+    ax.set_title(ax.get_title(loc="left"), pad=4.0 + 10.5 * rows)
 
 
 def _is_visible(line: Line, width: float) -> bool:

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flexneedle.figures import curves, scene, space
-from flexneedle.figures.layout import legend_of, mosaic, short
+from flexneedle.figures.layout import fit, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
-from flexneedle.figures.style import INK, STRATEGIES, apply_style, format_signed, tone
+from flexneedle.figures.style import INK, STRATEGIES, apply_style, format_signed, is_column, small, tone
 from flexneedle.results import Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import X, Y
@@ -35,7 +35,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
             for ax, view in zip(drawn, scene.sections(scenario).values(), strict=True):
                 scene.draw_tissue(ax, scenario, known, view)
                 _draw_plan(ax, scenario, plan, color, view)
-            title = fill(_result(scenario, plan), _LINES[scenario.setup.axes])
+            title = fill(_result(scenario, plan), fit(_LINES[1 if is_column() else scenario.setup.axes]))
             scene.name_scenes(drawn, title, scene.color_of(plan), 9.5)
             scenes += drawn
             if scenario.setup.axes == 2:
@@ -148,7 +148,7 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
         values = np.array([plan.terms.get(name, 0.0) for name in names])
         where = rows + (k - (len(plans) - 1) / 2) * thick
         bars = ax.barh(where, values, 0.9 * thick, color=STRATEGIES[k], label=plan.strategy)
-        ax.bar_label(bars, [f"{value:.2f}" for value in values], padding=2, fontsize=7.5)
+        ax.bar_label(bars, [f"{value:.2f}" for value in values], padding=2, fontsize=min(7.5, small()))
     ax.set_yticks(rows, names)
     ax.tick_params(axis="y", length=0)
     ax.invert_yaxis()

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
-from flexneedle.figures.style import BAD, GUIDE, INK, NEEDLE, QUIET, TARGET, format_signed
+from flexneedle.figures.style import BAD, GUIDE, INK, NEEDLE, QUIET, TARGET, format_signed, is_column, small
 from flexneedle.results import TARGET_RADIUS_MM, Insertion, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
@@ -29,7 +29,6 @@ _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
 _SKIN, _BORDER, _NAME = "#8c5a36", "#c9a27f", "#6d4526"
 _SHAPE = 0.2  # height of a scene by its width
 _OPENING, _BLOCK, _WIDE = 0.7, 2.2, 1.1  # half opening, length and half width of the guide's jaws (mm)
-_SMALL: Any = {"textcoords": "offset points", "fontsize": 8}
 
 
 def sections(scenario: Scenario) -> dict[str, View]:
@@ -46,7 +45,7 @@ def moved_axes(scenario: Scenario) -> dict[str, int]:
 
 def name_scenes(scenes: Sequence[Axes], title: str, color: str, size: float = 10.0) -> None:
     """Write the title over the first of scenes one above the other, and depths below the last."""
-    scenes[0].set_title(title, color=color, fontsize=size)
+    scenes[0].set_title(title, color=color, fontsize=7.5 if is_column() else size)
     for ax in scenes[:-1]:
         ax.tick_params(labelbottom=False)
         ax.set_xlabel("")
@@ -71,15 +70,19 @@ def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats], view: Vie
     _frame(ax, scenario, np.concatenate([path[:, : 1 + scenario.setup.axes] for path in paths]), view)
     tint_layers(ax, scenario)
     ax.axvline(0.0, color=_SKIN, linewidth=1.6, zorder=1)
-    ax.annotate("air", (0, 0), (4, 4), "axes fraction", color=QUIET, **_SMALL)
+    ax.annotate(
+        "air", (0, 0), (4, 4), "axes fraction", color=QUIET, textcoords="offset points", fontsize=small()
+    )
     above: dict[str, Any] = {"xycoords": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-    ax.annotate("skin", (0, 1), (-4, -3), color=_SKIN, **above, **_SMALL)
+    ax.annotate("skin", (0, 1), (-4, -3), color=_SKIN, **above, textcoords="offset points", fontsize=small())
     ax.set(xlabel="depth (mm)", ylabel=lateral_label(scenario, view[1]))
 
 
 def lateral_label(scenario: Scenario, axis: int) -> str:
     """Return the label of a lateral axis."""
-    return "lateral (mm)" if scenario.setup.axes == 1 else f"lateral {'xyz'[axis]} (mm)"
+    if scenario.setup.axes == 1:
+        return "lateral (mm)"
+    return f"{'' if is_column() else 'lateral '}{'xyz'[axis]} (mm)"
 
 
 def _frame(ax: Axes, scenario: Scenario, points: Floats, view: View) -> None:
@@ -120,8 +123,10 @@ def name_layers(ax: Axes, scenario: Scenario) -> None:
     for layer, top, bottom in _layers(ax, scenario):
         right = ax.transData.transform((bottom, 0.0))[0]
         modulus = f"μ {layer.shear_modulus_kpa:g} kPa"
-        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), color=_NAME, **_SMALL)
-        for text in (f"{layer.name}, {modulus}", f"{layer.name}\n{modulus}", modulus, ""):
+        how: dict[str, Any] = {"textcoords": "offset points", "fontsize": small(), "color": _NAME}
+        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), **how)
+        two_lines = [] if is_column() else [f"{layer.name}\n{modulus}"]
+        for text in (f"{layer.name}, {modulus}", *two_lines, modulus, ""):
             name.set_text(text)
             if name.get_window_extent().x1 < right or not text:
                 break
@@ -140,7 +145,14 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
         ax.plot([beside, beside], ends, label="guide travel", **how)
     ax.plot([beside], [y], color=GUIDE, marker=">", markersize=4, linestyle="none")
     above: dict[str, Any] = {"xytext": (0, 3), "ha": "center", "va": "bottom"}
-    ax.annotate("guide", (x, y + _OPENING + _BLOCK), color=GUIDE, **above, **_SMALL)
+    ax.annotate(
+        "guide",
+        (x, y + _OPENING + _BLOCK),
+        color=GUIDE,
+        **above,
+        textcoords="offset points",
+        fontsize=small(),
+    )
 
 
 def draw_needle(

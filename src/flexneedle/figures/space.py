@@ -13,7 +13,7 @@ from flexneedle.figures import scene
 from flexneedle.figures.curves import Roll, planned_rolls, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
-from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, format_signed
+from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, format_signed, is_column, small
 from flexneedle.results import Period, Plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Point, X, Y, Z
@@ -27,6 +27,7 @@ _DEPTHS = LinearSegmentedColormap.from_list(
 )  # from the start to the end
 _RING = 0.9  # mm; radius of the guide along the axis
 _SCALE = (0.1, -0.33, 0.8, 0.035)  # the scale of depths, in shares of the axes
+_SCALE_IN_COLUMN = (0.0, -0.36, 1.0, 0.035)
 _ROOM = 1.4  # mm around all that is drawn in the view along the axis
 
 
@@ -110,7 +111,9 @@ def _draw_depths(ax: Axes, path: Floats) -> None:
     line.set_gid("path by depth")
     ax.add_collection(line, autolim=False)
     figure: Any = ax.figure
-    bar = figure.colorbar(line, cax=ax.inset_axes(_SCALE), orientation="horizontal")
+    bar = figure.colorbar(
+        line, cax=ax.inset_axes(_SCALE_IN_COLUMN if is_column() else _SCALE), orientation="horizontal"
+    )
     bar.set_label("depth of the tip (mm)")
     bar.outline.set_visible(False)
 
@@ -123,6 +126,6 @@ def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
     ring.set_gid("guide")
     ax.add_patch(ring)
     up = 1 if target[Y] < y[-1] else -1
-    beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": 8}
+    beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": small()}
     beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
     ax.annotate("guide and its path", (z[-1], y[-1] + up * _RING), **beside)

@@ -23,6 +23,8 @@ from flexneedle.types import Z
 
 _WINDOWS = ("macosx", "qtagg", "gtk4agg", "gtk3agg", "tkagg", "wxagg")  # backends, in the order of pyplot
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
+COLUMN = 5.5  # inches; a narrower figure is one of a journal's column, with all parts one below another
+_widths = [WIDTH]  # the last one is in use
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
 INK, QUIET = "#222222", "#6b6b6b"
@@ -74,6 +76,43 @@ _SETTINGS: Any = {
 }
 
 
+# In a column, where figures are not reduced: 7 to 8 points.
+_COLUMN_SETTINGS: Any = {
+    "font.size": 7.5,
+    "axes.titlesize": 7.5,
+    "axes.labelsize": 7.5,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "lines.linewidth": 1.1,
+}
+
+
+@contextmanager
+def figures_of_width(inches: float) -> Iterator[None]:
+    """Make figures of this width inside the block."""
+    _widths.append(inches)
+    try:
+        yield
+    finally:
+        _widths.pop()
+
+
+def width() -> float:
+    """Return the width (inches) of new figures."""
+    return _widths[-1]
+
+
+def is_column() -> bool:
+    """Return whether new figures are for a journal's column."""
+    return width() < COLUMN
+
+
+def small() -> float:
+    """Return the font size of names inside a panel."""
+    return 7.0 if is_column() else 8.0
+
+
 def tone(color: str, axis: int) -> str:
     """Return the colour of a line along y, or its lighter variant for a line along z."""
     return _SECOND[color] if axis == Z else color
@@ -90,7 +129,7 @@ def apply_style() -> Iterator[None]:
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_SETTINGS)
+        matplotlib.rcParams.update(_SETTINGS | (_COLUMN_SETTINGS if is_column() else {}))
         yield
 
 
@@ -144,7 +183,7 @@ def _has_display() -> bool:
 
 def new_figure(height: float) -> StyledFigure:
     """Return an empty figure of this height (inches), with automatic layout."""
-    figure = StyledFigure(figsize=(WIDTH, height), layout="constrained")
+    figure = StyledFigure(figsize=(width(), height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

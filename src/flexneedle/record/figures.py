@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import NARROWEST_MM, WIDEST_MM, make_refusal
 from flexneedle.errors import RunError
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
-from flexneedle.figures.style import save
+from flexneedle.figures.style import WIDTH, figures_of_width, save
 from flexneedle.record.folder import TRACE_FILE, read_run
 from flexneedle.record.loading import insertion_of, unfinished_note
 from flexneedle.results import Insertion, Plan, scenario_of
@@ -37,15 +38,19 @@ def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -
     return save(plan_figure(run.scenario, list(run.plans.values())), folder, "plan")
 
 
-def plot(record: Plan | Insertion) -> Figure:
+def plot(record: Plan | Insertion, width_mm: float = 25.4 * WIDTH) -> Figure:
     """Return the figure of a plan or of an insertion, as `flexneedle view` draws it.
 
-    An insertion without a period is drawn as its plan.
+    An insertion without a period is drawn as its plan. Below 140 mm, a journal's column, all parts are one below
+    another.
 
     Raises:
-        InputError: Not a plan or insertion, or without a scenario.
+        InputError: Not a plan or insertion, or without a scenario; a width outside 60 to 600 mm.
     """
     scenario = scenario_of(record)
-    if isinstance(record, Insertion) and record.periods:
-        return insertion_figure(scenario, record)
-    return plan_figure(scenario, [record.plan if isinstance(record, Insertion) else record])
+    if not NARROWEST_MM <= width_mm <= WIDEST_MM:
+        raise make_refusal("width_mm", width_mm, f"must be from {NARROWEST_MM:g} to {WIDEST_MM:g}")
+    with figures_of_width(width_mm / 25.4):
+        if isinstance(record, Insertion) and record.periods:
+            return insertion_figure(scenario, record)
+        return plan_figure(scenario, [record.plan if isinstance(record, Insertion) else record])

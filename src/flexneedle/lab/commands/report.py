@@ -6,7 +6,7 @@ import argparse
 
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
-from flexneedle.cli.common import print_json
+from flexneedle.cli.common import add_width, print_json
 
 
 def add_parser(commands: Commands) -> None:
@@ -26,6 +26,7 @@ def add_parser(commands: Commands) -> None:
         "--out", type=expand_home, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)"
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
+    add_width(parser)
 
 
 def _report(args: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.figure import Figure
 
 from flexneedle.figures.layout import Floats, short
-from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
+from flexneedle.figures.style import BAD, QUIET, TARGET, is_column, new_figure, width
 
 Content = TypeVar("Content")
 
@@ -36,12 +36,12 @@ class Panel(Generic[Content]):
 
 def columns_of(count: int) -> int:
     """Return the number of columns for `count` panels."""
-    return {1: 1, 2: 2, 4: 2}.get(count, 3)
+    return 1 if is_column() else {1: 1, 2: 2, 4: 2}.get(count, 3)
 
 
 def ticks_of(count: int) -> int:
     """Return the number of ticks that fit along each of `count` panels."""
-    return {1: 9, 2: 7}.get(columns_of(count), 5)
+    return 5 if is_column() else {1: 9, 2: 7}.get(columns_of(count), 5)
 
 
 def sheet(
@@ -75,7 +75,7 @@ def panels(
 
 def head(ax: Axes, panel: Panel[Any], columns: int) -> None:
     """Write title, note and alarm above a panel, one of `columns` side by side."""
-    most = int((WIDTH / columns - 0.7 - 0.06 * len(panel.alarm)) / 0.085)
+    most = int((width() / columns - 0.7 - 0.06 * len(panel.alarm)) / 0.085)
     pad = 15.0 if panel.note else 4.0
     ax.set_title(short(panel.title, most), loc="left", color=panel.color, pad=pad)
     ax.set_title(panel.alarm, loc="right", color=BAD, weight="normal", pad=pad)

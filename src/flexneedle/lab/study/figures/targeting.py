@@ -15,7 +15,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from flexneedle.figures.layout import Floats, legend
-from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, apply_style
+from flexneedle.figures.style import BAD, QUIET, TARGET, apply_style, width
 from flexneedle.lab.study.figures.panels import FAINT, Panel, choose_dots, columns_of, head, panels, sheet
 
 MAP = ("depth (mm)", "lateral (mm)")
@@ -60,7 +60,7 @@ def draw_targeting(shown: Sequence[Panel[TipPositions]]) -> Figure:
         if len(shown) == 1:
             figure, axes = _with_close_up(shown[0], ratio)
         else:
-            height = ratio * (WIDTH / columns_of(len(shown)) - 0.3) + 0.75
+            height = ratio * (width() / columns_of(len(shown)) - 0.3) + 0.75
             figure, axes = panels(shown, height, *shown[0].content.labels)
         for ax, panel in zip(axes, shown, strict=True):
             _draw_map(ax, panel, low, high)
@@ -79,7 +79,7 @@ def _find_window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Float
 
 def _with_close_up(panel: Panel[TipPositions], ratio: float) -> tuple[Figure, list[Axes]]:
     """Return a figure with an empty map and, beside it, the tips relative to their targets."""
-    height = ratio * (WIDTH - 1.2) / (1.0 + ratio) + 0.8
+    height = ratio * (width() - 1.2) / (1.0 + ratio) + 0.8
     figure, (ax, close) = sheet(height, columns=2, widths=(1.0, ratio))
     head(ax, panel, 2)
     ax.set_xlabel(panel.content.labels[0])

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from flexneedle.figures.layout import short
-from flexneedle.figures.style import QUIET, WIDTH, apply_style, format_signed, new_figure
+from flexneedle.figures.style import QUIET, apply_style, format_signed, new_figure, width
 
 MOST_ROWS, MOST_SLICES = 6, 5
 MOST_ARROWS = 400
@@ -41,7 +41,7 @@ def draw_field(rows: Sequence[FieldRow]) -> Figure:
     layers = [_slices(row.true[:, 2]) for row in shown]
     columns = max(map(len, layers))
     with apply_style():
-        figure = new_figure(len(shown) * (_AROUND + min((WIDTH - 1.6) / columns, _WIDEST)))
+        figure = new_figure(len(shown) * (_AROUND + min((width() - 1.6) / columns, _WIDEST)))
         parts = figure.subfigures(len(shown), 1, squeeze=False).ravel()
         for part, row, slices in zip(parts, shown, layers, strict=True):
             _draw_row(part, row, slices)
