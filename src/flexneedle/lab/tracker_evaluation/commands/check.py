@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.common import print_json
 from flexneedle.cli.values import positive
@@ -27,7 +27,7 @@ def add_parser(commands: Commands) -> None:
         "threshold.",
     )
     parser.add_argument(
-        "data", metavar="DATA", type=Path, help="table with both environments (CSV or Parquet)"
+        "data", metavar="DATA", type=expand_home, help="table with both environments (CSV or Parquet)"
     )
     for power in ("off", "on"):
         parser.add_argument(
