@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_line, print_note
 from flexneedle.errors import RigError
@@ -47,7 +47,7 @@ def add_test(commands: Commands) -> None:
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=expand_home,
         metavar="DIR",
         help="folder of the evidence (default: runs/<date>-rig-test-<name>)",
     )

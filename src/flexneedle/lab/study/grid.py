@@ -210,7 +210,7 @@ def _expand(file: StudyFile, base: Scenario) -> ExpandedStudy:
 def _make_study(settings: Mapping[str, Any], base: Scenario) -> ExpandedStudy:
     """Return the study of a definition, which may lack derived values. base: its scenario."""
     fixed, cases, axes = (settings[key] for key in ("values", "cases", "axes"))
-    names = {key: _collect_values(key, fixed, cases, axes) for key in _OWN}
+    names = {key: _collect_values(key, settings) for key in _OWN}
     own = find_own_controllers(names["controller"])
     base = check_tables(base, *own)
     _check_without(settings["without"], base)
@@ -227,13 +227,9 @@ def _make_study(settings: Mapping[str, Any], base: Scenario) -> ExpandedStudy:
     return ExpandedStudy(plain(definition), grid, repeats, settings["first_seed"], tuple(settings["seeds"]))
 
 
-def _collect_values(
-    key: str,
-    fixed: Mapping[str, Any],
-    cases: Mapping[str, Mapping[str, Any]],
-    axes: Mapping[str, list[Any]],
-) -> list[Any]:
-    """Return all values of a key in a study."""
+def _collect_values(key: str, settings: Mapping[str, Any]) -> list[Any]:
+    """Return all values of a key in the settings of a study."""
+    fixed, cases, axes = (settings[name] for name in ("values", "cases", "axes"))
     return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
 
 
