@@ -42,7 +42,7 @@ def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_re
     """The needle rests from the first such decision; the reason gives the miss, the limit and the remedy."""
     done, recorded = inserted(plan, [0.0] * 5 + [3.0], force=False)
     assert done.outcome == "held"
-    assert done.reason.startswith("no path to the target found: predicted miss +3.00 ± 0.10 mm is beyond")
+    assert done.reason.startswith("no path to the target found: predicted miss +3.000 ± 0.100 mm is beyond")
     assert "control.miss_limit_mm = 2 " in done.reason
     assert done.reason.endswith("to insert anyway: flexneedle insert --force")
     assert done.summary.endswith(done.reason)
@@ -69,7 +69,7 @@ def test_force_continues_with_a_warning(plan):
     done, recorded = inserted(in_air(plan), [3.0], force=True)
     assert done.outcome == "done"
     assert len(recorded.moves) >= 8
-    assert done.warning == "predicted miss +3.00 ± 0.10 mm: likely beyond 1 mm"
+    assert done.warning == "predicted miss +3.000 ± 0.100 mm: likely beyond 1 mm"
     assert to_row(done.periods[-1])["warning"] == done.periods[-1].warning
     assert sum(bool(period.warning) for period in moving(done)) > len(moving(done)) - 4
     assert not any("nan" in period.warning for period in done.periods)

@@ -186,7 +186,7 @@ def test_a_search_that_still_improves_continues_as_long_as_the_scenario_allows()
 @pytest.mark.parametrize(
     ("target", "strategy", "changes", "limit"),
     [
-        (LATERAL, "steering", {}, "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.80 to 1.80 mm"),
+        (LATERAL, "steering", {}, "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.796 to 1.796 mm"),
         ((60.0, 0.0), "steering", CARELESS, "plan.accuracy_weight_per_mm = 0"),
         ((45.0, 14.0), "manipulation", {"setup.max_guide_step_mm": 1e-3}, "setup.max_guide_step_mm = 0.001"),
         ((25.0, 5.0), "manipulation", CARELESS, "plan.accuracy_weight_per_mm = 0"),
