@@ -1,5 +1,6 @@
 """Actions of benchmarks/page.py on the page, by pointer like a person."""
 
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ MODIFIED = {"control.adaptive_mpc.samples": 64}
 """So that 64 paths are sampled in each period."""
 SECTION, STATUS = "[data-panel=section]", "[data-panel=status]"
 VIEWS = {"section": SECTION, "plots": "[data-panel=plots]"}
-"""Panels in view while an insertion plays; the scene in space is drawn beside them."""
+"""Panels in view while an insertion plays: the section in place of the scene in space, plots beside it."""
 
 
 def new_page(browser: Browser, address: str) -> Page:
@@ -71,9 +72,8 @@ def inserted(page: Page) -> None:
     """Start an insertion in real time with 64 sampled paths, and wait until it runs."""
     page.evaluate("values => flexneedle.link.edit(values)", MODIFIED)
     _until_planned(page)
-    page.locator("[data-panel=insertion]").get_by_role("button", name="Insert", exact=True).click()
+    page.locator("[data-panel=actions]").get_by_role("button", name="Insert", exact=True).click()
     until(page, "flexneedle.store.get('insertion live')?.state === 'running'")
-    page.evaluate("document.getElementById('main').scrollTo(0, 0)")
     until(page, "flexneedle.store.get('shape samples live')?.paths === 64")
 
 
@@ -126,4 +126,5 @@ class Pointer:
             self._page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
 
     def _show(self, what: str) -> None:
-        self._page.evaluate("what => document.querySelector(what).scrollIntoView({block: 'end'})", what)
+        key = "view scene" if what == SECTION else "view tab"
+        self._page.evaluate("([key, name]) => flexneedle.store.set(key, name)", [key, re.findall("=(.*)]", what)[0]])

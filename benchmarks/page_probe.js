@@ -60,9 +60,9 @@
   }
   frame(tick);
 
-  // Whether the frame before has shown the scene with its needle, in space and in section.
+  // Whether the frame before has shown the scene with its needle.
   function pictured() {
-    const legend = document.querySelectorAll("[data-panel=section] .legend li");
+    const legend = document.querySelectorAll("[data-panel=space] .legend li");
     return probe.draws > 0 && [...legend].some(({ textContent }) => textContent === "needle");
   }
 

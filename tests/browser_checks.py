@@ -44,6 +44,13 @@ _ADDED = f"""async ([selectors, tone]) => {{
 }}"""
 
 
+def show(page, panel):
+    """Show a view of the scene, or a tab; other panels are always in view."""
+    key = {"space": "view scene", "section": "view scene"}.get(panel, "view tab")
+    page.evaluate("([key, panel]) => flexneedle.store.set(key, panel)", [key, panel])
+    page.wait_for_selector(f"section.{panel}:not([hidden])", state="attached")
+
+
 def painted(page):
     """Wait until two paints have followed."""
     page.evaluate(PAINTED)

@@ -71,19 +71,22 @@ def _press(page: Page, panel: str, name: str) -> None:
     page.locator(f"[data-panel={panel}]").get_by_role("button", name=name, exact=True).click()
 
 
+def _show_tab(page: Page, name: str) -> None:
+    page.locator(f"[data-tab={name}]").click()
+
+
 def _inserted(page: Page, pace: str = "20") -> None:
     """Insert to the end."""
-    _press(page, "insertion", "Insert")
+    _press(page, "actions", "Insert")
     page.locator("[aria-label=Pace]").select_option(pace)
     _await(page, _ENDED)
 
 
 def _shown(page: Page, share: float) -> None:
-    """Show the period at a share of the insertion, from the top of the page, and wait for its painting."""
+    """Show the period at a share of the insertion, and wait for its painting."""
     page.evaluate(
         """share => {
             flexneedle.store.set('view period', Math.round(share * flexneedle.store.get('rows live').length));
-            for (const part of [document.getElementById('main'), document.scrollingElement]) part.scrollTop = 0;
         }""",
         share,
     )
@@ -93,7 +96,7 @@ def _shown(page: Page, share: float) -> None:
 def _draw_insertion(browser: Browser, folder: Path) -> None:
     """In space, in light and, on a telephone, in dark."""
     with _served("phantom3d") as address:
-        with _visited(browser, address, 1440, 1080, "light") as page:
+        with _visited(browser, address, 1440, 900, "light") as page:
             _inserted(page)
             _shown(page, 0.75)
             page.screenshot(path=folder / "page.png")
@@ -107,6 +110,7 @@ def _draw_plans(browser: Browser, folder: Path) -> None:
     """Both strategies side by side."""
     with _served("phantom") as address, _visited(browser, address, 1440, 1200, "light") as page:
         page.evaluate("flexneedle.link.edit({'target.depth_mm': 40, 'target.lateral_mm': 1.5})")
+        _show_tab(page, "plans")
         _press(page, "plans", "Both strategies")
         _await(page, _COMPARED)
         page.locator("section.plans").screenshot(path=folder / "page-plans.png")
@@ -115,18 +119,18 @@ def _draw_plans(browser: Browser, folder: Path) -> None:
 def _draw_disturbance(browser: Browser, folder: Path) -> None:
     """A tip that is pushed half way: what the controller does, in plots and words."""
     with _served("phantom") as address, _visited(browser, address, 1440, 1200, "light") as page:
-        _press(page, "insertion", "Start paused")
+        _press(page, "actions", "Start paused")
         _await(page, "flexneedle.store.get('insertion live')?.state === 'paused'")
         page.locator("[aria-label=Pace]").select_option("2")
-        _press(page, "insertion", "Continue")
+        _press(page, "actions", "Continue")
         _await(page, "flexneedle.store.get('rows live')?.length > 40")
-        _press(page, "insertion", "Pause")
+        _press(page, "actions", "Pause")
         page.get_by_label("Force on the tip in N").fill("0.02")
         _press(page, "insertion", "Push")
         page.locator("[aria-label=Pace]").select_option("20")
-        _press(page, "insertion", "Continue")
+        _press(page, "actions", "Continue")
         _await(page, _ENDED)
-        page.locator("section.plots").scroll_into_view_if_needed()  # plots are drawn only on the screen
+        _show_tab(page, "plots")  # which are drawn only on the screen
         page.wait_for_timeout(_PAINTED_MS)
         page.locator("section.plots").screenshot(path=folder / "page-disturbed.png")
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from browser_checks import show
 from chromium import ARGUMENTS, CHROMIUM
 from fake_page import PATIENCE_S, FakePage
 
@@ -114,7 +115,8 @@ def tab(browser, kept_tabs):
 def visit(server, tab):
     """A function that opens the page and returns it.
 
-    news: messages and frames for it (default: an opening); before: a script that runs first; ready: awaited selectors.
+    news: messages and frames for it (default: an opening); before: a script that runs first; ready: awaited selectors;
+    shows: view and tab to show, by their panels.
     """
 
     def opened(
@@ -125,11 +127,15 @@ def visit(server, tab):
         scheme="light",
         before=None,
         ready=("[data-panel=status] .connection",),
+        shows=(),
         **how,
     ):
         server.news = news or server.news
         page = tab(width, height, scheme, before, **how)
         page.goto(server.url)
+        page.wait_for_selector("[data-panel=status] .connection")
+        for panel in shows:
+            show(page, panel)
         for selector in [ready] if isinstance(ready, str) else ready:
             page.wait_for_selector(selector)
         return page

@@ -24,7 +24,7 @@ def tab_to(page, name):
 
 
 def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
-    page = visit(ready="[data-panel=insertion] button:visible")
+    page = visit(ready="[data-panel=actions] button:visible")
     page.wait_for_selector("[data-panel=space] .legend li")
     page.wait_for_selector("text=nobody is in control")
     tab_to(page, "Skip to the scene")
@@ -34,11 +34,9 @@ def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
     page.keyboard.press("Enter")
     assert server.wait_for("insert") == [{"type": "insert"}]
     server.send(clients(steering=1), insertion("running", periods=3), rows(0, 3))
-    until(page, "document.querySelector('[data-panel=insertion] [role=toolbar] .danger:not([hidden])')")
+    until(page, "document.querySelector('[data-panel=actions] .stop.danger')")
     assert tab_to(page, "Stop") == []  # in place of the button that started it
     page.keyboard.press(" ")
     assert server.wait_for("stop") == [{"type": "stop"}]
-    page.evaluate("document.getElementById('main').scrollTop = 0")
     server.send(insertion("done", periods=3))
     until(page, "document.activeElement.innerText === 'Insert'")
-    assert page.evaluate("document.getElementById('main').scrollTop") == 0  # the view stays

@@ -29,16 +29,15 @@ pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
 PERIOD = 50
-LEAST = (20, 15)
+LEAST = (20, 6)
 """Pixels of a part in the section, and along the axis, where a path may be seen from its end."""
 
 
 @pytest.fixture
 def views(visit):
     def opened(news, **how):
-        page = visit(news, ready=f"{SECTION} .legend li", **how)
-        page.evaluate("document.querySelector('.panel.section').scrollIntoView()")
-        page.wait_for_selector(f"{AXIAL} .legend li")
+        page = visit(news, ready=f"{SECTION} .legend li", shows=["section"], **how)
+        page.wait_for_selector(f"{AXIAL} .legend li", state="attached")
         arrived(page)
         return page
 
@@ -115,7 +114,7 @@ def test_the_sampled_horizon_is_shown_from_its_period_on(views, server):
     """In all views; it stays until the next one, and scrubbing back shows the horizon of the period."""
     frames = [frame for period in range(20) for frame in period_frames(period)]
     page = views([*opening(), insertion("running", periods=20), rows(0, 20), *frames])
-    page.wait_for_selector("[data-panel=space] .legend li")
+    page.wait_for_selector("[data-panel=space] .legend li", state="attached")
     for number, count in ((5, 8), (12, 16)):
         server.send(samples(number, count, source=FrameSource.LIVE, x=(number, TARGET[0])))
     arrived(page)

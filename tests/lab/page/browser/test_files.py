@@ -24,7 +24,7 @@ def files(visit, server):
     server.files["/scenario.toml"] = TEXT
 
     def opened(**how):
-        page = visit(ready=f"{FILES} li", **how)
+        page = visit(ready=f"{FILES} li", shows=["files"], **how)
         page.wait_for_selector("text=nobody is in control")
         return page
 
@@ -213,7 +213,6 @@ def saved(tmp_path):
 
 
 def test_pictures_are_of_the_scene_in_space_or_of_the_section(files, server, saved):
-    """Without WebGL of the section, even off the screen."""
     page = files(draws=True)
     page.wait_for_selector("[data-panel=space] .legend li")
     picture = imread(BytesIO(saved(page)))
@@ -221,16 +220,9 @@ def test_pictures_are_of_the_scene_in_space_or_of_the_section(files, server, sav
     assert list(picture.shape[:2]) == size
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
     page = files(width=390, before=NO_WEBGL)
-    assert "no WebGL" in page.inner_text("[data-panel=space] [role=note]")
-    page.locator("text=Picture").scroll_into_view_if_needed()
-    painted(page)
-    box = page.locator(SECTION).bounding_box()
-    assert box["y"] + box["height"] < -100.0
+    assert "no WebGL" in page.inner_text(".scene > [role=note]")
+    page.wait_for_selector(f"{SECTION}:visible")
     before = saved(page)
     server.send(insertion("done", of="first"), rows(0, 4, "first"), *period_frames(3, FrameSource.FIRST))
     until(page, "flexneedle.store.get('rows first')?.length === 4")
-    picture = saved(page)
-    assert picture != before
-    page.locator(SECTION).scroll_into_view_if_needed()  # where it is drawn anyway
-    painted(page)
-    assert saved(page) == picture
+    assert saved(page) != before

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from browser_checks import painted
+from browser_checks import painted, show
 from fake_page import until
 from flexneedle.lab.page.protocol import (
     DisturbancesMessage,
@@ -17,16 +17,16 @@ from recorded_page import WELCOME, clients, insertion, opening, row, rows, sessi
 
 pytestmark = pytest.mark.page
 
-PANEL = "[data-panel=insertion]"
+BAR, PANEL, RIG = (f"[data-panel={name}]" for name in ("actions", "insertion", "rig"))
 
 
 @pytest.fixture
 def panel(visit):
-    return partial(visit, ready=(f"{PANEL} button:visible", "text=person"))
+    return partial(visit, ready=(f"{BAR} button:visible", "text=person"), shows=["insertion"])
 
 
-def click(page, text):
-    page.locator(PANEL).get_by_role("button", name=text, exact=True).click()
+def click(page, text, panel=BAR):
+    page.locator(panel).get_by_role("button", name=text, exact=True).click()
 
 
 FOCUSED = "document.activeElement.textContent"
@@ -41,12 +41,12 @@ def test_a_virtual_insertion_is_started_paused_paced_stepped_and_stopped(panel, 
     page.wait_for_selector("text=you are in control")
     for state, words in (("waiting", "Waiting for the computation"), ("planning", "Planning")):
         server.send(insertion(state, periods=0, pace=0.0))
-        page.wait_for_selector(f"{PANEL} >> text={words}")
+        page.wait_for_selector(f"{BAR} >> text={words}")
         until(page, f"{FOCUSED} === 'Stop'")
-        assert page.locator(f"{PANEL} button:visible:enabled").all_inner_texts() == ["Stop"]
+        assert page.locator(f"{BAR} button:visible:enabled").all_inner_texts() == ["Plan", "Stop"]
         assert page.is_disabled("[aria-label=Pace]")
     server.send(insertion("running", periods=3), rows(0, 3))
-    page.wait_for_selector(f"{PANEL} >> text=Running: ")
+    page.wait_for_selector(f"{BAR} >> text=Running: ")
     assert page.is_disabled("text=One period")
     click(page, "Pause")
     server.send(insertion("paused", periods=3, pace=0.0))
@@ -64,7 +64,7 @@ def test_a_virtual_insertion_is_started_paused_paced_stepped_and_stopped(panel, 
     page.wait_for_selector("text=The tip ended 0.016 mm from the target.")
     until(page, f"{FOCUSED} === 'Insert'")
     server.send(clients(2, steering=2), insertion("running"))
-    page.wait_for_selector(f"{PANEL} button:text-is('Pause'):disabled")
+    page.wait_for_selector(f"{BAR} button:text-is('Pause'):disabled")
     click(page, "Stop")  # which anybody may
     assert len(server.wait_for("stop", 2)) == 2
 
@@ -91,6 +91,7 @@ def in_a_field():
 def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_words_change(panel, server):
     decided = some_rows(0, *({"decision": text} for text in SAID))
     page = panel([*opening(), insertion("running", periods=4), decided])
+    page.wait_for_selector(f"{PANEL} .outcome")
     why = page.locator(f"{PANEL} >> text=The tracker of this scenario has no field that metal distorts")
     bring = page.locator(PANEL).get_by_role("button", name="Bring", exact=True)
     assert (why.is_visible(), bring.is_enabled()) == (True, False)
@@ -105,17 +106,17 @@ def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_word
         field = page.get_by_label(label, exact=True)
         before = field.input_value()
         field.fill(text)
-        click(page, button)
+        click(page, button, PANEL)
         assert not field.evaluate("(input) => input.checkValidity()")
         field.fill(before)
     page.fill("[aria-label='Force on the tip in N']", "0.25")
-    click(page, "Push")
+    click(page, "Push", PANEL)
     page.click("[aria-label='Let go of the tip']")
     page.select_option("[aria-label=Layer]", "1")
-    click(page, "Stiffen")
-    click(page, "Drop")
-    click(page, "Bring")
-    click(page, "Remove the plate")
+    click(page, "Stiffen", PANEL)
+    click(page, "Drop", PANEL)
+    click(page, "Bring", PANEL)
+    click(page, "Remove the plate", PANEL)
     assert server.wait_for("disturb", 6) == [
         {"type": "disturb", "what": "push", "size": 0.25, "angle_deg": 0},
         {"type": "disturb", "what": "push", "size": 0},
@@ -128,7 +129,7 @@ def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_word
     page.wait_for_selector("text=Active: 0.25 N on the tip")
     page.wait_for_selector(f".decisions .now >> text={SAID[-1]}")
     assert page.locator(".decisions li span").all_inner_texts() == [SAID[2], SAID[0]]
-    assert "held" not in page.inner_text(f"{PANEL} [role=status]")
+    assert "held" not in page.inner_text(f"{BAR} [role=status]")
     held = {
         "action": "hold",
         "decision": "hold",
@@ -141,9 +142,9 @@ def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_word
     page.wait_for_selector(
         "text=hold; measurement held: no reading; decided late, after 312 ms; the tip is off"
     )
-    page.wait_for_selector(f"{PANEL} >> text=The needle is held, for the reason below.")
+    page.wait_for_selector(f"{BAR} >> text=The needle is held, for the reason in the decisions.")
     server.send(rows(5, 1))
-    until(page, f"!document.querySelector('{PANEL} [role=status]').textContent.includes('held')")
+    until(page, f"!document.querySelector('{BAR} [role=status]').textContent.includes('held')")
     page.click(".decisions li:last-child button")
     until(page, "flexneedle.store.get('view period') === 0")
     page.wait_for_selector(f".decisions .now >> text=Period 1, 0.0 s: {SAID[0]}")
@@ -179,18 +180,19 @@ def rig_panel(panel):
 
 def shown_buttons(page):
     """Names of the rig's buttons that can be seen, and whether they can be pressed."""
-    buttons = page.locator(f"{PANEL} .rig button:visible").all()
+    buttons = page.locator(f"{BAR} [data-step]:visible").all()
     return {each.inner_text(): each.is_enabled() for each in buttons}
 
 
 def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
     page = rig_panel()
-    assert shown_buttons(page) == {"Check": True, "Prepare": True}
+    beginning = {"Check": True, "Prepare": True, "Arm": False, "Insert on the rig": False}
+    assert shown_buttons(page) == beginning
     click(page, "Check")
     page.wait_for_selector("text=you are in control")
     server.send(JobMessage(job=9, kind="check", state="running", text="each device is read, nothing moves"))
     page.wait_for_selector("text=Checking: each device is read, nothing moves …")
-    assert page.is_disabled(f"{PANEL} button:text-is('Check')")
+    assert page.is_disabled(f"{BAR} button:text-is('Check')")
     findings = [
         {"part": "driver", "item": "connection", "found": "galil", "problem": ""},
         {"part": "insertion", "item": "motor", "found": "A, off", "problem": "moves"},
@@ -208,37 +210,45 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
     click(page, "Prepare")
     server.wait_for("prepare")
-    server.send(insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7))
-    page.wait_for_selector("text=is ready; nothing moves before it is armed and started")
+    show(page, "plots")
+    job = JobMessage(job=7, kind="insertion", state="running", share=0.0, text="planned")
+    server.send(insertion("ready", rig="Bench"), rig("ready", *MOVES, job=7), job)
+    page.wait_for_selector(f"{RIG} >> text=is prepared; nothing moves before it is armed and started")
+    page.wait_for_selector("footer >> text=Insertion: prepared, nothing moves")
+    assert page.locator("button.danger:visible").count() == 0
     assert page.locator(".rig .moves li").all_inner_texts() == MOVES
-    assert shown_buttons(page) == {"Arm": False, "Insert on the rig": False}
-    assert page.evaluate(FOCUSED) == "Stop"
+    waiting = {"Check": False, "Prepare": False, "Arm": False, "Insert on the rig": False}
+    assert shown_buttons(page) == waiting
+    assert page.evaluate(FOCUSED) == "End the preparation"
     for last in ("Disarm", "Insert on the rig"):
         page.check("#rig-free")
-        assert shown_buttons(page) == {"Arm": True, "Insert on the rig": False}
+        until(page, f"!document.querySelector('{BAR} [data-step=arm]').disabled")
+        assert shown_buttons(page) == waiting | {"Arm": True}
         click(page, "Arm")
         server.send(rig("armed", *MOVES, job=7))
-        until(page, f"!document.querySelector('{PANEL} .rig button.danger').disabled")
-        assert shown_buttons(page) == {"Disarm": True, "Insert on the rig": True}
+        until(page, f"document.querySelector('{BAR} [data-step].danger')")
+        assert shown_buttons(page) == {"Check": False, "Prepare": False, "Disarm": True, "Insert on the rig": True}
         click(page, last)
         if last == "Disarm":
             server.send(rig("ready", *MOVES, job=7))
-            page.wait_for_selector(f"{PANEL} >> text=is ready; nothing moves")
+            page.wait_for_selector(f"{RIG} >> text=is prepared; nothing moves")
             assert not page.is_checked("#rig-free")
     server.send(rig("inserting", job=7, begun=True), insertion("running", rig="Bench"))
     page.wait_for_selector("text=It inserts.")
     asked = [(each["type"], each.get("armed"), each.get("job")) for each in server.requests[-4:]]
     assert asked == [("arm", True, 7), ("arm", False, 7), ("arm", True, 7), ("go", None, None)]
     assert shown_buttons(page) == {}
+    assert page.locator(f"{BAR} .stop.danger").is_visible()
     for what in (".disturb", "[aria-label=Pace]", "button[data-next]", "text=One period"):
-        assert not page.locator(PANEL).locator(what).is_visible()
+        assert not page.locator(what).first.is_visible()
     click(page, "Stop")
     ended = insertion("interrupted", rig="Bench", summary="stopped: person 1", folder="2026-rig")
     server.send(ended, rig("stopped", why="person 1 on the page"))
     page.wait_for_selector("text=It was stopped: person 1 on the page.")
-    page.wait_for_selector("text=Recorded as 2026-rig.")
+    page.wait_for_selector(f"{BAR} >> text=Recorded as 2026-rig.")
     assert len(server.asked("stop")) == 1
-    assert shown_buttons(page) == {"Check": True, "Prepare": True}
+    assert shown_buttons(page) == beginning
+    assert page.locator(RIG).get_by_text("To withdraw the needle").is_visible()
 
 
 def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_panel, server):
@@ -258,7 +268,7 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
     )
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
     page.check("#rig-free")
-    shows("armed", "It is armed for one start.", True)
+    shows("armed", "It is armed for one start", True)
     shows("holding", "not started within 60 s", False, "not started within 60 s: arm it again")
     server.send(clients(2, steering=2))
     page.check("#rig-free")

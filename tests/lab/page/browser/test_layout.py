@@ -1,8 +1,9 @@
-"""Each state of the page at two widths, light and dark: layout, names of controls, colours."""
+"""Each state and tab of the page at two sizes, light and dark: layout, names of controls, colours."""
 
 import pytest
 
-from browser_checks import arrived, painted, too_wide
+from browser_checks import arrived, painted, show, too_wide
+from fake_page import until
 from flexneedle.lab.page.protocol import RigStateMessage, RunsMessage
 from flexneedle.scenario.files import load_scenario
 from recorded_page import (
@@ -20,18 +21,19 @@ from recorded_page import (
 
 pytestmark = pytest.mark.page
 
-PANELS = ("section", "plans", "insertion", "player", "plots", "files", "form")
+VIEWS_AND_TABS = (("space", "form"), ("section", "plans"), ("space", "insertion"), ("section", "plots"), ("section", "files"))
 GROUND = "getComputedStyle(document.body).backgroundColor"
 
 
 NAMED = {
     *("button", "link", "textbox", "searchbox", "spinbutton", "combobox", "checkbox", "radio", "slider"),
-    *("DisclosureTriangle", "image", "Canvas", "application", "dialog", "toolbar", "progressbar", "meter"),
+    *("DisclosureTriangle", "image", "Canvas", "application", "dialog", "tab", "tabpanel", "toolbar", "progressbar", "meter"),
     "region",
 }
 """Roles, as Chromium has them, that have a name."""
 FOUND = {
-    "button": "button:visible, input[type=file]",
+    "button": "button:not([role=tab]):visible, input[type=file]:visible",
+    "tab": "[role=tab]:visible",
     "slider": "input[type=range]:visible",
     "combobox": "select:visible",
 }
@@ -64,47 +66,63 @@ def whole_session():
     return session().model_copy(update={"values": load_scenario("phantom3d").flat()})
 
 
+WAITS = RigStateMessage(
+    name="Bench", state="ready", job=7, moves=["The motors are switched on first." * 4]
+)
+STATES = {
+    "planned": list,
+    "inserting": inserting,
+    "rig": lambda: [
+        WELCOME.model_copy(update={"rig": "Bench"}),
+        clients(),
+        whole_session(),
+        insertion("ready", rig="Bench", periods=0),
+        WAITS,
+    ],
+    "recorded": lambda: [
+        insertion("interrupted", rig="Bench"),
+        insertion("done", of="first", name="mine"),
+        rows(0, 3, "first"),
+    ],
+}
+TALLEST = 0.4
+"""Least share of the screen's height for the scene."""
+
+COCKPIT = """() => {
+  const { scrollHeight, clientHeight } = document.documentElement;
+  const place = (selector) => document.querySelector(selector).getBoundingClientRect();
+  const [stage, stop, scrub] = [".scene > :not([hidden]) .stage", ".actions .stop", ".player"].map(place);
+  const inside = (box) => box.width > 0 && box.top >= 0 && box.left >= 0 && box.bottom <= innerHeight && box.right <= innerWidth;
+  const scrolls = [...document.querySelectorAll("*")].filter((one) =>
+    one.scrollHeight > one.clientHeight + 1 && ["auto", "scroll"].includes(getComputedStyle(one).overflowY) && one.clientHeight);
+  return { page: scrollHeight - clientHeight, scene: stage.height / innerHeight, seen: [stage, stop, scrub].every(inside),
+    scrolls: scrolls.length };
+}"""
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
-def test_each_state_fits_its_width_with_named_controls_and_both_colours(
-    visit, server, pictures, size, scheme
-):
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)])
+def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictures, size, scheme):
+    """Nothing but the shown tab scrolls; controls have names; both schemes have their colours."""
     server.answers["study"] = study_rows
     server.news = [*planned(), REACH, whole_session(), RunsMessage(runs=[MANY])]
     page = visit(width=size[0], height=size[1], scheme=scheme, ready="[data-panel=form] details")
+    show(page, "files")
     page.click("[aria-label='Rows of many']")
     page.wait_for_selector("text=Row 17")
-    page.evaluate(
-        "document.querySelectorAll('main details, .runs details').forEach((one) => { one.open = true; })"
-    )
-    waits = RigStateMessage(
-        name="Bench", state="ready", job=7, moves=["The motors are switched on first." * 4]
-    )
-    states = {
-        "planned": [],
-        "inserting": inserting(),
-        "rig": [
-            WELCOME.model_copy(update={"rig": "Bench"}),
-            clients(),
-            insertion("ready", rig="Bench"),
-            waits,
-        ],
-        "recorded": [
-            insertion("interrupted", rig="Bench"),
-            insertion("done", of="first", name="mine"),
-            rows(0, 3, "first"),
-        ],
-    }
-    for state, news in states.items():
-        server.send(*news)
-        for panel in PANELS:
-            page.locator(f"[data-panel={panel}]").scroll_into_view_if_needed()
-            painted(page)
+    page.evaluate("document.querySelectorAll('.runs details').forEach((one) => { one.open = true; })")
+    for number, (state, news) in enumerate(STATES.items()):
+        server.send(*news())
         arrived(page)
-        if state in ("inserting", "recorded"):
-            page.locator("[data-panel=plots]").scroll_into_view_if_needed()
-            page.wait_for_selector("[data-panel=plots] canvas")
-        assert too_wide(page) == [], state
+        for view, tab in VIEWS_AND_TABS:
+            show(page, view)
+            show(page, tab)
+            painted(page)
+            found = page.evaluate(COCKPIT)
+            assert (found["page"], found["seen"], found["scrolls"] <= 1) == (0, True, True), (state, tab, found)
+            assert found["scene"] >= TALLEST, (state, tab)
+            assert too_wide(page) == [], (state, tab)
+        show(page, VIEWS_AND_TABS[number][1])
         check_names(page)
         pictures(page, f"{state}-{size[0]}-{scheme}")
     before = page.evaluate(GROUND)
@@ -115,17 +133,12 @@ def test_each_state_fits_its_width_with_named_controls_and_both_colours(
     assert page.evaluate(GROUND) != before
 
 
-def test_on_a_telephone_the_section_stays_above_the_controls_of_the_insertion(visit, server):
-    page = visit(width=390, height=844, ready="[data-panel=insertion] button:visible")
-    box = """(selector) => {
-      document.querySelector(selector).scrollIntoView({ block: 'end' });
-      const { top, bottom } = document.querySelector('.section canvas').getBoundingClientRect();
-      return [top, bottom];
-    }"""
-    assert page.evaluate("getComputedStyle(document.querySelector('.panel.section')).position") == "static"
-    server.send(insertion("running", periods=3), rows(0, 3))
-    page.wait_for_selector("[data-panel=insertion] fieldset.disturb")
-    assert page.evaluate(box, "[data-panel=plots]")[0] >= 0.0
-    top, bottom = page.evaluate(box, "fieldset.disturb")
-    push = page.get_by_role("button", name="Push", exact=True).bounding_box()
-    assert 0 <= top < bottom < push["y"] < 844 - push["height"]
+def test_tabs_are_one_stop_and_arrow_keys_choose(visit):
+    page = visit(ready="[role=tab]")
+    chosen = "document.querySelector('[role=tab][aria-selected=true]').textContent"
+    page.focus("[role=tab][tabindex='0']")
+    for key, name in (("ArrowRight", "Plan"), ("End", "Files"), ("ArrowRight", "Scenario"), ("ArrowLeft", "Files"), ("Home", "Scenario")):
+        page.keyboard.press(key)
+        until(page, f"{chosen} === '{name}' && document.activeElement.textContent === '{name}'")
+        assert page.locator("[role=tabpanel]:visible").count() == 1
+        assert page.locator("[role=tab][tabindex='0']").count() == 1

@@ -30,7 +30,7 @@ PLANS = "[data-panel=plans]"
 
 @pytest.fixture
 def plans(visit):
-    return partial(visit, ready=(f"{PLANS} button:visible", "text=in control"))
+    return partial(visit, ready=(f"{PLANS} button:visible", "text=in control"), shows=["plans"])
 
 
 def table(page):
@@ -75,7 +75,7 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     """The lowest line is the best cost until then, on a logarithmic axis; the others are above it."""
     page = plans()
     for work in ("plan", "compare", "reach"):
-        page.click(f"{PLANS} [data-work={work}]")
+        page.click(f"[data-work={work}]")
     assert [each["work"] for each in server.wait_for("start", 3)] == ["plan", "compare", "reach"]
     server.send(JobMessage(job=4, kind="compare", state="running", share=0.25))
     page.click(f"{PLANS} button:has-text('Cancel')")
@@ -101,7 +101,7 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     np.testing.assert_allclose(lowest, [share_of(cost) for cost in iteration(3).best], atol=3.0 / height)
     assert highest == pytest.approx(share_of(iteration(3).median[0]), abs=4.0 / height)
     server.send(clients(2, steering=2))
-    until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
+    until(page, f"document.querySelector('{PLANS} [data-work=reach]').disabled")
     assert page.locator(f"{PLANS} [data-work]:enabled").count() == 0
     server.send(iteration(2), samples(2))
     server.send(JobMessage(job=4, kind="compare", state="running", share=0.5), iteration(3, "steering"))
@@ -120,7 +120,7 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
         """() => {
           window.changes = 0;
           const count = (records) => { window.changes += records.length; };
-          new MutationObserver(count).observe(document.querySelector(".words"), { childList: true, subtree: true });
+          new MutationObserver(count).observe(document.querySelector(".plans .words"), { childList: true, subtree: true });
           window.table = document.querySelector(".plans table");
         }"""
     )
@@ -150,7 +150,11 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
         canvas = f"{PLANS} .sweeps canvas[aria-label*={source}]"
         frames = plan_frames(FrameSource[source.upper()], sway=3.0)
         assert added(page, server, f"--{source}", *frames, canvases=[canvas])[0] > 50
-    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=False, roll_deg=0.0))
-    page.wait_for_selector(f"{PLANS} >> text=First estimate: error at the target 0.31 mm, out of reach.")
+    server.send(session(2), EstimateMessage(revision=2, error_mm=0.31, reached=True, roll_deg=0.0))
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: ends 0.31 mm from the target.")
     page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
+    for error in (1.01, 3.27, 42.0):  # what one small search has found: the plan may reach it
+        server.send(EstimateMessage(revision=2, error_mm=error, reached=False, roll_deg=0.0))
+        page.wait_for_selector(f"{PLANS} >> text=First estimate: ends {error:.2f} mm from the target; whether")
+    assert "out of reach" not in page.inner_text("body")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_checks import painted
+from browser_checks import painted, show
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
@@ -42,8 +42,8 @@ def player(visit):
 
 
 def see_plots(page):
-    """Scroll to the plots, which are drawn only on the screen."""
-    page.locator(PLOTS).scroll_into_view_if_needed()
+    """Show the plots, which are drawn only on the screen."""
+    show(page, "plots")
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
     page.locator(f"{PLOTS} figure").last.scroll_into_view_if_needed()  # others have grown above them
 
@@ -57,10 +57,7 @@ def test_a_run_is_scrubbed_and_played_and_a_period_without_a_shape_shows_none(pl
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 50 of 50']")
     page.click("text=Latest period")
     until(page, f"{PERIOD} === undefined")
-    speed = page.locator(f"{PLAYER} .tools .number").first
-    for text, factor in (("Slower", "0.5×"), ("Slower", "0.25×"), ("Faster", "0.5×"), ("Faster", "1×")):
-        page.click(f"{PLAYER} >> text={text}")
-        speed.locator(f"text={factor}").wait_for()
+    page.select_option(f"{PLAYER} [aria-label=Speed]", "1×")
     assert not page.evaluate(PLAYING)
     page.click(f"{PLAYER} >> text=Play")
     until(page, f"{PERIOD} > 0")
@@ -70,7 +67,7 @@ def test_a_run_is_scrubbed_and_played_and_a_period_without_a_shape_shows_none(pl
     page.keyboard.press("Home")
     for _ in range(3):
         page.keyboard.press(">")
-    page.wait_for_selector(f"{PLAYER} >> text=10×")
+    until(page, f"document.querySelector('{PLAYER} [aria-label=Speed]').value === '10×'")
     start = page.evaluate("performance.now()")
     page.keyboard.press(" ")
     until(page, f"{PERIOD} === 49 && !{PLAYING}")
@@ -113,7 +110,7 @@ def test_the_newest_insertion_or_run_is_shown_unless_another_is_chosen(player, s
     server.send(insertion("done", periods=3), insertion("planning", periods=0))
     shows(page, "live")
     server.send(insertion("running", periods=30), rows(0, 30), insertion("done", periods=30))
-    page.wait_for_selector("[data-panel=insertion] button:visible:text-is('Insert')")
+    page.wait_for_selector("[data-panel=actions] button:visible:text-is('Insert')")
     shows(page, "live")  # and not the run that was opened before
     for name in ("phantom3d", "other"):  # the same again, and another
         choose(page, "Target and plan")
@@ -222,8 +219,10 @@ def test_times_count_from_the_first_period_of_each_run(player, server):
     page.evaluate("flexneedle.store.set('view period', 20)")
     page.wait_for_selector(f"{PLAYER} >> text=4.0 s · period 21 of 50")
     page.wait_for_selector(f"{PLOTS} [aria-label^='Roll (°) at 4.0 s']")
+    show(page, "insertion")
     page.wait_for_selector("text=Period 21, 4.0 s: advance as planned")
     page.wait_for_selector(".decisions li button >> text=0.0 s")
+    show(page, "plots")
     click_in_the_middle(page)
     until(page, f"Math.abs({PERIOD} - 25) <= 2")
     shapes = [frame for period in range(50) for frame in period_frames(period, FrameSource.SECOND)]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from browser_checks import painted, too_wide
+from browser_checks import painted, show, too_wide
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.replay import make_document
@@ -67,9 +67,8 @@ def test_a_run_is_read_played_and_scrubbed(replay):
     assert f"Ended: adaptive-mpc, seed 0, {PERIODS} periods." in page.inner_text(WORDS)
     assert "advance as planned" in page.inner_text(WORDS)
     assert page.locator("[data-panel=player] [role=group]").is_hidden()
-    assert page.locator("main .panel").count() == 6
-    assert page.locator("main .panel:visible").count() == 6
-    page.locator(SECTION).scroll_into_view_if_needed()
+    assert page.locator("[role=tab]").all_inner_texts() == ["Insertion", "Plots"]
+    show(page, "section")
     at(page, 3)
     assert page.locator(".handle").count() == 0
     page.focus(SCRUB)
@@ -82,7 +81,7 @@ def test_a_run_is_read_played_and_scrubbed(replay):
     until(page, "!flexneedle.store.get('view playing')")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period {PERIODS} of {PERIODS}']")
     assert page.input_value(SCRUB) == str(PERIODS - 1)
-    page.locator(PLOTS).scroll_into_view_if_needed()
+    show(page, "plots")
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
 
 
@@ -110,11 +109,11 @@ def test_two_runs_are_beside_each_other_and_fit_the_width(replay, pictures, size
     page = replay([*record(), *second], width=size[0], height=size[1], scheme=scheme)
     at(page, 45)
     for panel in ("space", "section", "axial"):
-        page.locator(f"[data-panel={panel}]").scroll_into_view_if_needed()
-        page.wait_for_selector(f"[data-panel={panel}] .legend >> text=second run")
+        show(page, "section" if panel == "axial" else panel)
+        page.wait_for_selector(f"[data-panel={panel}] .legend >> text=second run", state="attached")
         pictures(page, f"replay-{size[0]}-{scheme}-{panel}")
     assert "Compared with other. Ended: ce-mpc, seed 7" in page.inner_text(WORDS)
-    page.locator(PLOTS).scroll_into_view_if_needed()
+    show(page, "plots")
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     pictures(page, f"replay-{size[0]}-{scheme}-plots")
     assert too_wide(page) == []

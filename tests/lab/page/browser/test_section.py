@@ -33,9 +33,8 @@ SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
 @pytest.fixture
 def views(visit):
     def opened(news=None, **how):
-        page = visit(news, ready=f"{SECTION} .legend li", **how)
-        page.locator(SECTION).scroll_into_view_if_needed()
-        page.wait_for_selector(f"{AXIAL} .legend li")
+        page = visit(news, ready=f"{SECTION} .legend li", shows=["section"], **how)
+        page.wait_for_selector(f"{AXIAL} .legend li", state="attached")
         return page
 
     return opened
@@ -57,6 +56,7 @@ def drag(page, element, right, up=0):
 def edited(page, server):
     until(page, "!flexneedle.store.get('draft')")
     painted(page)
+    painted(page)  # the views follow a frame later
     return server.asked("edit")[-1]["values"]
 
 
@@ -109,6 +109,7 @@ def test_legends_of_all_views_name_the_drawn_parts(views, server):
     missing = RowsMessage(of="live", first=0, rows=blind)
     server.send(insertion("planning", periods=0), insertion(rig="Bench"), missing)
     until(page, "!document.querySelector('[data-panel=space] .legend').textContent.includes('measured tip')")
+    painted(page)
     assert [both & names for names in legends(page)] == [set()] * 3
 
 

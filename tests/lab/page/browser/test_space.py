@@ -133,8 +133,8 @@ def test_lengths_are_to_scale_the_legend_follows_and_only_a_change_is_drawn(spac
         """
         const corner = (x, y) => {
           const point = view.target.ball.position.clone().set(x, y, 0).project(view.camera.camera);
-          const { clientWidth, clientHeight } = view.renderer.domElement;
-          return [point.x * clientWidth / 2, point.y * clientHeight / 2];
+          const { width, height } = view.renderer.domElement.getBoundingClientRect();
+          return [point.x * width / 2, point.y * height / 2];
         };
         const [a, b, c] = [corner(0, 0), corner(10, 0), corner(0, 10)];
         return [b[0] - a[0], c[1] - a[1]];

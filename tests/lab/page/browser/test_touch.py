@@ -8,7 +8,7 @@ from recorded_page import TARGET, insertion, period_frames, rows
 
 pytestmark = pytest.mark.page
 
-SECTION, INSERTION, PLAYER = (f"[data-panel={name}]" for name in ("section", "insertion", "player"))
+SECTION, ACTIONS, PLAYER = (f"[data-panel={name}]" for name in ("section", "actions", "player"))
 PERIODS, STEPS = 21, 8
 
 
@@ -33,8 +33,7 @@ def middle(element):
 
 
 def test_by_finger_the_target_is_dragged_and_an_insertion_stopped_and_scrubbed(visit, server):
-    page = visit(width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]")
-    page.locator(SECTION).scroll_into_view_if_needed()
+    page = visit(width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]", shows=["section"])
     page.evaluate(PAINTED)
     scrolled = page.evaluate("scrollY")
     drag(page, middle(page.locator(f"{SECTION} [data-handle=target]")), 24, 12)
@@ -44,10 +43,9 @@ def test_by_finger_the_target_is_dragged_and_an_insertion_stopped_and_scrubbed(v
     assert page.evaluate("scrollY") == scrolled
     frames = [frame for period in range(PERIODS) for frame in period_frames(period)]
     server.send(insertion("running", periods=PERIODS), rows(0, PERIODS), *frames)
-    page.locator(INSERTION).get_by_role("button", name="Stop", exact=True).tap()
+    page.locator(ACTIONS).get_by_role("button", name="Stop", exact=True).tap()
     assert server.wait_for("stop") == [{"type": "stop"}]
     scrub = page.locator(f"{PLAYER} input[type=range]")
-    scrub.scroll_into_view_if_needed()
     page.evaluate(PAINTED)
     box = scrub.bounding_box()
     right, height = box["x"] + box["width"] - 4, box["y"] + box["height"] / 2

@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import pytest
 
+from browser_checks import show
 from fake_page import until
 from flexneedle.lab.page.server.clients import PageLimits
 from page_clients import PATIENCE_S, served
 
 pytestmark = pytest.mark.page
 
-PLANS, INSERTION, PLAYER, FILES = (
-    f"[data-panel={name}]" for name in ("plans", "insertion", "player", "files")
+PLANS, ACTIONS, INSERTION, PLAYER = (
+    f"[data-panel={name}]" for name in ("plans", "actions", "insertion", "player")
 )
 WORKER = "flexneedle.lab.page.worker"
 LIMITS = replace(
@@ -45,29 +46,33 @@ def downloaded(page, name, path):
 def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
     page = tab(1280, 800, "light")
     page.goto(address)
+    page.wait_for_selector("[data-panel=status] .connection")
+    show(page, "plans")
+    show(page, "section")
     see(page, f"{PLANS} >> text=Manipulation:")
     depth = page.evaluate("flexneedle.store.get('scene').target[0]")
 
     page.focus("[data-panel=section] [data-handle=target]")
     page.keyboard.press("ArrowRight")
-    see(page, f"{PLANS} >> text=First estimate: error at the target")
+    see(page, f"{PLANS} >> text=First estimate: ends")
     until(page, f"flexneedle.store.get('scene').target[0] === {depth + 0.5}")
-    page.click(f"{PLANS} [data-work=plan]")
+    page.click("[data-work=plan]")
     see(page, f"{PLANS} .words:not(:has-text('earlier state')) >> text=Manipulation:")
 
-    page.locator(INSERTION).get_by_role("button", name="Insert", exact=True).click()
+    page.locator(ACTIONS).get_by_role("button", name="Insert", exact=True).click()
     see(page, f"{INSERTION} .decisions .now:has-text('Period')")
     page.select_option("[aria-label=Pace]", "2")
     page.locator(INSERTION).get_by_role("button", name="Push", exact=True).click()
     page.wait_for_selector(f"{INSERTION} >> text=Active: push of 0.02 N at 0°")
     page.select_option("[aria-label=Pace]", "20")
-    see(page, f"{INSERTION} >> text=Ended: adaptive-mpc, seed 0,")
+    see(page, f"{ACTIONS} >> text=Ended: adaptive-mpc, seed 0,")
     periods = page.evaluate("flexneedle.store.get('insertion live').periods")
     assert periods > 30
     assert page.evaluate("flexneedle.store.get('rows live').map(({ index }) => index)") == list(
         range(periods)
     )
 
+    show(page, "files")
     page.fill("[aria-label='Name of the run to save']", "mine")
     page.click("text=Save the insertion")
     page.click("[aria-label='Open mine']")

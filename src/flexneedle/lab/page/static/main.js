@@ -1,19 +1,18 @@
-// Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place (panels.js).
+// Loads the panels: each is a module with `export function mount(element, store, link)`, and has a place (layout.js).
 // The scene comes first, and in it space.js, the largest, last; the rest when the scene is drawn.
 
+import { layOut } from "./layout.js";
 import { Link } from "./link.js";
-import { addPanels } from "./panels.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-const SCENE = ["status", "section", "axial", "space"];
-const OTHERS = ["form", "insertion", "player", "plans", "plots", "files"];
+const SCENE = ["status", "actions", "section", "axial", "space"];
+const OTHERS = ["form", "insertion", "player", "plans", "plots", "files", "rig"];
 const PATIENCE = 2000; // ms
 const FRAMES = 3; // until the mounted panels are on the screen
 
 const store = new Store();
-addPanels(document.getElementById("main"), ["space", "player", "section", "axial", "plans", "insertion", "plots"]);
-addPanels(document.getElementById("settings"), ["files", "form"]);
+layOut(store, ["player", "actions"], ["form", "plans", "insertion", "plots", "files", "rig"]);
 const link = new Link(store);
 window.flexneedle = { store, link }; // for the console, and for tests
 link.connect();

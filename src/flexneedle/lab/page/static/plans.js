@@ -4,15 +4,14 @@ import { button, make, renew, shown } from "./dom.js";
 import { CostPlot } from "./plans/cost.js";
 import { SweepView } from "./plans/sweep.js";
 import { termsTable } from "./plans/terms.js";
-import { isStale, maySteer, shownReach } from "./shown.js";
+import { STRATEGIES, planWords } from "./plans/words.js";
+import { maySteer, shownReach } from "./shown.js";
 
-const STRATEGIES = ["manipulation", "steering"];
-const WORK = [["Plan", "plan"], ["Both strategies", "compare"], ["Reach", "reach"]];
+const WORK = [["Both strategies", "compare"], ["Reach", "reach"]];
 const ACTIVE = ["waiting", "running"];
 
 export function mount(element, store, link) {
   const starts = WORK.map(([text, work]) => button(text, () => link.ask({ type: "start", work }), { "data-work": work }));
-  starts[0].classList.add("primary");
   const cancel = button("Cancel", () => activeJobs(store).forEach(({ job }) => link.ask({ type: "cancel", job })), { hidden: true });
   const progress = make("progress", { max: "1", "aria-label": "Progress of the plan", hidden: true });
   const words = make("ul.words", { role: "status" });
@@ -47,23 +46,10 @@ export function mount(element, store, link) {
 
 const activeJobs = (store) => ["plan", "compare", "reach"].map((kind) => store.get(`job ${kind}`)).filter((job) => job && ACTIVE.includes(job.state));
 
-// [text, stale] for each result.
 function lines(store) {
-  const found = [];
-  const estimate = store.get("estimate");
-  const plans = STRATEGIES.map((strategy) => store.get(`plan ${strategy}`)).filter(Boolean);
-  if (estimate && !isStale(store, estimate) && plans.every((plan) => isStale(store, plan))) {
-    found.push([`First estimate: error at the target ${shown(estimate.error_mm, 2)} mm${estimate.reached ? "" : ", out of reach"}.`, false]);
-  }
-  for (const plan of plans) {
-    const stale = isStale(store, plan);
-    found.push([`${titled(plan.strategy)}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
-  }
   const reach = shownReach(store);
-  if (reach) found.push([`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not searched.`, false]);
-  return found;
+  const words = reach ? [[`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not searched.`, false]] : [];
+  return [...planWords(store), ...words];
 }
 
 const depth = ([x]) => shown(x, 0);
-
-const titled = (word) => word[0].toUpperCase() + word.slice(1);

@@ -11,18 +11,18 @@ const NAMES = { scene: TARGET_AND_PLAN, live: "Insertion", first: "Recorded run"
 export function mount(element, store) {
   const player = new Player(store);
   const choices = Object.entries(NAMES).map(([of, text]) => button(text, () => player.choose(of), { "data-of": of }));
-  const play = button("Play", () => player.toggle(), { "aria-keyshortcuts": "Space", class: "primary" });
+  const play = button("Play", () => player.toggle(), { "aria-keyshortcuts": "Space" });
   const back = button("‹", () => player.step(-1), { "aria-label": "Previous period", "aria-keyshortcuts": "," });
   const on = button("›", () => player.step(1), { "aria-label": "Next period", "aria-keyshortcuts": "." });
-  const slower = button("Slower", () => player.change(-1), { "aria-keyshortcuts": "<" });
-  const faster = button("Faster", () => player.change(1), { "aria-keyshortcuts": ">" });
+  const speed = make("select", { "aria-label": "Speed", "aria-keyshortcuts": "< >", change: () => store.set("view speed", speed.selectedIndex) });
+  speed.append(...SPEEDS.map((each) => make("option", {}, `${each}×`)));
   const newest = button("Latest period", () => player.follow(), { title: "Show the latest period, and each new one" });
-  const [speed, place] = [make("span.number"), make("span.number.quiet")];
+  const place = make("span.number.quiet");
   const scrub = make("input", { type: "range", min: "0", step: "1", "aria-label": "Period", input: () => player.show(Number(scrub.value)) });
-  const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, slower, speed, faster, newest, place);
+  const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, speed, newest);
   const nothing = make("p.quiet", {}, "No insertion and no recorded run yet.");
   const group = make("div.tools", { role: "group", "aria-label": "Shown insertion" }, ...choices);
-  element.append(group, scrub, tools, nothing);
+  element.append(group, tools, scrub, place, nothing);
   element.addEventListener("keydown", (event) => player.key(event));
 
   store.subscribe([...SHOWN, "view playing", "view speed"], () => {
@@ -33,9 +33,9 @@ export function mount(element, store) {
       each.setAttribute("aria-pressed", String(each.dataset.of === of));
       each.hidden = each.dataset.of !== "scene" && !store.get(`insertion ${each.dataset.of}`);
     }
-    group.hidden = !store.get("scene"); // as in a replay, which has only its run
+    group.hidden = choices.filter(({ hidden }) => !hidden).length < 2 || !store.get("scene"); // a replay has only its run
     const some = period !== null;
-    scrub.hidden = tools.hidden = !some;
+    scrub.hidden = tools.hidden = place.hidden = !some;
     nothing.hidden = some || Boolean(store.get("insertion live") ?? store.get("insertion first"));
     if (!some) return;
     scrub.max = String(rows.length - 1);
@@ -44,8 +44,8 @@ export function mount(element, store) {
     scrub.setAttribute("aria-valuetext", `period ${period + 1} of ${rows.length}, ${time}`);
     place.textContent = `${time} · period ${period + 1} of ${rows.length}`;
     play.textContent = store.get("view playing") ? "Pause playback" : "Play";
-    speed.textContent = `${player.speed}×`;
-    newest.hidden = store.get("view period") === undefined;
+    speed.selectedIndex = SPEEDS.indexOf(player.speed);
+    newest.disabled = store.get("view period") === undefined; // not hidden: the scrub would move under the finger
   });
 }
 

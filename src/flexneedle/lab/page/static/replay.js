@@ -5,7 +5,7 @@ import { make } from "./dom.js";
 import { unpacked } from "./frames.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { inWords } from "./insertion/words.js";
-import { addPanels } from "./panels.js";
+import { layOut } from "./layout.js";
 import { mount as mountPlayer } from "./player.js";
 import { mount as mountPlots } from "./plots.js";
 import { mount as mountSection } from "./section.js";
@@ -24,7 +24,7 @@ for (const each of JSON.parse(document.getElementById("run").textContent)) {
   if (typeof each === "string") store.receiveFrame(unpacked(bytesOf(each)));
   else store.receive(each);
 }
-addPanels(document.getElementById("main"), ["space", "player", "section", "axial", "plots", "insertion"]);
+layOut(store, ["player"], ["insertion", "plots"]);
 for (const [name, mount] of Object.entries(PANELS)) load(mount, document.querySelector(`[data-panel="${name}"]`));
 
 // The ArrayBuffer of a text in base64.

@@ -12,7 +12,7 @@ import { showLegend } from "./legend.js";
 import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
 
-const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Axis and target", "target"]];
+const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Target", "target"]];
 const STRETCHES = [1, 2, 5];
 const EDGE = 1; // mm, around the reach
 
@@ -23,8 +23,8 @@ export function mount(element, store, link) {
   const stage = make("div.stage", {}, canvas);
   const legend = make("ul.legend", { "aria-label": "Legend of the section" });
   view = new SectionView(canvas, stage, legend, store, link);
-  const planes = PLANES.map(([text, name]) => button(text, () => view.choose(name), { "data-plane": name }));
-  const stretch = make("select", { "aria-label": "Stretch of the lateral axis", change: () => view.stretchBy(Number(stretch.value)) });
+  const planes = PLANES.map(([text, name]) => button(text, () => view.choose(name), { "data-plane": name, title: name === "target" ? "The plane through the axis and the target" : `The plane ${name}` }));
+  const stretch = make("select.wide", { "aria-label": "Stretch of the lateral axis", change: () => view.stretchBy(Number(stretch.value)) });
   stretch.append(...STRETCHES.map((each) => make("option", { value: String(each) }, each === 1 ? "to scale" : `lateral ×${each}`)));
   element.append(stage, make("div.tools", { role: "toolbar", "aria-label": "Section" }, ...planes, stretch), stillNote(store), legend);
   view.changed = () => {

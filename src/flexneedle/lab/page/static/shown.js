@@ -6,11 +6,19 @@
 // An insertion that begins, and a recording that is opened, makes both undefined (store.js).
 
 const RUNS = ["waiting", "planning", "ready", "running", "paused", "holding"];
+const BEFORE = ["waiting", "planning", "ready"];
+const PREPARED = ["preparing", "ready", "armed"]; // states of a rig
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
 const SAME = 1e-3; // s, largest difference between times of the same period
 
 // Return whether an insertion (message "insertion", or none) runs or waits.
 export const runs = (live) => RUNS.includes(live?.state);
+
+// Return whether an insertion on a rig is only prepared: nothing has moved, and nothing moves before it is started.
+export function isPrepared(store) {
+  const [live, rig] = [store.get("insertion live"), store.get("rig")];
+  return runs(live) && Boolean(live.rig) && BEFORE.includes(live.state) && PREPARED.includes(rig?.state) && !rig.begun;
+}
 
 // Keys to subscribe to for the functions of this module.
 export const SHOWN = [

@@ -7,23 +7,22 @@ import { stillNote } from "./still.js";
 
 const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 show x–y, x–z and along the axis.";
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+const NO_WEBGL = "This browser has no WebGL, so there is no view in space. The section and the view along the axis show the same.";
+const SLOW = "WebGL runs in software here, so this view is slow. The section is fast.";
 const VIEWS = [["Reset", "reset", "0"], ["x–y", "side", "1"], ["x–z", "top", "2"], ["Axis", "axis", "3"]];
 
 let view = null;
 
 export async function mount(element, store, link) {
-  const notice = make("p.quiet", { role: "note", hidden: true });
   const canvas = make("canvas", { tabindex: "0", role: "application", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
   const context = canvas.getContext("webgl2");
   const graphics = context && nameOf(context);
-  if (graphics === null || SOFTWARE.test(graphics)) {
-    notice.hidden = false;
-    notice.textContent = graphics === null
-      ? "This browser has no WebGL, so there is no view in space. The section and the view along the axis show the same."
-      : "WebGL runs in software here, so this view is slow. The section and the view along the axis are fast.";
+  if (graphics === null) {
+    store.set("view notice", NO_WEBGL);
+    store.set("view scene", "section");
+    return;
   }
-  element.append(notice);
-  if (graphics === null) return;
+  if (SOFTWARE.test(graphics)) element.append(make("p.quiet.notice", { role: "note" }, SLOW));
 
   const legend = make("ul.legend", { "aria-label": "Legend" });
   const text = make("p.spoken", { id: "space-text" });
@@ -33,11 +32,11 @@ export async function mount(element, store, link) {
   const { SpaceView } = await import("./space/view.js");
   view = new SpaceView(context, legend, store, link);
   for (const [label, name, key] of VIEWS) {
-    tools.append(button(label, () => view.camera.look(name), { "aria-keyshortcuts": key, title: `Key ${key}` }));
+    tools.append(button(label, () => view.camera.look(name), { "aria-keyshortcuts": key, title: `Key ${key}`, class: name === "axis" ? "wide" : "" }));
   }
   tools.append(
-    button("+", () => view.camera.zoom(0.8), { "aria-label": "Zoom in" }),
-    button("−", () => view.camera.zoom(1.25), { "aria-label": "Zoom out" }),
+    button("+", () => view.camera.zoom(0.8), { "aria-label": "Zoom in", class: "wide" }),
+    button("−", () => view.camera.zoom(1.25), { "aria-label": "Zoom out", class: "wide" }),
   );
   store.subscribe(SHOWN, () => {
     text.textContent = inWords(store);

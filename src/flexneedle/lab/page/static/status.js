@@ -1,7 +1,7 @@
 // The bar at the bottom: connection, who is connected and in control, work with progress and cancel, refusals in words.
 
 import { button, make, renew } from "./dom.js";
-import { runs } from "./shown.js";
+import { isPrepared } from "./shown.js";
 
 const CONNECTIONS = {
   connecting: "Connecting…",
@@ -26,15 +26,11 @@ export function mount(element, store, link) {
   const connection = make("span.connection", { role: "status" });
   const steering = make("span.steering");
   const jobs = make("span.jobs");
-  const stop = button("Stop the insertion", () => link.ask({ type: "stop" }), { class: "danger", hidden: true });
   const refusals = make("div.refusals", { role: "alert" });
-  element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
+  element.append(refusals, make("div.status-line", {}, connection, steering, jobs));
 
   store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
   followSteering(steering, store, link);
-  store.subscribe(["insertion live"], () => {
-    stop.hidden = !runs(store.get("insertion live"));
-  });
   store.subscribe(["session"], () => showTitle(store.get("session")));
   followJobs(jobs, store, link);
   followRefusals(refusals, store);
@@ -80,7 +76,7 @@ function inControl({ clients, steering }, own) {
 // Work that takes longer than a second has a bar; a failure stays until the next job of its kind begins.
 function followJobs(element, store, link) {
   const entries = new Map(); // by kind
-  store.subscribe(["job "], () => {
+  store.subscribe(["job ", "rig", "insertion live"], () => {
     const kinds = new Set([...entries.keys(), ...store.keys("job ").map((key) => key.slice(4))]);
     for (const kind of kinds) change(kind, store.get(`job ${kind}`));
   });
@@ -106,7 +102,8 @@ function followJobs(element, store, link) {
   function update(entry, job) {
     const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
-    entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
+    if (kind === "insertion" && isPrepared(store)) entry.words = "Insertion: prepared, nothing moves";
+    else entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     entry.counts = !failed && (job.share ?? null) === null;
     tell(entry);
     text.classList.toggle("bad", failed);

@@ -84,7 +84,7 @@ class InsertionReporter:
         """Report the plan."""
         self.plan = plan
         self.task.report(shapes_of(plan, FrameSource.LIVE)[0])
-        self.task.report_job("running", 0.0, "inserting")
+        self.task.report_job("running", 0.0, "planned")
 
     def _report_period(self, period: Period) -> None:
         if self.plan is None:

@@ -3,19 +3,21 @@
 import { shown } from "../dom.js";
 
 const STATES = {
-  waiting: "Waiting for the computation", planning: "Planning", ready: "Ready", running: "Running", paused: "Paused",
+  waiting: "Waiting for the computation", planning: "Planning", ready: "Prepared", running: "Running", paused: "Paused",
   holding: "Holding", done: "Ended", held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
 };
 
 const COUNTED = ["paused", "holding", "done", "held", "failed", "interrupted"]; // else the player counts the periods
 
-// insertion: the message of that type; rows: of its periods.
-export function inWords(insertion, rows = []) {
+// insertion: the message of that type; rows: of its periods; rig: its state, if it is connected.
+export function inWords(insertion, rows = [], rig = null) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
-  const parts = [`${STATES[insertion.state] ?? insertion.state}${where}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
+  const state = insertion.rig && insertion.state === "ready" && rig?.state === "starting" ? "Starting" : STATES[insertion.state] ?? insertion.state;
+  const parts = [`${state}${where}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
+  if (state === "Prepared") parts.push("Nothing moves.");
   if (insertion.summary) parts.push(insertion.summary);
-  else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason below.");
+  else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason in the decisions.");
   else if ((insertion.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(insertion.error_mm, 3)} mm from the target.`);
   if (insertion.folder) parts.push(`Recorded as ${insertion.folder}.`);
   return parts.join(" ");

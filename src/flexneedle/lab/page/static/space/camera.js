@@ -20,7 +20,7 @@ export class Camera {
   // canvas: whose pointer and keys it follows; changed: called after each movement.
   constructor(canvas, changed) {
     this.#changed = changed;
-    this.camera = new PerspectiveCamera(24, 1, 1, 5000);
+    this.camera = new PerspectiveCamera(36, 1, 1, 5000);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", changed);
     this.controls.addEventListener("start", () => {

@@ -1,0 +1,105 @@
+// The action bar: plan, insert, stop, pause, pace; on a rig check, prepare, arm, insert. Below it what runs, in words.
+
+import { button, make } from "./dom.js";
+import { confirmed, isArmed, isChecking, waits } from "./rig.js";
+import { inWords } from "./insertion/words.js";
+import { planWords } from "./plans/words.js";
+import { SHOWN, isPrepared, maySteer, runs as isRunning, shownOf } from "./shown.js";
+
+const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
+const SHOWN_BY = ["insertion live", "clients", "welcome", "rig", "job check", "view confirmed"];
+const BEFORE_IT = ["waiting", "planning"];
+
+export function mount(element, store, link) {
+  const shows = (tab, request) => () => {
+    store.set("view tab", tab);
+    link.ask(request());
+  };
+  const plan = button("Plan", shows("plans", () => ({ type: "start", work: "plan" })), { "data-work": "plan" });
+  const start = button("Insert", shows("insertion", () => ({ type: "insert" })), { class: "primary", title: "On the virtual rig, in real time" });
+  const slowly = button("Start paused", shows("insertion", () => ({ type: "insert", paused: true })));
+  const stop = button("Stop", () => link.ask({ type: "stop" }), { class: "stop" });
+  const [pause, step, pace] = pacing(store, link);
+  const steps = rigSteps(store, shows);
+  const words = make("p.words", { role: "status" });
+  element.append(make("div.tools", { role: "toolbar", "aria-label": "Actions" }, plan, ...steps, start, slowly, pause, step, pace, stop), words);
+
+  let focused = null;
+  store.subscribe(SHOWN_BY, () => {
+    focused = document.activeElement; // before it is hidden
+  });
+  store.subscribe(SHOWN_BY, () => {
+    const live = store.get("insertion live");
+    const [runs, prepared, rig] = [isRunning(live), isPrepared(store), store.get("rig")];
+    const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.state === "paused"];
+    const signalled = steers && !BEFORE_IT.includes(live?.state); // before it moves it can only be stopped
+    plan.disabled = !steers || (runs && real);
+    for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
+    start.textContent = store.get("welcome")?.rig ? "Insert virtually" : "Insert";
+    stop.disabled = !runs;
+    stop.textContent = prepared ? "End the preparation" : "Stop";
+    stop.classList.toggle("danger", runs && !prepared);
+    for (const each of [pause, step, pace]) each.hidden = !runs || real;
+    pause.disabled = pace.disabled = !signalled;
+    step.disabled = !signalled || !paused;
+    pause.dataset.next = paused ? "go" : "pause";
+    pause.textContent = paused ? "Continue" : "Pause";
+    if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
+    showSteps(steps, store, rig, steers, runs);
+    if (element.contains(focused) && focused.matches(":disabled, [hidden], [hidden] *")) (runs ? stop : start).focus({ preventScroll: true });
+  });
+  store.subscribe([...SHOWN, "rows live", "rig"], () => {
+    const text = wordsOf(store);
+    if (words.textContent !== text) words.textContent = words.title = text; // a text that is set again is read out again
+  });
+}
+
+function pacing(store, link) {
+  const isPaused = () => store.get("insertion live")?.state === "paused";
+  const pause = button("Pause", () => link.ask({ type: "pace", pace: pause.dataset.next === "go" ? Number(pace.value) : 0 }));
+  const step = button("One period", () => link.ask({ type: "advance" }), { title: "Execute one control period" });
+  const pace = make("select", { "aria-label": "Pace", change: () => isPaused() || link.ask({ type: "pace", pace: Number(pace.value) }) }); // paused: “Continue” takes it
+  pace.append(...PACES.map((each) => make("option", { value: String(each) }, `${each}×`)));
+  pace.value = "1";
+  return [pause, step, pace];
+}
+
+// Check → Prepare → Arm → Insert, in the tab of the rig.
+function rigSteps(store, shows) {
+  const step = (text, title, request) => button(text, shows("rig", request), { "data-step": text.toLowerCase(), title });
+  const arm = () => ({ type: "arm", armed: !isArmed(store), job: store.get("rig").job });
+  return [
+    step("Check", "Compare the rig with its file and the scenario; nothing moves", () => ({ type: "check" })),
+    step("Prepare", "Plan, open the rig, and measure the tip; nothing moves", () => ({ type: "prepare" })),
+    step("Arm", "For one start, once the motions are confirmed in the tab of the rig", arm),
+    step("Insert on the rig", "Motors are switched on, and the needle moves", () => ({ type: "go" })),
+  ];
+}
+
+function showSteps([check, prepare, arm, go], store, rig, steers, runs) {
+  const begun = Boolean(rig) && runs && (rig.begun || rig.state === "starting");
+  const shown = Boolean(rig && store.get("welcome")?.rig);
+  check.hidden = prepare.hidden = !shown || begun;
+  arm.hidden = go.hidden = !shown || (begun && !waits(rig));
+  if (!shown) return;
+  check.disabled = prepare.disabled = !steers || runs || rig.job !== null || isChecking(store);
+  arm.textContent = isArmed(store) ? "Disarm" : "Arm";
+  arm.disabled = !steers || !waits(rig) || !(isArmed(store) || confirmed(store));
+  go.textContent = rig.begun ? "Continue" : "Insert on the rig";
+  go.disabled = !steers || !isArmed(store);
+  go.classList.toggle("danger", !go.disabled);
+}
+
+// The insertion that runs or is shown, else the plan.
+function wordsOf(store) {
+  const live = store.get("insertion live");
+  const shown = shownOf(store);
+  const real = Boolean(live?.rig) && store.get("view of") !== "scene"; // its needle may still be in the tissue
+  const of = isRunning(live) || (shown === "scene" && real) ? "live" : shown;
+  if (of === "scene") return planWords(store).map(([text]) => text).join(" ") || "No plan yet.";
+  const insertion = store.get(`insertion ${of}`);
+  const name = of === "first" ? `${insertion.name}: ` : "";
+  return name + inWords(insertion, store.get(`rows ${of}`), of === "live" ? store.get("rig") : null);
+}
+
+const nearest = (pace) => PACES.reduce((best, each) => (Math.abs(each - pace) < Math.abs(best - pace) ? each : best));
