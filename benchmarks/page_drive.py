@@ -127,4 +127,6 @@ class Pointer:
 
     def _show(self, what: str) -> None:
         key = "view scene" if what == SECTION else "view tab"
-        self._page.evaluate("([key, name]) => flexneedle.store.set(key, name)", [key, re.findall("=(.*)]", what)[0]])
+        self._page.evaluate(
+            "([key, name]) => flexneedle.store.set(key, name)", [key, re.findall("=(.*)]", what)[0]]
+        )

@@ -138,7 +138,10 @@ def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, vis
     server.send(RunsMessage(runs=[MANY]))
     page.wait_for_selector("text=changed", state="detached")
     assert not page.is_visible("[aria-label='Name of the run to save']")
-    server.send(insertion("done"))
+    server.send(insertion("done", name="world:7"))
+    until(
+        page, "/^world-7-adaptive-mpc-20[0-9-]{17}$/.test(document.querySelector('form.tools input').value)"
+    )
     page.fill("[aria-label='Name of the run to save']", "../x")
     page.click("text=Save the insertion")
     page.wait_for_selector("text=The name must begin with a letter or digit")

@@ -184,10 +184,8 @@ def shown_buttons(page):
     return {each.inner_text(): each.is_enabled() for each in buttons}
 
 
-def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
-    page = rig_panel()
-    beginning = {"Check": True, "Prepare": True, "Arm": False, "Insert on the rig": False}
-    assert shown_buttons(page) == beginning
+def check_the_rig(page, server):
+    """A check is shown with its findings, and is of an earlier state once the scenario has changed."""
     click(page, "Check")
     page.wait_for_selector("text=you are in control")
     server.send(JobMessage(job=9, kind="check", state="running", text="each device is read, nothing moves"))
@@ -208,6 +206,13 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     assert page.locator(".findings details[open]").count() == 1
     server.send(*opening(revision=2)[2:3])
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
+
+
+def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
+    page = rig_panel()
+    beginning = {"Check": True, "Prepare": True, "Arm": False, "Insert on the rig": False}
+    assert shown_buttons(page) == beginning
+    check_the_rig(page, server)
     click(page, "Prepare")
     server.wait_for("prepare")
     show(page, "plots")
@@ -227,7 +232,12 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
         click(page, "Arm")
         server.send(rig("armed", *MOVES, job=7))
         until(page, f"document.querySelector('{BAR} [data-step].danger')")
-        assert shown_buttons(page) == {"Check": False, "Prepare": False, "Disarm": True, "Insert on the rig": True}
+        assert shown_buttons(page) == {
+            "Check": False,
+            "Prepare": False,
+            "Disarm": True,
+            "Insert on the rig": True,
+        }
         click(page, last)
         if last == "Disarm":
             server.send(rig("ready", *MOVES, job=7))

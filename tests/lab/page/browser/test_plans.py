@@ -120,7 +120,8 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
         """() => {
           window.changes = 0;
           const count = (records) => { window.changes += records.length; };
-          new MutationObserver(count).observe(document.querySelector(".plans .words"), { childList: true, subtree: true });
+          const words = document.querySelector(".plans .words");
+          new MutationObserver(count).observe(words, { childList: true, subtree: true });
           window.table = document.querySelector(".plans table");
         }"""
     )
@@ -156,5 +157,7 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
     page.wait_for_selector(f"{PLANS} .sweeps .stale")
     for error in (1.01, 3.27, 42.0):  # what one small search has found: the plan may reach it
         server.send(EstimateMessage(revision=2, error_mm=error, reached=False, roll_deg=0.0))
-        page.wait_for_selector(f"{PLANS} >> text=First estimate: ends {error:.2f} mm from the target; whether")
+        page.wait_for_selector(
+            f"{PLANS} >> text=First estimate: ends {error:.2f} mm from the target; whether"
+        )
     assert "out of reach" not in page.inner_text("body")

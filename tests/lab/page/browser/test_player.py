@@ -273,7 +273,7 @@ def test_unknown_values_are_gaps_and_each_run_has_its_line(player, server):
     assert drawn(end, "--measured", 3.95, 5.0, 5.9, 8.7, 9.3) == [False] * 5
     second = of_rows("second", indicators(set(range(35, 40)), 0.3, 0.23))
     server.send(insertion("done", of="second", periods=50), second)
-    page.wait_for_selector(f"{PLOTS} >> text=indicator, second")
+    page.wait_for_selector(f"{PLOTS} >> text=indicator, phantom3d")
     end = 49 * 0.23
     assert all(drawn(end, "--measured", *np.linspace(0.2, 3.7, 40), *np.linspace(6.1, 8.3, 20)))
     assert all(drawn(end, "--second", *np.linspace(0.2, 7.7, 40)))

@@ -110,10 +110,10 @@ def test_two_runs_are_beside_each_other_and_fit_the_width(replay, pictures, size
     at(page, 45)
     for panel in ("space", "section", "axial"):
         show(page, "section" if panel == "axial" else panel)
-        page.wait_for_selector(f"[data-panel={panel}] .legend >> text=second run", state="attached")
+        page.wait_for_selector(f"[data-panel={panel}] .legend >> text=run other", state="attached")
         pictures(page, f"replay-{size[0]}-{scheme}-{panel}")
     assert "Compared with other. Ended: ce-mpc, seed 7" in page.inner_text(WORDS)
     show(page, "plots")
-    page.wait_for_selector(f"{PLOTS} >> text=roll, second")
+    page.wait_for_selector(f"{PLOTS} >> text=roll, other")
     pictures(page, f"replay-{size[0]}-{scheme}-plots")
     assert too_wide(page) == []

@@ -33,7 +33,9 @@ def middle(element):
 
 
 def test_by_finger_the_target_is_dragged_and_an_insertion_stopped_and_scrubbed(visit, server):
-    page = visit(width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]", shows=["section"])
+    page = visit(
+        width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]", shows=["section"]
+    )
     page.evaluate(PAINTED)
     scrolled = page.evaluate("scrollY")
     drag(page, middle(page.locator(f"{SECTION} [data-handle=target]")), 24, 12)

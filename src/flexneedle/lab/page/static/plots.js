@@ -51,7 +51,7 @@ export function mount(element, store) {
     grid.hidden = !rows.length;
     if (!rows.length || !onScreen) return;
     plots ??= PLOTS.map((plot) => new PlotView(grid, plot, choose));
-    const data = [rows, store.get("rows second") ?? null, startOf(store, of), store.get("view theme")];
+    const data = [rows, store.get("rows second") ?? null, startOf(store, of), store.get("view theme"), store.get("insertion second")?.name];
     if (data.some((each, at) => each !== drawn[at])) for (const plot of plots) plot.update(...data);
     drawn = data;
     for (const plot of plots) plot.point(shownRow(store, of));

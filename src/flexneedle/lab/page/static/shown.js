@@ -64,7 +64,7 @@ export function startOf(store, of) {
   return store.get(`insertion ${of}`)?.rig ? store.get(`rows ${of}`)?.[0]?.time ?? 0 : 0;
 }
 
-// The second recorded run, {row, shape(kind)}, at the same time after its first period as the shown one; or null. If the
+// The second recorded run, {name, row, shape(kind)}, at the same time after its first period as the shown one; or null. If the
 // user chose the scene, no run is compared.
 export function shownSecond(store) {
   const chosen = store.get("view of") === "scene" && ["live", "first"].some((of) => store.get(`insertion ${of}`));
@@ -73,7 +73,7 @@ export function shownSecond(store) {
   const [rows, row] = [store.get("rows second") ?? [], shownRow(store, of)];
   const since = row ? row.time - store.get(`rows ${of}`)[0].time : Infinity;
   const period = rows.findLastIndex(({ time }) => time - rows[0].time <= since + SAME);
-  return { row: rows[period] ?? null, shape: (kind) => store.track(kind, "second", period) };
+  return { name: store.get("insertion second").name, row: rows[period] ?? null, shape: (kind) => store.track(kind, "second", period) };
 }
 
 // Scene of the shown state, or null before the first.

@@ -16,8 +16,13 @@ export function showRuns(element, store, link) {
   const list = make("ul", { "aria-label": "Recorded runs" });
   const opened = make("div.opened");
   const save = saveForm(link, "live", "", "Save the insertion");
+  const name = save.querySelector("input");
+  let proposed = "";
   store.subscribe(["insertion live"], () => {
-    save.hidden = !ENDED.includes(store.get("insertion live")?.state);
+    const live = store.get("insertion live");
+    const ended = ENDED.includes(live?.state);
+    if (ended && save.hidden && name.value === proposed) name.value = proposed = defaultName(live);
+    save.hidden = !ended;
   });
   const study = make("div");
   element.append(save, opened, study, make("details", { open: true }, make("summary", {}, "Recorded runs and studies"), search, list));
@@ -79,6 +84,13 @@ function downloadOf(name, file, text, status) {
 }
 
 const addressOf = (name, file) => `/runs/${encodeURIComponent(name)}/${file}`;
+
+// Scenario, controller and time of day, as a valid name.
+function defaultName({ name, controller }) {
+  const now = new Date(Date.now() - 60_000 * new Date().getTimezoneOffset()).toISOString();
+  const text = `${name}-${controller}-${now.slice(0, 19).replace("T", "-")}`;
+  return text.replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "").slice(-80);
+}
 
 function showOpened(element, store, link) {
   const lines = [["first", false, "Shown"], ["second", true, "Compared with"]].flatMap(([of, second, what]) => {

@@ -64,7 +64,7 @@ function secondRun(store, radius) {
   const rows = second.row ? store.get("rows second").slice(0, second.row.index + 1) : [];
   return [
     { path: pathOfRows(rows, "estimate"), tone: "--second", width: 1.5 },
-    { path: first(second.shape("needle")), tone: "--second", thick: 2 * radius, least: 2, text: "second run" },
+    { path: first(second.shape("needle")), tone: "--second", thick: 2 * radius, least: 2, text: `run ${second.name}` },
   ];
 }
 

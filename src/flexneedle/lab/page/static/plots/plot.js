@@ -30,11 +30,11 @@ export class PlotView {
     new ResizeObserver(([{ contentRect }]) => this.#chart?.setSize({ width: contentRect.width, height: HEIGHT })).observe(this.#place);
   }
 
-  // Rows of the shown insertion, one at least, whose times count from `start`, and of the second run (or null), with
+  // Rows of the shown insertion, one at least, whose times count from `start`, and of the second run (or null) of a name, with
   // the same beginning.
-  update(rows, second, start, theme) {
+  update(rows, second, start, theme, name) {
     [this.#rows, this.#start] = [rows, start];
-    const compared = Boolean(second?.length);
+    const compared = second?.length ? name : "";
     if (theme !== this.#theme || compared !== this.#compared) this.#make(theme, compared);
     const one = this.#columnsOf(rows, start);
     const data = compared ? joined(one, this.#columnsOf(second, second[0].time - one[0][0])) : one;
@@ -74,7 +74,7 @@ export class PlotView {
     [this.#theme, this.#compared] = [theme, compared];
     this.#chart?.destroy();
     const lines = compared
-      ? [...this.#spec.lines, ...this.#spec.lines.map((line) => ({ ...line, name: `${line.name}, second`, tone: "--second" }))]
+      ? [...this.#spec.lines, ...this.#spec.lines.map((line) => ({ ...line, name: `${line.name}, ${compared}`, tone: "--second" }))]
       : this.#spec.lines;
     this.#lines = lines;
     const axis = { stroke: color("--quiet"), font: FONT, grid: { stroke: color("--edge"), width: 1 }, ticks: { show: false } };

@@ -203,7 +203,7 @@ export class Shapes {
     if (this.#differs("second tips", [rows.length, rows[0]])) {
       this.#draw("secondPath", pathOfRows(rows, "estimate"), PATH, { tone: "--second" });
     }
-    return second && { text: "second run", tone: "--second" };
+    return second && { text: `run ${second.name}`, tone: "--second" };
   }
 
   // Its strip is in the plane of the target for which it was computed; a target that was moved may be outside.
