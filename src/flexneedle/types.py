@@ -205,6 +205,8 @@ FARTHEST_MM = 1e4
 """Largest coordinate of a position: 10 m, beyond any tracker and below their codes for "no value"."""
 BAD_FLOAT = -3.697314e28
 """NDI's code for a missing number."""
+BAD_FLOAT_TOLERANCE = 1e-2
+"""Relative tolerance of the code: files may have fewer digits."""
 ORIGIN = (0.0, 0.0, 0.0)
 """The position that some devices report for a missing one."""
 
@@ -232,7 +234,7 @@ class SensorReading:
             object.__setattr__(self, "orientation", None)
         if position is None:
             return
-        if any(math.isclose(value, BAD_FLOAT, rel_tol=1e-6) for value in position):
+        if any(math.isclose(value, BAD_FLOAT, rel_tol=BAD_FLOAT_TOLERANCE) for value in position):
             self._drop_position("missing")
         elif no_orientation and position == ORIGIN:
             self._drop_position("missing (position and orientation are 0)")

@@ -9,7 +9,9 @@ from flexneedle.errors import InputError
 from flexneedle.geometry.pair_checks import (
     check_pairs,
     compare_handedness,
+    find_better_fit,
     find_order,
+    find_scale,
     mirrored_frame,
     misfit,
     unknown_side,
@@ -47,6 +49,43 @@ def test_a_residual_up_to_a_tenth_of_the_size_is_accepted():
         check_pairs(scale * CUBE + 500.0, CUBE)
     for scale in (0.88, 1.12):
         assert "the fit has a residual of 8.31 mm" in misfit(scale * CUBE, CUBE)
+
+
+@pytest.mark.parametrize(
+    ("count", "scale", "noise"), [(3, 1.05, 0.002), (8, 1.02, 0.1), (8, 0.97, 0.1), (8, 2.0, 0.1)]
+)
+def test_a_scale_that_fits_far_better_is_noted(count, scale, noise):
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-50.0, 50.0, (count, 3))
+    found = re.search(
+        r"scaled by ([\d.]+), fit far better", find_better_fit(scale * measure(rng, points, noise), points)
+    )
+    assert float(found[1]) == pytest.approx(1.0 / scale, rel=5e-3)
+
+
+@pytest.mark.parametrize("count", [3, 4, 12])
+def test_no_scale_is_noted_for_right_sets(count):
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        points = rng.uniform(-50.0, 50.0, (count, 3))
+        assert find_scale(measure(rng, points, 10.0 ** rng.uniform(-2.0, 0.7)), points) is None
+
+
+@pytest.mark.parametrize("size", [1.0, 10.0])
+def test_points_on_a_line_within_their_errors_are_refused(size):
+    rng = np.random.default_rng(6)
+    line = np.linspace(-50.0, 50.0, 6)[:, None] * (1.0, 0.5, 0.2)
+    for off, refused in ((0.02, True), (1.0, False)):
+        points = size * (line + rng.normal(0.0, off, line.shape))
+        problem = misfit(measure(rng, points, 0.1 * size), points)
+        assert (problem is not None and "on a line within their errors" in problem) == refused
+
+
+def test_points_measured_twice_may_be_out_of_order():
+    rng = np.random.default_rng(7)
+    points = np.vstack([CUBE * (1.0, 0.8, 0.6), CUBE[:2] * (1.0, 0.8, 0.6)])
+    measured = measure(rng, points, 0.02)[[1, 0, *range(2, 10)]]
+    assert "1 and 2 exchanged" in find_better_fit(measured, points)
 
 
 # ---- handedness

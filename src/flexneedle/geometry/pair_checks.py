@@ -1,4 +1,4 @@
-"""Checks of pairs of points before a registration: units, handedness of the frames, order of the points."""
+"""Checks of pairs of points before a registration: units, scale, handedness of the frames, order of the points."""
 
 import math
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ _UNIQUE = 0.25  # largest residual over smallest distance of two points up to wh
 _BETTER = 3.0  # ratio of residuals
 _MOST_ORDERED = 300  # points; the time grows with their number to the third power
 _STEPS = 10  # of the search for an order
+_LARGEST_ANGLE = 0.25  # rad: standard deviation of the angle about a line above which it is unknown
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def check_pairs(moving: Floats, fixed: Floats, names: Names = None) -> None:
 
 
 def misfit(moving: Floats, fixed: Floats, names: Names = None) -> str | None:
-    """Return one line on why no rotation fits pairs (n, 3): a mirrored frame, or a large residual. None if one fits."""
+    """Return one line on why no rotation fits pairs (n, 3): a mirrored frame, a residual, a line; None if one fits."""
     if (problem := mirrored_frame(moving, fixed)) is not None:
         return problem
     size = _radius(fixed)
@@ -107,9 +108,23 @@ def misfit(moving: Floats, fixed: Floats, names: Names = None) -> str | None:
         cause = "are points swapped, axes exchanged, or did the sensor not move?"
         return (
             f"the fit has a residual of {error:.3g} mm (RMS) for points within {size:.3g} mm of their center: "
-            f"{find_order(moving, fixed, names) or cause}"
+            f"{find_better_fit(moving, fixed, names) or cause}"
         )
-    return None
+    return _line(fixed, error)
+
+
+def _line(fixed: Floats, error: float) -> str | None:
+    """Return one line if points (n, 3) are on a line within their errors; error: residual of the fit (RMS, mm)."""
+    count = len(fixed)
+    sizes = np.linalg.svd(fixed - fixed.mean(axis=0), compute_uv=False)
+    noise = error * math.sqrt(count / (3.0 * count - 6.0))
+    if noise <= _LARGEST_ANGLE * math.hypot(*sizes[1:]):
+        return None
+    off = math.hypot(*sizes[1:]) / math.sqrt(count)
+    return (
+        f"the points are on a line within their errors ({off:.2g} mm off it, residual {error:.2g} mm, RMS): the "
+        "rotation about the line is unknown: add a point off the line"
+    )
 
 
 def mirrored_frame(moving: Floats, fixed: Floats) -> str | None:
@@ -140,10 +155,39 @@ def unknown_side(moving: Floats, fixed: Floats, targets: Floats) -> str | None:
     )
 
 
+def find_better_fit(moving: Floats, fixed: Floats, names: Names = None) -> str | None:
+    """Return one line on an order or a scale of `moving` (n, 3) that fits `fixed` (n, 3) far better, or None."""
+    return find_order(moving, fixed, names) or find_scale(moving, fixed)
+
+
+def find_scale(moving: Floats, fixed: Floats) -> str | None:
+    """Return one line on a scale of `moving` (n, 3) that fits `fixed` (n, 3) far better than none, or None.
+
+    With the centred points m, turned by the fit, and f, the scale is Σ m·f / Σ m². The root of the decrease of the sum
+    of squares over the variance that is left is Student's t with 3n − 7 degrees of freedom if there is no scale.
+    """
+    from scipy.special import stdtrit
+
+    count, target = len(fixed), fixed - fixed.mean(axis=0)
+    turned = fit_rigid(moving, fixed).apply(moving) - fixed.mean(axis=0)
+    scale = float(np.sum(turned * target) / np.sum(turned**2))
+    given, scaled = (float(np.sum((factor * turned - target) ** 2)) for factor in (1.0, scale))
+    freedom = 3 * count - 7
+    least = max(scaled, (_ROUNDING * _radius(fixed)) ** 2 * count)
+    critical = float(stdtrit(freedom, _FALSE_ALARM)) ** 2 / freedom
+    if given <= max(_BETTER**2, 1.0 + critical) * least:
+        return None
+    before, after = math.sqrt(given / count), math.sqrt(scaled / count)
+    return (
+        f"the tracker's points, scaled by {scale:.4g}, fit far better (residual {after:.3g} mm, not {before:.3g} mm): "
+        "check the units and the scale of the stage's axes"
+    )
+
+
 def find_order(moving: Floats, fixed: Floats, names: Names = None) -> str | None:
     """Return one line on an order of `moving` (n, 3) that fits `fixed` (n, 3) far better than the given one, or None.
 
-    There is no search if each residual is below a quarter of the smallest distance of two points. names: of
+    There is no search if each residual is below a quarter of the smallest distance of two places. names: of
     the points (default: their numbers from 1).
     """
     if len(fixed) > _MOST_ORDERED:
@@ -218,7 +262,8 @@ def _rms(errors: Floats) -> float:
 def _smallest_distance(points: Floats) -> float:
     from scipy.spatial.distance import pdist
 
-    return float(pdist(points).min())
+    distances = pdist(points)
+    return float(distances[distances > _ROUNDING * _radius(points)].min())
 
 
 def _radius(points: Floats) -> float:

@@ -1,5 +1,7 @@
 """The reader of tables: separators, decimal marks, empty values, and malformed rows by line number."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -74,6 +76,10 @@ def written(tmp_path):
         (SEMICOLONS + "a;1;2\n" * 2000 + "a;1,25;2\n", [*ONE * 2000, ("a", 1.25, 2.0)]),
         (SEMICOLONS + "a;1,5;2.5\na;1,25;-.5\n", [("a", 1.5, 2.5), ("a", 1.25, -0.5)]),
         (SEMICOLONS + "a;1,500;2\n", [("a", 1.5, 2.0)]),
+        (COMMAS + "a,1,2\n# pause, then on\n//\n% \n #\na,1,2\n# end", ONE * 2),
+        ("sensor|x_mm|y_mm\na|1,5|2\n", [("a", 1.5, 2.0)]),
+        ("sep=|\nsensor | x_mm | y_mm\na | 1.5 | 2\n", [("a", 1.5, 2.0)]),
+        (COMMAS + "a,-3.697314E28,-3.69731e+28\na,-3.697e28,-3.70E+28\n", [("a", None, None)] * 2),
         (b"# 20 \xb0C\nsensor,x_mm,y_mm,note\na,1,2,\xb5m\n", ONE),
     ],
 )
@@ -87,7 +93,13 @@ def test_a_csv_file_is_read(written, text, rows):
         (COMMAS + "a,1\n", "line 2"),
         (COMMAS + "a,1,2,3\n", "line 2"),
         (COMMAS + "a,1,5,2\n", "line 2"),
-        (COMMAS + "a,1,2\n# end\n", "line 3"),
+        (COMMAS + "a,1,2\n#b,1,2\n", "line 3: is a comment or a row"),
+        (COMMAS + "%b,1,2\n", "line 2: is a comment or a row"),
+        (COMMAS + "a,1,2\n # b,1,2,3\n", "line 3: is a comment or a row"),
+        (
+            SEMICOLONS + "a;1.234;0,5\na;-12.345;0,7\n",
+            "line 2: x_mm: points may be decimal or separate thousands",
+        ),
         (COMMAS + "a,1,2\na,1,2,\n", "line 3: has more fields"),
         (COMMAS + "a,1,2,\na,1,2\n", "line 3: has fewer fields"),
         (COMMAS + "a,1,2,\na,1,2,5\n", "line 3: has more fields"),
@@ -123,6 +135,9 @@ def test_a_csv_file_is_read(written, text, rows):
         (COMMAS, "has no rows"),
         ("", "is empty"),
         ("# x\n\n", "column names"),
+        ("Device: x\n" + COMMAS + "a,1,2\n", "in the first line that is no comment"),
+        (b"\x1f\x8b\x08\n\n", "is compressed with gzip: unpack it"),
+        (b"PK\x03\x04\n\n", "is an Excel or ZIP file: save it as CSV"),
         ("\0\1\n2", "neither CSV nor Parquet"),
     ],
 )
@@ -161,6 +176,56 @@ def test_parquet_rows_follow_the_same_rules(tmp_path):
     pq.write_table(pa.table(table | {"x_mm": [1.0, float("inf")]}), path)
     with pytest.raises(InputError, match="row 2: x_mm"):
         read(path, require_numbers("x_mm"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"x_mm": ["1"]}, "x_mm: must be a column of numbers, not of VARCHAR: convert it"),
+        ({"x_mm": [[1.0]]}, "x_mm: must be a column of numbers, not of DOUBLE"),
+        ({"X_MM": [9.0]}, "two columns have the name 'x_mm': names must differ in more than case"),
+    ],
+)
+def test_a_parquet_file_with_unclear_columns_is_refused(tmp_path, columns, message):
+    path = tmp_path / "table.parquet"
+    pq.write_table(pa.table({"sensor": ["a"], "x_mm": [1.0], "y_mm": [2.0]} | columns), path)
+    with pytest.raises(InputError, match=message):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "accepted"),
+    [
+        ("mm", "x [mm]", True),
+        ("mm", "x [m]", False),
+        ("m", "x (m)", True),
+        ("mm", "x_cm", False),
+        ("mm", "x_m", True),
+    ],
+)
+def test_a_mapped_column_with_another_unit_in_its_name_is_refused(written, unit, name, accepted):
+    path = written(f"{name},y_mm\n1,2\n")
+    with nullcontext() if accepted else pytest.raises(InputError, match="all lengths must be in mm"):  # noqa: SIM117
+        with open_table(path, ("x_mm", "y_mm"), (), mapping={"x_mm": name}, unit=unit):
+            pass
+
+
+@pytest.mark.parametrize("head", ["", "\n"], ids=["regular", "copied"])
+@pytest.mark.parametrize(
+    ("status", "measured"),
+    [
+        ("ok", True),
+        ("OK", True),
+        ("", True),
+        ("NA", True),
+        ("MISSING", False),
+        ("missing", False),
+        ("BAD_FIT", False),
+    ],
+)
+def test_a_row_counts_only_with_the_status_ok_or_none(written, head, status, measured):
+    path = written(f"sensor,status,x_mm,y_mm\n{head}a,{status},1,2\n")
+    assert read(path) == (ONE if measured else [("a", None, None)])
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -79,7 +79,7 @@ def test_ndis_code_is_a_missing_reading_and_zeros_are_noted(tmp_path):
     assert (found.pairs.missing, len(found.pairs.names), found.fre < 1e-9) == (1, 7, True)
     zeros = [(*row[:4], 0, 0, 0, "ref1") for row in rows()[:1]]
     found = read_pairs(table(tmp_path, [*rows(), *zeros]))
-    assert found.zero == 1
+    assert (found.coded, found.codes) == (1, (0.0,))
     with pytest.raises(InputError, match="the fit has a residual of"):
         register(found)
 

@@ -4,6 +4,7 @@ A table has one row per sample and many samples per grid point. `flexneedle em s
 evaluate` reads it.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from flexneedle.errors import InputError
@@ -32,6 +33,7 @@ REFERENCE = "reference"
 """Name in the column `sensor` of the 6-DOF sensor (paper, Table II); the 5-DOF sensor is `types.TIP` (Table I)."""
 
 _OPTION = "--columns NAME=COLUMN"
+_UNIT = re.compile(r"[\[(]\s*(mm|cm|m|in|inch|um|µm)\s*[\])]\s*$|_(cm|inch|um)$")
 
 
 def map_columns(given: Iterable[str]) -> dict[str, str]:
@@ -48,6 +50,14 @@ def map_columns(given: Iterable[str]) -> dict[str, str]:
             raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
         names[column] = name
     return names
+
+
+def check_units(mapping: Mapping[str, str], unit: str) -> None:
+    """Raise InputError if the name of a mapped column of lengths has another unit, such as "x [cm]"."""
+    for column, name in mapping.items():
+        found = _UNIT.search(name)
+        if found and column.endswith("_mm") and (found[1] or found[2]) != unit:
+            raise InputError(f"{name!r}: all lengths must be in mm, or in m with --unit m (now: {unit})")
 
 
 def choose_columns(
@@ -69,7 +79,8 @@ def choose_columns(
     ]
     if missing:
         remedy = "" if mapping is None else f": map other names with {_OPTION}{_label_options(missing)}"
-        raise InputError(f"no column {', '.join(missing)} (found: {_list(header)}){remedy}")
+        place = "" if {*names.values()} & {*header} else " in the first line that is no comment"
+        raise InputError(f"no column {', '.join(missing)}{place} (found: {_list(header)}){remedy}")
     found = {column: name for column, name in names.items() if name in header}
     duplicates = [name for name in found.values() if header.count(name) > 1]
     if duplicates:

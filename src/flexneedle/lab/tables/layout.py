@@ -14,9 +14,15 @@ SHOWN = 60
 """Number of characters of a line or field in a message."""
 BLANKS = " "
 """The separator of a file with blanks between the columns, any number of them."""
-_SEPARATORS = ",;\t"
-_SEPARATOR_LINE = re.compile(r'"?sep=([,;\t])"?', re.IGNORECASE)  # written by Excel
-_COMMENT = ("#", "%", "//")
+_SEPARATORS = ",;\t|"
+_SEPARATOR_LINE = re.compile(r'"?sep=([,;\t|])"?', re.IGNORECASE)  # written by Excel
+COMMENT = ("#", "%", "//")
+"""Starts of lines that are comments."""
+_OTHER_KINDS = {
+    b"\x1f\x8b": "is compressed with gzip: unpack it",
+    b"PK\x03\x04": "is an Excel or ZIP file: save it as CSV",
+    b"\xd0\xcf\x11\xe0": "is an Excel file: save it as CSV",
+}
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _DECIMAL = re.compile(r"\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*")
 _LONGEST_LINE = 1 << 20  # characters
@@ -44,13 +50,18 @@ def read_layout(path: Path) -> CsvLayout:
 
     Raises InputError if there are no column names or no row.
     """
+    with path.open("rb") as binary:
+        start = binary.read(4)
+    for kind, problem in _OTHER_KINDS.items():
+        if start.startswith(kind):
+            raise InputError(problem)
     separator, skipped = "", 0
     with open_text(path) as file:
         for line in iter(lambda: file.readline(_LONGEST_LINE), ""):
             text = _check_line(line).strip(" \n")
             found = _SEPARATOR_LINE.fullmatch(text)
             separator = found[1] if found else separator
-            if text and not found and not text.startswith(_COMMENT):
+            if text and not found and not text.startswith(COMMENT):
                 break
             skipped += 1
         else:
@@ -64,7 +75,7 @@ def read_layout(path: Path) -> CsvLayout:
 def has_decimal_commas(path: Path, layout: CsvLayout, columns: Container[str]) -> bool:
     """Return whether the first number with a decimal mark in these columns has a comma.
 
-    Only files with semicolons, tabs or blanks between the columns can have decimal commas.
+    Only files with semicolons, tabs, bars or blanks between the columns can have decimal commas.
     """
     if layout.separator == ",":
         return False

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.layout import BLANKS, SHOWN, CsvLayout, open_text, split_line
+from flexneedle.lab.tables.layout import BLANKS, COMMENT, SHOWN, CsvLayout, open_text, split_line
 
 EMPTY = ("", "nan", "-nan", "na", "n/a", "#n/a", "<na>", "null", "none", "missing", "-", "--")
 """Spellings of an empty value, in lower case."""
@@ -21,7 +21,8 @@ _GROUPS = re.compile(rb"_(?<=[0-9]_)[0-9]")
 _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[-+]?\d+)?|[-+]?inf(?:inity)?", re.ASCII | re.IGNORECASE
 )
-_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}", re.ASCII)  # 1,234: perhaps 1234
+_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # 1,234: perhaps 1234
+_COMMENTS = tuple(f"\n{blank}{mark}".encode() for blank in ("", " ") for mark in COMMENT)
 
 
 def is_regular(path: Path, layout: CsvLayout) -> bool:
@@ -36,7 +37,7 @@ def is_regular(path: Path, layout: CsvLayout) -> bool:
         file.seek(start)
         line = layout.separator.encode() * (len(layout.header) - 1) + end
         ignored = bytes({*range(256)} - {*line, *b"\r"})
-        left, last = b"", b""
+        left, last = b"", b"\n"
         for block in iter(lambda: file.read(_BLOCK), b""):
             left += block.translate(None, ignored)
             count, cut = divmod(len(left), len(line))
@@ -47,8 +48,8 @@ def is_regular(path: Path, layout: CsvLayout) -> bool:
 
 
 def _is_misread(text: bytes) -> bool:
-    """Return whether DuckDB may misread a text: quotes after blanks are kept, +-1 is -1, and 1_0 is 10."""
-    return b' "' in text or b"+-" in text or _GROUPS.search(text) is not None
+    """Return whether DuckDB may misread a text: comments, quotes after blanks, +-1 (read as -1), 1_0 (as 10)."""
+    return any(part in text for part in (b' "', b"+-", *_COMMENTS)) or _GROUPS.search(text) is not None
 
 
 def write_copy(
@@ -96,19 +97,20 @@ class _DecimalMarks:
             raise InputError(
                 f"{problem} has a decimal {mark!r}, line {first} has {before!r}: use points throughout"
             )
-        if mark == ",":
+        if mark:
             self._grouped[k] = self._grouped.get(k, True) and _GROUPED.fullmatch(field) is not None
         return field.replace(",", ".")
 
     def check(self) -> None:
-        """Raise InputError if commas may separate thousands: three digits after each, and points in other columns."""
-        points = any(mark == "." for mark, _ in self._found.values())
-        for k, grouped in self._grouped.items():
-            if grouped and points:
-                line, name = self._found[k][1], self._names[k]
-                raise InputError(
-                    f"line {line}: {name}: commas may be decimal or separate thousands: use points"
-                )
+        """Raise InputError if marks may separate thousands: three digits after each, other marks in other columns."""
+        if len({mark for mark, _ in self._found.values()}) < 2:
+            return
+        for k in (k for k, grouped in self._grouped.items() if grouped):
+            (mark, line), name = self._found[k], self._names[k]
+            marks = "commas" if mark == "," else "points"
+            raise InputError(
+                f"line {line}: {name}: {marks} may be decimal or separate thousands: use decimal points throughout"
+            )
 
 
 def _read_rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
@@ -122,6 +124,12 @@ def _read_rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]
             if line <= layout.skipped + 1 or not text.strip(" \n"):
                 continue
             fields = _split_row(line, text.strip("\n"), layout.separator)
+            if text.lstrip(" ").startswith(COMMENT):
+                if len(fields) < names:
+                    continue
+                raise InputError(
+                    f"line {line}: is a comment or a row: delete or quote {text.strip()[:SHOWN]!r}"
+                )
             surplus = any(fields[names:])
             width = width or max(len(fields), names)
             if surplus or len(fields) != width:

@@ -1,5 +1,7 @@
 """Rules for the rows of a table: SQL conditions that invalid rows of `samples` meet, each with its message."""
 
+from collections.abc import Iterable
+
 from flexneedle.lab.tables.plain_copy import EMPTY
 from flexneedle.lab.tables.sample_table import Rule
 from flexneedle.types import FARTHEST_MM
@@ -9,8 +11,10 @@ SAME_POSITION_MM = 1e-3
 _LARGEST_INDICATOR = 1e6
 UNIT_TOLERANCE = 0.01  # devices round quaternions to 4 digits
 
-AT_ORIGIN = "x_mm = 0 AND y_mm = 0 AND z_mm = 0"
-"""SQL condition of samples exactly at the origin."""
+CODED = "x_mm = y_mm AND y_mm = z_mm AND (x_mm IN (0, -1, 99, -99) OR abs(x_mm) >= 999)"
+"""SQL condition of positions that may be codes for missing, such as (0, 0, 0) or (-999, -999, -999)."""
+CODE = f"any_value(x_mm) FILTER ({CODED})"
+"""SQL for the coordinate of such a position in a group."""
 _TRUE, _MEASURED, _QUATERNION = "true_x_mm, true_y_mm, true_z_mm", "x_mm, y_mm, z_mm", "qw, qx, qy, qz"
 
 
@@ -24,12 +28,13 @@ def require_numbers(*columns: str) -> tuple[Rule, ...]:
     return tuple((f"{name} IS NULL OR isinf({name})", f"{name}: must be a finite number") for name in columns)
 
 
-def note_origin(count: int, total: int) -> str | None:
-    """Return one line on `count` of `total` samples exactly at the origin, None without any."""
+def note_codes(count: int, total: int, codes: Iterable[float]) -> str | None:
+    """Return one line on `count` of `total` positions with coordinates that are codes, None without any."""
     if not count:
         return None
+    found = " or ".join(f"({code:g}, {code:g}, {code:g})" for code in sorted({*codes}, key=abs))
     return (
-        f"{count} of {total} positions are exactly (0, 0, 0), a code for missing? They count as measured: if they are "
+        f"{count} of {total} positions are exactly {found}, a code for missing? They count as measured: if they are "
         "missing, leave them empty"
     )
 

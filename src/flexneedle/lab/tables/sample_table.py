@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.columns import choose_columns
+from flexneedle.lab.tables.columns import check_units, choose_columns
 from flexneedle.lab.tables.layout import CsvLayout, has_decimal_commas, read_layout
-from flexneedle.lab.tables.plain_copy import is_regular, write_copy
-from flexneedle.types import BAD_FLOAT
+from flexneedle.lab.tables.plain_copy import EMPTY, is_regular, write_copy
+from flexneedle.types import BAD_FLOAT, BAD_FLOAT_TOLERANCE, VISIBLE
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 TEXT = ("point_id", "sensor", "environment", "status")
 """Columns of text; numbers in them are converted, so that 1 and "1" are the same. All other columns hold numbers."""
 MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
+NO_STATUS = tuple(text for text in EMPTY if text != "missing")
+"""Spellings of an empty status, in lower case."""
 Rule = tuple[str, str]
 """An SQL condition that invalid rows of `samples` meet, and the message."""
 
@@ -54,8 +56,9 @@ class SampleTable:
     """An open table. Its view `samples` has the requested columns and a row for each row of the file.
 
     Text is without surrounding blanks, empty in any of the spellings `EMPTY`. Numbers are DOUBLE with lengths in mm,
-    NULL if empty, if a known code for a missing number or sample, or if the table lacks the column. fields: the
-    requested columns that the table has, with their SQL names in the file.
+    NULL if empty, if a known code for a missing number or sample, or if the table lacks the column; a row with a status
+    other than ok has no position. fields: the requested columns and the status that the table has, with their SQL names
+    in the file.
     """
 
     connection: "DuckDBPyConnection"
@@ -124,6 +127,7 @@ def open_table(
     }
     requested, scale = (tuple(required), tuple(optional)), MILLIMETRES_IN[unit]
     try:
+        check_units(mapping or {}, unit)
         with connect(config=settings) as connection, tempfile.TemporaryDirectory() as folder:
             yield _open(connection, path, Path(folder), requested, mapping, labels or {}, scale)
     except OSError as error:
@@ -148,13 +152,19 @@ def _open(
     if not start:
         raise InputError("is empty")
     source: _Source = _Parquet(path) if start == _MAGIC else _Csv(path, folder / "copy.csv")
-    fields = source.open(connection, lambda header: choose_columns(header, mapping, *requested))
+    required, optional = requested
+    optional = tuple(dict.fromkeys((*optional, "status")))
+    fields = source.open(connection, lambda header: choose_columns(header, mapping, required, optional))
     given = [name for name in labels if name in fields]
     if given:
         raise InputError(f"has a column {given[0]}: --{given[0]} is only for a table without it")
-    names = dict.fromkeys((*requested[0], *requested[1], *labels))
+    names = dict.fromkeys((*required, *optional, *labels))
     values = (f"{_value(name, fields.get(name), labels.get(name, ''), scale)} AS {name}" for name in names)
     query = f"SELECT {', '.join(values)} FROM file"
+    if "status" in fields and "x_mm" in fields:
+        measured = f"lower(status) IN {(VISIBLE, *NO_STATUS)}"
+        position = (f"CASE WHEN {measured} THEN {name} END AS {name}" for name in _POSE[0] if name in fields)
+        query = f"SELECT * REPLACE ({', '.join(position)}) FROM ({query})"
     if fields.keys() >= {*_POSE[0], *_POSE[1]}:
         query = f"SELECT * REPLACE ({_drop_zeros()}) FROM ({query})"
     connection.execute(f"CREATE TEMP VIEW samples AS {query}")
@@ -176,7 +186,7 @@ def _value(name: str, field: str | None, label: str, scale: float) -> str:
     if field is None:
         return "NULL::DOUBLE"
     factor = f" * {scale}" if scale != 1.0 and name.endswith("_mm") else ""
-    missing = f"isnan({field}::DOUBLE) OR abs({field}::DOUBLE - {BAD_FLOAT!r}) < {-1e-6 * BAD_FLOAT!r}"
+    missing = f"isnan({field}::DOUBLE) OR abs({field}::DOUBLE - {BAD_FLOAT!r}) < {-BAD_FLOAT_TOLERANCE * BAD_FLOAT!r}"
     return f"CASE WHEN NOT ({missing}) THEN {field}::DOUBLE{factor} END"
 
 
@@ -186,6 +196,7 @@ class _Csv:
     def __init__(self, path: Path, copy: Path) -> None:
         self._path, self._copy, self._layout = path, copy, read_layout(path)
         self._chosen: dict[int, str] = {}  # types in SQL by column number
+        self._empty = _EMPTY_FIELDS
         self._lines: Sequence[int] = ()
 
     def open(self, connection: "DuckDBPyConnection", choose: _Choose) -> dict[str, str]:
@@ -193,6 +204,7 @@ class _Csv:
         layout = self._layout
         columns = {name: layout.header.index(text) for name, text in choose(layout.header).items()}
         self._chosen = {k: "VARCHAR" if name in TEXT else "DOUBLE" for name, k in columns.items()}
+        self._empty = [text for text in _EMPTY_FIELDS if "status" not in columns or text.lower() != "missing"]
         if is_regular(self._path, layout):
             kinds = {f"c{k}": self._chosen.get(k, "VARCHAR") for k in range(len(layout.header))}
             numbers = {layout.header[k] for k, kind in self._chosen.items() if kind == "DOUBLE"}
@@ -219,14 +231,18 @@ class _Csv:
         """Return "line 5" of a row."""
         return f"line {self._lines[row - 1] if self._lines else self._layout.skipped + 1 + row}"
 
-    @staticmethod
     def _create_view(
-        connection: "DuckDBPyConnection", path: Path, kinds: Mapping[str, str], layout: CsvLayout, mark: str
+        self,
+        connection: "DuckDBPyConnection",
+        path: Path,
+        kinds: Mapping[str, str],
+        layout: CsvLayout,
+        mark: str,
     ) -> None:
         connection.execute(
             f"CREATE OR REPLACE TEMP VIEW file AS SELECT * FROM read_csv({_literal(escape(str(path)))}, "
             f"columns={dict(kinds)}, auto_detect=false, header=true, skip={layout.skipped}, "
-            f"delim={_literal(layout.separator)}, quote='\"', escape='\"', nullstr={_EMPTY_FIELDS}, "
+            f"delim={_literal(layout.separator)}, quote='\"', escape='\"', nullstr={self._empty}, "
             f"decimal_separator='{mark}')"
         )
 
@@ -241,16 +257,23 @@ class _Parquet:
         """Create the view `file` and return the SQL names of the requested columns."""
         from duckdb import InvalidInputException
 
-        source = f"read_parquet({_literal(escape(str(self._path)))}, binary_as_string=true)"
+        path = _literal(escape(str(self._path)))
         try:
-            connection.execute(f"CREATE TEMP VIEW file AS SELECT * FROM {source}")
+            connection.execute(
+                f"CREATE TEMP VIEW file AS SELECT * FROM read_parquet({path}, binary_as_string=true)"
+            )
         except InvalidInputException:
             raise InputError("is a truncated or damaged Parquet file") from None
         types = {name: str(kind) for name, kind, *_ in connection.execute("DESCRIBE file").fetchall()}
+        written = connection.execute(f"SELECT name FROM parquet_schema({path})").fetchall()
+        doubles = {each.rpartition("_")[0].lower() for each in types.keys() - {name for (name,) in written}}
         chosen = choose(list(types))
         for name, text in chosen.items():
-            if name not in TEXT and types[text].startswith(_NOT_NUMERIC):
-                raise InputError(f"{name}: must be a column of numbers, not of {types[text]}")
+            if text.lower() in doubles:
+                raise InputError(f"two columns have the name {text!r}: names must differ in more than case")
+            if name not in TEXT and (types[text].startswith(_NOT_NUMERIC) or types[text].endswith("]")):
+                remedy = "convert it, such as with pandas.to_numeric"
+                raise InputError(f"{name}: must be a column of numbers, not of {types[text]}: {remedy}")
         return {name: '"' + text.replace('"', '""') + '"' for name, text in chosen.items()}
 
     def reopen(self, _connection: "DuckDBPyConnection") -> bool:

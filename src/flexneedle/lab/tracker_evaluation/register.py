@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.figures.style import save
-from flexneedle.geometry.pair_checks import check_pairs, find_order, unknown_side
+from flexneedle.geometry.pair_checks import check_pairs, find_better_fit, unknown_side
 from flexneedle.geometry.quaternion import from_matrix
 from flexneedle.geometry.rigid import (
     Rigid,
@@ -22,11 +22,12 @@ from flexneedle.geometry.rigid import (
 )
 from flexneedle.lab.tables.columns import REQUIRED, map_columns
 from flexneedle.lab.tables.row_rules import (
-    AT_ORIGIN,
+    CODE,
+    CODED,
     POSITIONS,
     SAME_POSITION_MM,
     TRUE_POSITIONS,
-    note_origin,
+    note_codes,
 )
 from flexneedle.lab.tables.sample_table import SampleTable, open_table
 from flexneedle.lab.tracker_evaluation.figures.registration import draw_registration
@@ -47,8 +48,8 @@ _HEAD = """\
 class PointPairs:
     """n fiducials: names, and positions (n, 3) in the frames of stage and tracker (mm).
 
-    samples (n,): number of averaged readings; missing: number of readings without a position, which are ignored; zero:
-    exactly at (0, 0, 0).
+    samples (n,): number of averaged readings; missing: number of readings without a position, which are ignored; coded:
+    with a position that may be a code for missing, codes: its coordinates.
     """
 
     names: tuple[str, ...]
@@ -56,7 +57,8 @@ class PointPairs:
     tracker: Floats
     samples: NDArray[np.int64]
     missing: int
-    zero: int = 0
+    coded: int = 0
+    codes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +146,9 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
 
 
 def _find_notes(pairs: PointPairs, targets: Floats) -> Iterator[str | None]:
-    yield note_origin(pairs.zero, int(pairs.samples.sum()))
+    yield note_codes(pairs.coded, int(pairs.samples.sum()), pairs.codes)
     yield unknown_side(pairs.tracker, pairs.stage, targets)
-    yield find_order(pairs.tracker, pairs.stage, pairs.names)
+    yield find_better_fit(pairs.tracker, pairs.stage, pairs.names)
 
 
 def write_registration(registered: RegistrationResult, path: Path) -> None:
@@ -186,7 +188,7 @@ def _draw(registered: RegistrationResult, path: Path) -> None:
 _POINTS = """
     WITH named AS (SELECT row_number() OVER () AS row, * FROM samples)
     SELECT CASE WHEN point_id = '' THEN 'row ' || row ELSE point_id END AS name, count(x_mm) AS n,
-        count(*) - count(x_mm) AS missing, count(*) FILTER ({origin}) AS zero,
+        count(*) - count(x_mm) AS missing, count(*) FILTER ({coded}) AS coded, {code} AS code,
         favg(x_mm) AS x, favg(y_mm) AS y, favg(z_mm) AS z,
         first(true_x_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_x,
         first(true_y_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_y,
@@ -205,7 +207,7 @@ def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
     chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in given)])
     table.refuse(POSITIONS, chosen, **given)
     table.refuse(TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **given)
-    found = table.arrays(_POINTS.format(chosen=chosen, origin=AT_ORIGIN), **given)
+    found = table.arrays(_POINTS.format(chosen=chosen, coded=CODED, code=CODE), **given)
     known = found["n"] > 0
     if not known.any():
         raise InputError("no reading has a position")
@@ -224,7 +226,8 @@ def _pairs(table: SampleTable, labels: Mapping[str, str | None]) -> PointPairs:
         tracker,
         points["n"],
         int(found["missing"].sum()),
-        int(found["zero"].sum()),
+        int(found["coded"].sum()),
+        tuple(found["code"][found["coded"] > 0].tolist()),
     )
 
 

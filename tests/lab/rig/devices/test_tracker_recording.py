@@ -38,6 +38,7 @@ def table(tmp_path):
 
 ROWS = [row for frame in FRAMES for row in rows_of(frame)]
 ZEROS = dict.fromkeys(("qw", "qx", "qy", "qz"), 0.0)
+FAR = dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1e30)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -61,17 +62,27 @@ def test_a_table_of_measurements_without_status_can_be_read(table):
     assert frames[0].readings["ref1"].status == "missing"
 
 
-def test_a_position_with_a_bad_status_is_not_used(table):
-    (frame,) = read_frames(table([{**ROWS[0], "status": "out of volume"}]))
-    assert frame.readings["tip"].position is None
+@pytest.mark.parametrize("status", ["out of volume", "MISSING", "missing", "BAD_FIT"])
+def test_a_position_with_a_bad_status_is_not_used(table, status):
+    (frame,) = read_frames(table([{**ROWS[0], "status": status}]))
+    assert (frame.readings["tip"].position, frame.readings["tip"].status) == (None, status)
+
+
+@pytest.mark.parametrize("status", ["OK", "", "none"])
+def test_a_position_counts_with_the_status_ok_or_none(table, status):
+    (frame,) = read_frames(table([{**ROWS[0], "status": status}]))
+    assert frame.readings["tip"] == MEASURED
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"x_mm": 1.0}, "line 3: x_mm, y_mm, z_mm: must all have values"),
-        (dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1e30), "line 3: x_mm, y_mm, z_mm: must be at most 10000 mm"),
-        (dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1.0) | ZEROS, "line 3: qw, qx, qy, qz: must be a unit"),
+        ({"x_mm": 1.0, "status": "ok"}, "line 3: x_mm, y_mm, z_mm: must all have values"),
+        (FAR | {"status": "ok"}, "line 3: x_mm, y_mm, z_mm: must be at most 10000 mm"),
+        (
+            dict.fromkeys(("x_mm", "y_mm", "z_mm"), 1.0) | ZEROS | {"status": "ok"},
+            "line 3: qw, qx, qy, qz: must be a unit",
+        ),
         ({"indicator": "inf"}, "line 3: indicator: must be from 0"),
         ({"qx": 1.0}, "line 3: qw, qx, qy, qz: must all have values"),
         ({"sensor": "tip"}, "line 3: duplicate sensor tip in frame 4"),

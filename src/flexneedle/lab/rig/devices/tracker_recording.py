@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.plain_copy import EMPTY
 from flexneedle.lab.tables.row_rules import INDICATORS, ORIENTATIONS, POSITIONS, require_numbers, require_text
-from flexneedle.lab.tables.sample_table import SampleTable, open_table
+from flexneedle.lab.tables.sample_table import NO_STATUS, SampleTable, open_table
 from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
@@ -77,10 +76,10 @@ def _frames(table: SampleTable, rows: Sequence[_Row]) -> tuple[Frame, ...]:
 def _reading(row: _Row) -> SensorReading:
     position, orientation = _none_if_empty(row, _POSITION), _none_if_empty(row, _ORIENTATION)
     indicator = None if isnan(row["indicator"]) else row["indicator"]
-    status = VISIBLE if row["status"].lower() in EMPTY else row["status"]
+    status = VISIBLE if row["status"].lower() in (VISIBLE, *NO_STATUS) else row["status"]
     if position is None and status == VISIBLE:
         status = "missing"
-    return SensorReading(position if status == VISIBLE else None, orientation, indicator, status)
+    return SensorReading(position, orientation, indicator, status)
 
 
 def _none_if_empty(row: _Row, names: Iterable[str]) -> Any:

@@ -7,9 +7,9 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.geometry.pair_checks import find_order, mirrored_frame, misfit, unknown_side
+from flexneedle.geometry.pair_checks import find_better_fit, mirrored_frame, misfit, unknown_side
 from flexneedle.lab.tables.columns import OPTIONAL, REFERENCE, REQUIRED, map_columns
-from flexneedle.lab.tables.row_rules import note_origin
+from flexneedle.lab.tables.row_rules import note_codes
 from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tracker_evaluation.evaluation import published
 from flexneedle.lab.tracker_evaluation.evaluation.accuracy import (
@@ -147,8 +147,9 @@ def _find_notes(grid: MeasuredGrid) -> Iterator[str]:
             f"{missing} of {missing + int(count.sum())} samples have no position (left out), "
             f"all samples at {int((count == 0).sum())} of {len(count)} grid points"
         )
-    if (origin := note_origin(int(grid.points.zero.sum()), int(count.sum()))) is not None:
-        yield origin
+    coded = grid.points.coded
+    if (codes := note_codes(int(coded.sum()), int(count.sum()), grid.points.code[coded > 0])) is not None:
+        yield codes
     try:
         yield from (note for note in _check_frames(grid) if note is not None)
     except InputError:  # too few points, or collinear ones: no fit to compare with
@@ -162,7 +163,7 @@ def _check_frames(grid: MeasuredGrid) -> Iterator[str | None]:
         yield mirrored_frame(*pairs)
         return
     names = tuple(grid.name_of(k) for k in range(len(measured)))
-    yield misfit(*pairs, names) or find_order(*pairs, names)
+    yield misfit(*pairs, names) or find_better_fit(*pairs, names)
     yield unknown_side(*pairs, measured.true)
 
 

@@ -16,7 +16,8 @@ from flexneedle.geometry.rigid import Rigid
 from flexneedle.lab.tables.columns import REFERENCE
 from flexneedle.lab.tables.plain_copy import EMPTY
 from flexneedle.lab.tables.row_rules import (
-    AT_ORIGIN,
+    CODE,
+    CODED,
     INDICATORS,
     ORIENTATIONS,
     POSITIONS,
@@ -57,7 +58,8 @@ _INDICATORS = f"""
 class Moments:
     """Moments of the samples at n grid points.
 
-    count, missing (n,): number of samples with and without a position; zero (n,): exactly at (0, 0, 0). true, position
+    count, missing (n,): number of samples with and without a position; coded (n,): with a position that may be
+    a code for missing; code (n,): the coordinates of such a position. true, position
     (n, 3): true and mean measured position (mm); scatter (n, 3): sum of squares about the mean along each axis (mm²).
     indicators, orientations (n,): number of samples with a position and an indicator or an orientation; indicator (n,):
     mean indicator; products (n, 4, 4): mean of q qᵀ with q = (w, x, y, z). NaN for points without such samples.
@@ -65,7 +67,8 @@ class Moments:
 
     count: Counts
     missing: Counts
-    zero: Counts
+    coded: Counts
+    code: Floats
     true: Floats
     position: Floats
     scatter: Floats
@@ -175,7 +178,8 @@ def _points_query(table: SampleTable, rules: tuple[Rule, ...]) -> str:
                 if(x_mm IS NULL, NULL, qw * qw + qx * qx + qy * qy + qz * qz) AS norm
             FROM samples
         ), grouped AS (
-            SELECT {_KEY}, count(*) AS n_rows, count(x_mm) AS n, count(*) FILTER ({AT_ORIGIN}) AS n_zero,
+            SELECT {_KEY}, count(*) AS n_rows, count(x_mm) AS n, count(*) FILTER ({CODED}) AS n_coded,
+                {CODE} AS code,
                 {_POSITIONS}, {orientations},
                 favg(indicator) AS indicator, count(indicator) AS n_indicator, count(norm) AS n_orientation,
                 count(rule) AS n_invalid
@@ -224,7 +228,8 @@ def _moments(own: _Arrays) -> Moments:
     return Moments(
         count=own["n"],
         missing=own["n_rows"] - own["n"],
-        zero=own["n_zero"],
+        coded=own["n_coded"],
+        code=own["code"],
         true=stack_axes("true"),
         position=stack_axes("mean"),
         scatter=stack_axes("scatter"),
