@@ -38,6 +38,7 @@ class AirRig:
         self.run_out, self.sd, self.delay, self.tilt = run_out, sd, delay, tilt
         self.positions = {name: 0.0 for name, _ in rig.axes.items()}
         self.load = dict(self.positions)
+        self.farthest = dict(self.positions)
         self.time, self.history, self.found, self.listener = 0.0, [(0.0, self.tip())], [], None
         self.rng, self.frame, self.moves = np.random.default_rng(seed), 0, []
 
@@ -79,6 +80,7 @@ class AirRig:
         wanted = scale * self.positions[axis]
         gap = 0.5 * self.lost.get(target, 0.0)
         self.load[target] = min(max(self.load[target], wanted - gap), wanted + gap)
+        self.farthest[target] = max(self.farthest[target], abs(self.load[target]))
 
     def _tick(self):
         self.time += 0.025

@@ -29,8 +29,8 @@ KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers
 POSITIONS = {"insertion": 30.0, "rotation": 0.0, "guide_y": -1.5}
 MOVES = [
     "Bench: the needle will be inserted from its present position to a target 40 mm deep, 5 mm to the side.",
-    "insertion: at 30 mm, moves at most at 10 mm/s",
-    "rotation: at 0 deg, moves at most at 360 deg/s",
+    "insertion: at 30 mm, moves at most at 7.81 mm/s",
+    "rotation: at 0 deg, moves at most at 270 deg/s",
     "guide_y: at -1.5 mm, moves at most at 5 mm/s",
 ]
 

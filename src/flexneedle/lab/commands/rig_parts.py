@@ -29,14 +29,18 @@ def add_yes(parser: argparse.ArgumentParser, action: str = "move") -> None:
 
 def print_findings(rig: str, findings: Sequence[Finding]) -> None:
     """Print a line for each finding, and the number of problems of the rig."""
+    from flexneedle.lab.rig.preflight.rig_check import UncheckedFinding
+
     parts = max(len(one.part) for one in findings)
     items = max(len(one.item) for one in findings)
     for one in findings:
-        verdict, found = "PROBLEM" if one.problem else "ok", "; ".join(filter(None, (one.found, one.problem)))
+        verdict = "PROBLEM" if one.problem else "unknown" if isinstance(one, UncheckedFinding) else "ok"
+        found = "; ".join(filter(None, (one.found, one.problem)))
         print(f"{verdict:7}  {one.part:{parts}}  {one.item:{items}}  {found}")
     problems = sum(1 for one in findings if one.problem)
     counted = f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
-    print(f"\n{rig}: {counted}")
+    unknown = ", ".join(one.part for one in findings if isinstance(one, UncheckedFinding))
+    print(f"\n{rig}: {counted}{f'; unknown: {unknown}' if unknown else ''}")
 
 
 def arm(operator: SupervisorClient) -> None:

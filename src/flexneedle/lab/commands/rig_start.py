@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 from flexneedle.arguments import expand_home
 from flexneedle.cli.commands import Commands, add_command
 from flexneedle.cli.progress import print_line, print_note
-from flexneedle.errors import RigError
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 from flexneedle.lab.commands.rig_parts import add_rig, add_yes, arm, print_findings, stop_on_error
 
 if TYPE_CHECKING:
     from flexneedle.lab.rig.preflight.moves import AxisMove
-    from flexneedle.lab.rig.rig_file import RigFile
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
     from flexneedle.scenario.model import Scenario
     from flexneedle.types import Point
@@ -80,9 +78,12 @@ def _test(args: argparse.Namespace) -> int:
         plan_axis_test,
         run_axis_test,
     )
+    from flexneedle.lab.rig.preflight.frame_turn import describe_frame
+    from flexneedle.lab.rig.preflight.ready import require_air
     from flexneedle.lab.rig.preflight.tip_response import air_responses
     from flexneedle.lab.rig.rig_file import load_rig
     from flexneedle.lab.rig.tracked import open_tracked
+    from flexneedle.scenario.sections.settings import ControlSettings
 
     rig, scenario, motors = load_rig(args.rig), _load(args.scenario), MotorHistory()
     with open_tracked(rig, scenario, motors.add) as operator, stop_on_error(operator):
@@ -91,27 +92,19 @@ def _test(args: argparse.Namespace) -> int:
         plans = plan_axis_test(rig, operator.positions, rest, responses)
         moves = [plan.move for plan in plans]
         if scenario is not None:
-            check_air(
-                rig, float(rest.tip[0]), max(abs(one.distance) for one in moves if one.axis.unit == "mm")
-            )
+            require_air(float(rest.tip[0]), max(abs(one.distance) for one in moves if one.axis.unit == "mm"))
         confirm_motions([*map(str, moves), _IN_AIR, ARMS], "" if args.yes else "Move?")
         folder = create_evidence(rig, args.out)
         _start(operator, moves)
         share_of = partial(share_after_probe, rig, responses)
         runs = [run_axis_test(operator, plan, share_of) for plan in plans]
     motions = {run.name: measure_motion(rig, responses, run, motors) for run in runs}
-    findings = describe_motions(rig, motions, None if scenario is None else scenario.control.stale_after_s)
+    control = ControlSettings() if scenario is None else scenario.control
+    findings = [*describe_motions(rig, motions, control.stale_after_s), *describe_frame(motions)]
     write_evidence(folder, rig, runs, motors, findings)
     print_findings(args.rig, findings)
     print_line(f"evidence: {folder}")
     return 1 if any(one.problem for one in findings) else 0
-
-
-def check_air(rig: RigFile, tip_x: float, free: float) -> None:
-    """Raise RigError if a tip (mm) has less than `free` mm of air before the skin, from x = 0."""
-    if tip_x > -free:
-        rule = f"must be {free:.1f} mm or more before the skin: withdraw it first: flexneedle rig retract RIG"
-        raise RigError(f"{rig.name}: tip at x = {tip_x:.1f} mm: {rule}")
 
 
 def _ready(args: argparse.Namespace) -> int:

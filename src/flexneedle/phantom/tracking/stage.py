@@ -35,9 +35,9 @@ def tilt_of(axis: Floats) -> Lateral:
     """Return slopes θ, ψ (rad) of a needle along a vector (3,): its tilt from x in the directions y and z."""
     x, y, z = axis.tolist()
     across = math.hypot(y, z)
-    if across == 0.0:
-        return 0.0, 0.0
     angle = math.atan2(across, x)
+    if across == 0.0:
+        return angle, 0.0
     return angle * y / across, angle * z / across
 
 
@@ -48,7 +48,10 @@ def has_position(measurement: Measurement) -> bool:
 
 
 def median_pose(measurements: Iterable[Measurement]) -> Pose | None:
-    """Return the medians of the measured tips, None without any; z is 0 in the plane, unknown slopes are NaN."""
+    """Return the medians of the measured tips, None without any; z is 0 in the plane, unknown slopes are NaN.
+
+    The slopes of a sensor that points backwards are its angle and 0: to which side it turns is noise.
+    """
     found = [one for one in measurements if has_position(one)]
     if not found:
         return None
@@ -56,6 +59,8 @@ def median_pose(measurements: Iterable[Measurement]) -> Pose | None:
     slopes = [
         one.direction for one in found if one.direction is not None and np.isfinite(one.direction).all()
     ]
+    if slopes and (angle := median(math.hypot(*slope) for slope in slopes)) > 0.5 * math.pi:
+        slopes = [(angle, 0.0)]
     x, y, z = (median(values) for values in zip(*places, strict=True))
     return Pose(x, y, z, *(median(values) for values in zip(*(slopes or [UNKNOWN]), strict=True)))
 

@@ -16,6 +16,7 @@ from flexneedle.lab.rig.preflight.axis_test import (
     plan_axis_test,
     run_axis_test,
 )
+from flexneedle.lab.rig.preflight.frame_turn import describe_frame
 from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.types import Measurement
 
@@ -34,7 +35,7 @@ def outcome_of(rig, responses=AIR):
     plans = plan_axis_test(RIG, rig.positions, rest, responses)
     runs = [run_axis_test(rig, plan, lambda run: share_after_probe(RIG, responses, run)) for plan in plans]
     motions = {run.name: measure_motion(RIG, responses, run, motors) for run in runs}
-    found = describe_motions(RIG, motions, 0.2)
+    found = [*describe_motions(RIG, motions, 0.2), *describe_frame(motions)]
     return motions, {(one.part, one.item): one.problem for one in found if one.problem}, found
 
 
@@ -44,7 +45,7 @@ def test_a_right_rig_has_no_problem_and_returns_to_its_start():
     assert problems == {}
     assert rig.positions == pytest.approx(dict.fromkeys(rig.positions, 0.0))
     assert motions["insertion"].scale == pytest.approx(1.0, abs=0.02)
-    assert motions["insertion"].delay == pytest.approx(0.02, abs=0.01)
+    assert motions["insertion"].delay[0] == pytest.approx(0.02, abs=0.01)
     assert next(one.found for one in found if one.part == "rotation").startswith("not seen")
 
 
@@ -107,7 +108,7 @@ def test_a_motor_that_does_not_drive_its_axis_and_a_tilted_frame_are_problems():
 
 def test_late_readings_are_a_problem():
     motions, problems, _ = outcome_of(AirRig(RIG, delay=0.3))
-    assert motions["insertion"].delay == pytest.approx(0.3, abs=0.01)
+    assert motions["insertion"].delay[0] == pytest.approx(0.3, abs=0.01)
     assert ("insertion", "delay") in problems
 
 
@@ -116,7 +117,7 @@ def test_without_a_scenario_the_scale_of_the_base_is_not_checked():
     _, problems, found = outcome_of(AirRig(RIG), air)
     assert problems == {}
     assert [one.found for one in found if one.part == "guide_y"] == [
-        "not checked: depends on needle and guide; give --scenario"
+        "depends on needle and guide; give --scenario"
     ]
 
 
@@ -161,3 +162,48 @@ def test_a_needle_that_passes_through_the_clearance_of_its_guide_is_no_wrong_sca
     motions, problems, _ = outcome_of(rig)
     assert motions["guide_y"].scale == pytest.approx(scale, abs=0.03)
     assert (("guide_y", "scale") in problems) == (scale != 1.0)
+
+
+@pytest.mark.parametrize("axis", ["insertion", "guide_y", "guide_z"])
+@pytest.mark.parametrize("scale", [25.4, -25.4, 1 / 25.4])
+def test_counts_in_inches_are_found_within_the_free_air(axis, scale):
+    rig = AirRig(RIG, {axis: scale})
+    motions, problems, found = outcome_of(rig)
+    assert max(abs(way) for name, way in rig.farthest.items() if name != "rotation") < 3.5
+    assert {name for name, _ in problems} == {axis}
+    if scale == 1 / 25.4:
+        assert next(one.found for one in found if one.part == axis).startswith(
+            "no motion of the tip by more than"
+        )
+    else:
+        assert motions[axis].scale == pytest.approx(scale, rel=0.05)
+
+
+@pytest.mark.parametrize("scale", [57.3, -57.3])
+def test_degrees_for_radians_are_not_taken_for_another_scale(scale):
+    """A needle that turns 57 times would show a turn modulo 360°."""
+    motions, problems, _ = outcome_of(AirRig(RIG, {"rotation": scale}, roll=True))
+    assert motions["rotation"].scale == pytest.approx(scale, rel=0.02)
+    assert ("rotation", "scale") in problems
+
+
+TURNED = {
+    "x by 180°": {"guide_y": -1.0, "guide_z": -1.0},
+    "x by 90°": {"guide_y": ("guide_z", 1.0), "guide_z": ("guide_y", -1.0)},
+    "-x by 90°": {"guide_y": ("guide_z", -1.0), "guide_z": ("guide_y", 1.0)},
+    "z by 90°": {"insertion": ("guide_y", 1.0), "guide_y": ("insertion", -1.0)},
+    "y by 180°": {"insertion": -1.0, "guide_z": -1.0},
+    "": {"guide_y": ("guide_z", 1.0), "guide_z": ("guide_y", 1.0)},  # swapped: mirrored
+    " ": {"guide_z": -1.0},
+}
+
+
+@pytest.mark.parametrize("about", TURNED)
+def test_a_turned_frame_of_the_tracker_is_named_beside_the_axes(about):
+    _, problems, found = outcome_of(AirRig(RIG, TURNED[about]))
+    turns = [one.found for one in found if (one.part, one.item) == ("tracker", "frame")]
+    assert ("tracker", "frame") in problems or not about.strip()
+    assert [turn.startswith("turned by ") for turn in turns] == ([True] if about.strip() else [])
+    if about.strip():
+        axis, angle = about.split(" by ")
+        assert turns == [f"turned by {angle} about {axis}"]

@@ -148,6 +148,8 @@ def test_a_motion_is_described_in_one_line_with_its_uncertainty():
         "insertion: from 10 to 15 mm (5 mm), at most at 2 mm/s; the start is uncertain by 0.05 mm"
     )
     base, turn, guide = describe_axes(loose, {"insertion": 10.0, "rotation": 0.0, "guide_y": 0.0})
-    assert base.startswith("insertion: at 10 mm, moves at most at 10 mm/s; the start is uncertain by 0.05 mm")
+    assert base.startswith(
+        "insertion: at 10 mm, moves at most at 7.81 mm/s; the start is uncertain by 0.05 mm"
+    )
     assert "uncertain by 0.45 deg" in turn
     assert guide == "guide_y: at 0 mm, moves at most at 5 mm/s"

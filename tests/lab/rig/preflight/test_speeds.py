@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.lab.rig.preflight.speeds import attained_speed, describe_speeds, step_time
+from flexneedle.lab.rig.preflight.speeds import attained_speed, describe_speed, step_time
 from flexneedle.lab.rig.supervisor import protocol
 from stages import TICK_S, Bench, rig_file
 
@@ -36,7 +36,8 @@ def test_a_step_takes_the_time_that_its_acceleration_needs(acceleration):
 
 
 def test_a_speed_that_an_axis_does_not_keep_is_printed_with_its_reason():
-    assert dict(describe_speeds(slow(10.0, 50.0))) == {
+    rig = slow(10.0, 50.0)
+    assert {name: describe_speed(rig, axis) for name, axis in rig.axes.items()} == {
         "insertion": "5.93 of 10 mm/s: acceleration_mm_s2 = 50 cannot brake a faster axis within the queue",
         "rotation": "360 deg/s",
         "guide_y": "10 mm/s",

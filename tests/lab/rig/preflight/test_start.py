@@ -7,7 +7,7 @@ import pytest
 
 from bench_rig import rig
 from flexneedle.lab.rig.preflight.start import StartLimits, _Mount, axis_start_problem, tip_problems
-from flexneedle.phantom.tracking.stage import median_pose
+from flexneedle.phantom.tracking.stage import median_pose, tilt_of
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import UNKNOWN, Control, Measurement, Pose
@@ -132,4 +132,18 @@ def test_the_pose_of_the_tip_is_the_median_of_what_is_measured():
     assert median_pose(found) == Pose(1.2, 2.2, 3.0, 0.1, 0.2)
     assert median_pose(found[3:]) is None
     assert math.isnan(median_pose(found[1:2]).theta)
+
+
+@pytest.mark.parametrize("turn", [0.3, 1.2, 2.5, 3.0, math.pi])
+@pytest.mark.parametrize("jitter", [0.0, 0.003])
+def test_a_sensor_that_points_elsewhere_is_a_line_also_where_its_sides_are_noise(turn, jitter):
+    rng = np.random.default_rng(0)
+    x = PLANE.setup.start_tip_x
+    axes = [
+        np.array([math.cos(turn), math.sin(turn) * math.cos(side), math.sin(turn) * math.sin(side)])
+        for side in (rng.uniform(-3.0, 3.0, 99) if turn > 2.9 else np.full(99, 0.4))
+    ]
+    slopes = [tilt_of(axis + jitter * rng.standard_normal(3)) for axis in axes]
+    pose = median_pose(Measurement(0.0, x, 0.0, 0.0, direction=slope) for slope in slopes)
+    assert any("mrad: must be within" in line for line in tip_problems(PLANE, pose))
     assert all(map(math.isnan, UNKNOWN))

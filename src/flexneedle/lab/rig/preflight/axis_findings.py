@@ -10,20 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.lab.rig.preflight.axis_test import SCALE_SD, AxisRun, MotorHistory
-from flexneedle.lab.rig.preflight.rig_check import Finding
+from flexneedle.lab.rig.preflight.axis_test import MOST_SCALE, SCALE_SD, AxisRun, MotorHistory
+from flexneedle.lab.rig.preflight.rig_check import Finding, UncheckedFinding
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.types import Floats
 
 _SDS = 4.0  # standard deviations beyond which a difference is certain
-_MOST_TILT = math.radians(10.0)  # of a motion from its axis, beyond the noise
+MOST_TILT = math.radians(10.0)
+"""Largest angle (rad) of a motion from its axis."""
 _OTHER = math.cos(math.radians(25.0))  # a motion along another axis
-_MOST_SCALE = 3.0  # of an axis that continues after its probe
+_LATERAL_SD = (
+    0.0075  # of a lateral axis's scale beside the noise: mount and clearance change the needle's lever
+)
 _LEAST_SHARE = 0.5
 _SWAPPED = 0.25  # relative difference of a motion from another axis's
 _MOST_GAP = 0.31  # mm
 _AFTER_S = 0.4  # of rest after the way out, in which late readings show the motion
+_EARLY_S = 0.05  # two ticks
 _DELAYS = np.arange(-0.2, 0.8, 0.001)
 
 
@@ -32,7 +36,9 @@ class Motion:
     """Measured motion of an axis: the axis that moved ("" if none was measured), and its scale with standard deviation.
 
     scale: measured over commanded travel, negative if reversed, None if unknown; tilt: angle from the expected
-    direction (rad); lost: motion lost on reversal (mm or rad), with standard deviation; delay: of the readings (s).
+    direction (rad); lost: motion lost on reversal (mm or rad), with standard deviation; delay: of the readings (s),
+    with standard deviation; turn: expected and measured direction (2, 3) for a positive motion; unseen: largest motion
+    (mm) of the tip that would be noise, and the motor's.
     """
 
     moved: str
@@ -40,7 +46,9 @@ class Motion:
     sd: float = 0.0
     tilt: float = 0.0
     lost: tuple[float, float] | None = None
-    delay: float | None = None
+    delay: tuple[float, float] | None = None
+    turn: Floats | None = None
+    unseen: tuple[float, float] | None = None
 
 
 def share_after_probe(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> float:
@@ -49,16 +57,16 @@ def share_after_probe(rig: RigFile, responses: Mapping[str, Floats], run: AxisRu
     An axis that moves too far goes less far, so that the tip moves by the planned way; it is 0 if another axis or none
     moved.
     """
-    seen, noise = run.moved(0, 1), run.noise(0, 1)
+    seen = run.moved(0, 1)
     if _other_axis(rig, responses, run) is not None:
         return 0.0
     if run.name == "rotation":
         return 1.0
     size = float(np.linalg.norm(seen))
-    if run.name not in responses or size <= _SDS * math.sqrt(3.0) * noise:
+    if run.name not in responses or size <= run.least_seen(0, 1):
         return 0.0
     scale = size / float(np.linalg.norm(run.travel(0, 1) * responses[run.name]))
-    return 0.0 if scale > _MOST_SCALE else min(1.0, max(_LEAST_SHARE, 1.0 / scale))
+    return 0.0 if scale > MOST_SCALE else min(1.0, max(_LEAST_SHARE, 1.0 / scale))
 
 
 def measure_motion(
@@ -69,30 +77,33 @@ def measure_motion(
         return _measure_rotation(rig, responses, run)
     first, last = (1, -2) if run.complete else (0, 1)
     seen, travel, noise = run.moved(first, last), run.travel(first, last), run.noise(first, last)
-    size = float(np.linalg.norm(seen))
-    if size <= _SDS * math.sqrt(3.0) * noise:
+    size, least = float(np.linalg.norm(seen)), run.least_seen(first, last)
+    if size <= least:
         turned = run.rests[last].turned_since(run.rests[first])
         turns = turned is not None and abs(turned) > math.radians(2.0) and rig.axes.rotation is not None
-        return Motion("rotation" if turns else "")
-    if (other := _other_axis(rig, responses, run)) is not None:
-        return Motion(other)
-    response = responses.get(run.name)
+        return Motion("rotation" if turns else "", unseen=(least, abs(travel)))
+    response, other = responses.get(run.name), _other_axis(rig, responses, run)
     if response is None:
-        return Motion(run.name)
-    gain, along = float(np.linalg.norm(response)), float(seen @ response) / float(np.linalg.norm(response))
+        return Motion(other or run.name)
+    gain = float(np.linalg.norm(response))
+    turn = np.stack([response / gain, seen / math.copysign(size, travel)])
+    if other is not None:
+        return Motion(other, turn=turn)
+    along = float(seen @ response) / gain
     scale, sd = math.copysign(size, along * travel) / (gain * abs(travel)), noise / (gain * abs(travel))
     tilt = math.acos(min(1.0, abs(along) / size))
     if not run.complete:
         back = run.moved(1, 2)
         size = 0.5 * (size + float(np.linalg.norm(back)))
-        return Motion(run.name, math.copysign(size, scale) / (gain * abs(travel)), sd, tilt)
+        return Motion(run.name, math.copysign(size, scale) / (gain * abs(travel)), sd, tilt, turn=turn)
     delay = _measure_delay(run, motors, noise)
     if run.name == "insertion":
-        return Motion(run.name, scale, sd, tilt, _lost_motion(run, gain, abs(scale)), delay)
-    at = motors.at(run.name, run.times - (delay or 0.0)) - run.rests[0].positions[run.name]
+        return Motion(run.name, scale, sd, tilt, _lost_motion(run, gain, abs(scale)), delay, turn)
+    at = motors.at(run.name, run.times - (delay[0] if delay else 0.0)) - run.rests[0].positions[run.name]
     along_axis = (run.tips - run.rests[0].tip) @ response / gain**2
     scale, sd, gap = _fit_with_clearance(at, along_axis, float(run.rests[0].spread.max()) / gain)
-    return Motion(run.name, scale, sd, tilt, (gap, sd * abs(travel)), delay)
+    lost = gap, sd * abs(travel)
+    return Motion(run.name, scale, math.hypot(sd, _LATERAL_SD * scale), tilt, lost, delay, turn)
 
 
 def _fit_with_clearance(at: Floats, along: Floats, noise: float) -> tuple[float, float, float]:
@@ -127,7 +138,7 @@ def _other_axis(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> 
     last = 2 if run.complete else 1
     seen = run.moved(0, last)
     size, axes = float(np.linalg.norm(seen)), dict(rig.axes.items())
-    if size <= _SDS * math.sqrt(3.0) * run.noise(0, last):
+    if size <= run.least_seen(0, last):
         return None
     found = dict[str, float]()
     for name, response in responses.items():
@@ -144,12 +155,12 @@ def _other_axis(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> 
 def _measure_rotation(rig: RigFile, responses: Mapping[str, Floats], run: AxisRun) -> Motion:
     if (other := _other_axis(rig, responses, run)) is not None:
         return Motion(other)
-    if not run.complete:
-        return Motion("")
-    turned = run.rests[2].turned_since(run.rests[1])
+    first, last = (1, 2) if run.complete else (0, 1)
+    turned = run.rests[last].turned_since(run.rests[first])
     if turned is not None and abs(turned) > math.radians(5.0):
-        return Motion("rotation", turned / run.travel(1, 2), 0.01)
-    return _fit_run_out(run)
+        scale = turned / run.travel(first, last)
+        return Motion("rotation", scale, 0.01 * max(1.0, abs(scale)))
+    return _fit_run_out(run) if run.complete else Motion("")
 
 
 def _fit_run_out(run: AxisRun) -> Motion:
@@ -179,8 +190,11 @@ def _fit_circle(
     return float(np.sum(np.abs(at - columns @ solution) ** 2)), float(abs(solution[1]))
 
 
-def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> float | None:
-    """Return the delay (s) of the readings behind the motor: the shift of the motor's path that fits them best."""
+def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> tuple[float, float] | None:
+    """Return the delay (s) of the readings behind the motor, with its standard deviation.
+
+    It is the shift of the motor's path that fits them best.
+    """
     if len(motors.times) < 2:
         return None
     way = run.moved(0, -2)
@@ -196,11 +210,13 @@ def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> float | 
         columns = np.stack([np.ones(len(path)), path], axis=1)
         residual = along[chosen] - columns @ np.linalg.lstsq(columns, along[chosen], rcond=None)[0]
         misfit.append(float(residual @ residual))
-    return float(_DELAYS[int(np.argmin(misfit))])
+    best = int(np.argmin(misfit))
+    near = _DELAYS[np.array(misfit) < misfit[best] * (1.0 + 1.0 / np.count_nonzero(chosen))]
+    return float(_DELAYS[best]), 0.5 * float(near.max() - near.min())
 
 
-def describe_motions(rig: RigFile, motions: Mapping[str, Motion], most_delay: float | None) -> list[Finding]:
-    """Return the findings of all axes; most_delay: age (s) from which readings are stale, None if unknown."""
+def describe_motions(rig: RigFile, motions: Mapping[str, Motion], most_delay: float) -> list[Finding]:
+    """Return the findings of all axes; most_delay: age (s) from which readings are stale."""
     axes = dict(rig.axes.items())
     return [
         finding
@@ -215,10 +231,10 @@ def _describe_motion(
     motion: Motion,
     motions: Mapping[str, Motion],
     axes: Mapping[str, Axis],
-    most_delay: float | None,
+    most_delay: float,
 ) -> Iterator[Finding]:
     if motion.moved == "":
-        yield _unseen(name, axis)
+        yield _unseen(name, axis, motion.unseen)
         return
     if motion.moved != name:
         fits = next((other for other, one in motions.items() if one.moved == name), None)
@@ -227,31 +243,41 @@ def _describe_motion(
         yield Finding(name, "axis", motion.moved, problem)
         return
     if motion.scale is None:
-        yield Finding(name, "scale", "not checked: depends on needle and guide; give --scenario")
+        found = "depends on needle and guide; give --scenario"
+        yield UncheckedFinding(name, "scale", found)
         return
     yield from _scale_findings(name, axis, motion, motion.scale)
     if axis.unit == "mm":
         rule = (
-            f"must be within {math.degrees(_MOST_TILT):g}°: check registration"
-            if motion.tilt > _MOST_TILT
+            f"must be within {math.degrees(MOST_TILT):g}°: check registration"
+            if motion.tilt > MOST_TILT
             else ""
         )
         yield Finding(name, "direction", f"{math.degrees(motion.tilt):.1f}° from its axis", rule)
     if motion.lost is not None:
         yield _lost_finding(name, axis, *motion.lost)
     if motion.delay is not None:
-        late = most_delay is not None and abs(motion.delay) > most_delay
-        rule = f"must be at most {most_delay:g} s, control.stale_after_s" if late else ""
-        yield Finding(name, "delay", f"readings are {1e3 * motion.delay:.0f} ms behind the motor", rule)
+        yield _delay_finding(name, *motion.delay, most_delay)
 
 
-def _unseen(name: str, axis: Axis) -> Finding:
+def _unseen(name: str, axis: Axis, unseen: tuple[float, float] | None) -> Finding:
     if axis.unit == "deg":
-        return Finding(
-            name, "motion", "not seen: the sensor shows no roll, and the tip has too little run-out"
-        )
+        why = "not seen: the sensor shows no roll, and the tip has too little run-out"
+        return UncheckedFinding(name, "motion", why)
     rule = f'axes.{name}.channel = "{axis.channel}": must be the motor of this axis, with axes.{name}.counts_per_mm'
-    return Finding(name, "motion", "no motion of the tip", f"{rule}, and its motor must drive the axis")
+    found = "no motion of the tip"
+    if unseen is not None:
+        found = f"no motion of the tip by more than {unseen[0]:.2f} mm, for {unseen[1]:.2f} mm of the motor"
+    return Finding(name, "motion", found, f"{rule}, and its motor must drive the axis")
+
+
+def _delay_finding(name: str, delay: float, sd: float, most: float) -> Finding:
+    """Return the delay of the readings; ahead of the motor beyond the noise, their times are wrong."""
+    shown = f"readings are {1e3 * delay:.0f} ± {1e3 * sd:.0f} ms behind the motor"
+    if delay > most:
+        return Finding(name, "delay", shown, f"must be at most {most:g} s, control.stale_after_s")
+    early = delay < -max(_EARLY_S, _SDS * sd)
+    return Finding(name, "delay", shown, "must be 0 or more: check the times of the tracker" if early else "")
 
 
 def _scale_findings(name: str, axis: Axis, motion: Motion, scale: float) -> Iterator[Finding]:

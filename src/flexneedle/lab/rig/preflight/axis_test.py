@@ -18,8 +18,13 @@ SCALE_SD = 0.005
 """Standard deviation of a scale to which the travel and the time at rest are adapted: 1 to 2 % are then certain."""
 PROBE = 0.25
 """First part of a travel, after which an axis that does not move as expected turns back."""
+MOST_SCALE = 3.0
+"""Scale beyond which an axis goes no further."""
+_FIRST = 0.04  # part of a travel before the probe: in inches, an axis moves by a travel
 _LEAST_MM, _MOST_MM = 2.0, 4.0  # travel of a linear axis
-_TURN_DEG, _LEAST_TURN_DEG, _PROBE_DEG = 180.0, 45.0, 10.0
+_TURN_DEG, _LEAST_TURN_DEG, _PROBE_DEG, _FIRST_DEG = 180.0, 45.0, 10.0, 1.0
+_SEEN_DEG = 2.0  # more than the noise of a turn
+_SDS = 4.0  # standard deviations beyond which a motion is seen
 _LEAST_S, _MOST_S, _SETTLE_S = 1.0, 4.0, 0.4
 _LEAST_READINGS, _ENOUGH, _MOST_WAITS = 5, 0.8, 5
 
@@ -92,12 +97,14 @@ class Rest:
 
 @dataclass(frozen=True)
 class AxisPlan:
-    """Planned motion of one axis: positions of the probe (mm or rad) and of the rests, as shares of its way.
+    """Planned motion of one axis: positions before the probe and of it (mm or rad), rests as shares of its way.
 
-    seconds: time at rest; readings: of it that suffice.
+    gain: motion of the tip for that of the axis (mm per mm); seconds: time at rest; readings: of it that suffice.
     """
 
     move: AxisMove
+    gain: float
+    first: float
     probe: float
     rests: tuple[float, ...]
     seconds: float
@@ -137,6 +144,19 @@ class AxisRun:
     def noise(self, first: int, last: int) -> float:
         """Return the standard deviation (mm) of a coordinate of the motion between two rests."""
         return float(np.hypot(self.rests[first].sd, self.rests[last].sd).max())
+
+    def least_seen(self, first: int, last: int) -> float:
+        """Return the motion of the tip (mm) between two rests from which it is more than noise."""
+        return _SDS * math.sqrt(3.0) * self.noise(first, last)
+
+    @property
+    def runs_away(self) -> bool:
+        """Whether the axis moved much further than commanded until its second rest."""
+        travel, turned = abs(self.travel(0, 1)), self.rests[1].turned_since(self.rests[0])
+        if self.plan.move.axis.unit == "deg":
+            return abs(turned or 0.0) > MOST_SCALE * travel + math.radians(_SEEN_DEG)
+        most = MOST_SCALE * self.plan.gain * travel
+        return float(np.linalg.norm(self.moved(0, 1))) > most + self.least_seen(0, 1)
 
 
 def measure_rest(operator: Operator, seconds: float) -> Rest:
@@ -197,15 +217,15 @@ def _plan_axis(
 ) -> AxisPlan:
     axis = dict(rig.axes.items())[name]
     rests: tuple[float, ...] = (1.0,) if name == "insertion" else (0.5, 0.75, 1.0)
+    gain = float(np.linalg.norm(responses[name])) if name in responses else 1.0
     if axis.unit == "deg":
         room = max(position - axis.limits[0], axis.limits[1] - position)
         wanted = min(_TURN_DEG * axis.size, max(room, _LEAST_TURN_DEG * axis.size))
-        probe, rests, seconds = _PROBE_DEG * axis.size, (0.5, 1.0), _LEAST_S
+        first, probe, rests, seconds = _FIRST_DEG * axis.size, _PROBE_DEG * axis.size, (0.5, 1.0), _LEAST_S
     else:
-        gain = float(np.linalg.norm(responses[name])) if name in responses else 1.0
         noise = math.sqrt(2.0) * float(rest.spread.max()) / (SCALE_SD * gain * (1.0 - PROBE))
         wanted = min(max(_LEAST_MM, noise / math.sqrt(rest.rate * _LEAST_S)), _MOST_MM)
-        probe = PROBE * wanted
+        first, probe = _FIRST * wanted, PROBE * wanted
         seconds = min(max(_LEAST_S, (noise / wanted) ** 2 / rest.rate), _MOST_S)
     low, high = axis.limits
     back, ahead = position - low, high - position
@@ -220,6 +240,8 @@ def _plan_axis(
         raise InputError(f"{name}: no motion")
     return AxisPlan(
         move,
+        gain,
+        position + sign * min(first, _largest_probe(rig, name)),
         position + sign * min(probe, _largest_probe(rig, name)),
         rests,
         seconds,
@@ -235,9 +257,10 @@ def _largest_probe(rig: RigFile, name: str) -> float:
 
 
 def run_axis_test(operator: Operator, plan: AxisPlan, share_of: Callable[[AxisRun], float]) -> AxisRun:
-    """Move one axis to the probe, on towards its goal and back to its start.
+    """Move one axis a little, to the probe, on towards its goal and back to its start.
 
-    share_of: returns the share of the way to the goal after the probe, 0 to go back from there.
+    It goes back at once if it runs away. share_of: returns the share of the way to the goal after the probe, 0 to go
+    back from there.
     """
     move, rests, found = plan.move, list[Rest](), list[Measurement]()
 
@@ -253,11 +276,19 @@ def run_axis_test(operator: Operator, plan: AxisPlan, share_of: Callable[[AxisRu
         found.extend(new)
         rests.append(_rest_of(dict(operator.positions), new, plan.seconds))
 
+    def run_so_far() -> AxisRun:
+        return AxisRun(plan, tuple(rests), np.zeros(0), np.zeros((0, 3)))
+
     operator.read()
     rest()
-    operator.move_to(move.name, plan.probe, move.speed)
+    operator.move_to(move.name, plan.first, move.speed)
     rest()
-    share = share_of(AxisRun(plan, tuple(rests), np.zeros(0), np.zeros((0, 3))))
+    share = 0.0
+    if not run_so_far().runs_away:
+        rests.pop()
+        operator.move_to(move.name, plan.probe, move.speed)
+        rest()
+        share = share_of(run_so_far())
     for part in plan.rests if share > 0.0 else ():
         operator.move_to(move.name, move.start + part * share * move.distance, move.speed)
         rest()

@@ -7,6 +7,7 @@ from math import isfinite
 
 from flexneedle.arguments import shorten as text_of
 from flexneedle.errors import InputError, RefusedError
+from flexneedle.lab.rig.preflight.speeds import attained_speed
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.lab.rig.supervisor.checks import STILL
@@ -88,12 +89,17 @@ def describe_uncertainty(axis: Axis) -> str:
 
 
 def describe_axes(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
-    """Return one line for each axis: its position (mm or rad, by name), and its largest speed."""
+    """Return one line for each axis: its position (mm or rad, by name), and the largest speed that it attains."""
     return [
-        f"{name}: at {_with_unit(axis, positions[name])}, moves at most at {_with_unit(axis, axis.speed)}/s"
+        f"{name}: at {_with_unit(axis, positions[name])}, moves at most at {_describe_speed(rig, axis)}"
         + (f"; the start is {describe_uncertainty(axis)}" if axis.backlash else "")
         for name, axis in rig.axes.items()
     ]
+
+
+def _describe_speed(rig: RigFile, axis: Axis) -> str:
+    speed = f"{attained_speed(axis, rig.loop, axis.speed) / axis.size:.3g}"
+    return f"{float(speed):g} {axis.unit}/s"  # no exponent
 
 
 def describe_insertion(rig: RigFile, scenario: Scenario, positions: Mapping[str, float]) -> list[str]:

@@ -41,10 +41,7 @@ def plan_way_to_start(
         raise RigError("tip: not measured: the start of the insertion axis is unknown; look at rig check RIG")
     start, here = scenario.setup.start_tip_x, tip[0]
     margin = min(_SDS * scenario.control.start_axial_sd_mm, -_HALF * start)
-    if here > -margin:
-        where = f"{here:.1f} mm deep" if here > 0.0 else f"{-here:.1f} mm before the skin"
-        rule = f"must be {margin:g} mm or more before the skin, so that nothing bends the needle in tissue"
-        raise RigError(f"tip: {where}: {rule}: withdraw it first: flexneedle rig retract RIG")
+    require_air(here, margin)
     at = positions["insertion"]
     goal = _within_limits(rig, scenario, at, at + (start - here) * axis_stretch(scenario.entry.slope))
     across = [_move(rig, name, positions[name], 0.0) for name, _ in rig.axes.items() if name != "insertion"]
@@ -54,6 +51,17 @@ def plan_way_to_start(
         both = _move(rig, "insertion", at, middle), _move(rig, "insertion", middle, goal)
         return WayToStart((), tuple(filter(None, across)), tuple(filter(None, both)))
     return WayToStart((along,) if along else (), tuple(filter(None, across)), ())
+
+
+def require_air(tip_x: float, margin: float) -> None:
+    """Raise RigError for a tip that is at x = `tip_x`, less than `margin` mm before the skin."""
+    if tip_x > -margin:
+        where = f"{tip_x:.1f} mm deep" if tip_x > 0.0 else f"{-tip_x:.1f} mm before the skin"
+        rule = f"must be {margin:.2g} mm or more before the skin, so that nothing bends the needle in tissue"
+        remedy = "withdraw it first: flexneedle rig retract RIG"
+        raise RigError(
+            f"tip: {where}: {rule}: {remedy}; or, in air, register the tracker again ([registration])"
+        )
 
 
 def _within_limits(rig: RigFile, scenario: Scenario, position: float, goal: float) -> float:

@@ -11,7 +11,7 @@ from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.lab.rig.devices.opening import OpenTracker, open_motors, open_tracker
 from flexneedle.lab.rig.preflight.fit import describe_queues, fit_problems, limits_problem, room_problem
 from flexneedle.lab.rig.preflight.moves import describe_uncertainty
-from flexneedle.lab.rig.preflight.speeds import describe_speeds, step_time
+from flexneedle.lab.rig.preflight.speeds import describe_speed, step_time
 from flexneedle.lab.rig.preflight.start import axis_start_problem, tip_problems, with_registration
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
@@ -41,6 +41,10 @@ class Finding:
     problem: str = ""
 
 
+class UncheckedFinding(Finding):
+    """A line where nothing could be compared."""
+
+
 @dataclass(frozen=True)
 class IntendedInsertion:
     """Scenario, and strategy of its plan, that the rig is checked for."""
@@ -66,7 +70,7 @@ def check_rig(
         return findings
 
     found = [Finding(name, "queued motion", distance) for name, distance in describe_queues(rig)]
-    found += [Finding(name, "speed", speed) for name, speed in describe_speeds(rig)]
+    found += [Finding(name, "speed", describe_speed(rig, axis)) for name, axis in rig.axes.items()]
     found += _scenario_findings(rig, wanted) if wanted is not None else ()
     found += check_device("driver", rig.driver.kind, lambda: open_motors(rig), read_motors)
     found += check_device(

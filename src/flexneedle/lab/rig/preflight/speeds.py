@@ -32,16 +32,9 @@ def step_time(axis: Axis, loop: LoopSettings, way: float, duration: float) -> fl
     return max(made.duration, shortest_duration(way, attained_speed(axis, loop, fastest), axis.acceleration))
 
 
-def describe_speeds(rig: RigFile) -> list[tuple[str, str]]:
-    """Return for each axis its name and its attained speed, such as `10 mm/s`, or `5.93 of 10 mm/s: …`."""
-    return [
-        (name, _describe_speed(axis, attained_speed(axis, rig.loop, axis.speed)))
-        for name, axis in rig.axes.items()
-    ]
-
-
-def _describe_speed(axis: Axis, speed: float) -> str:
-    unit, most = axis.unit, axis.to_text(axis.speed)
+def describe_speed(rig: RigFile, axis: Axis) -> str:
+    """Return the largest speed that an axis attains, such as `10 mm/s`, or `5.93 of 10 mm/s: …`."""
+    unit, most, speed = axis.unit, axis.to_text(axis.speed), attained_speed(axis, rig.loop, axis.speed)
     if speed >= axis.speed * (1.0 - _ROUNDING):
         return f"{most} {unit}/s"
     why = f"acceleration_{unit}_s2 = {axis.to_text(axis.acceleration)} cannot brake a faster axis within the queue"
