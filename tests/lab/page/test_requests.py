@@ -77,6 +77,14 @@ def test_only_the_client_in_control_may_ask_for_what_needs_control(shared_server
         other.do("steer", take=False)
         one.steer()
         other.has("clients", steering=one.number)
+        for take, over in ((True, other.number), (False, one.number), (True, None)):
+            assert other.refused("steer", take=take, over=over).startswith(
+                f"person {one.number} is in control"
+            )
+        other.do("steer", take=True, over=one.number)
+        one.has("clients", steering=other.number)
+        assert one.refused("insert").startswith(f"person {other.number} is in control")
+        other.do("steer", take=False)
 
 
 def test_an_edit_is_sent_to_all_and_computed(server, client):

@@ -200,6 +200,24 @@ def test_it_is_held_when_control_is_lost_and_never_continues_by_itself(server, w
     watcher.has("rig", state="inserting")
 
 
+@pytest.mark.parametrize(
+    ("until", "ends_as"), [(prepared, "stopped"), (armed, "stopped"), (inserting, "holding")]
+)
+def test_who_takes_over_control_confirms_the_motions_again(client, watcher, until, ends_as):
+    until(client)
+    watcher.do("steer", take=True, over=client.number)
+    watcher.has("rig", state=ends_as, why=f"person {watcher.number} has taken over control")
+    for each, reason in ((watcher, "Bench is not armed"), (client, f"person {watcher.number} is in control")):
+        assert each.refused("go").startswith(reason)
+    if ends_as == "holding":
+        arm(watcher)
+        client.do("steer", take=True, over=watcher.number)  # the confirmation is void
+        client.has("rig", state="holding", why=f"person {client.number} has taken over control")
+        refuses_to_go(client)
+        watcher.do("stop")
+        client.has("rig", state="stopped", job=None)
+
+
 def test_a_fault_is_shown_until_the_next_preparation(client):
     client.do("options", seed=FAULTY)
     armed(client)

@@ -30,12 +30,13 @@ class ClientRequest(ProtocolMessage):
 
 
 class SteerRequest(ClientRequest):
-    """Take control, or release it. Refused while another client is in control."""
+    """Take control, or release it. over: number of the client from which it is taken; no other one loses it."""
 
     needs_control = False
 
     type: Literal["steer"]
     take: bool
+    over: Whole | None = None
 
 
 class EditRequest(ClientRequest):

@@ -6,9 +6,9 @@ import pytest
 
 from browser_checks import arrived
 from fake_page import until
-from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage
+from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage, RigStateMessage
 from flexneedle.lab.page.shape_frames import FrameSource
-from recorded_page import clients, insertion, period_frames, planned, rows, session
+from recorded_page import WELCOME, clients, insertion, opening, period_frames, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -37,6 +37,7 @@ def test_control_is_taken_shared_released_and_taken_by_edits_which_are_merged(vi
     page.wait_for_selector("text=Person 2 is in control", state="detached")
     server.send(clients(3, steering=2))
     page.wait_for_selector("text=3 people connected, you are person 1, person 2 is in control")
+    assert page.locator(f"{STATUS} .steering button").inner_text() == "Take over"
     del server.answers["steer"]
     server.send(clients())
     page.wait_for_selector("text=nobody is in control")
@@ -62,6 +63,34 @@ def test_control_is_taken_shared_released_and_taken_by_edits_which_are_merged(vi
     del server.answers["edit"]
     page.evaluate("flexneedle.link.edit({'target.depth_mm': 30})")
     page.wait_for_selector("[role=alert] >> text=must be above 0", state="detached")
+
+
+def test_a_page_takes_over_control_and_another_takes_it_back(visit, server):
+    moving = insertion("running", rig="Bench")
+    rig = RigStateMessage(name="Bench", state="inserting", job=7, begun=True)
+    page = visit(
+        [WELCOME.model_copy(update={"rig": "Bench"}), *opening()[1:], clients(2, steering=2), moving, rig]
+    )
+    page.wait_for_selector("[data-panel=actions] button:text-is('Plan'):disabled")
+    page.click("text=Take over and hold the needle")
+    page.wait_for_selector("text=you are in control")
+    assert server.asked("steer") == [{"type": "steer", "take": True, "over": 2}]
+    server.send(rig.model_copy(update={"state": "holding", "moves": ["Bench: further"]}))
+    page.check("#rig-free")
+    until(page, "!document.querySelector('[data-step=arm]').disabled")
+    server.send(clients(2, steering=2))
+    page.wait_for_selector("[role=alert] >> text=Person 2 has taken over control. This page can still stop")
+    page.wait_for_selector("[data-step=arm]:disabled")
+    assert not page.is_checked("#rig-free")
+    page.click("[data-panel=actions] >> text=Stop")
+    assert server.wait_for("stop") == [{"type": "stop"}]
+    for state, begun, job, text in (
+        ("ready", False, 7, "Take over and end the preparation"),
+        ("stopped", False, 7, "Take over"),
+        ("idle", False, None, "Take over"),
+    ):
+        server.send(rig.model_copy(update={"state": state, "begun": begun, "job": job}))
+        until(page, f"document.querySelector('.steering button').textContent === '{text}'")
 
 
 def test_work_is_shown_and_cancelled_in_the_status_bar(visit, server):

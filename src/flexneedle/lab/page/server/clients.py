@@ -80,10 +80,13 @@ class Clients:
         if self.in_control == client:
             self.in_control = None
 
-    def steer(self, client: int, take: bool) -> None:
-        """Give or take a client's control. Raises Refusal if another client is in control."""
-        if self.in_control not in (None, client):
-            raise Refusal(f"person {self.in_control} is in control: it must release it first")
+    def steer(self, client: int, take: bool, over: int | None = None) -> None:
+        """Give a client control, or take it from the client. over: client that may lose it to this one.
+
+        Raises Refusal if another client is in control.
+        """
+        if self.in_control not in (None, client) and not (take and self.in_control == over):
+            raise Refusal(f"person {self.in_control} is in control: take over from this person first")
         self.in_control = client if take else None
 
     def require_control(self, client: int) -> None:
@@ -91,7 +94,7 @@ class Clients:
         if self.in_control is None:
             raise Refusal("nobody is in control: take control first")
         if self.in_control != client:
-            raise Refusal(f"person {self.in_control} is in control: ask for it first")
+            raise Refusal(f"person {self.in_control} is in control: take over from this person first")
 
     def describe(self) -> ClientsMessage:
         """Return the message about clients and control."""

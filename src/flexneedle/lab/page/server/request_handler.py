@@ -140,7 +140,7 @@ class RequestHandler:
             self.clients.require_control(client)
         match request:
             case ask.SteerRequest():
-                self._steer(client, request.take)
+                self._steer(client, request)
             case ask.EditRequest():
                 self._begin(self.session.edit_scenario(request.values))
             case ask.RestRequest():
@@ -209,12 +209,14 @@ class RequestHandler:
             case _:
                 assert_never(request)
 
-    def _steer(self, client: int, take: bool) -> None:
+    def _steer(self, client: int, request: ask.SteerRequest) -> None:
         before = self.clients.in_control
-        self.clients.steer(client, take)
+        self.clients.steer(client, request.take, request.over)
         self.hub.publish(self.clients.describe())
-        if before == client and not take:
+        if before == client and not request.take:
             self.rig.lose_control("nobody is in control: it was released")
+        elif before not in (None, client):  # who confirmed the motions is not the one in control any more
+            self.rig.lose_control(f"person {client} has taken over control")
 
     def _begin(self, session: PageSession) -> None:
         """Continue with a changed session, and cancel what is computed for the old one.

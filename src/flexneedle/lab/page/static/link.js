@@ -151,6 +151,7 @@ export class Link {
       this.#store.set("connection", "open");
     }
     if (message.type === "session") this.#compare(message);
+    if (message.type === "clients") this.#reportLoss(message);
     this.#store.receive(message);
   }
 
@@ -160,6 +161,13 @@ export class Link {
       this.#refuse({ reason: "The server was restarted with its initial scenario. Unsaved changes are lost." });
     }
     this.#revision = revision;
+  }
+
+  // Another page has taken over this page's control.
+  #reportLoss({ steering }) {
+    const [own, before] = [this.#store.get("welcome")?.client, this.#store.get("clients")?.steering];
+    if (before !== own || steering === own || (steering ?? null) === null) return;
+    this.#refuse({ reason: `Person ${steering} has taken over control. This page can still stop an insertion.` });
   }
 
   #answer(request, answer) {

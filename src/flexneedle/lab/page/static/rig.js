@@ -36,6 +36,7 @@ export function mount(element, store) {
   };
   free.addEventListener("change", () => store.set("view confirmed", free.checked ? motionsOf(store) : undefined));
   store.subscribe(["rig", "welcome", "view confirmed", "insertion live"], show);
+  store.subscribe(["clients"], () => maySteer(store) || store.set("view confirmed", undefined)); // another page is in control
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
 }
 

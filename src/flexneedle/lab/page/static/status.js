@@ -16,8 +16,10 @@ const JOBS = {
 const CONTROL = {
   take: "Needed to change the scenario, plan and insert. Anyone can stop an insertion.",
   release: "Lets another page take control. An insertion on a rig is then held.",
+  over: "Control goes from the other page to this one at once. On a rig, nothing moves before its motions are confirmed here.",
 };
 const OWN_END = ["insertion", "save"]; // not cancelled: an insertion is stopped, and a run is saved completely
+const ENDED = ["stopped", "fault", "ended"]; // states of a rig
 const SHOWN_FOR = 12_000; // ms
 const LONG = 5; // s
 const SHORT = 1_000; // ms: work that ends sooner is not shown
@@ -51,19 +53,26 @@ function showTitle(session) {
 
 // The client in control, and a button that takes or releases control and keeps the focus.
 function followSteering(element, store, link) {
-  let mine = false;
+  let [mine, others] = [false, false];
   const words = make("span", { "aria-live": "polite" });
-  const change = button("", () => link.ask({ type: "steer", take: !mine }));
+  const change = button("", () => link.ask({ type: "steer", take: !mine, ...(others ? { over: store.get("clients").steering } : {}) }));
   element.append(words, change);
-  store.subscribe(["clients", "welcome", "connection"], () => {
+  store.subscribe(["clients", "welcome", "connection", "rig"], () => {
     const [clients, welcome] = [store.get("clients"), store.get("welcome")];
     element.hidden = !clients || !welcome || store.get("connection") !== "open";
     if (element.hidden) return;
     mine = clients.steering === welcome.client;
+    others = !mine && clients.steering !== null;
     renew(words, [make("span", {}, inControl(clients, welcome.client))]);
-    [change.textContent, change.title] = mine ? ["Release control", CONTROL.release] : ["Take control", CONTROL.take];
-    change.hidden = !mine && clients.steering !== null;
+    const [text, title] = mine ? ["Release control", CONTROL.release] : others ? [`Take over${lossOf(store.get("rig"))}`, CONTROL.over] : ["Take control", CONTROL.take];
+    if (change.textContent !== text) Object.assign(change, { textContent: text, title });
   });
+}
+
+// Effect of a take-over on an insertion on the rig, as the end of the button's text: whoever confirmed its motions has lost control.
+function lossOf(rig) {
+  if (!rig || rig.job === null || ENDED.includes(rig.state)) return "";
+  return rig.begun ? " and hold the needle" : " and end the preparation";
 }
 
 // The number of this page is shown if there are others, since refusals and stops name people by number.
