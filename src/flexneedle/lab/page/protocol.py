@@ -80,6 +80,7 @@ class SessionMessage(ServerMessage):
         reach_since: First revision with the reach of this one: later ones differ in target and controller only.
         changed: Keys that differ from the preset or file.
         doubts: Values that are valid but implausible.
+        undoes, redoes: Whether a change can be undone, and redone.
     """
 
     type: Literal["session"] = "session"
@@ -92,6 +93,8 @@ class SessionMessage(ServerMessage):
     seed: int
     strategy: str
     controller: str
+    undoes: bool = False
+    redoes: bool = False
 
 
 class SceneMessage(ServerMessage):

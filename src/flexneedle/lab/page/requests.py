@@ -47,7 +47,7 @@ class EditRequest(ClientRequest):
 
 
 class RestRequest(ClientRequest):
-    """Make the plan now: no edit follows, since a dragged target was released."""
+    """End a change of several edits, such as a drag, whose target was released, and make the plan now."""
 
     type: Literal["rest"]
 
@@ -74,6 +74,13 @@ class OptionsRequest(ClientRequest):
     seed: Whole | None = None
     strategy: Strategy | None = None
     controller: Annotated[str, Field(max_length=60, pattern=r"^[a-z][a-z0-9-]*$")] | None = None
+
+
+class UndoRequest(ClientRequest):
+    """Undo the last change of scenario or options, or redo the one that was undone last."""
+
+    type: Literal["undo"]
+    redo: bool = False
 
 
 class StartRequest(ClientRequest):
@@ -212,6 +219,7 @@ AnyRequest = Annotated[
     | OptionsRequest
     | StartRequest
     | RestRequest
+    | UndoRequest
     | CancelRequest
     | InsertRequest
     | CheckRequest

@@ -53,8 +53,9 @@ def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
     depth = page.evaluate("flexneedle.store.get('scene').target[0]")
 
     page.focus("[data-panel=section] [data-handle=target]")
-    page.keyboard.press("ArrowRight")
+    page.keyboard.down("ArrowRight")
     see(page, f"{PLANS} >> text=First estimate: ends")
+    page.keyboard.up("ArrowRight")
     until(page, f"flexneedle.store.get('scene').target[0] === {depth + 0.5}")
     page.click("[data-work=plan]")
     see(page, f"{PLANS} .words:not(:has-text('earlier state')) >> text=Manipulation:")

@@ -5,7 +5,7 @@ import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from flexneedle.errors import ScenarioError, ScenarioWarning, make_printable
@@ -87,8 +87,13 @@ class PageSession:
         chosen = options.model_dump(include={"seed", "strategy", "controller"}, exclude_none=True)
         return self._change(**chosen)
 
+    def resume(self, other: "PageSession") -> "PageSession":
+        """Return the session with the content of another, as its next revision."""
+        names = [one.name for one in fields(self) if one.name not in ("revision", "reach_since")]
+        return self._change(**{name: getattr(other, name) for name in names})
+
     def describe(self) -> SessionMessage:
-        """Return the message about the session."""
+        """Return the message about the session, without its history."""
         values, before = self.scenario.flat(), self.origin.flat()
         return SessionMessage(
             revision=self.revision,

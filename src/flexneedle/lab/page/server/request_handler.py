@@ -23,6 +23,7 @@ from flexneedle.lab.page.protocol import (
 from flexneedle.lab.page.server.catalog import STRATEGIES, build_catalog
 from flexneedle.lab.page.server.clients import Clients, PageLimits, Refusal
 from flexneedle.lab.page.server.connected_rig import ConnectedRig, RigReference
+from flexneedle.lab.page.server.history import SessionHistory
 from flexneedle.lab.page.server.hub import ClientOutbox, Hub
 from flexneedle.lab.page.server.job_queue import JobQueue
 from flexneedle.lab.page.server.live_insertion import LiveInsertion
@@ -61,6 +62,7 @@ class RequestHandler:
         self._insertions = JobQueue(
             insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
         )
+        self._history = SessionHistory()
         self._timers = dict[str, asyncio.TimerHandle]()
         self._watching: asyncio.Task[None] | None = None
         self._runs_changed = asyncio.Event()
@@ -142,16 +144,19 @@ class RequestHandler:
             case ask.SteerRequest():
                 self._steer(client, request)
             case ask.EditRequest():
-                self._begin(self.session.edit_scenario(request.values))
+                self._step(self.session.edit_scenario(request.values), frozenset(request.values))
             case ask.RestRequest():
+                self._history.close()
                 if self._stop_timer("plan"):
                     self._plan_unless_inserting()
+            case ask.UndoRequest():
+                self._undo(redo=request.redo)
             case ask.PresetRequest():
-                self._begin(self.session.with_preset(request.name))
+                self._step(self.session.with_preset(request.name))
             case ask.LoadRequest():
-                self._begin(self.session.with_file(request.name, request.text))
+                self._step(self.session.with_file(request.name, request.text))
             case ask.OptionsRequest():
-                self._begin(self._with_options(request))
+                self._step(self._with_options(request))
             case ask.StartRequest():
                 self.require_processor()
                 self._order("reach" if request.work == "reach" else "plan", request.work)
@@ -213,10 +218,20 @@ class RequestHandler:
         before = self.clients.in_control
         self.clients.steer(client, request.take, request.over)
         self.hub.publish(self.clients.describe())
+        self._history.close()
         if before == client and not request.take:
             self.rig.lose_control("nobody is in control: it was released")
         elif before not in (None, client):  # who confirmed the motions is not the one in control any more
             self.rig.lose_control(f"person {client} has taken over control")
+
+    def _step(self, session: PageSession, keys: frozenset[str] | None = None) -> None:
+        """Continue with a changed session, as a step of the history. keys: of an edit."""
+        self._history.add(self.session, session, keys)
+        self._begin(session)
+
+    def _undo(self, *, redo: bool) -> None:
+        self.live.require_none("changes are undone and redone at its end")
+        self._begin(self._history.redo(self.session) if redo else self._history.undo(self.session))
 
     def _begin(self, session: PageSession) -> None:
         """Continue with a changed session, and cancel what is computed for the old one.
@@ -229,7 +244,8 @@ class RequestHandler:
             self.hub.forget_frames(FrameSource.SCENE, FrameSource.MANIPULATION, FrameSource.STEERING)
         outdated: tuple[JobKind, ...] = ("reach",) if session.reach_since == session.revision else ()
         self.session = session
-        self.hub.publish(session.describe())
+        steps = {"undoes": self._history.undoes, "redoes": self._history.redoes}
+        self.hub.publish(session.describe().model_copy(update=steps))
         self.hub.publish(describe_scene(session.scenario, session.revision))
         self.rig.invalidate("the scenario or an option was changed")
         self._plans.cancel("plan", "compare", *outdated)

@@ -120,8 +120,8 @@ class Form {
     if (section.views.length) return;
     const { values } = this.#session;
     section.views = section.fields.map((field) => {
-      const edit = (value) => this.#edit(field, value);
-      return Object.assign(new FieldView(field, valueOf(field, values), edit), { key: field.key, field });
+      const edit = (value, complete = true) => this.#edit(field, value, complete);
+      return Object.assign(new FieldView(field, valueOf(field, values), edit, () => this.#link.rest()), { key: field.key, field });
     });
     if (section.description) section.element.append(make("p.quiet", {}, section.description));
     section.element.append(...section.views.map((view) => view.element));
@@ -141,13 +141,18 @@ class Form {
     return new Set(this.#sections.flatMap(({ fields }) => fields.map(({ key }) => key)));
   }
 
-  #edit(field, value) {
+  #edit(field, value, complete) {
     this.#chosen = field.key;
+    this.#link.edit(this.#editOf(field, value));
+    if (complete) this.#link.rest();
+  }
+
+  #editOf(field, value) {
     const [, name] = LAW.exec(field.key) ?? [];
     const { values } = this.#session;
-    if (!name) return this.#link.edit(editOf(field, value, values));
+    if (!name) return editOf(field, value, values);
     const [layers, layer] = [layersOf(values), Number(name.split(".")[1])];
-    return this.#link.edit({ tissue: layers.with(layer, withLaw(this.#schema, layers[layer], value)) });
+    return { tissue: layers.with(layer, withLaw(this.#schema, layers[layer], value)) };
   }
 
   #fill(section) {
@@ -178,7 +183,10 @@ class Form {
 
   #layerTools(name) {
     const layer = Number(name.split(".")[1]);
-    const change = (make) => this.#link.edit({ tissue: make(layersOf(this.#session.values)) });
+    const change = (make) => {
+      this.#link.edit({ tissue: make(layersOf(this.#session.values)) });
+      this.#link.rest();
+    };
     const add = () => change((layers) => layers.toSpliced(layer, 0, { ...layers[layer], thickness_mm: layers[layer].thickness_mm ?? 10 }));
     const remove = button("Remove", () => change((layers) => layers.toSpliced(layer, 1)), { "aria-label": `Remove layer ${layer + 1}` });
     remove.disabled = !("tissue.1.shear_modulus_kpa" in this.#session.values);

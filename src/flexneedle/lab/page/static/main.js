@@ -7,7 +7,7 @@ import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
 const SCENE = ["status", "actions", "section", "axial", "space"];
-const OTHERS = ["form", "insertion", "player", "plans", "plots", "files", "rig"];
+const OTHERS = ["history", "form", "insertion", "player", "plans", "plots", "files", "rig"];
 const PATIENCE = 2000; // ms
 const FRAMES = 3; // until the mounted panels are on the screen
 

@@ -13,7 +13,7 @@ export class Handles {
   #made = new Map(); // by id: {element, handle}
   dragged = false;
 
-  // stage: element that the handles are placed in; dropped: called when a dragged handle is released.
+  // stage: element that the handles are placed in; dropped: called when a dragged handle, or an arrow key, is released.
   constructor(stage, dropped) {
     this.#stage = stage;
     this.#dropped = dropped;
@@ -63,6 +63,7 @@ export class Handles {
     element.addEventListener("pointerup", end);
     element.addEventListener("pointercancel", end);
     element.addEventListener("lostpointercapture", end);
+    element.addEventListener("keyup", ({ key }) => ARROWS[key] && this.#dropped());
     element.addEventListener("keydown", (event) => {
       const arrow = ARROWS[event.key];
       if (!arrow || event.ctrlKey || event.altKey || event.metaKey) return;

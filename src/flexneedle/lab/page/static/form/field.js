@@ -14,10 +14,11 @@ export class FieldView {
   #dismissed; // problem that was left with Escape
   #before = ""; // text when the field got the focus
 
-  // field: of fields.js; value: at first, which the slider's range depends on; edit: called with a new value.
-  constructor(field, value, edit) {
+  // field: of fields.js; value: at first, which the slider's range depends on; edit: called with a new value, and whether the change
+  // is complete; rest: called when a slider is released.
+  constructor(field, value, edit, rest) {
     this.#field = field;
-    this.edit = edit;
+    [this.edit, this.rest] = [edit, rest];
     const id = `field-${field.key.replaceAll(".", "-")}`;
     this.#problem.id = `${id}-problem`;
     const help = make("p.help.quiet", { id: `${id}-help` }, field.description);
@@ -88,8 +89,9 @@ export class FieldView {
       const value = Number(slider.value);
       this.input.value = written(value);
       this.#taken = true;
-      this.edit(value);
+      this.edit(value, false);
     });
+    slider.addEventListener("change", () => this.rest());
     return slider;
   }
 
