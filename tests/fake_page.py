@@ -21,7 +21,7 @@ from flexneedle.lab.page.server.access import _with_headers
 from recorded_page import TARGET, clients, opening, scene, scene_frames, session
 
 STATIC = Path(flexneedle.lab.page.__file__).parent / "static"
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 _KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 
 

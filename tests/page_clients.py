@@ -40,16 +40,23 @@ IN_CONTROL = {
 """Requests that only the client in control may send, by type."""
 
 
+def restored(session):
+    """Values of the request that gives a session (its message) back."""
+    return {name: session[name] for name in ("name", "values", "seed", "strategy", "controller")}
+
+
 def start_worker(module, *arguments):
     """Start a worker: the stub in a thread, any other in a process."""
     return WorkerThread() if (module,) == STUB else ChildProcess(module, *arguments)
 
 
 @contextmanager
-def served(runs: Path, *, limits=QUICK, rig=None, host="127.0.0.1", workers=(STUB, STUB)):
+def served(
+    runs: Path, name="phantom", *, limits=QUICK, rig=None, host="127.0.0.1", port=0, workers=(STUB, STUB)
+):
     """A server in a thread, on a free port; its workers may be modules of the tests."""
-    session = PageSession.of("phantom", load_scenario("phantom"))
-    server = PageServer(PageSetup(session, runs, limits, workers, rig), host, 0)
+    session = PageSession.of(name, load_scenario(name))
+    server = PageServer(PageSetup(session, runs, limits, workers, rig), host, port)
     listens = Event()
     server.on_start = listens.set
     thread = Thread(target=server.serve_until_interrupted)

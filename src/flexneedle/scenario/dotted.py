@@ -28,6 +28,31 @@ def _leaves(key: str, value: Any) -> list[tuple[str, Any]]:
     return [leaf for name, item in items for leaf in _leaves(opening + name, item)]
 
 
+def nest(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the nested tables of leaves by dotted key, the reverse of `flatten`; tables with keys 0, 1, … are lists.
+
+    Raises ScenarioError for a key below a value.
+    """
+    tables: dict[str, Any] = {}
+    for key, value in values.items():
+        *parents, last = key.split(".")
+        table: Any = tables
+        for part in parents:
+            table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise ScenarioError(f"{key}: no such key: the value above it is not a table")
+        table[last] = value
+    return {name: _with_lists(value) for name, value in tables.items()}
+
+
+def _with_lists(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    items = {name: _with_lists(item) for name, item in value.items()}
+    numbered = [str(index) for index in range(len(items))]
+    return [items[name] for name in numbered] if items and items.keys() == set(numbered) else items
+
+
 def set_value(values: dict[str, Any], key: str, value: Any) -> None:
     """Set a value in nested tables in place; None removes the key. Missing intermediate tables are created."""
     *parents, last = split_key(key)

@@ -26,7 +26,7 @@ OTHERS = {
     "number": ("1", True, [1], {}, math.nan, math.inf, 1e9, -1e9),
     "string": (1, True, ["a"], {}, "a" * 200_001),
     "boolean": (1, 0, "true", [True]),
-    "object": (1, "a", [1], {}, {f"a{number}": 1 for number in range(201)}),
+    "object": (1, "a", [1], {}, {f"a{number}": 1 for number in range(1_001)}),
 }
 """Values of other types or beyond all bounds; a request with them is refused, they are not converted."""
 NAMES = (["a", "A 1._-"], ["", ".a", "-a", " a", "a/b", "a\\b", "a\0", "a\n", "é", "a" * 81])
@@ -39,6 +39,11 @@ FORMS = {
         [{"tissue.0.a_b": 1}],
         [{key: 1} for key in ("", "A", "a b", "a-b", "a\n", "é", "a" * 81)],
     ),
+    ("restore", "name"): (
+        ["a", "é 1.toml", "world:7"],
+        ["", ".a", "..", "a/b", "a\\b", "a\0", "a\n", "a" * 201],
+    ),
+    ("restore", "controller"): (["ce-mpc"], ["Ce", "a" * 61]),
     ("pace", "pace"): ([0.0, 0.01, 50.0], [0.005, 50.1]),
     ("disturb", "size"): ([0.0, 1e4], [-1e-9, 1.1e4]),
     ("open", "row"): ([0, 999_999], [1_000_000]),

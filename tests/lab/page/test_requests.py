@@ -8,7 +8,7 @@ import pytest
 from flexneedle.lab.page import requests as r
 from flexneedle.lab.page.server.connected_rig import RigReference
 from flexneedle.scenario.files import dump_scenario, load_scenario
-from page_clients import IN_CONTROL, QUICK, STUB, Client, get, served
+from page_clients import IN_CONTROL, QUICK, STUB, Client, get, restored, served
 from page_worker import HANGS, ROWS, WORKS_ON
 
 NONE_RUNS = "no insertion runs: start one first"
@@ -63,7 +63,7 @@ def test_a_requested_comparison_is_not_replaced_by_the_plan_of_a_rested_scenario
 
 def test_only_the_client_in_control_may_ask_for_what_needs_control(shared_server):
     free = {request for request in r.ClientRequest.__subclasses__() if not request.needs_control}
-    assert free == {r.SteerRequest, r.StopRequest, r.PingRequest}
+    assert free == {r.SteerRequest, r.StopRequest, r.PingRequest, r.RestoreRequest}
     assert len(IN_CONTROL) + len(free) == len(r.ClientRequest.__subclasses__())
     with Client(shared_server) as one, Client(shared_server) as other:
         for request, values in IN_CONTROL.items():
@@ -85,6 +85,49 @@ def test_only_the_client_in_control_may_ask_for_what_needs_control(shared_server
         one.has("clients", steering=other.number)
         assert one.refused("insert").startswith(f"person {other.number} is in control")
         other.do("steer", take=False)
+
+
+def lost_session(folder):
+    """Return the welcome and the session of a server that has ended."""
+    with served(folder) as server, Client(server) as client:
+        client.steer().do("edit", values={DEPTH: 35.0})
+        client.do("options", seed=3)
+        return client.newest["welcome"], client.has("session", seed=3)
+
+
+def test_a_restarted_server_gets_the_session_of_the_first_page_back(tmp_path):
+    welcome, lost = lost_session(tmp_path)
+    with served(tmp_path) as server, Client(server) as one, Client(server) as other:
+        assert one.newest["welcome"]["started"] == other.newest["welcome"]["started"] != welcome["started"]
+        assert one.newest["welcome"]["initial"] == welcome["initial"]
+        assert one.refused("restore", **restored(lost) | {"controller": "x"}).startswith("controller = x")
+        one.do("restore", **restored(lost))
+        again = other.has("session", revision=2)
+        assert (restored(again), again["changed"]) == (restored(lost), [DEPTH])
+        other.do("restore", **restored(lost))  # the same
+        changed = restored(lost) | {"seed": 4}
+        assert other.refused("restore", **changed) == "nobody is in control: take control first"
+        one.steer()
+        assert other.refused("restore", **changed).startswith(f"person {one.number} is in control")
+        one.do("restore", **changed)  # as any change
+        other.has("session", revision=3, seed=4)
+        one.do("undo")
+        other.has("session", revision=4, seed=3)
+    with served(tmp_path, rig=RigReference("Bench", "bench.toml")) as server, Client(server) as client:
+        assert client.newest["welcome"]["initial"] != welcome["initial"]
+
+
+def test_a_session_is_not_restored_beside_a_client_in_control_or_an_insertion(tmp_path):
+    _welcome, lost = lost_session(tmp_path)
+    with served(tmp_path) as server, Client(server) as one, Client(server) as other:
+        one.steer()
+        assert other.refused("restore", **restored(lost)).startswith(f"person {one.number} is in control")
+        one.inserts("paused", paused=True)
+        one.do("steer", take=False)
+        assert other.refused("restore", **restored(lost)).startswith("an insertion runs")
+        one.do("stop")
+        one.job("insertion", "done")
+        other.do("restore", **restored(lost))
 
 
 def test_an_edit_is_sent_to_all_and_computed(server, client):

@@ -4,11 +4,12 @@ import tomllib
 
 import pytest
 
-from flexneedle.lab.page.requests import OptionsRequest
+from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.sections.needle import GAUGES
+from page_clients import restored
 
 
 @pytest.fixture
@@ -146,3 +147,44 @@ def test_options_that_are_not_set_stay(session):
     changed = session.with_options(OptionsRequest(type="options", seed=7))
     assert (changed.seed, changed.strategy, changed.controller) == (7, "manipulation", "")
     assert changed.revision == session.revision + 1
+
+
+def given_back(session):
+    """The request with which a page gives a session back."""
+    values = restored(session.describe().model_dump(mode="json"))
+    return RestoreRequest(type="restore", **values | {"controller": "ce-mpc"})
+
+
+@pytest.mark.parametrize("name", ["phantom", "phantom3d", "world:7", "world:100012"])
+def test_a_session_is_restored_from_its_message(session, name):
+    lost = session.with_preset(name).edit_scenario({"target.depth_mm": 33.0, "tissue.0.alpha": 9.0})
+    lost = lost.with_options(OptionsRequest(type="options", seed=3, strategy="steering", controller="ce-mpc"))
+    found = session.restore(given_back(lost))
+    assert found.has_content_of(lost)
+    assert found.revision == session.revision + 1
+    assert found.describe().changed == ["tissue.0.alpha", "target.depth_mm"]
+
+
+def test_a_restored_file_is_compared_with_the_file_where_the_server_has_it(session, minimal_text):
+    file = PageSession.of("mine", session.with_file("mine", minimal_text).scenario)
+    lost = file.edit_scenario({"target.depth_mm": 33.0})
+    assert file.restore(given_back(lost)).describe().changed == ["target.depth_mm"]
+    elsewhere = session.restore(given_back(lost))
+    assert (elsewhere.scenario, elsewhere.describe().changed) == (lost.scenario, [])
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"target.depth_mm": -1.0}, "target.depth_mm"),
+        ({"target.depth": 30.0}, "target.depth"),
+        ({"name.x": 1}, "name.x"),
+        ({"tissue.7.alpha": 1.0}, "tissue"),
+    ],
+)
+def test_an_invalid_session_is_not_restored(session, change, problem):
+    request = given_back(session)
+    with pytest.raises(Refusal) as refusal:
+        session.restore(request.model_copy(update={"values": request.values | change}))
+    assert refusal.value.reason.startswith("phantom: ")
+    assert problem in refusal.value.problems, refusal.value.problems

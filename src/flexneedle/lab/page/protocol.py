@@ -52,7 +52,13 @@ class ServerMessage(ProtocolMessage):
 
 
 class WelcomeMessage(ServerMessage):
-    """First message: number of this client, and the choices. rig: name of the connected rig or None."""
+    """First message: number of this client, and the choices.
+
+    Attributes:
+        rig: Name of the connected rig, None without one.
+        started: Identifies this start of the server.
+        initial: Identifies its initial session and rig: equal for a server that was restarted with the same ones.
+    """
 
     type: Literal["welcome"] = "welcome"
     client: int
@@ -60,6 +66,8 @@ class WelcomeMessage(ServerMessage):
     controllers: list[dict[str, str]]
     strategies: list[str]
     rig: str | None = None
+    started: str = ""
+    initial: str = ""
 
 
 class ClientsMessage(ServerMessage):

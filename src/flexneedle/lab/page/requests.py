@@ -13,6 +13,7 @@ from flexneedle.lab.page.protocol import ProtocolMessage, Strategy
 Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
 FileName = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
 RunName = Annotated[str, Field(min_length=1, max_length=200)]
+ControllerName = Annotated[str, Field(max_length=60, pattern=r"^[a-z][a-z0-9-]*$")]
 Whole = Annotated[int, Field(ge=0, le=2**53)]  # JavaScript represents these without rounding
 Index = Annotated[int, Field(ge=0, lt=1_000_000)]
 Value = float | int | bool | str | list[Any] | dict[str, Any] | None
@@ -73,7 +74,7 @@ class OptionsRequest(ClientRequest):
     type: Literal["options"]
     seed: Whole | None = None
     strategy: Strategy | None = None
-    controller: Annotated[str, Field(max_length=60, pattern=r"^[a-z][a-z0-9-]*$")] | None = None
+    controller: ControllerName | None = None
 
 
 class UndoRequest(ClientRequest):
@@ -81,6 +82,25 @@ class UndoRequest(ClientRequest):
 
     type: Literal["undo"]
     redo: bool = False
+
+
+class RestoreRequest(ClientRequest):
+    """Give a restarted server the session of an open page: the values of its scenario by key, and the options.
+
+    Any client may while nobody is in control, nothing has changed and nothing runs; otherwise the one in control.
+    """
+
+    needs_control = False
+
+    type: Literal["restore"]
+    name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\w[^/\\\x00-\x1f]*$")]
+    values: Annotated[
+        dict[Annotated[str, Field(min_length=1, max_length=200)], Value],
+        Field(min_length=1, max_length=1_000),
+    ]
+    seed: Whole
+    strategy: Strategy
+    controller: ControllerName
 
 
 class StartRequest(ClientRequest):
@@ -219,6 +239,7 @@ AnyRequest = Annotated[
     | OptionsRequest
     | StartRequest
     | RestRequest
+    | RestoreRequest
     | UndoRequest
     | CancelRequest
     | InsertRequest

@@ -1,5 +1,6 @@
 """Connection, control, refusals, work in the status bar, and recovery after a lost connection."""
 
+from contextlib import ExitStack
 from typing import get_args
 
 import pytest
@@ -8,6 +9,8 @@ from browser_checks import arrived
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage, RigStateMessage
 from flexneedle.lab.page.shape_frames import FrameSource
+from page_clients import port_of, served
+from page_worker import Worker
 from recorded_page import WELCOME, clients, insertion, opening, period_frames, planned, rows, session
 
 pytestmark = pytest.mark.page
@@ -134,10 +137,9 @@ def test_after_a_restart_a_dead_line_and_a_lost_connection_the_state_is_recovere
     page.wait_for_selector("text=nobody is in control")
     server.send(session(5, seed=7))
     page.wait_for_selector("text=seed 7")
-    server.drop()
-    page.wait_for_selector("text=The server was restarted")
+    server.drop()  # and it is the same server
     page.wait_for_selector("text=seed 0")
-    assert page.evaluate("flexneedle.store.get('refusals').length") == 1
+    assert not page.evaluate("flexneedle.store.get('refusals')")
     arrived(page)
     page.evaluate("look(); look();")  # while all is quiet
     server.wait_for("ping", 2)
@@ -154,6 +156,117 @@ def test_after_a_restart_a_dead_line_and_a_lost_connection_the_state_is_recovere
     server.drop("64 pages are connected, which is the limit")
     page.wait_for_selector("text=No connection; trying again… (64 pages are connected, which is the limit)")
     assert page.get_attribute(f"{STATUS} .connection", "data-state") == "lost"
+
+
+RESTARTS = [
+    # before: seed, whether an insertion ran; now: revision, seed, initial, rig; line, restores, offers
+    ((1, False), (1, 1, "a", None), "", None, None),
+    ((1, True), (1, 1, "a", None), "The server was restarted. No insertion is resumed.", None, None),
+    (
+        (1, False),
+        (1, 0, "a", None),
+        "The server was restarted, and has this page's scenario again.",
+        True,
+        None,
+    ),
+    (
+        (1, True),
+        (1, 0, "a", None),
+        "The server was restarted, and has this page's scenario again. No insertion is resumed.",
+        True,
+        None,
+    ),
+    (
+        (1, False),
+        (2, 0, "a", None),
+        "The server was restarted, and another page has changed its scenario.",
+        None,
+        True,
+    ),
+    ((1, False), (2, 1, "b", "Bench"), "", None, None),
+    (
+        (1, False),
+        (1, 0, "b", None),
+        "The server was restarted with another scenario: phantom3d is kept.",
+        None,
+        True,
+    ),
+    (
+        (1, False),
+        (1, 0, "b", "Bench"),
+        "The server was restarted with another rig: phantom3d is kept.",
+        None,
+        True,
+    ),
+]
+
+
+def test_what_a_restarted_server_gets_back(visit):
+    page = visit()
+    for (seed, ran), (revision, now, initial, rig), line, restores, offers in RESTARTS:
+        before = {
+            "welcome": {"initial": "a", "rig": None},
+            "session": session(5, seed=seed).model_dump(),
+            "ran": ran,
+        }
+        after = [{"initial": initial, "rig": rig}, session(revision, seed=now).model_dump()]
+        found = page.evaluate(
+            "async ([before, after]) => (await import('/static/restart.js')).afterRestart(before, ...after)",
+            [before, after],
+        )
+        assert (found["line"], found.get("restores"), found.get("offers")) == (line, restores, offers)
+
+
+@pytest.fixture
+def restarted(tmp_path, monkeypatch):
+    """A function that ends the last server, if there is one, and starts another one at the same address."""
+    for action in ("needle", "estimate", "plan"):  # invented results are not complete enough to be drawn
+        monkeypatch.setattr(Worker, action, lambda _worker, _order: None)
+    running, port = ExitStack(), 0
+
+    def start(name="phantom"):
+        nonlocal port
+        running.close()
+        server = running.enter_context(served(tmp_path / "runs", name, port=port))
+        port = port_of(server)
+        return server.address
+
+    with running:
+        yield start
+
+
+DEPTH = "flexneedle.store.get('session')?.values['target.depth_mm']"
+
+
+def test_a_restarted_server_gets_the_scenario_of_the_open_pages_back_but_not_another_one(restarted, tab):
+    address, pages = restarted(), [tab(1280, 800, "light"), tab(1280, 800, "light")]
+    for page in pages:
+        page.goto(address)
+        page.wait_for_selector("[data-panel=status] .connection")
+    page, _other = pages
+    page.evaluate("flexneedle.link.edit({ 'target.depth_mm': 35 })")
+    page.evaluate("flexneedle.link.ask({ type: 'insert', paused: true })")
+    for each in pages:
+        until(each, f"{DEPTH} === 35 && flexneedle.store.get('insertion live')?.state === 'paused'")
+    restarted()
+    for each in pages:
+        each.wait_for_selector(
+            "[role=alert] >> text=/^The server was restarted.* No insertion is resumed\\.$/"
+        )
+        until(each, f"{DEPTH} === 35")
+        assert not each.evaluate("flexneedle.store.get('insertion live')")
+        each.wait_for_selector("text=2 people connected")
+    assert page.evaluate("flexneedle.store.get('session').revision") == 2  # once
+    restarted("phantom3d")  # on purpose
+    for each in pages:
+        each.wait_for_selector("text=The server was restarted with another scenario: phantom3d is kept.")
+        until(each, f"flexneedle.store.get('session').name === 'phantom3d' && {DEPTH} === 40")
+    page.click("text=Put this page's scenario back")
+    for each in pages:
+        until(each, f"flexneedle.store.get('session').name === 'phantom' && {DEPTH} === 35")
+    page.wait_for_selector("text=you are in control")
+    assert all("ERR_CONNECTION_REFUSED" in error for error in tab.errors), tab.errors
+    tab.errors.clear()
 
 
 def test_outdated_state_is_dropped_and_a_broken_panel_is_isolated(visit, server):

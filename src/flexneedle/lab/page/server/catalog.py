@@ -6,6 +6,7 @@ from functools import cache
 from typing import get_args
 
 from flexneedle.lab.page.protocol import Strategy
+from flexneedle.lab.page.server.clients import Refusal
 
 STRATEGIES: list[str] = list(get_args(Strategy))
 
@@ -27,3 +28,10 @@ def build_catalog() -> Catalog:
     controllers = [{"name": one.name, "summary": one.summary} for one in CONTROLLERS.values()]
     schema = scenario_class(tuple(CONTROLLERS.values())).model_json_schema()
     return Catalog(controllers, json.dumps(schema, ensure_ascii=False).encode())
+
+
+def require_controller(name: str) -> None:
+    """Raise Refusal for an unknown controller."""
+    known = [controller["name"] for controller in build_catalog().controllers]
+    if name not in known:
+        raise Refusal(f"controller = {name}: must be one of {', '.join(known)}")

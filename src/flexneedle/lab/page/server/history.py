@@ -1,7 +1,5 @@
 """History of the session: steps that are undone and redone."""
 
-from dataclasses import replace
-
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.page_session import PageSession
 
@@ -29,7 +27,7 @@ class SessionHistory:
 
     def add(self, before: PageSession, after: PageSession, keys: frozenset[str] | None = None) -> None:
         """Add a step, unless nothing has changed. keys: of an edit, which may continue the last step."""
-        if _content(before) == _content(after):
+        if after.has_content_of(before):
             return
         if keys is None or keys != self._open:
             self._before = [*self._before, before][-_MOST:]
@@ -56,7 +54,3 @@ class SessionHistory:
         self.close()
         goal.append(present)
         return present.resume(source.pop())
-
-
-def _content(session: PageSession) -> PageSession:
-    return replace(session, revision=0, reach_since=0)

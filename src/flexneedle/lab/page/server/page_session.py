@@ -1,18 +1,20 @@
 """The session that all clients share: scenario, seed, strategy, controller."""
 
+import json
 import re
 import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from hashlib import sha256
 from typing import Any
 
 from flexneedle.errors import ScenarioError, ScenarioWarning, make_printable
 from flexneedle.lab.page.protocol import SessionMessage, Strategy
-from flexneedle.lab.page.requests import OptionsRequest
+from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest
 from flexneedle.lab.page.server.clients import Refusal
-from flexneedle.scenario.dotted import split_key
+from flexneedle.scenario.dotted import nest, split_key
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import PRESETS, WORLD
 from flexneedle.scenario.model import Scenario
@@ -62,7 +64,7 @@ class PageSession:
 
     def with_preset(self, name: str) -> "PageSession":
         """Return the session with a preset or random world. Raises Refusal."""
-        if name not in PRESETS.names() and not name.startswith(WORLD):
+        if not _is_preset(name):
             choices = ", ".join(PRESETS.names())
             raise Refusal(f"preset = {name}: must be one of {choices}, or {WORLD}NUMBER")
         with _refuse_problems():
@@ -86,6 +88,28 @@ class PageSession:
         """Return the session with other options; None leaves one unchanged."""
         chosen = options.model_dump(include={"seed", "strategy", "controller"}, exclude_none=True)
         return self._change(**chosen)
+
+    def restore(self, request: RestoreRequest) -> "PageSession":
+        """Return the session of an open page. Raises Refusal with the problems by key."""
+        with _refuse_problems(request.name):
+            scenario = Scenario.from_values(nest(request.values))
+            if _is_preset(request.name):
+                origin = load_scenario(request.name)
+            else:
+                origin = self.origin if request.name == self.name else scenario
+        options = request.model_dump(include={"seed", "strategy", "controller"})
+        return replace(self._begin(request.name, origin, ()), scenario=scenario, **options)
+
+    def has_content_of(self, other: "PageSession") -> bool:
+        """Return whether all but the revisions is equal."""
+        return (
+            replace(self, revision=other.revision, reach_since=other.reach_since, notes=other.notes) == other
+        )
+
+    def digest(self, rig: str | None) -> str:
+        """Return a text that is equal for the same session and rig."""
+        content = [self.name, self.scenario.values(), self.seed, self.strategy, self.controller, rig]
+        return sha256(json.dumps(content).encode()).hexdigest()
 
     def resume(self, other: "PageSession") -> "PageSession":
         """Return the session with the content of another, as its next revision."""
@@ -116,6 +140,11 @@ class PageSession:
         revision = self.revision + 1
         begun = replace(self, name=name, origin=scenario, scenario=scenario, notes=notes)
         return replace(begun, revision=revision, reach_since=revision)
+
+
+def _is_preset(name: str) -> bool:
+    """Return whether a name is one of a preset or a random world."""
+    return name in PRESETS.names() or name.startswith(WORLD)
 
 
 def _cross_section(needle: Needle, values: Mapping[str, Any]) -> dict[str, Any]:

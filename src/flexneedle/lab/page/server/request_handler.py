@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, assert_never
 
 from flexneedle.lab.page import requests as ask
@@ -20,7 +21,7 @@ from flexneedle.lab.page.protocol import (
     WelcomeMessage,
     describe_scene,
 )
-from flexneedle.lab.page.server.catalog import STRATEGIES, build_catalog
+from flexneedle.lab.page.server.catalog import STRATEGIES, build_catalog, require_controller
 from flexneedle.lab.page.server.clients import Clients, PageLimits, Refusal
 from flexneedle.lab.page.server.connected_rig import ConnectedRig, RigReference
 from flexneedle.lab.page.server.history import SessionHistory
@@ -59,6 +60,7 @@ class RequestHandler:
         self.rig = ConnectedRig(self.hub, lambda: self._insertions, setup.limits, setup.rig)
         self.live = LiveInsertion(self.hub, lambda: self._insertions, setup.limits, self.rig)
         self._rig_name = None if setup.rig is None else setup.rig.name
+        self._started, self._initial = token_hex(8), setup.session.digest(self._rig_name)
         self._insertions = JobQueue(
             insertions, self.hub, setup.limits, numbers, self._end_job, self.live.take
         )
@@ -121,6 +123,8 @@ class RequestHandler:
             controllers=build_catalog().controllers,
             strategies=STRATEGIES,
             rig=self._rig_name,
+            started=self._started,
+            initial=self._initial,
         )
 
     def leave(self, client: int, outbox: ClientOutbox) -> None:
@@ -151,6 +155,8 @@ class RequestHandler:
                     self._plan_unless_inserting()
             case ask.UndoRequest():
                 self._undo(redo=request.redo)
+            case ask.RestoreRequest():
+                self._restore(client, request)
             case ask.PresetRequest():
                 self._step(self.session.with_preset(request.name))
             case ask.LoadRequest():
@@ -254,10 +260,21 @@ class RequestHandler:
         self._start_timer("plan", self.limits.rest_s, self._plan_unless_inserting)
 
     def _with_options(self, options: ask.OptionsRequest) -> PageSession:
-        known = [controller["name"] for controller in build_catalog().controllers]
-        if options.controller is not None and options.controller not in known:
-            raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
+        if options.controller is not None:
+            require_controller(options.controller)
         return self.session.with_options(options)
+
+    def _restore(self, client: int, request: ask.RestoreRequest) -> None:
+        """Continue with the session of an open page; two pages of one session give the same one."""
+        require_controller(request.controller)
+        restored = self.session.restore(request)
+        if restored.has_content_of(self.session):
+            return
+        if self.clients.in_control != client:
+            if self.clients.in_control is not None or self.session.revision > 1:
+                self.clients.require_control(client)
+            self.live.require_none("the scenario of the page can be put back at its end")
+        self._step(restored)
 
     def require_processor(self) -> None:
         """Raise Refusal during an insertion on the rig: a long computation would delay its loop."""

@@ -13,7 +13,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from flexneedle.errors import make_printable
 from flexneedle.lab.page.protocol import DoneMessage, RefusedMessage
-from flexneedle.lab.page.requests import REQUESTS, AnyRequest, LoadRequest
+from flexneedle.lab.page.requests import REQUESTS, AnyRequest, LoadRequest, RestoreRequest
 from flexneedle.lab.page.server.clients import PageLimits, Refusal
 from flexneedle.lab.page.server.hub import ClientOutbox
 from flexneedle.lab.page.server.request_handler import RequestHandler
@@ -84,7 +84,7 @@ def _answer(handler: RequestHandler, client: int, outbox: ClientOutbox, text: st
     try:
         request = _parse(text, handler.limits.file_bytes)
         what, number = request.type, request.request
-        if not isinstance(request, LoadRequest):
+        if not isinstance(request, LoadRequest | RestoreRequest):
             _require_length(text, handler.limits.message_bytes)
         handler.carry_out(client, request)
     except Refusal as refusal:

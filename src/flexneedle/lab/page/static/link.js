@@ -1,6 +1,8 @@
 // The web socket: connects and reconnects automatically, matches answers to requests, passes messages to the store.
 
 import { unpacked } from "./frames.js";
+import { afterRestart, restoreOf } from "./restart.js";
+import { runs } from "./shown.js";
 
 const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
 const EDIT_EVERY = 50; // ms
@@ -8,7 +10,7 @@ const MOST_REFUSALS = 20;
 const ANSWER_WITHIN = 10_000; // ms
 const LOOK_EVERY = 1000; // ms between two checks of the server
 const MOST_SILENT = 4; // checks without a message: more, and the line is dead, which a browser notices after minutes
-const FREE = ["steer", "stop", "ping"]; // requests that need no control
+const FREE = ["steer", "stop", "ping", "restore"]; // requests that need no control
 
 export class Link {
   #store;
@@ -17,7 +19,7 @@ export class Link {
   #attempts = 0;
   #timer = 0;
   #number = 0;
-  #revision = -1; // of the newest session
+  #before = null; // session of this page before the server was restarted, until the new one's arrives
   #silent = 0; // checks since the last message; not a time, since a page that was suspended has messages pending
   #waiting = new Map(); // by number of the request: {resolve, timer}
   #edits = {};
@@ -112,9 +114,10 @@ export class Link {
     return answer;
   }
 
-  #refuse({ reason, problems }) {
+  // action: {text, call} of a button, without which the refusal disappears after some seconds.
+  #refuse({ reason, problems, action }) {
     const refusals = this.#store.get("refusals") ?? [];
-    const newest = { reason, problems: problems ?? {}, number: (refusals.at(-1)?.number ?? 0) + 1 };
+    const newest = { reason, problems: problems ?? {}, action, number: (refusals.at(-1)?.number ?? 0) + 1 };
     this.#store.set("refusals", [...refusals, newest].slice(-MOST_REFUSALS));
   }
 
@@ -149,18 +152,34 @@ export class Link {
     if (message.type === "welcome") {
       this.#attempts = 0;
       this.#store.set("connection", "open");
+      this.#before = this.#sessionBefore(message);
     }
-    if (message.type === "session") this.#compare(message);
     if (message.type === "clients") this.#reportLoss(message);
     this.#store.receive(message);
+    if (message.type === "session" && this.#before) this.#recover(message);
   }
 
-  // A restarted server counts its revisions from the beginning.
-  #compare({ revision }) {
-    if (revision < this.#revision) {
-      this.#refuse({ reason: "The server was restarted with its initial scenario. Unsaved changes are lost." });
-    }
-    this.#revision = revision;
+  // The session of this page, which a restarted server does not know; null otherwise.
+  #sessionBefore({ started }) {
+    const [welcome, session, live] = ["welcome", "session", "insertion live"].map((key) => this.#store.get(key));
+    if (!welcome || welcome.started === started) return null;
+    return session ? { welcome, session, ran: runs(live) } : this.#before;
+  }
+
+  async #recover(session) {
+    const before = this.#before;
+    this.#before = null;
+    const { line, restores, offers } = afterRestart(before, this.#store.get("welcome"), session);
+    const request = restoreOf(before.session);
+    const answer = restores ? await this.ask(request, { quiet: true }) : { done: true };
+    const action = { text: "Put this page's scenario back", call: () => this.#putBack(request) };
+    if (!answer.done) this.#refuse({ reason: `The server was restarted without this page's scenario: ${answer.reason}`, action });
+    else if (line) this.#refuse({ reason: line, action: offers && action });
+  }
+
+  async #putBack(request) {
+    const steering = this.#mustSteer({ type: "edit" }) ? await this.ask({ type: "steer", take: true }) : { done: true };
+    if (steering.done) await this.ask(request);
   }
 
   // Another page has taken over this page's control.

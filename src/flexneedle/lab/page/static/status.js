@@ -148,13 +148,17 @@ function followRefusals(element, store) {
       show(refusal);
     }
   });
-  function show({ reason, problems }) {
+  function show({ reason, problems, action }) {
     const keys = Object.keys(problems).join();
     if (keys && element.lastChild?.dataset.keys === keys) element.lastChild.remove(); // for example during a drag
     const close = button("Close", () => shown.remove());
-    const shown = make("div.refusal", { "data-keys": keys }, make("p", {}, reason), close);
+    const act = action && button(action.text, () => {
+      shown.remove();
+      action.call();
+    });
+    const shown = make("div.refusal", { "data-keys": keys }, make("p", {}, reason), ...(act ? [act] : []), close);
     element.append(shown);
     while (element.children.length > 3) element.firstChild.remove();
-    setTimeout(() => shown.remove(), SHOWN_FOR);
+    if (!action) setTimeout(() => shown.remove(), SHOWN_FOR);
   }
 }
