@@ -92,7 +92,7 @@ vars(PARTS).update(
     managed_lists=managed_lists,
     refuses=raising(RigError("port = 3: must be text", "speed = 0: must be above 0")),
     refuses_in_one_line=raising(InputError("/dev/tty9: no such port")),
-    does_not_reply=raising(RunError("/dev/tty9: no tracker: no reply")),
+    does_not_reply=raising(RunError("/dev/tty9: not connected: no reply")),
     does_not_open=raising(KeyError("nothing")),
     takes_one=lambda _settings: None,
     PROJECT=PROJECT,

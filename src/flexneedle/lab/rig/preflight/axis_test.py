@@ -97,9 +97,9 @@ class Rest:
 
 @dataclass(frozen=True)
 class AxisPlan:
-    """Planned motion of one axis: positions before the probe and of it (mm or rad), rests as shares of its way.
+    """Planned motion of one axis: positions of the first part and the probe (mm or rad), rests as shares of its way.
 
-    gain: motion of the tip for that of the axis (mm per mm); seconds: time at rest; readings: of it that suffice.
+    gain: motion of the tip (mm) for 1 mm of the axis; seconds: time at rest; readings: of it that suffice.
     """
 
     move: AxisMove

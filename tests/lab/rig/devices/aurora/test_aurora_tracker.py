@@ -13,7 +13,7 @@ import pytest
 from emulated import assert_true_and_new, emulated, emulator, read_until, until
 from flexneedle.errors import InputError, RunError
 from flexneedle.lab.process import ChildProcess
-from flexneedle.lab.rig.devices.aurora import aurora_tracker, incoming, library, link
+from flexneedle.lab.rig.devices.aurora import aurora_tracker, incoming, library
 from flexneedle.lab.rig.devices.aurora.aurora_tracker import Aurora
 from flexneedle.lab.rig.devices.clock import WallClock
 from flexneedle.types import VISIBLE
@@ -286,66 +286,8 @@ def test_a_link_that_cannot_be_started_at_first_is_an_error(terminal, monkeypatc
         raise OSError(24, "Too many open files")
 
     monkeypatch.setattr(Aurora, "_connect_once", fail)
-    with pytest.raises(RunError, match=r"no tracker: the link failed: .*Too many open files"):
+    with pytest.raises(RunError, match=r"not connected: the link failed: .*Too many open files"):
         Aurora(terminal, WallClock())
-
-
-class FakeDevice:
-    """A device with the handle 0B of an unplugged sensor and others of present ones; errors: codes by command."""
-
-    def __init__(self, present=(0x0A,), **errors):
-        self.sent, self.errors = [], {key.replace("_", ":"): code for key, code in errors.items()}
-        self.listed = {"PHSR:01": [[0x0B]], "PHSR:02": [[*present], [*present][len(present) :]]}
-
-    def command(self, text):
-        self.sent.append(text)
-        return self.errors.get(text, 0)
-
-    def port_handles(self):
-        return self.listed[self.sent[-1]].pop(0)
-
-    def location(self):
-        handle = int(self.sent[-1][6:8], 16)
-        if handle == self.errors.get("location"):
-            raise ValueError("not a port location: 'x'")
-        return f"{handle - 9:02d}", "00"
-
-    def explain(self, code):
-        return f"error {code:02X}"
-
-
-@pytest.mark.parametrize(
-    ("errors", "failed"),
-    [
-        ({"PINIT_0C": 0x13}, {"12": (("03", "00"), "port 3 cannot be initialised: error 13")}),
-        ({"PENA_0CD": 0x28}, {"12": (("03", "00"), "port 3 cannot be enabled: error 28")}),
-        ({"PHINF_0C0020": 0x0E}, {"12": (None, "port handle 0C cannot be described: error 0E")}),
-        (
-            {"PINIT_0C": 0x1E, "PHINF_0C0020": 0x0E},
-            {"12": (None, "port handle 0C cannot be initialised: error 1E")},
-        ),
-        ({"location": 0x0C}, {"12": (None, "port handle 0C cannot be described: not a port location: 'x'")}),
-        ({"PHF_0B": 0x08}, {}),
-    ],
-)
-def test_a_sensor_that_cannot_be_set_up_is_left_out_with_its_port_and_reason(errors, failed):
-    found = link.set_up(FakeDevice((0x0A, 0x0C), **errors))
-    assert found.failed == failed
-    left = {"12": ("03", "00")} if not failed else {}
-    assert found.ports == {"10": ("01", "00"), **left}
-
-
-@pytest.mark.parametrize(
-    ("errors", "reason"),
-    [
-        ({"PINIT_0A": 0x13}, "port 1 cannot be initialised: error 13"),
-        ({"PINIT_0A": 0x103}, "PINIT:0A: no reply"),
-        ({"PENA_0AD": 0x100}, "PENA:0AD: replies are garbled"),
-    ],
-)
-def test_without_a_sensor_or_a_line_the_connection_ends(errors, reason):
-    with pytest.raises(link._End, match=reason):
-        link.set_up(FakeDevice(**errors))
 
 
 def test_a_sensor_that_cannot_be_initialised_does_not_affect_the_others_and_may_come_back(path, order):
@@ -363,19 +305,12 @@ def test_a_sensor_that_cannot_be_initialised_does_not_affect_the_others_and_may_
         assert (aurora.counts.reconnections, aurora.counts.errors) == (0, {})
 
 
-def test_handles_of_unplugged_sensors_are_freed_before_set_up():
-    device = FakeDevice()
-    assert link.set_up(device).ports == {str(0x0A): ("01", "00")}
-    assert device.sent[:3] == ["PHSR:01", "PHF:0B", "PHSR:02"]
-    assert [text for text in device.sent if "0B" in text] == ["PHF:0B"]
-
-
 def test_a_path_without_a_serial_port_is_rejected_in_one_line(tmp_path):
     (tmp_path / "plain").write_text("no port")
     for path, kind, reason in (
         (tmp_path / "nothing", InputError, r"nothing: no such port; serial ports found: "),
-        ("/dev/null", RunError, "no tracker: not a serial port$"),
-        (tmp_path / "plain", RunError, "no tracker: not a serial port$"),
+        ("/dev/null", RunError, "not connected: not a serial port$"),
+        (tmp_path / "plain", RunError, "not connected: not a serial port$"),
     ):
         with pytest.raises(kind, match=reason) as refusal:
             Aurora(str(path), WallClock())
@@ -399,7 +334,7 @@ def test_any_error_code_has_a_description(terminal):
 @pytest.mark.slow
 def test_a_port_without_a_tracker_is_rejected(terminal):
     """Slow: it waits for the tracker's reset after a serial break."""
-    with pytest.raises(RunError, match="no tracker: no reply, not even to a serial break"):
+    with pytest.raises(RunError, match="not connected: no reply, not even to a serial break"):
         Aurora(terminal, WallClock())
 
 

@@ -77,7 +77,7 @@ class Aurora:
     def _await_first(self) -> None:
         self._first.wait()
         if self._stop.is_set():
-            raise RunError(f"{self._path}: no tracker: {self._incoming.reason}")
+            raise RunError(f"{self._path}: not connected: {self._incoming.reason}")
 
     def _keep_connected(self) -> None:
         pause, attempt = _FIRST_WAIT_S, 0

@@ -142,10 +142,14 @@ class LinkReceiver:
             f"handle{int(h):02X}" if location is None else sensor_name(*location, self._names): why
             for h, (location, why) in failed.items()
         }
-        if len({*named.values(), *without}) < len(named) + len(failed):
-            raise ValueError(f"two sensors with one name: {', '.join((*named.values(), *without))}")
+        if len(set(named.values())) < len(named):
+            raise ValueError(f"two sensors with one name: {', '.join(named.values())}")
         self._named = named
-        self._failed = {name: SensorReading(None, status=to_one_line(why)) for name, why in without.items()}
+        self._failed = {
+            name: SensorReading(None, status=to_one_line(why))
+            for name, why in without.items()
+            if name not in named.values()  # another handle of its port is read
+        }
         with self._lock:
             self._connections += not self._again
         self._again = True

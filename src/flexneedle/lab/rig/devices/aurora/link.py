@@ -17,6 +17,7 @@ it, and because a planner that holds Python's lock for a frame or two would lose
 import json
 import signal
 import sys
+from collections import Counter
 from dataclasses import dataclass, field
 from enum import Enum
 from time import monotonic, sleep
@@ -152,7 +153,8 @@ class SensorSetUp:
         """Leave a sensor out: the others are not affected."""
         location = self.ports.pop(str(handle), None)
         where = f"port handle {handle:02X}" if location is None else f"port {location[0].lstrip('0')}"
-        self.failed[str(handle)] = location, f"{where} {problem}"
+        second = "" if location is None or location[1] == "00" else f" (sensor {int(location[1], 16) + 1})"
+        self.failed[str(handle)] = location, f"{where}{second} {problem}"
 
 
 def set_up(device: AuroraDevice) -> SensorSetUp:
@@ -168,8 +170,9 @@ def set_up(device: AuroraDevice) -> SensorSetUp:
             _initialise(device, handle, found)
         if not waiting:
             break
-    if len(set(found.ports.values())) < len(found.ports):  # their sensors could not be distinguished
-        raise _End("two port handles report the same port")
+    same = Counter(found.ports.values())
+    for handle in [int(handle) for handle, location in found.ports.items() if same[location] > 1]:
+        found.fail(handle, "is reported by two port handles: its sensors cannot be distinguished")
     for handle in list(map(int, found.ports)):
         if problem := _refusal(device, f"PENA:{handle:02X}D"):
             found.fail(handle, f"cannot be enabled: {problem}")
