@@ -47,7 +47,9 @@ def test_without_a_home_kernels_go_to_a_temporary_folder_with_one_line(home, tmp
     assert os.environ["NUMBA_CACHE_DIR"] == str(found[0].parent)
     assert os.environ["MPLCONFIGDIR"] == str(found[0].parents[1] / "matplotlib")
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"flexneedle: no home that can be written; caches are in {found[0].parents[1]}")
+    assert line.startswith(
+        f"flexneedle: no folder of caches can be written; caches are in {found[0].parents[1]}"
+    )
 
 
 def test_kernels_go_to_the_first_folder_that_can_be_written(tmp_path, monkeypatch, capsys):
@@ -56,12 +58,49 @@ def test_kernels_go_to_the_first_folder_that_can_be_written(tmp_path, monkeypatc
         folder.mkdir()
     monkeypatch.setenv("HOME", str(home))
     orders = {
-        (chosen, code, home): chosen, (code, home): code / "__pycache__", (home,): home / ".cache" / "flexneedle",
-    }  # fmt: skip
-    for writable, expected in orders.items():
+        (str(chosen), chosen, code, home): chosen,
+        ("", code, home): code / "__pycache__",
+        ("", home): home / ".cache" / "flexneedle",
+    }
+    for (given, *writable), expected in orders.items():
         locked(monkeypatch, *writable)
-        assert caches.kernel_folder("kernels-1", code, str(chosen)) == expected / "kernels-1"
+        assert caches.kernel_folder("kernels-1", code, given) == expected / "kernels-1"
     assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("chosen", ["/proc/flexneedle", "file"])
+def test_a_chosen_folder_that_cannot_be_created_is_replaced_with_one_line(
+    chosen, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    found = [caches.kernel_folder("kernels-1", tmp_path, chosen) for _ in range(2)]
+    assert found == [tmp_path / f"flexneedle-{os.getuid()}" / "kernels" / "kernels-1"] * 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(found[0].parents[1]) in line
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("NUMBA_NUM_THREADS", "0"),
+        ("NUMBA_NUM_THREADS", "two"),
+        ("NUMBA_DISABLE_JIT", "true"),
+        ("NUMBA_DISABLE_JIT", ""),
+        ("NUMBA_DISABLE_JIT", "1"),
+    ],
+)
+def test_settings_of_numba_that_cannot_be_used_are_refused_in_one_line(variable, value):
+    code = "from flexneedle.cli.main import main; raise SystemExit(main(['plan', 'phantom']))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, variable: value},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "unset it" in done.stderr
 
 
 def test_a_folder_of_matplotlib_that_the_user_chose_is_kept(tmp_path, monkeypatch):

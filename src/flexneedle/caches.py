@@ -14,11 +14,17 @@ def home_folder(variable: str, name: str) -> Path | None:
 
 
 def is_writable(folder: Path | None) -> bool:
-    """Return whether a folder can be written, or created below the nearest folder that exists."""
+    """Return whether a folder can be written; it is created below the nearest folder that exists."""
     if folder is None:
         return False
     nearest = next((path for path in (folder, *folder.parents) if os.path.exists(path)), folder)  # noqa: PTH110
-    return os.path.isdir(nearest) and os.access(nearest, os.W_OK | os.X_OK)  # noqa: PTH112  no PermissionError
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        return False
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # nearest is a file, or its file system refuses
+        return False
+    return True
 
 
 @cache
@@ -30,7 +36,9 @@ def temporary_folder() -> Path:
     if folder.is_symlink() or about.st_uid != os.getuid() or about.st_mode & 0o022:
         folder = Path(tempfile.mkdtemp(prefix="flexneedle-"))  # another user could write into the other
     choice = "NUMBA_CACHE_DIR and MPLCONFIGDIR choose others"
-    print(f"flexneedle: no home that can be written; caches are in {folder} ({choice})", file=sys.stderr)
+    print(
+        f"flexneedle: no folder of caches can be written; caches are in {folder} ({choice})", file=sys.stderr
+    )
     return folder
 
 
@@ -44,11 +52,11 @@ def use_matplotlib_folder() -> None:
 def kernel_folder(name: str, home: Path, chosen: str) -> Path:
     """Return the folder `name` of compiled kernels whose sources are in `home`.
 
-    It is in the first that can be written: `chosen` (NUMBA_CACHE_DIR), beside the code, the user's cache, or a
-    temporary folder.
+    It is in `chosen` (NUMBA_CACHE_DIR), else beside the code or in the user's cache, or in a temporary folder if these
+    cannot be written.
     """
     user = home_folder("XDG_CACHE_HOME", ".cache")
-    places = (Path(chosen) if chosen else None, home / "__pycache__", user and user / "flexneedle")
+    places = (Path(chosen),) if chosen else (home / "__pycache__", user and user / "flexneedle")
     found = next((place for place in places if place and is_writable(place / name)), None)
     if found is None:
         found = temporary_folder() / "kernels"
