@@ -34,6 +34,7 @@ def write_all(folder, files):
 
 PACKAGE = {"mine/__init__.py": "", "mine/sub/__init__.py": "", "mine/sub/gains.py": "", "mine/other.py": ""}
 OF_MINE = "from mine import "
+BOTH = ["mine_b.py", "mine_c.py"]
 IMPORTS = [  # the module, its source, further files, the files that are found apart from the module's
     ("mine_a", "", {"mine_b.py": ""}, []),
     (
@@ -109,6 +110,28 @@ IMPORTS = [  # the module, its source, further files, the files that are found a
         PACKAGE,
         ["mine/__init__.py", "mine/other.py"],
     ),
+    (
+        "mine_a",
+        "import importlib\nimportlib.import_module('mine_' + 'b')",
+        {"mine_b.py": "", "mine_c.py": ""},
+        BOTH,
+    ),
+    ("mine_a", "for k in 'bc':\n    __import__(f'mine_{k}')", {"mine_b.py": "", "mine_c.py": ""}, BOTH),
+    (
+        "mine_a",
+        "open('gains.json')\nprint('.', 'a\\0', 'x' * 9)",
+        {"gains.json": "1", "other.json": ""},
+        ["gains.json"],
+    ),
+    ("mine_a", "HERE / 'data' / 'gains.csv'", {"data/gains.csv": "1"}, ["data/gains.csv"]),
+    ("mine_a", "runpy.run_path('mine_b.py')", {"mine_b.py": ""}, ["mine_b.py"]),
+    (
+        "mine.part",
+        "files(__package__) / 'k.npz'",
+        PACKAGE | {"mine/k.npz": ""},
+        ["mine/__init__.py", "mine/k.npz"],
+    ),
+    ("mine_a", "open('../mine_x.json')", {"../mine_x.json": "1"}, []),
     ("mine_a", "import os.path, json, sys, math, flexneedle", {}, []),
     ("mine_a", "import numpy as np\nfrom scipy import special", {}, ["numpy", "scipy"]),
     ("mine_a", "from mine_b import K  # \xe9", {"mine_b.py": "# \xe9"}, ["mine_b.py"]),

@@ -1,7 +1,8 @@
-"""The source files on which a custom module depends: its own file and the files of the modules that it imports.
+"""The files on which a custom module depends: its source, the modules that it imports, and data beside them.
 
 Imports are read from the sources and resolved without executing a module: statements anywhere in a file, and
-`import_module` and `__import__` with a literal name. Names computed at run time and data files are not found.
+`import_module` and `__import__`. Where they compute a name, all modules of the folder count. Data are files in the
+folder of a module, or below, that a text in its source names, such as "gains.json".
 """
 
 import ast
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 _DIGITS = 12
+_LONGEST_NAME = 100  # of a data file
 _PACKAGE = __name__.partition(".")[0]
 _PYTHON = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")}
 _LINE_ENDS = ((b"\r\n", b"\n"), (b"\r", b"\n"))
@@ -109,13 +111,42 @@ def _add_module(found: dict[str, str], name: str, place: _Place, as_loaded: bool
         found[file] = ""
         return []
     found[file] = _digest(name, source, as_loaded)
-    return list(_find_imports(source, name if place.folders else name.rpartition(".")[0]))
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):  # cannot be imported either
+        return []
+    package, folder = name if place.folders else name.rpartition(".")[0], Path(place.spec.origin or "").parent
+    for data in _find_data(tree, folder):
+        inside = f"{package.replace('.', '/')}/{data}" if package else data
+        found.setdefault(inside, _digest_bytes((folder / data).read_bytes()))
+    imported = list(_find_imports(tree, package))
+    if "" in imported:
+        imported += [f"{package}.{each.name}".lstrip(".") for each in pkgutil.iter_modules([str(folder)])]
+    return list(filter(None, imported))
+
+
+def _find_data(tree: ast.Module, folder: Path) -> set[str]:
+    """Return the paths, relative to a folder, of the files in it or in its folders that a source names."""
+    texts = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    names = {text for text in texts if text.isprintable() and len(text) <= _LONGEST_NAME}
+    folders = [folder, *(folder / name for name in names if (folder / name).is_dir())]
+    paths = ((each / name).resolve() for each in folders for name in names if (each / name).is_file())
+    home = folder.resolve()
+    return {str(path.relative_to(home)) for path in paths if path.is_relative_to(home)}
+
+
+def _digest_bytes(content: bytes) -> str:
+    for end, plain in _LINE_ENDS:
+        content = content.replace(end, plain)
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]
 
 
 def _digest(name: str, source: bytes, as_loaded: bool) -> str:
-    for end, plain in _LINE_ENDS:
-        source = source.replace(end, plain)
-    digest = hashlib.sha256(source).hexdigest()[:_DIGITS]
+    digest = _digest_bytes(source)
     if name not in sys.modules:
         return digest
     if not has_record(name):
@@ -139,12 +170,11 @@ def _read(spec: ModuleSpec) -> bytes | None:
         return None
 
 
-def _find_imports(source: bytes, package: str) -> Iterator[str]:
-    """Yield the names that a source imports; of `from a import b` both a and a.b, which may be an attribute."""
-    try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError):  # cannot be imported either
-        return
+def _find_imports(tree: ast.Module, package: str) -> Iterator[str]:
+    """Yield the names that a source imports, "" for a computed one.
+
+    Of `from a import b` both a and a.b, which may be an attribute.
+    """
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -152,9 +182,8 @@ def _find_imports(source: bytes, package: str) -> Iterator[str]:
             base = _resolve("." * node.level + (node.module or ""), package)
             yield from (name for alias in node.names if base for name in (base, f"{base}.{alias.name}"))
         elif isinstance(node, ast.Call) and node.args and _is_import(node.func):
-            given = node.args[0]
-            if isinstance(given, ast.Constant) and isinstance(given.value, str):
-                yield from filter(None, [_resolve(given.value, package)])
+            given = node.args[0].value if isinstance(node.args[0], ast.Constant) else None
+            yield _resolve(given, package) if isinstance(given, str) else ""
 
 
 def _is_import(function: ast.expr) -> bool:
