@@ -10,7 +10,7 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Measurement, Motion
 from tasks import begun_with
 
-PHANTOM = flexneedle.load_scenario("phantom")
+PHANTOM = flexneedle.load_scenario("phantom").with_values({"control.axial_scale_sd": 0.0})
 QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3})
 AHEAD = Control(db_x=1.0)
 

@@ -219,8 +219,8 @@ def test_the_error_along_the_axis_is_as_large_as_its_standard_deviation():
         for k, row in enumerate(rows):
             estimate = estimate.move(Motion(row, k, k + 1.0))
             estimate = estimate.observe(readings(needle, states[k], states[k + 1], k, 2, noise, rng))
-        off.append((estimate.axial - needle.base_x) / np.sqrt(estimate.axial_variance))
-    assert np.sqrt(estimate.axial_variance) == pytest.approx(noise / np.sqrt(12.0), rel=0.01)
+        off.append((estimate.axial - needle.base_x) / np.sqrt(estimate.axial_covariance[0, 0]))
+    assert np.sqrt(estimate.axial_covariance[0, 0]) == pytest.approx(noise / np.sqrt(12.0), rel=0.01)
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.25)
 
 

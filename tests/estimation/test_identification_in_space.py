@@ -228,9 +228,9 @@ def test_a_second_axis_makes_the_distance_of_the_next_reading_larger():
         StateCorrection().begin(begun_with(Simulator(plane.with_values({"setup.axes": axes}), 1)))
         for axes in (1, 2)
     )
-    across = one.tip_sd**2 - one.axial
+    across = one.tip_sd**2 - one.axial[0, 0]
     assert across > 0.1
-    assert two.tip_sd**2 == pytest.approx(two.axial + 2.0 * across)
+    assert two.tip_sd**2 == pytest.approx(two.axial[0, 0] + 2.0 * across)
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi / 2])

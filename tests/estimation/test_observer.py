@@ -94,7 +94,9 @@ def test_without_estimating_the_load_the_offset_stays(gain, estimates):
 
 def test_the_load_grows_by_the_gain_times_the_reaction_and_the_tip_is_held_where_measured():
     simulator = Simulator(PHANTOM)
-    known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=(0.001,))), axial=0.0)
+    known = replace(
+        begun(simulator, in_tissue(simulator).with_estimate(tip_load=(0.001,))), axial=np.zeros((2, 2))
+    )
     moved = known.move(Motion(AHEAD, 0.0, 1.0))
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
@@ -124,7 +126,7 @@ def test_the_start_along_the_axis_and_its_variance_are_found(base_x):
         sds.append(estimate.tip_sd)
     control, jitter = PHANTOM.control, PHANTOM.tracker.jitter_per_axis
     precision = control.start_axial_sd_mm**-2.0 + 40.0 / jitter**2
-    assert estimate.axial == pytest.approx(1.0 / precision, rel=1e-6)
+    assert estimate.axial[0, 0] == pytest.approx(1.0 / precision, rel=1e-6)
     assert estimate.tip[X] == pytest.approx(truth.tip[X], abs=0.01)
     assert estimate.state.travel[0] == pytest.approx(10.0)
     assert (np.diff(sds) < 0.0).all()
@@ -150,7 +152,7 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
 def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):
     """The tip is where it was measured, and new contacts rest on the line to it."""
     simulator = Simulator(PHANTOM)
-    start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
+    start = replace(begun(simulator, in_tissue(simulator)), axial=np.diag([axial, 0.0]))
     moved = start.move(Motion(AHEAD, 0.0, 1.0))
     x, y = np.add(moved.tip[:2], off).tolist()
     corrected = moved.observe([Measurement(1.0, x, y)])

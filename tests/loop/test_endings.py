@@ -134,7 +134,9 @@ class Rounding(RecordedPhantom):
 
 
 def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
-    known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
+    known = PHANTOM.with_values(
+        {"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0, "control.axial_scale_sd": 0.0}
+    )
     recorded = Rounding(plan.roll, scenario=known)
     done = run(plan, recorded.rig(), known)
     assert any(period.command.dg_y != period.applied.dg_y for period in done.periods)
@@ -166,3 +168,35 @@ def test_without_a_truth_the_true_error_is_not_known(plan, quick):
     assert {period.true_strain_energy for period in replayed.periods} == {None}
     assert {period.true_stretch for period in replayed.periods} == {None}
     assert replayed.residual_mm == done.residual_mm
+
+
+class Longer(RecordedPhantom):
+    """A driver whose insertion axis moves `factor` times as far as commanded, and reports what was commanded."""
+
+    factor = 1.0
+
+    def apply(self, command, duration):
+        motion = super().apply(command._replace(db_x=self.factor * command.db_x), duration)
+        return motion._replace(control=motion.control._replace(db_x=motion.control.db_x / self.factor))
+
+
+@pytest.mark.parametrize("controller", ["adaptive-mpc", "ce-mpc"])
+@pytest.mark.parametrize(
+    ("factor", "outcome"), [(0.9, "held"), (1.1, "held"), (0.985, "done"), (1.02, "done")]
+)
+def test_a_wrong_scale_of_the_insertion_axis_is_found_by_the_tracker(plan, controller, factor, outcome):
+    """A large one ends the insertion, still in air; a small one is fitted, and the tip ends at the target's depth."""
+    wide = {
+        "setup.max_advance_mm": 1.1 * PHANTOM.setup.max_advance_mm,
+        "setup.insertion_speed_mm_s": 1.1 * PHANTOM.setup.insertion_speed_mm_s,
+    }
+    recorded = Longer(plan.roll, scenario=PHANTOM.with_values(wide))
+    recorded.factor = factor
+    done = run(plan, recorded.rig(), controller=controller)
+    assert done.outcome == outcome
+    depth = done.periods[-1].true_tip.x
+    if outcome == "done":
+        assert depth == pytest.approx(plan.target[0], abs=0.1)
+    else:
+        assert "times as far as commanded" in done.reason
+        assert depth < 0.0

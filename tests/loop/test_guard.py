@@ -203,3 +203,19 @@ def test_a_hold_ends_with_a_command_that_the_guard_admits(plan):
 def test_an_ordinary_insertion_is_not_held_by_it(real):
     assert real[0].outcome is Outcome.DONE
     assert not any("guard" in period.decision for period in real[0].periods)
+
+
+# ---- the advance by the tracker
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_a_needle_that_advances_far_more_or_less_than_commanded_is_held(plan, scale):
+    """The limit is three standard deviations of the scenario's prior of the scale."""
+    estimate = replace(estimate_at(Simulator(PHANTOM, 1).start()), axial_scale=scale)
+    refusal = guard_of(plan).refusal(estimate, Control(db_x=1.0))
+    assert refusal == (
+        f"guard: the tracker sees the needle advance {scale:.3f} times as far as commanded (limit 1 ± 0.03): "
+        "check the insertion axis and the tracker"
+    )
+    wide = Guard.of(PHANTOM.with_values({"control.axial_scale_sd": 0.02}), plan)
+    assert wide.refusal(estimate, Control(db_x=1.0)) == ""

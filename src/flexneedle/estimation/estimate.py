@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-import numpy as np
-
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import THETA, Control, Floats, Measurement, Motion, Point
+from flexneedle.types import THETA, Floats, Measurement, Motion, Point
 
 
 class Estimate(Protocol):
@@ -47,6 +45,11 @@ class Estimate(Protocol):
         """Return standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5) of the needle at the target."""
         ...
 
+    @property
+    def axial_scale(self) -> float:
+        """Advance of the needle, as the tracker measures it, over the commanded advance."""
+        ...
+
     def tip_at(self, time: float) -> Point:
         """Return the estimated position of the tip (mm) at `time`, with constant velocity in each move."""
         ...
@@ -71,8 +74,3 @@ def describe_estimate(estimate: Estimate) -> str:
     slope = ", ".join(f"{1e3 * value:.2f}" for value in tip[THETA : THETA + axes])
     where = f"tip ({position}) mm ± {estimate.tip_sd:.3f} mm, slope {slope} mrad"
     return f"<{type(estimate).__name__} {where}>"
-
-
-def carry_out(simulator: Simulator, state: State, applied: Control) -> State:
-    """Return the state after a motion as the driver carried it out, which may exceed a limit of commands a little."""
-    return simulator.replay(state, np.array([applied]))[0]

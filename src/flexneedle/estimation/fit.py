@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flexneedle.estimation.axial import replay_scaled
 from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, adapt_model
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
@@ -112,7 +113,7 @@ def _perturb(fitted: FittedInsertion, parameters: Floats, k: int, ahead: Floats)
     if first == 0:
         state = fitted.settle_start(simulator, parameters)
     before = np.concatenate([fitted.tips[:first], state.tip[None]])
-    now, tips = simulator.replay(state, fitted.rows[first:])
+    now, tips = replay_scaled(simulator, state, fitted.rows[first:], fitted.axial_scale)
     later = simulator.replay(now, ahead)[1]
     member = Perturbed(k, float(fitted.prior.steps[k]), simulator, now)
     return member, np.concatenate([before, tips, later])

@@ -6,6 +6,7 @@ from typing import Self, TypeVar
 
 import numpy as np
 
+from flexneedle.estimation.axial import replay_scaled
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move
@@ -48,6 +49,7 @@ class FittedInsertion:
     curves: Laterals  # derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first
     precision: Floats  # inverse covariance (K, K) of the parameters
     axial: float = 0.0  # start error along the axis (mm)
+    axial_scale: float = 1.0  # advance of the needle over the commanded advance
     period: int = 0
     # the present needle with one parameter changed, for some parameters
     perturbed: tuple[Perturbed, ...] = ()
@@ -122,7 +124,7 @@ class FittedInsertion:
         for last in ends:
             stops.append((first, state))
             if last > first:
-                state, tips = simulator.replay(state, self.rows[first:last])
+                state, tips = replay_scaled(simulator, state, self.rows[first:last], self.axial_scale)
                 parts.append(tips)
             first = last
         return replace(

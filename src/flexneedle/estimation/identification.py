@@ -14,21 +14,21 @@ is a shift of all axial readings, fitted separately. The residuals of the fit ar
 
 import cmath
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
+from flexneedle.estimation.axial import axial_prior, axial_variance, fit_axial_error, replay_scaled
 from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.fit import ROUND, differentiate, improve_fit
 from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import directions, from_components, variance_of
-from flexneedle.estimation.move_means import fit_constant
 from flexneedle.estimation.moves import Move, assign_readings, position_along
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, check_cells
 from flexneedle.estimation.sensors import sensors_of
 from flexneedle.estimation.task import Task
-from flexneedle.types import STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z
+from flexneedle.types import DB_X, STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z
 
 _RECENT = 12  # moves whose residuals are low-passed
 
@@ -61,7 +61,7 @@ class Identification:
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
-            axial_variance=scenario.control.start_axial_sd_mm**2,
+            axial_covariance=axial_prior(scenario.control),
         )
         return differentiate(start, range(prior.mean.size))
 
@@ -70,7 +70,9 @@ class Identification:
 class Identified(FittedInsertion):
     """An `Estimate` with fitted parameters."""
 
-    axial_variance: float = 0.0  # variance (mm²) of the start error along the axis
+    axial_covariance: Floats = field(
+        default_factory=lambda: np.zeros((2, 2))
+    )  # of axial (mm) and axial_scale
     residual: complex = 0.0  # low-passed residual (mm)
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
     # tip measured at the end of the last move with a reading (mm), None before the first
@@ -113,7 +115,8 @@ class Identified(FittedInsertion):
         if motion.control == STILL and rested:  # one move, however long
             return replace(self, moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)), perturbed=())
         new = Move.parts_of(motion)
-        state, tips = self.simulator.replay(self.state, np.array([done.applied for done in new]))
+        rows = np.array([done.applied for done in new])
+        state, tips = replay_scaled(self.simulator, self.state, rows, self.axial_scale)
         tips = np.concatenate([self.tips, tips])
         return replace(self, state=state, tips=tips, moves=(*self.moves, *new), perturbed=())
 
@@ -121,12 +124,8 @@ class Identified(FittedInsertion):
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
         if not measurements or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assign_readings(self.moves, measurements))
+        extended = replace(self, moves=assign_readings(self.moves, measurements))._fit_axially()
         readings = extended.readings[0]
-        without = readings.ahead(extended.tips[:, X]) + extended.axial
-        prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
-        axial, axial_variance = fit_constant(without, extended.axial_variances(), prior_sd)
-        extended = replace(extended, axial=axial, axial_variance=axial_variance)
         fitted = differentiate(improve_fit(extended))
         left, ahead = fitted.residuals[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
@@ -141,11 +140,17 @@ class Identified(FittedInsertion):
             measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
         )
 
-    def axial_variances(self) -> Floats:
-        """Return variances (r,) of the means of the tip's x: jitter and model error."""
-        scenario, position = self.nominal.scenario, self.sensors[0]
+    def _fit_axially(self) -> "Identified":
+        """Return the estimate with the axial start error and the scale of the advance fitted to all readings."""
+        scenario, position, readings = self.nominal.scenario, self.sensors[0], self.readings[0]
+        travel = readings.between(np.cumsum(np.append(0.0, self.rows[:, DB_X])))
+        without = readings.ahead(self.tips[:, X]) + self.axial + (self.axial_scale - 1.0) * travel
         unexplained = position.unexplained(scenario, self.settings)
-        return self.readings[0].axial_variance(position.sd(scenario) or 0.0, unexplained)
+        variance = readings.axial_variance(position.sd(scenario) or 0.0, unexplained)
+        found, covariance = fit_axial_error(without, travel, variance, axial_prior(scenario.control))
+        return replace(
+            self, axial=float(found[0]), axial_scale=1.0 + float(found[1]), axial_covariance=covariance
+        )
 
     @cached_property
     def covariance(self) -> Floats:
@@ -158,7 +163,8 @@ class Identified(FittedInsertion):
         """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
         slope = self.slopes(self.state.tip[:1])[0]
         slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
-        return float(np.sqrt(variance_of(slope, self.covariance) + self.axial_variance))
+        axial = axial_variance(self.axial_covariance, float(self.state.travel[DB_X]))
+        return float(np.sqrt(variance_of(slope, self.covariance) + axial))
 
     def shape_sd(self, nodes: Floats) -> Floats:
         """Return standard deviations (n, 2), mm, of y and z at nodes (n, 5), as of a tip that passes there."""

@@ -81,14 +81,3 @@ class MoveMeans:
         change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
         sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])
         return sag
-
-
-def fit_constant(ahead: Floats, variance: Floats, prior_sd: float) -> tuple[float, float]:
-    """Return the maximum a posteriori of a constant that all readings share (mm), and its variance.
-
-    ahead (r,): readings minus predictions without it, mm, of `variance` (r,); prior: mean 0, standard deviation
-    `prior_sd` (mm).
-    """
-    weight = 1.0 / variance
-    left = 1.0 / (weight.sum() + prior_sd**-2.0)
-    return float(left * (weight @ ahead)), float(left)

@@ -3,7 +3,7 @@
 Readings are late. Each belongs to the move in which it was taken; the estimate is corrected there, and the moves since
 are predicted again (a fixed-lag filter).
 
-The start error along the axis is estimated from all readings (a scalar Kalman filter): axial motion is rigid. In air
+The start error along the axis and the scale of the advance are estimated from all readings (a Kalman filter). In air
 the free end is short and stiff, so that noise would act as a force: there the start offset and angle of the base are
 fitted (recursive least squares with a prior). In tissue the measured tip is an essential condition, and the force that
 it needs, low-passed, remains as a tip load in the prediction.
@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import carry_out, describe_estimate
+from flexneedle.estimation.axial import axial_prior, axial_variance, carry_out
+from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along, tip_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import STILL, THETA, Floats, Measurement, Motion, Point, Y, Z
+from flexneedle.types import DB_X, STILL, THETA, Floats, Measurement, Motion, Point, X, Y, Z
 
 _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
@@ -41,9 +42,8 @@ class StateCorrection:
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
         state = simulator.start(task.plan.roll)
-        axial = control.start_axial_sd_mm**2
         drift = _DRIFT * _bevel_reach(simulator, task.plan.target[0]) / task.plan.target[0] ** 2
-        return Corrected(simulator, self, state, state, prior, axial, state.tip[None], drift)
+        return Corrected(simulator, self, state, state, prior, axial_prior(control), state.tip[None], drift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +55,10 @@ class Corrected:
     state: State  # present state
     past: State  # state before the first of `moves`
     covariance: Floats  # covariance (2, 2) of base y (mm) and θ (rad) before `moves`
-    axial: float  # variance of the start along the axis (mm²) before `moves`
+    axial: Floats  # covariance (2, 2) of the start along the axis (mm) and of the scale of the advance before `moves`
     tips: Floats  # estimated tip poses (k + 1, 5) at the ends of the moves, the start first
     drift: float  # standard deviation of the path's curvature (1/mm)
+    axial_scale: float = 1.0  # advance of the needle over the commanded advance
     moves: tuple[Move, ...] = ()  # moves whose readings may still arrive
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
     # tip measured at the end of the last move with a reading (mm), None before the first
@@ -79,7 +80,8 @@ class Corrected:
         """
         arm = np.array([self.simulator.scenario.needle.length_mm])
         axes = self.simulator.scenario.setup.axes
-        return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + self.axial))
+        axial = axial_variance(self.axial, float(self.state.travel[DB_X]))
+        return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + axial))
 
     def _across(self, x: Floats, arms: Floats) -> Floats:
         """Return the variance (n,), mm², of positions on a lateral axis at x (n,), mm, `arms` (n,) from the base."""
@@ -106,7 +108,7 @@ class Corrected:
         """Move the estimated needle as the driver did."""
         if motion.control == STILL and self._rests_unread:  # one move, however long
             return replace(self, moves=(*self.moves[:-1], self.moves[-1].extend(motion.ended)))
-        state = carry_out(self.simulator, self.state, motion.control)
+        state = carry_out(self.simulator, self.state, motion.control, self.axial_scale)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)))
 
@@ -132,6 +134,7 @@ class Corrected:
             past=past.state,
             covariance=past.covariance,
             axial=past.axial,
+            axial_scale=past.axial_scale,
             moves=moves[closed:],
             tips=np.array(tips[closed:]),
         )
@@ -139,7 +142,7 @@ class Corrected:
 
 def _follow(at: Corrected, done: Move) -> Corrected:
     """Return the estimate after a move: predicted, and corrected by the mean innovation of its readings."""
-    before, predicted = at.tip, carry_out(at.simulator, at.state, done.applied)
+    before, predicted = at.tip, carry_out(at.simulator, at.state, done.applied, at.axial_scale)
     if not done.measurements:
         return replace(at, state=predicted)
     innovation = np.mean([_innovation(before, predicted.tip, done, one) for one in done.measurements], axis=0)
@@ -176,14 +179,19 @@ def _assimilate(at: Corrected, predicted: State, measured: Floats) -> State:
 
 
 def _correct_axially(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
-    """Return the start along the axis corrected by a Kalman filter's step, and the move predicted again with it.
+    """Return start and scale along the axis corrected by a Kalman filter's step, and the move predicted again.
 
     Prediction and correction are one step, so that the cut of the move still follows the measured tip.
     """
-    gain = at.axial / (at.axial + noise**2 + 1e-12)
-    moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
-    predicted = carry_out(at.simulator, moved, done.applied)
-    return replace(at, axial=(1.0 - gain) * at.axial), predicted
+    before = float(at.state.travel[DB_X])
+    part = np.mean([done.part(one.time) for one in done.measurements])
+    sensitivity = np.array([1.0, before + part * done.applied.db_x])
+    spread = at.axial @ sensitivity
+    gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
+    start, scale = (gain * off).tolist()
+    moved = at.state.with_estimate(base_x=float(at.state.base[X]) + start + scale * before)
+    corrected = replace(at, axial=at.axial - np.outer(gain, spread), axial_scale=at.axial_scale + scale)
+    return corrected, carry_out(at.simulator, moved, done.applied, corrected.axial_scale)
 
 
 def _bevel_reach(simulator: Simulator, depth: float) -> float:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Estimate, carry_out
+from flexneedle.estimation.axial import carry_out
+from flexneedle.estimation.estimate import Estimate
 from flexneedle.results import Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
@@ -18,6 +19,7 @@ from flexneedle.simulator.state import State
 from flexneedle.types import Control, Floats, X
 
 _SHARE_OF_LAW = 0.95  # of the compression at which a law ends
+_SCALE_SDS = 3.0  # of the prior of the scale
 _ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest
 
 
@@ -33,8 +35,8 @@ class Excess:
 class Guard:
     """Limits of an insertion.
 
-    Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), and
-    distance (mm) of the tip past the target, which is at `depth` (mm).
+    Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), distance
+    (mm) of the tip past the target, which is at `depth` (mm), and error of the scale of the needle's advance.
     """
 
     compression: Floats
@@ -42,6 +44,7 @@ class Guard:
     force: float
     past: float
     depth: float
+    scale: float
 
     @staticmethod
     def of(scenario: Scenario, plan: Plan) -> "Guard":
@@ -51,14 +54,20 @@ class Guard:
         compression = [_SHARE_OF_LAW * law.limit if least is None else 1.0 - least for law in laws]
         force = math.inf if settings.guide_force_n is None else settings.guide_force_n
         strain, past = 1e-2 * settings.needle_strain_percent, settings.past_target_mm
-        return Guard(np.array(compression), strain, force, past, plan.target[0])
+        scale = _SCALE_SDS * scenario.control.axial_scale_sd
+        return Guard(np.array(compression), strain, force, past, plan.target[0], scale)
 
     def refusal(self, estimate: Estimate, command: Control) -> str:
         """Return the reason to refuse a command, "" for none.
 
         Beyond a limit, which a reading may reveal, a command may lead back but not further.
         """
-        now = estimate.state
+        now, scale = estimate.state, estimate.axial_scale
+        if abs(scale - 1.0) > self.scale:
+            return (
+                f"guard: the tracker sees the needle advance {scale:.3f} times as far as commanded "
+                f"(limit 1 ± {self.scale:g}): check the insertion axis and the tracker"
+            )
         then = carry_out(estimate.simulator, now, command)
         if not then.converged:
             return f"guard: the model does not converge: residual {then.residual:.3g} mm"

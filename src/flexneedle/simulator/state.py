@@ -206,6 +206,12 @@ class State:
         needle = self.needle._replace(boundary=boundary._replace(base=pose, load=load))
         return replace(self, needle=needle, clamp=moved)
 
+    def discount_advance(self, extra: float) -> "State":
+        """Return the state with this part (mm) of the base's advance counted as an error, which is no travel."""
+        clamp, aside = self.clamp, self.scenario.entry.slope * extra
+        across = lateral(clamp.y, clamp.y.real + aside.real, clamp.y.imag + aside.imag)
+        return replace(self, clamp=nd.NodePose(clamp.x + extra, across, clamp.slope))
+
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
         """Return x, y and slope of base, nodes and tip."""
         ends = self.needle.boundary.base, self.needle.solution.tip

@@ -86,6 +86,9 @@ class ControlSettings(Section):
     """Readings whose innovation exceeds this value plus three standard deviations of the prediction are rejected."""
     start_axial_sd_mm: NonNegative = 1.0
     """Prior standard deviation of the tip's axial position at the start."""
+    axial_scale_sd: NonNegative = 0.01
+    """Prior standard deviation of the ratio of the needle's advance, as the tracker measures it, to the commanded
+    advance. The needle is held if the estimate differs from 1 by more than three times this value."""
     miss_limit_mm: Positive = 2.0
     """Largest predicted lateral miss at the target. The needle is held if no better path is found."""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexneedle.estimation.estimate import carry_out
+from flexneedle.estimation.axial import carry_out
 from flexneedle.lab.rig.axis_columns import AxisColumns
 from flexneedle.lab.rig.preflight.fit import axis_stretch
 from flexneedle.lab.rig.rig_file import RigFile

@@ -1,0 +1,49 @@
+"""Advance of the needle along its axis, as the tracker measures it: a start error and a scale.
+
+Axial motion is rigid, so that both act on all depths alike. The scale is the ratio of the measured to the commanded
+advance: the error of the insertion axis in the rig file, or of the tracker.
+"""
+
+import numpy as np
+
+from flexneedle.scenario.sections.settings import ControlSettings
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import DB_X, Control, Floats
+
+
+def axial_prior(control: ControlSettings) -> Floats:
+    """Return the prior covariance (2, 2) of the start error (mm) and of the scale."""
+    return np.diag([control.start_axial_sd_mm**2, control.axial_scale_sd**2])
+
+
+def axial_variance(covariance: Floats, travel: float) -> float:
+    """Return the variance (mm²) of the needle's depth after an advance of `travel` (mm)."""
+    return float(covariance[0, 0] + 2.0 * travel * covariance[0, 1] + travel**2 * covariance[1, 1])
+
+
+def fit_axial_error(ahead: Floats, travel: Floats, variance: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """Return the maximum a posteriori (2,) of the start error (mm) and of the scale's error, and their covariance.
+
+    ahead (r,): readings minus predictions without both, mm, of `variance` (r,); travel (r,): commanded advance, mm;
+    prior: its covariance (2, 2), with means 0.
+    """
+    columns = np.stack([np.ones_like(travel), travel])
+    weighted = columns / variance
+    covariance: Floats = prior @ np.linalg.inv(np.eye(2) + weighted @ columns.T @ prior)  # a prior of 0 stays
+    return covariance @ (weighted @ ahead), covariance
+
+
+def carry_out(simulator: Simulator, state: State, applied: Control, axial_scale: float = 1.0) -> State:
+    """Return the state after a motion as the driver carried it out, which may exceed a limit of commands a little."""
+    return replay_scaled(simulator, state, np.array([applied]), axial_scale)[0]
+
+
+def replay_scaled(
+    simulator: Simulator, state: State, rows: Floats, axial_scale: float
+) -> tuple[State, Floats]:
+    """Return the state and the tips (m, 5) after motions (m, 9) that advance the needle `axial_scale` times as far."""
+    scaled = rows.copy()
+    scaled[:, DB_X] *= axial_scale
+    after, tips = simulator.replay(state, scaled)
+    return after.discount_advance(float(scaled[:, DB_X].sum() - rows[:, DB_X].sum())), tips
