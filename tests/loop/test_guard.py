@@ -214,7 +214,7 @@ def test_a_needle_that_advances_far_more_or_less_than_commanded_is_held(plan, sc
     estimate = replace(estimate_at(Simulator(PHANTOM, 1).start()), axial_scale=scale)
     refusal = guard_of(plan).refusal(estimate, Control(db_x=1.0))
     assert refusal == (
-        f"guard: the tracker sees the needle advance {scale:.3f} times as far as commanded (limit 1 ± 0.03): "
+        f"guard: by the tracker the needle advances {scale:.3f} times as far as commanded (limit 1 ± 0.03): "
         "check the insertion axis and the tracker"
     )
     wide = Guard.of(PHANTOM.with_values({"control.axial_scale_sd": 0.02}), plan)

@@ -65,7 +65,7 @@ class Guard:
         now, scale = estimate.state, estimate.axial_scale
         if abs(scale - 1.0) > self.scale:
             return (
-                f"guard: the tracker sees the needle advance {scale:.3f} times as far as commanded "
+                f"guard: by the tracker the needle advances {scale:.3f} times as far as commanded "
                 f"(limit 1 ± {self.scale:g}): check the insertion axis and the tracker"
             )
         then = carry_out(estimate.simulator, now, command)

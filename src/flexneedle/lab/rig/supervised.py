@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from flexneedle.errors import DriverError, RefusedError, RigError
-from flexneedle.estimation.estimate import Estimate, carry_out
+from flexneedle.estimation.axial import carry_out
+from flexneedle.estimation.estimate import Estimate
 from flexneedle.lab.rig.axis_columns import AxisColumns
 from flexneedle.lab.rig.diagnosis import explain_record
 from flexneedle.lab.rig.dry_run import dry_run_ports
