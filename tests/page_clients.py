@@ -33,16 +33,19 @@ IN_CONTROL = {
     "edit": {"values": {"target.depth_mm": 35.0}}, "preset": {"name": "phantom3d"},
     "load": {"name": "mine", "text": ""},
     "options": {"seed": 3}, "start": {"work": "plan"}, "cancel": {"job": 1}, "insert": {}, "check": {},
-    "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}, "rest": {}, "undo": {}, "pace": {"pace": 1.0},
-    "advance": {}, "disturb": {"what": "drop", "size": 1.0}, "open": {"name": None}, "study": {"name": "mine"},
-    "save": {"name": "mine"},
+    "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}, "rest": {}, "undo": {}, "targets": {"what": "add"},
+    "pace": {"pace": 1.0}, "advance": {}, "disturb": {"what": "drop", "size": 1.0}, "open": {"name": None},
+    "study": {"name": "mine"}, "save": {"name": "mine"},
 }  # fmt: skip
 """Requests that only the client in control may send, by type."""
 
 
+_RESTORED = ("name", "values", "seed", "strategy", "controller", "targets", "target")
+
+
 def restored(session):
     """Values of the request that gives a session (its message) back."""
-    return {name: session[name] for name in ("name", "values", "seed", "strategy", "controller")}
+    return {name: session[name] for name in _RESTORED}
 
 
 def start_worker(module, *arguments):

@@ -18,14 +18,24 @@ BOUNDS = {
     "string": [{"enum", "maxLength"}],
     "object": [{"minProperties"}, {"maxProperties"}, {"propertyNames"}],
     "boolean": [],
+    "array": [{"maxItems"}],
 }
 """Words of a schema by its type, of which each set must have one."""
-VALID = {"integer": 1, "number": 1.0, "string": "a", "boolean": True, "object": {"a": 1}}
+VALID = {"integer": 1, "number": 1.0, "string": "a", "boolean": True, "object": {"a": 1}, "array": []}
 OTHERS = {
     "integer": (1.5, "1", True, [1], {}, -1, 2**53 + 1),
     "number": ("1", True, [1], {}, math.nan, math.inf, 1e9, -1e9),
     "string": (1, True, ["a"], {}, "a" * 200_001),
     "boolean": (1, 0, "true", [True]),
+    "array": (
+        1,
+        "a",
+        {},
+        True,
+        ["a"],
+        [{"name": "a", "position": ["1", 2, 3]}],
+        [{"name": "a", "position": [1, 2]}],
+    ),
     "object": (1, "a", [1], {}, {f"a{number}": 1 for number in range(1_001)}),
 }
 """Values of other types or beyond all bounds; a request with them is refused, they are not converted."""
@@ -43,6 +53,7 @@ FORMS = {
         ["a", "é 1.toml", "world:7"],
         ["", ".a", "..", "a/b", "a\\b", "a\0", "a\n", "a" * 201],
     ),
+    ("targets", "name"): (["a", "Near the é 1"], ["", " a", "a ", "a\0b", "a\n", "a" * 41]),
     ("restore", "controller"): (["ce-mpc"], ["Ce", "a" * 61]),
     ("pace", "pace"): ([0.0, 0.01, 50.0], [0.005, 50.1]),
     ("disturb", "size"): ([0.0, 1e4], [-1e-9, 1.1e4]),

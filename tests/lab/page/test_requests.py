@@ -130,6 +130,18 @@ def test_a_session_is_not_restored_beside_a_client_in_control_or_an_insertion(tm
         other.do("restore", **restored(lost))
 
 
+def test_a_chosen_target_is_planned_and_undone_as_any_change(client):
+    client.do("targets", what="add", name="Near")
+    client.do("edit", values={DEPTH: 30.0})
+    client.do("targets", what="choose", name="Target 1")
+    client.has("estimate", revision=client.has("session", target="Target 1", revision=4)["revision"])
+    client.do("undo")
+    client.has("scene", target=[30.0, 5.0, 0.0])
+    assert client.has("session", revision=5)["target"] == "Near"
+    client.inserts("paused", paused=True)
+    assert json.loads(client.newest["insertion live"]["summary"])["target_name"] == "Near"
+
+
 def test_an_edit_is_sent_to_all_and_computed(server, client):
     with Client(server) as other:
         client.do("edit", values={DEPTH: 35.0})

@@ -1,10 +1,12 @@
 """The session: edits, presets, files, options."""
 
+import json
 import tomllib
 
 import pytest
 
-from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest
+from flexneedle.lab.page.protocol import NamedTarget
+from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest, TargetsRequest
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.page_session import PageSession
 from flexneedle.scenario.files import dump_scenario, load_scenario
@@ -152,17 +154,86 @@ def test_options_that_are_not_set_stay(session):
 def given_back(session):
     """The request with which a page gives a session back."""
     values = restored(session.describe().model_dump(mode="json"))
-    return RestoreRequest(type="restore", **values | {"controller": "ce-mpc"})
+    return RestoreRequest.model_validate_json(
+        json.dumps(values | {"type": "restore", "controller": "ce-mpc"})
+    )
 
 
 @pytest.mark.parametrize("name", ["phantom", "phantom3d", "world:7", "world:100012"])
 def test_a_session_is_restored_from_its_message(session, name):
     lost = session.with_preset(name).edit_scenario({"target.depth_mm": 33.0, "tissue.0.alpha": 9.0})
+    lost = lost.with_targets(TargetsRequest(type="targets", what="add", name="Deep"))
     lost = lost.with_options(OptionsRequest(type="options", seed=3, strategy="steering", controller="ce-mpc"))
     found = session.restore(given_back(lost))
     assert found.has_content_of(lost)
     assert found.revision == session.revision + 1
     assert found.describe().changed == ["tissue.0.alpha", "target.depth_mm"]
+
+
+@pytest.mark.parametrize(("names", "active"), [(["A", "A"], "A"), (["A", "B"], "C"), ([], "A")])
+def test_targets_with_equal_names_or_without_the_active_one_are_not_restored(session, names, active):
+    targets = [NamedTarget(name=name, position=(30.0, 0.0, 0.0)) for name in names]
+    with pytest.raises(Refusal, match="must have different names"):
+        session.restore(given_back(session).model_copy(update={"targets": targets, "target": active}))
+
+
+def changed(session, what, name=None):
+    return session.with_targets(TargetsRequest(type="targets", what=what, name=name))
+
+
+def described(session):
+    """Name of the active target, and depths by name."""
+    found = session.describe()
+    assert (
+        found.values["target.depth_mm"] == {one.name: one.position for one in found.targets}[found.target][0]
+    )
+    return found.target, {one.name: one.position[0] for one in found.targets}
+
+
+def test_targets_are_added_chosen_and_removed_and_one_is_the_scenarios(session):
+    assert described(session) == ("Target 1", {"Target 1": 40.0})
+    assert session.target_name == ""
+    two = changed(session, "add").edit_scenario({"target.depth_mm": 30.0, "target.lateral_mm": 2.0})
+    assert described(two) == ("Target 2", {"Target 1": 40.0, "Target 2": 30.0})
+    assert two.target_name == "Target 2"
+    three = changed(two, "add", "Near").edit_scenario({"target.depth_mm": 20.0})
+    back = changed(three, "choose", "Target 1")
+    assert described(back) == ("Target 1", {"Target 1": 40.0, "Target 2": 30.0, "Near": 20.0})
+    assert back.scenario == session.scenario
+    assert back.reach_since == session.reach_since
+    assert changed(back, "choose", "Target 2").scenario == two.scenario
+    left = changed(back, "remove", "Target 2")
+    assert described(left) == ("Target 1", {"Target 1": 40.0, "Near": 20.0})
+    assert described(changed(left, "add"))[0] == "Target 2"
+    assert described(back.with_preset("phantom3d")) == ("Target 1", {"Target 1": 40.0})
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "reason"),
+    [
+        ("add", "Target 1", "Target 1: there is already a target of this name: choose another"),
+        ("choose", "Far", "target = Far: must be one of Target 1, Near"),
+        ("remove", "Far", "target = Far: must be one of Target 1, Near"),
+        ("remove", "Near", "Near is the target of the scenario: choose another one first"),
+    ],
+)
+def test_changes_of_targets_are_refused_with_their_reason(session, what, name, reason):
+    with pytest.raises(Refusal) as refusal:
+        changed(changed(session, "add", "Near"), what, name)
+    assert refusal.value.reason == reason
+
+
+def test_the_number_of_targets_is_limited_and_a_target_off_the_plane_is_refused(session):
+    many = session
+    for _ in range(49):
+        many = changed(many, "add")
+    with pytest.raises(Refusal, match="there are 50 targets"):
+        changed(many, "add")
+    space = changed(session.with_preset("phantom3d"), "add").edit_scenario({"target.lateral_z_mm": 3.0})
+    plane = changed(space, "choose", "Target 1").edit_scenario({"setup.axes": 1, "target.lateral_z_mm": 0.0})
+    with pytest.raises(Refusal) as refusal:
+        changed(plane, "choose", "Target 2")
+    assert "target.lateral_z_mm" in refusal.value.problems
 
 
 def test_a_restored_file_is_compared_with_the_file_where_the_server_has_it(session, minimal_text):

@@ -38,6 +38,7 @@ class WorkOrder:
         revision: Revision of the session, which the results repeat.
         name: Name of the scenario; of a run or study to read its name.
         scenario: Values of the scenario.
+        target_name: Name of the scenario's target, "" if it is the only one.
         seed: Seed of plan and insertion.
         paused: Whether the insertion begins paused.
         rig: Rig file, "" for a virtual rig.
@@ -55,6 +56,7 @@ class WorkOrder:
     seed: int = 0
     strategy: Strategy = "manipulation"
     controller: str = ""
+    target_name: str = ""
     paused: bool = False
     rig: str = ""
     folder: str = ""

@@ -5,9 +5,9 @@ are sent as null.
 """
 
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from flexneedle.scenario.model import Scenario
 
@@ -27,12 +27,22 @@ JobKind = Literal[
     "save",
 ]
 Vector = tuple[float, float, float]
+TargetName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^\S([^\x00-\x1f]*\S)?$")]
 
 
 class ProtocolMessage(BaseModel):
     """A message: frozen; unknown keys and NaN are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class NamedTarget(ProtocolMessage):
+    """A target with its name, and its position (mm)."""
+
+    model_config = ConfigDict(strict=True)
+
+    name: TargetName
+    position: Vector
 
 
 class ServerMessage(ProtocolMessage):
@@ -89,6 +99,7 @@ class SessionMessage(ServerMessage):
         changed: Keys that differ from the preset or file.
         doubts: Values that are valid but implausible.
         undoes, redoes: Whether a change can be undone, and redone.
+        targets: Named targets; `target` is the name of the scenario's.
     """
 
     type: Literal["session"] = "session"
@@ -103,6 +114,8 @@ class SessionMessage(ServerMessage):
     controller: str
     undoes: bool = False
     redoes: bool = False
+    targets: list[NamedTarget] = []
+    target: str = ""
 
 
 class SceneMessage(ServerMessage):
@@ -170,7 +183,8 @@ class IterationMessage(ServerMessage):
 class PlanMessage(ServerMessage):
     """A complete plan. Its needles are a frame SWEEP, the tip's path a frame PATH.
 
-    roll_deg: of the bevel's direction at the start, about x from y to z; terms: weighted terms of the cost by name.
+    roll_deg: of the bevel's direction at the start, about x from y to z; terms: weighted terms of the cost by name;
+    target_name: "" without other targets.
     """
 
     by = "strategy"
@@ -187,6 +201,7 @@ class PlanMessage(ServerMessage):
     cost: float
     terms: dict[str, float]
     seconds: float
+    target_name: str = ""
 
 
 class ReachMessage(ServerMessage):
@@ -228,6 +243,7 @@ class InsertionMessage(ServerMessage):
         rig: Name of the rig, "" for a virtual one.
         folder: Name of the run that records it, "" without one.
         row: Row of a study that was computed again and can be saved as a run.
+        target_name: Name of the target, "" without other targets.
     """
 
     by = "of"
@@ -246,6 +262,7 @@ class InsertionMessage(ServerMessage):
     rig: str = ""
     folder: str = ""
     row: int | None = None
+    target_name: str = ""
     scene: SceneMessage | None = None
 
 

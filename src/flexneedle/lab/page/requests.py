@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter
 
-from flexneedle.lab.page.protocol import ProtocolMessage, Strategy
+from flexneedle.lab.page.protocol import NamedTarget, ProtocolMessage, Strategy, TargetName
 
 Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
 FileName = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
@@ -84,6 +84,17 @@ class UndoRequest(ClientRequest):
     redo: bool = False
 
 
+class TargetsRequest(ClientRequest):
+    """Change the named targets: add one at the scenario's target, which it replaces; choose or remove one.
+
+    name: None for the next number.
+    """
+
+    type: Literal["targets"]
+    what: Literal["add", "choose", "remove"]
+    name: TargetName | None = None
+
+
 class RestoreRequest(ClientRequest):
     """Give a restarted server the session of an open page: the values of its scenario by key, and the options.
 
@@ -101,6 +112,8 @@ class RestoreRequest(ClientRequest):
     seed: Whole
     strategy: Strategy
     controller: ControllerName
+    targets: Annotated[list[NamedTarget], Field(max_length=50)]
+    target: TargetName
 
 
 class StartRequest(ClientRequest):
@@ -240,6 +253,7 @@ AnyRequest = Annotated[
     | StartRequest
     | RestRequest
     | RestoreRequest
+    | TargetsRequest
     | UndoRequest
     | CancelRequest
     | InsertRequest

@@ -242,7 +242,8 @@ def test_a_restarted_server_gets_the_scenario_of_the_open_pages_back_but_not_ano
     address, pages = restarted(), [tab(1280, 800, "light"), tab(1280, 800, "light")]
     for page in pages:
         page.goto(address)
-        page.wait_for_selector("[data-panel=status] .connection")
+        page.wait_for_selector("#field-target-depth_mm", state="attached")  # the last file is loaded
+        until(page, "[...document.querySelectorAll('[data-panel]')].every(({ children }) => children.length)")
     page, _other = pages
     page.evaluate("flexneedle.link.edit({ 'target.depth_mm': 35 })")
     page.evaluate("flexneedle.link.ask({ type: 'insert', paused: true })")

@@ -154,6 +154,7 @@ class LiveInsertion:
             periods=0,
             pace=0.0,
             rig=rig,
+            target_name=order.target_name,
         )
         self._hub.publish(self._waiting)
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from flexneedle.errors import ScenarioError, ScenarioWarning, make_printable
 from flexneedle.lab.page.protocol import SessionMessage, Strategy
-from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest
+from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest, TargetsRequest
 from flexneedle.lab.page.server.clients import Refusal
+from flexneedle.lab.page.server.named_targets import NamedTargets
 from flexneedle.scenario.dotted import nest, split_key
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import PRESETS, WORLD
@@ -22,6 +23,7 @@ from flexneedle.scenario.plausible import find_doubts
 from flexneedle.scenario.sections.needle import GAUGES, Needle
 from flexneedle.scenario.sections.settings import Target
 
+_TARGET_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 _MOST_DOTS, _MOST_KEYS = 300, 1_000
 """Limits of a line and of a file, far above any scenario: the time for a dotted key grows with the square of its parts,
 each unknown key starts a search for similar keys, and the server waits for both."""
@@ -50,6 +52,7 @@ class PageSession:
     revision: int = 1
     reach_since: int = 1
     notes: tuple[str, ...] = field(default=())
+    targets: NamedTargets = field(default_factory=NamedTargets)
 
     @classmethod
     def of(cls, name: str, scenario: Scenario) -> "PageSession":
@@ -84,6 +87,24 @@ class PageSession:
             scenario = Scenario.from_values(values)
         return self._begin(name, scenario, tuple(str(warning.message) for warning in caught))
 
+    def with_targets(self, request: TargetsRequest) -> "PageSession":
+        """Return the session with changed targets. Raises Refusal, also for a target that breaks a rule."""
+        position, name = self.scenario.target.position, request.name or ""
+        match request.what:
+            case "add":
+                return self._change(targets=self.targets.add(name, position))
+            case "remove":
+                return self._change(targets=self.targets.remove(name))
+            case _:
+                targets, goal = self.targets.choose(name, position)
+                moved = self.edit_scenario(dict(zip(_TARGET_KEYS, goal, strict=True)))
+                return replace(moved, targets=targets)
+
+    @property
+    def target_name(self) -> str:
+        """Name of the scenario's target, "" if it is the only one."""
+        return self.targets.active if self.targets.others else ""
+
     def with_options(self, options: OptionsRequest) -> "PageSession":
         """Return the session with other options; None leaves one unchanged."""
         chosen = options.model_dump(include={"seed", "strategy", "controller"}, exclude_none=True)
@@ -98,7 +119,8 @@ class PageSession:
             else:
                 origin = self.origin if request.name == self.name else scenario
         options = request.model_dump(include={"seed", "strategy", "controller"})
-        return replace(self._begin(request.name, origin, ()), scenario=scenario, **options)
+        targets = NamedTargets.of(request.targets, request.target)
+        return replace(self._begin(request.name, origin, ()), scenario=scenario, targets=targets, **options)
 
     def has_content_of(self, other: "PageSession") -> bool:
         """Return whether all but the revisions is equal."""
@@ -129,6 +151,8 @@ class PageSession:
             seed=self.seed,
             strategy=self.strategy,
             controller=self.controller,
+            targets=self.targets.list_all(self.scenario.target.position),
+            target=self.targets.active,
         )
 
     def _change(self, **changes: Any) -> "PageSession":
@@ -138,7 +162,9 @@ class PageSession:
 
     def _begin(self, name: str, scenario: Scenario, notes: tuple[str, ...]) -> "PageSession":
         revision = self.revision + 1
-        begun = replace(self, name=name, origin=scenario, scenario=scenario, notes=notes)
+        begun = replace(
+            self, name=name, origin=scenario, scenario=scenario, notes=notes, targets=NamedTargets()
+        )
         return replace(begun, revision=revision, reach_since=revision)
 
 

@@ -155,6 +155,8 @@ class RequestHandler:
                     self._plan_unless_inserting()
             case ask.UndoRequest():
                 self._undo(redo=request.redo)
+            case ask.TargetsRequest():
+                self._step(self.session.with_targets(request))
             case ask.RestoreRequest():
                 self._restore(client, request)
             case ask.PresetRequest():
@@ -299,6 +301,7 @@ class RequestHandler:
             seed=session.seed,
             strategy=session.strategy,
             controller=session.controller,
+            target_name=session.target_name,
             **more,
         )
 

@@ -7,7 +7,7 @@ import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
 import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
-import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
+import { SHOWN, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 
 const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
 
@@ -32,8 +32,8 @@ export function mount(element, store, link) {
     if (!handles.dragged) half = halfAround(target, ends);
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
-    const reached = drawAxial(pen, { width, height, map, scene, target, parts, ends, store });
-    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached));
+    const reached = drawAxial(pen, { width, height, map, scene, target, others: otherTargets(store), parts, ends, store });
+    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached), otherTargets(store));
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());

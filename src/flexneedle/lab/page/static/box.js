@@ -2,15 +2,16 @@
 
 const [BEHIND, BEYOND, AROUND, STEP] = [8, 8, 4, 5]; // mm
 
-// The box that is drawn, {left, right, half}: from behind the guide to beyond the target, as wide as it is high.
-export function boxOf(scene, target) {
+// The box that is drawn, {left, right, half}: from behind the guide to beyond the target, as wide as it is high. others: further targets.
+export function boxOf(scene, target, others = []) {
+  const points = others.map(({ position }) => position);
   const tip = scene.base[0] + scene.needle_length_mm;
   const left = Math.min(scene.guide ? scene.guide[0] : tip, tip, 0) - BEHIND;
   const deepest = scene.layers.at(-1)?.top_mm ?? 0;
-  const across = Math.max(...[target, scene.guide ?? target].flatMap(([, y, z]) => [Math.abs(y), Math.abs(z)]));
+  const across = Math.max(...[target, ...points, scene.guide ?? target].flatMap(([, y, z]) => [Math.abs(y), Math.abs(z)]));
   return {
     left: STEP * Math.floor(left / STEP),
-    right: STEP * Math.ceil((Math.max(target[0], deepest) + BEYOND) / STEP),
+    right: STEP * Math.ceil((Math.max(target[0], deepest, ...points.map(([x]) => x)) + BEYOND) / STEP),
     half: Math.max(2 * STEP, STEP * Math.ceil((across + AROUND) / STEP)),
   };
 }

@@ -4,6 +4,7 @@ import { button, make } from "./dom.js";
 import { FieldView } from "./form/field.js";
 import { editOf, sectionsOf, shownOf, valueOf, withLaw } from "./form/fields.js";
 import { followOptions } from "./form/options.js";
+import { followTargets } from "./form/targets.js";
 import { maySteer } from "./shown.js";
 
 const ORDER = ["target", "needle", "needle.bevel", "tissue", "setup", "entry", "plan", "control", "tracker", "phantom"];
@@ -16,8 +17,10 @@ export async function mount(element, store, link) {
   const search = make("input", { type: "search", placeholder: "Search: modulus, weight, seed …", "aria-label": "Search the settings" });
   const none = make("p.quiet", { role: "status" });
   const sections = make("div.sections");
-  const fields = make("fieldset.bare", {}, options, doubts, make("div.tools", {}, search), none, sections);
+  const targets = make("div.targets");
+  const fields = make("fieldset.bare", {}, targets, options, doubts, make("div.tools", {}, search), none, sections);
   element.append(fields);
+  followTargets(targets, store, link);
   const findOptions = followOptions(options, store, link);
 
   const answer = await fetch("/schema.json");

@@ -12,7 +12,7 @@ export function afterRestart(before, welcome, session) {
 }
 
 // The request that gives a session back.
-export const restoreOf = ({ name, values, seed, strategy, controller }) => ({ type: "restore", name, values, seed, strategy, controller });
+export const restoreOf = ({ name, values, seed, strategy, controller, targets, target }) => ({ type: "restore", name, values, seed, strategy, controller, targets, target });
 
 function isSame(one, other) {
   const [mine, theirs] = [restoreOf(one), restoreOf(other)].map(({ values, ...rest }) => JSON.stringify([rest, Object.entries(values).sort()]));

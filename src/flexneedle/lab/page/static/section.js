@@ -9,7 +9,7 @@ import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
 import { drawSection, outlineOf } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
-import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
+import { SHOWN, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
 
 const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Target", "target"]];
@@ -77,13 +77,14 @@ class SectionView {
     const [scene, target] = [shownScene(this.#store), shownTarget(this.#store)];
     if (!scene || !target) return;
     const plane = this.#handles.dragged ? this.#frozen : planeOf(this.plane, scene, target);
+    const others = otherTargets(this.#store);
     const outline = outlineOf(plane, this.#store);
-    if (!this.#handles.dragged) [this.#frozen, this.#box] = [plane, around(boxOf(scene, target), outline)];
+    if (!this.#handles.dragged) [this.#frozen, this.#box] = [plane, around(boxOf(scene, target, others), outline)];
     const map = mappingOf(this.#box, width, height, this.#stretch);
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
-    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, outline, store: this.#store });
-    showLegend(this.#legend, entriesOf([...parts, ...measuredTip(this.#store)], reached));
+    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, store: this.#store });
+    showLegend(this.#legend, entriesOf([...parts, ...measuredTip(this.#store)], reached), others);
     this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
   }
 

@@ -92,6 +92,15 @@ export function shownTarget(store) {
   return TARGET_KEYS.map((key, axis) => draft[key] ?? scene.target[axis]);
 }
 
+// The other targets [{name, position}]; beside an insertion those that it does not have; none beside a recorded one.
+export function otherTargets(store) {
+  const of = shownOf(store);
+  const { targets = [], target } = store.get("session") ?? {};
+  if (of === "scene") return targets.filter(({ name }) => name !== target);
+  const own = String(store.get(`insertion ${of}`).target);
+  return of === "live" ? targets.filter(({ position }) => String(position) !== own) : [];
+}
+
 // The edit that moves the target to a point (x, y, z), to 0.01 mm; in the plane without z.
 export function targetEdit(store, point) {
   const axes = store.get("scene").axes;

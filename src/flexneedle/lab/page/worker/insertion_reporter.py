@@ -58,6 +58,7 @@ class InsertionReporter:
                 error_mm=error,
                 rig=self.rig or order.rig,
                 folder=self.folder,
+                target_name=order.target_name,
                 scene=describe_scene(scenario, order.revision),
             )
         )

@@ -86,7 +86,7 @@ def plan(task: WorkerTask) -> None:
         search.report()
         for frame in shapes_of(found, FrameSource[strategy.upper()]):
             task.report(frame)
-        task.report(describe_plan(found, task.order.revision))
+        task.report(describe_plan(found, task.order.revision, task.order.target_name))
 
 
 class _Search:
@@ -137,7 +137,7 @@ class _Search:
         self._newest, self._due = None, monotonic() + BETWEEN_S
 
 
-def describe_plan(plan: Plan, revision: int) -> PlanMessage:
+def describe_plan(plan: Plan, revision: int, target_name: str) -> PlanMessage:
     """Return the message about a plan."""
     return PlanMessage(
         revision=revision,
@@ -151,6 +151,7 @@ def describe_plan(plan: Plan, revision: int) -> PlanMessage:
         cost=plan.cost,
         terms=plan.terms,
         seconds=plan.seconds,
+        target_name=target_name,
     )
 
 

@@ -85,10 +85,10 @@ function downloadOf(name, file, text, status) {
 
 const addressOf = (name, file) => `/runs/${encodeURIComponent(name)}/${file}`;
 
-// Scenario, controller and time of day, as a valid name.
-function defaultName({ name, controller }) {
+// Scenario, target if there are others, controller and time of day, as a valid name.
+function defaultName({ name, controller, target_name: target }) {
   const now = new Date(Date.now() - 60_000 * new Date().getTimezoneOffset()).toISOString();
-  const text = `${name}-${controller}-${now.slice(0, 19).replace("T", "-")}`;
+  const text = `${[name, target, controller].filter(Boolean).join("-")}-${now.slice(0, 19).replace("T", "-")}`;
   return text.replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "").slice(-80);
 }
 

@@ -16,13 +16,14 @@ export function endsOf(store, target) {
 }
 
 // ends: of the reach. Returns whether it was drawn.
-export function drawAxial(pen, { width, height, map, scene, target, parts, ends, store }) {
+export function drawAxial(pen, { width, height, map, scene, target, others, parts, ends, store }) {
   const place = (_x, y, z) => [map.toX(z), map.toY(y)];
   const [of, row] = [shownOf(store), shownRow(store)];
   grid(pen, map, width, height, ["z (mm)", "y (mm)"]);
   let reached = false;
   inside(pen, width, height, () => {
     reached = reach(pen, place, ends);
+    for (const { position } of others) disc(pen, place(...position), Math.max(map.sx, 3), { tone: "--target", alpha: 0.2 });
     disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
     for (const part of parts) draw(pen, part, place, map);
     if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));

@@ -18,7 +18,7 @@ export function outlineOf(plane, store) {
 }
 
 // outline: of the reach. Returns whether it was drawn.
-export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, parts, outline, store }) {
+export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, others, parts, outline, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
   const row = shownRow(store);
   let reached = false;
@@ -30,6 +30,7 @@ export function drawSection(pen, { width, height, map, plane, name, layers, guid
     for (const part of parts) draw(pen, part, place, map);
     if (guide !== null) drawGuide(pen, map, plane, guide, scene, row);
     if (isMeasured(row)) cross(pen, place(...row.measured), { tone: "--measured" });
+    for (const { name, position } of others) drawOther(pen, map, plane, name, position);
     drawTarget(pen, map, plane, target);
   });
   return reached;
@@ -51,6 +52,13 @@ const upward = (name, map) => [UP[name], stretchIn(map)].filter(Boolean).join(",
 function drawTarget(pen, map, plane, [x, y, z]) {
   const radii = [map.sx, map.sy].map((scale) => Math.max(scale, 3));
   disc(pen, [map.toX(x), map.toY(lateral(plane, x, y, z))], radii, { tone: "--target", alpha: 0.85 });
+}
+
+// Another target, faint, with its name.
+function drawOther(pen, map, plane, name, [x, y, z]) {
+  const at = [map.toX(x), map.toY(lateral(plane, x, y, z))];
+  disc(pen, at, [map.sx, map.sy].map((scale) => Math.max(scale, 3)), { tone: "--target", alpha: 0.3 });
+  words(pen, name, [at[0], at[1] - Math.max(map.sy, 3) - 4], { tone: "--quiet" });
 }
 
 function drawTissue(pen, map, layers, width, height) {

@@ -14,7 +14,8 @@ export function inWords(insertion, rows = [], rig = null) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
   const state = insertion.rig && insertion.state === "ready" && rig?.state === "starting" ? "Starting" : STATES[insertion.state] ?? insertion.state;
-  const parts = [`${state}${where}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
+  const to = insertion.target_name ? ` to ${insertion.target_name}` : "";
+  const parts = [`${state}${where}${to}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
   if (state === "Prepared") parts.push("Nothing moves.");
   if (insertion.summary) parts.push(insertion.summary);
   else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason in the decisions.");

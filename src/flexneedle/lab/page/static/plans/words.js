@@ -14,7 +14,8 @@ export function planWords(store) {
   if (estimate && !isStale(store, estimate) && plans.every((plan) => isStale(store, plan))) found.push([estimateWords(estimate), false]);
   for (const plan of plans) {
     const stale = isStale(store, plan);
-    found.push([`${titled(plan.strategy)}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
+    const to = plan.target_name ? `, ${plan.target_name}` : "";
+    found.push([`${titled(plan.strategy)}${to}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
   }
   return found;
 }

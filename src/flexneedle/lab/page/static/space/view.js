@@ -3,7 +3,7 @@
 import { AmbientLight, DirectionalLight, Scene, WebGLRenderer } from "../vendor/three.js";
 import { boxOf } from "../box.js";
 import { showLegend } from "../legend.js";
-import { SHOWN, shownOf, shownScene, shownTarget } from "../shown.js";
+import { SHOWN, otherTargets, shownOf, shownScene, shownTarget } from "../shown.js";
 import { Camera } from "./camera.js";
 import { Labels } from "./labels.js";
 import { Room } from "./room.js";
@@ -48,7 +48,7 @@ export class SpaceView {
     const scene = shownScene(this.#store);
     if (!scene) return;
     this.#updateRoom(scene);
-    showLegend(this.#legend, this.shapes.update(this.#store, scene, shownOf(this.#store)));
+    showLegend(this.#legend, this.shapes.update(this.#store, scene, shownOf(this.#store)), otherTargets(this.#store));
     this.target.update();
     this.#later ||= requestAnimationFrame(() => {
       this.#later = 0;
@@ -57,7 +57,7 @@ export class SpaceView {
   }
 
   #updateRoom(scene) {
-    const box = boxOf(scene, shownTarget(this.#store));
+    const box = boxOf(scene, shownTarget(this.#store), otherTargets(this.#store));
     const room = JSON.stringify([box, scene.layers, scene.guide, this.#store.get("view theme")]);
     if (room === this.#room) return;
     const another = JSON.stringify(box) !== JSON.stringify(JSON.parse(this.#room || "[null]")[0]);
