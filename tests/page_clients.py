@@ -35,7 +35,7 @@ IN_CONTROL = {
     "options": {"seed": 3}, "start": {"work": "plan"}, "cancel": {"job": 1}, "insert": {}, "check": {},
     "prepare": {}, "arm": {"armed": True, "job": 1}, "go": {}, "rest": {}, "undo": {}, "targets": {"what": "add"},
     "pace": {"pace": 1.0}, "advance": {}, "disturb": {"what": "drop", "size": 1.0}, "open": {"name": None},
-    "study": {"name": "mine"}, "save": {"name": "mine"},
+    "study": {"name": "mine"}, "save": {"name": "mine"}, "retract": {},
 }  # fmt: skip
 """Requests that only the client in control may send, by type."""
 

@@ -3,7 +3,8 @@
 It runs in a thread of the test, with the interface of a child process.
 
 The seed of a plan chooses a failure: 13 the process ends, 14 it does not cancel, 15 it works until it is cancelled, as
-row 15 of a study. An insertion with seed 14 neither cancels nor stops; a cancelled one sends one more row.
+row 15 of a study; so does a retraction. An insertion with seed 14 neither cancels nor stops; a cancelled one sends one
+more row.
 A save waits for a pipe called GATE in the folder of runs, if there is one. A run called SLOW is read until it is
 cancelled. An insertion on a rig waits for "go", also after a hold. Its seeds: 16 a fault follows "go", 17 it does not
 stop, 18 its record takes some beats of the server.
@@ -196,6 +197,21 @@ class Worker:
                     while self.change(order) != JobChange(order.job):
                         pass
                 self.insertion(order, "interrupted", as_text(change))
+                return "done"
+
+    def retract(self, order):
+        """It waits, and is withdrawn by "go", or with seed WORKS_ON retracts until it is stopped."""
+        self.rig("idle", waits=1)
+        while True:
+            change = self.change(order)
+            if change.stop:
+                self.rig("stopped", change.stop)
+                return "cancelled"
+            if change.go:
+                self.rig("armed")
+                self.rig("retracting")
+            if change.go and order.seed != WORKS_ON:
+                self.rig("ended", "the needle was withdrawn")
                 return "done"
 
     def read(self, order):

@@ -266,3 +266,73 @@ def test_a_virtual_insertion_comes_first(client):
 def test_a_check_is_sent_to_all(client, watcher):
     client.do("check")
     assert watcher.has("check", revision=1)["findings"][0]["found"] == "bench.toml"
+
+
+# Retractions
+
+
+def retracting(client):
+    """Retract until it is stopped."""
+    client.do("options", seed=WORKS_ON)
+    client.do("retract")
+    client.has("rig", state="ready", motion="retraction")
+    arm(client)
+    client.do("go")
+    client.has("rig", state="retracting", begun=True, moves=[])
+
+
+def test_a_needle_is_withdrawn_once_it_is_armed_and_started(client):
+    inserting(client)
+    assert client.refused("retract").startswith("an insertion runs")
+    ends(client)
+    client.do("retract")
+    ready = client.has("rig", state="ready", motion="retraction")
+    assert (ready["begun"], ready["moves"]) == (False, ["wait 1"])
+    refuses_to_go(client)
+    arm(client)
+    client.do("go")
+    client.has("rig", state="idle", why="the needle was withdrawn", job=None, motion="retraction")
+    client.job("retraction", "done")
+    client.has("insertion live", state="interrupted")
+    refuses_to_go(client)
+    prepared(client)
+    client.has("rig", motion="insertion")
+
+
+@pytest.mark.parametrize("request_", ["insert", "prepare", "check", "retract", "undo"])
+def test_nothing_else_is_started_beside_a_retraction(client, request_):
+    retracting(client)
+    assert client.refused(request_).startswith("a retraction runs")
+    assert client.refused("start", work="plan").startswith("a retraction is on the rig")
+    job = client.newest["rig"]["job"]
+    assert client.refused("cancel", job=job).startswith("it is a retraction on the rig")
+    client.do("edit", **DEEPER)  # it continues
+    client.has("scene", revision=3)
+    assert client.newest["rig"]["state"] == "retracting"
+    ends(client)
+    client.has("rig", state="stopped")
+
+
+def test_a_retraction_ends_by_any_stop_and_by_a_loss_of_control(server, client, watcher):
+    retracting(client)
+    watcher.do("stop")
+    client.has("rig", state="stopped", why=f"person {watcher.number} on the page", job=None)
+    retracting(client)
+    client.do("steer", take=False)
+    client.has("rig", state="stopped", why=RELEASED, job=None)
+    retracting(client.steer())
+    watcher.do("steer", take=True, over=client.number)
+    watcher.has("rig", state="stopped", why=f"person {watcher.number} has taken over control", job=None)
+    watcher.do("steer", take=False)
+    with Client(server) as other:
+        retracting(other.steer())
+    watcher.has("rig", state="stopped", why=LOST, job=None)
+    retracting(client.steer())
+    client.wait(lambda: client.newest["rig"]["state"] == "retracting")
+    server.handler._insertions.worker.kill()
+    client.has("rig", state="fault", job=None)
+
+
+def test_without_a_rig_there_is_nothing_to_retract(tmp_path):
+    with served(tmp_path) as server, Client(server) as client:
+        assert client.steer().refused("retract").startswith("no rig is connected")

@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.commands import Commands, add_command, add_group
 from flexneedle.cli.common import add_strategy, print_json, print_table
 from flexneedle.cli.progress import print_line, print_note
 from flexneedle.cli.values import finite, positive
-from flexneedle.errors import DriverError
 from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 from flexneedle.lab.commands.rig_parts import add_rig, add_yes, arm, print_findings, stop_on_error
 from flexneedle.lab.commands.rig_start import add_ready, add_test
@@ -230,12 +228,13 @@ def _load_intended(args: argparse.Namespace) -> IntendedInsertion | None:
 
 
 def _jog(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.devices.opening import read_positions
     from flexneedle.lab.rig.preflight.moves import find_axis, plan_jog
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
     axis = find_axis(rig, args.axis)
-    at, to = _read_positions(rig)[args.axis], args.to is not None
+    at, to = read_positions(rig)[args.axis], args.to is not None
     move = plan_jog(rig, args.axis, args.to if to else args.distance, at, args.speed, to=to)
     if move is None:
         print_note(f"{args.axis} is at {axis.to_text(at)} {axis.unit}: nothing to move")
@@ -265,48 +264,32 @@ def _home(args: argparse.Namespace) -> int:
 
 
 def _retract(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.preflight.moves import plan_retraction, withdrawn_position
+    from flexneedle.lab.rig.devices.opening import read_positions
+    from flexneedle.lab.rig.preflight.moves import describe_withdrawn, plan_retraction
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
-    position = _read_positions(rig)["insertion"]
+    position = read_positions(rig)["insertion"]
     move = plan_retraction(rig, position, args.to, args.speed)
     if move is None:
-        at, end = map(rig.axes.insertion.to_text, (position, withdrawn_position(rig)))
-        print_note(f"insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract")
+        print_note(describe_withdrawn(rig, position))
         return 0
     return _confirm_and_move(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
 
 
 def _off(args: argparse.Namespace) -> int:
+    from flexneedle.lab.rig.devices.opening import read_positions
     from flexneedle.lab.rig.preflight.moves import describe_power_off
     from flexneedle.lab.rig.rig_file import load_rig
 
     rig = load_rig(args.rig)
     confirm_motions(
-        [*describe_power_off(rig, _read_positions(rig)), _FALLS], "" if args.yes else "Switch off?"
+        [*describe_power_off(rig, read_positions(rig)), _FALLS], "" if args.yes else "Switch off?"
     )
     with open_supervisor(rig) as operator, stop_on_error(operator):
         operator.off()
     print_line("done")
     return 0
-
-
-def _read_positions(rig: RigFile) -> dict[str, float]:
-    """Return the positions of the axes (mm or rad).
-
-    Raises DriverError if the driver lacks a channel, or cannot be read.
-    """
-    from flexneedle.lab.rig.devices.opening import open_motors
-
-    with closing(open_motors(rig)) as motors:
-        states = motors.read()
-    missing = [axis.channel for _, axis in rig.axes.items() if axis.channel not in states]
-    if missing:
-        raise DriverError(
-            f"the driver has no channel {', '.join(missing)}; it has {', '.join(states) or 'none'}"
-        )
-    return {name: states[axis.channel].position / axis.scale for name, axis in rig.axes.items()}
 
 
 def _confirm_and_move(

@@ -14,7 +14,18 @@ from flexneedle.lab.page.requests import DisturbRequest
 from flexneedle.lab.page.shape_frames import ShapeFrame
 
 Action = Literal[
-    "needle", "estimate", "plan", "reach", "insert", "check", "read", "study", "row", "save", "save_row"
+    "needle",
+    "estimate",
+    "plan",
+    "reach",
+    "insert",
+    "check",
+    "retract",
+    "read",
+    "study",
+    "row",
+    "save",
+    "save_row",
 ]
 BEAT_S = 0.25
 """Time between two beats of the server to a worker whose job moves a rig."""

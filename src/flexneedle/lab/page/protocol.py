@@ -14,18 +14,9 @@ from flexneedle.scenario.model import Scenario
 Strategy = Literal["manipulation", "steering"]
 Recording = Literal["first", "second"]
 JobKind = Literal[
-    "needle",
-    "estimate",
-    "plan",
-    "compare",
-    "reach",
-    "insertion",
-    "check",
-    "recording",
-    "study",
-    "row",
+    "needle", "estimate", "plan", "compare", "reach", "insertion", "check", "retraction", "recording", "study", "row",
     "save",
-]
+]  # fmt: skip
 Vector = tuple[float, float, float]
 TargetName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^\S([^\x00-\x1f]*\S)?$")]
 
@@ -289,11 +280,12 @@ class RigStateMessage(ServerMessage):
     """State of the connected rig.
 
     Attributes:
-        state: Idle (not open), preparing, ready, armed, starting, inserting, holding, stopped, fault, ended (its record
-            is being written); stopped and fault remain until the next request.
+        state: Idle (not open), preparing, ready, armed, starting, inserting, holding, retracting, ended (its record is
+            being written), stopped, fault; these two remain until the next request.
         why: Reason of the state.
         job: Job of its insertion, None without one.
-        begun: Whether the insertion has begun.
+        begun: Whether the insertion or retraction has begun.
+        motion: The one that is prepared or runs, or was the last.
         moves: Motions that follow "go", a line each.
     """
 
@@ -303,6 +295,7 @@ class RigStateMessage(ServerMessage):
     why: str = ""
     job: int | None = None
     begun: bool = False
+    motion: Literal["insertion", "retraction"] = "insertion"
     moves: list[str] = []
 
 

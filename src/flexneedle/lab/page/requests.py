@@ -149,10 +149,16 @@ class PrepareRequest(ClientRequest):
     type: Literal["prepare"]
 
 
-class ArmRequest(ClientRequest):
-    """Arm the rig whose insertion waits, or disarm it.
+class RetractRequest(ClientRequest):
+    """Prepare to withdraw the needle of the connected rig, as `flexneedle rig retract`, and wait. Nothing moves."""
 
-    job: of the insertion whose `moves` the user has confirmed.
+    type: Literal["retract"]
+
+
+class ArmRequest(ClientRequest):
+    """Arm the rig whose insertion or retraction waits, or disarm it.
+
+    job: of the one whose `moves` the user has confirmed.
     """
 
     type: Literal["arm"]
@@ -161,7 +167,7 @@ class ArmRequest(ClientRequest):
 
 
 class GoRequest(ClientRequest):
-    """Begin the insertion on the armed rig, or continue it after a hold. The rig is then no longer armed."""
+    """Begin the insertion or retraction on the armed rig, or continue it after a hold; the rig is then disarmed."""
 
     type: Literal["go"]
 
@@ -259,6 +265,7 @@ AnyRequest = Annotated[
     | InsertRequest
     | CheckRequest
     | PrepareRequest
+    | RetractRequest
     | ArmRequest
     | GoRequest
     | PaceRequest

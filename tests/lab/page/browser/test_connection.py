@@ -124,7 +124,7 @@ def test_work_is_shown_and_cancelled_in_the_status_bar(visit, server):
     cancels = page.locator(f"{STATUS} .job button:visible").evaluate_all(
         "all => all.map((one) => one.ariaLabel)"
     )
-    assert len(cancels) == len(kinds) - 2  # an insertion is stopped, and a run is saved completely
+    assert len(cancels) == len(kinds) - 3  # motions are stopped, and a run is saved completely
 
 
 BY_HAND = """const every = setInterval;

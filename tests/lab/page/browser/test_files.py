@@ -140,7 +140,8 @@ def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, vis
     assert not page.is_visible("[aria-label='Name of the run to save']")
     server.send(insertion("done", name="world:7"))
     until(
-        page, "/^world-7-adaptive-mpc-20[0-9-]{17}$/.test(document.querySelector('form.tools input').value)"
+        page,
+        "/^world-7-adaptive-mpc-20[0-9-]{17}$/.test(document.querySelector('.files form.tools input').value)",
     )
     page.fill("[aria-label='Name of the run to save']", "../x")
     page.click("text=Save the insertion")

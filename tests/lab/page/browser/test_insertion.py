@@ -210,7 +210,7 @@ def check_the_rig(page, server):
 
 def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
     page = rig_panel()
-    beginning = {"Check": True, "Prepare": True, "Arm": False, "Insert on the rig": False}
+    beginning = {"Check": True, "Prepare": True, "Retract": True, "Arm": False, "Insert on the rig": False}
     assert shown_buttons(page) == beginning
     check_the_rig(page, server)
     click(page, "Prepare")
@@ -258,7 +258,7 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     page.wait_for_selector(f"{BAR} >> text=Recorded as 2026-rig.")
     assert len(server.asked("stop")) == 1
     assert shown_buttons(page) == beginning
-    assert page.locator(RIG).get_by_text("To withdraw the needle").is_visible()
+    assert page.locator(RIG).get_by_text("The needle may still be in the tissue").is_visible()
 
 
 def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_panel, server):
@@ -286,3 +286,49 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
     click(page, "Stop")
     assert server.wait_for("stop") == [{"type": "stop"}]
     assert server.asked("arm") == []
+
+
+def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel, server):
+    left_in = insertion("held", rig="Bench", periods=3, summary="the needle stays in place", folder="2026")
+    page = rig_panel(left_in, rows(0, 3))
+    hint = page.locator(RIG).get_by_text("The needle may still be in the tissue")
+    hint.wait_for(state="attached")
+    click(page, "Retract")
+    assert server.wait_for("retract") == [{"type": "retract"}]
+    motion, move = (
+        {"job": 7, "motion": "retraction"},
+        "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s",
+    )
+    server.send(JobMessage(job=7, kind="retraction", state="running"), rig("ready", move, **motion))
+    page.wait_for_selector(f"{BAR} >> text=Bench is prepared; nothing moves before it is armed and started.")
+    page.wait_for_selector("footer >> text=Retraction: prepared, nothing moves")
+    assert page.locator(".rig .moves li").all_inner_texts() == [move]
+    assert shown_buttons(page) == {
+        "Check": False, "Prepare": False, "Arm": False, "Retract the needle": False,
+    }  # fmt: skip
+    assert page.locator(f"{BAR} button:visible:enabled").all_inner_texts() == ["End the preparation"]
+    page.check("#rig-free")
+    until(page, f"!document.querySelector('{BAR} [data-step=arm]').disabled")
+    click(page, "Arm")
+    server.send(rig("armed", move, **motion))
+    until(page, f"document.querySelector('{BAR} [data-step].danger')")
+    click(page, "Retract the needle")
+    server.send(rig("starting", **motion))
+    page.wait_for_selector(f"{BAR} >> text=Bench starts: motors are switched on.")
+    server.send(rig("retracting", begun=True, **motion))
+    page.wait_for_selector(f"{BAR} >> text=Bench withdraws the needle.")
+    page.wait_for_selector(f"{BAR} .stop.danger")
+    assert shown_buttons(page) == {}
+    assert not page.locator("[aria-label=Pace]").is_visible()
+    click(page, "Stop")
+    assert server.wait_for("stop") == [{"type": "stop"}]
+    assert [each["type"] for each in server.requests if each["type"] in ("arm", "go")] == ["arm", "go"]
+    server.send(clients(2, steering=2))
+    page.wait_for_selector("text=Take over and stop the retraction")
+    server.send(clients(), rig("stopped", why="person 1 on the page", motion="retraction"))
+    page.wait_for_selector(f"{BAR} >> text=Bench was stopped: person 1 on the page.")
+    assert hint.is_visible()
+    assert shown_buttons(page)["Retract"]
+    server.send(rig("idle", why="the needle was withdrawn to 2.4 mm", motion="retraction"))
+    page.wait_for_selector(f"{BAR} >> text=Bench is not in use: the needle was withdrawn to 2.4 mm.")
+    assert not hint.is_visible()

@@ -7,7 +7,7 @@ it for one start. It holds while nobody is in control, and starts again only on 
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from flexneedle.lab.page.job_orders import BEAT_S, RigReport, WorkOrder
 from flexneedle.lab.page.protocol import RigStateMessage
@@ -15,8 +15,9 @@ from flexneedle.lab.page.server.clients import PageLimits, Refusal
 from flexneedle.lab.page.server.hub import Hub
 from flexneedle.lab.page.server.job_queue import JobQueue
 
-_MOVING, _OVER = ("inserting", "holding"), ("stopped", "fault", "ended")
-"""States of the supervisor once the insertion has begun, and once it has ended."""
+_INSERTS, _RETRACTS, _OVER = ("inserting", "holding"), "retracting", ("stopped", "fault", "ended")
+"""States of the supervisor once the insertion or retraction has begun, and once it has ended."""
+_MOVING = (*_INSERTS, _RETRACTS)
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,9 @@ class ConnectedRig:
         """jobs: returns the queue of the worker of insertions."""
         self._hub, self._jobs, self._limits, self._rig = hub, jobs, limits, rig
         self.job: int | None = None
-        """Number of the insertion's job, None without one."""
+        """Number of the job of the insertion or retraction, None without one."""
+        self.motion: Literal["insertion", "retraction"] = "insertion"
+        """The one of the job, or the last."""
         self._stopped = ""
         """Reason of the stop, "" without one."""
         self._armed: asyncio.TimerHandle | None = None
@@ -49,8 +52,13 @@ class ConnectedRig:
 
     @property
     def active(self) -> bool:
-        """Whether an insertion on the rig is prepared, or runs."""
+        """Whether an insertion or retraction on the rig is prepared, or runs."""
         return self.job is not None
+
+    @property
+    def what(self) -> str:
+        """Name, with its article, of the motion that is prepared or runs; without one "an insertion"."""
+        return "a retraction" if self.active and self.motion == "retraction" else "an insertion"
 
     @property
     def reference(self) -> RigReference:
@@ -63,6 +71,7 @@ class ConnectedRig:
 
     def prepare(self, order: WorkOrder) -> None:
         """Plan and open the rig."""
+        self.motion = "retraction" if order.kind == "retraction" else "insertion"
         self._report, self._gone, self._stopped = None, 0, ""
         self.job = self._jobs().add(order)
         self._send_beats()
@@ -76,7 +85,7 @@ class ConnectedRig:
         if not self._waits:
             raise Refusal(f"{name} is not ready: it can be armed when its motions are shown")
         if job != self.job:
-            raise Refusal(f"job = {job}: must be {self.job}, the insertion that waits")
+            raise Refusal(f"job = {job}: must be {self.job}, the {self.motion} that waits")
         limit = self._limits.armed_s
         self._set_armed(lambda: self.disarm(f"not started within {limit:g} s: arm it again"))
         self._refresh()
@@ -99,7 +108,9 @@ class ConnectedRig:
     def stop(self, why: str) -> None:
         """Stop the insertion in any state. Raises Refusal once the motors are stopped."""
         if self._state in _OVER:
-            raise Refusal(f"the insertion on the rig has ended ({self._state}): its record is being written")
+            raise Refusal(
+                f"the {self.motion} on the rig has ended ({self._state}): its record is being written"
+            )
         self._set_armed(None)
         self._stopped = self._stopped or why
         if self._change(stop=why):
@@ -117,8 +128,10 @@ class ConnectedRig:
             self.disarm(why)
 
     def lose_control(self, why: str) -> None:
-        """Hold the insertion, since nobody is in control, or end one that has not begun."""
-        if self.active and self._state in _MOVING:
+        """Hold the insertion, since nobody is in control; end a retraction, or what has not begun."""
+        if self.active and self._state == _RETRACTS:
+            self.stop(why)
+        elif self.active and self._state in _INSERTS:
             self._set_armed(None)
             if self._report is not None and self._report.waits == self._gone:
                 self._gone -= 1  # "go" may not have arrived: then it still waits, and reports no new wait
@@ -147,7 +160,8 @@ class ConnectedRig:
         elif found is not None and found.state in _MOVING:  # a process has ended, at which the motors stop
             self._publish("fault", text)
         else:
-            self._publish("idle", text if state == "failed" else self._stopped)
+            done = "" if found is None else found.why
+            self._publish("idle", text if state == "failed" else self._stopped or done)
 
     @property
     def _state(self) -> str:
@@ -200,5 +214,13 @@ class ConnectedRig:
         moves = list(self._report.moves) if self._report is not None and waits else []
         begun = self._state in _MOVING
         self._hub.publish(
-            RigStateMessage(name=self._rig.name, state=state, why=why, job=self.job, begun=begun, moves=moves)
+            RigStateMessage(
+                name=self._rig.name,
+                state=state,
+                why=why,
+                job=self.job,
+                begun=begun,
+                motion=self.motion,
+                moves=moves,
+            )
         )

@@ -37,7 +37,7 @@ class LiveInsertion:
     def start(self, order: WorkOrder) -> None:
         """Start a virtual insertion in place of the present virtual one. Raises Refusal."""
         if self._rig.active:
-            raise Refusal("an insertion runs on the rig: stop it first")
+            raise Refusal(f"{self._rig.what} runs on the rig: stop it first")
         self._begin(order, "")
         self._pace = 0.0 if order.paused else 1.0
         self._job = self._jobs().add(order)
@@ -49,8 +49,14 @@ class LiveInsertion:
         self._begin(order, rig.name)
         self._rig.prepare(replace(order, rig=rig.source))
 
+    def retract(self, order: WorkOrder) -> None:
+        """Prepare a retraction on the rig. Raises Refusal."""
+        rig = self._rig.reference
+        self.require_none("stop it first")
+        self._rig.prepare(replace(order, rig=rig.source))
+
     def stop(self, why: str) -> None:
-        """Stop the insertion. Raises Refusal if none runs."""
+        """Stop the insertion or retraction. Raises Refusal if none runs."""
         if self._rig.active:
             self._rig.stop(why)
             return
@@ -124,7 +130,7 @@ class LiveInsertion:
     def require_none(self, why: str) -> None:
         """Raise Refusal if an insertion runs or waits."""
         if self._job is not None or self._rig.active:
-            raise Refusal(f"an insertion runs: {why}")
+            raise Refusal(f"{self._rig.what} runs: {why}")
 
     def require_ended(self) -> None:
         """Raise Refusal unless there is an insertion that can be saved."""

@@ -17,7 +17,6 @@ from flexneedle.lab.page.protocol import (
     JobKind,
     PlanMessage,
     Recording,
-    RunsMessage,
     WelcomeMessage,
     describe_scene,
 )
@@ -35,6 +34,7 @@ from flexneedle.scenario.library import PRESETS
 
 _SEARCHES: tuple[JobKind, ...] = ("plan", "compare", "reach")
 _RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
+_MOTIONS: tuple[JobKind, ...] = ("insertion", "retraction")
 _WORK: tuple[JobKind, ...] = ("needle", "estimate", *_SEARCHES, "recording", "study", "row")
 
 
@@ -81,7 +81,10 @@ class RequestHandler:
         self.hub.publish(self.clients.describe())
         self._begin(self.session)
         self._order("plan", "plan")
-        self._watching = asyncio.create_task(self._watch_runs())
+        watched = self.runs.watch(
+            self._runs_changed, self.limits.runs_s, lambda: bool(self.clients.connected), self.hub.publish
+        )
+        self._watching = asyncio.create_task(watched)
 
     def halt(self) -> None:
         """Stop the insertion, if one runs."""
@@ -138,8 +141,6 @@ class RequestHandler:
         if not self.clients.connected:
             self._start_timer("alone", self.limits.alone_s, self._end_unattended)
 
-    # Requests
-
     def carry_out(self, client: int, request: ask.AnyRequest) -> None:
         """Carry out a request. Raises Refusal."""
         if request.needs_control:
@@ -182,7 +183,10 @@ class RequestHandler:
                 self._save(request)
             case ask.StopRequest():
                 self.live.stop(f"person {client} on the page")
-            case ask.CheckRequest() | ask.PrepareRequest() | ask.ArmRequest() | ask.GoRequest():
+            case (
+                ask.CheckRequest() | ask.PrepareRequest() | ask.RetractRequest()
+                | ask.ArmRequest() | ask.GoRequest()
+            ):  # fmt: skip
                 self._change_rig(request)
             case _:
                 self._change_insertion(request)
@@ -203,7 +207,8 @@ class RequestHandler:
                 assert_never(request)
 
     def _change_rig(
-        self, request: ask.CheckRequest | ask.PrepareRequest | ask.ArmRequest | ask.GoRequest
+        self,
+        request: ask.CheckRequest | ask.PrepareRequest | ask.RetractRequest | ask.ArmRequest | ask.GoRequest,
     ) -> None:
         match request:
             case ask.CheckRequest():
@@ -212,6 +217,9 @@ class RequestHandler:
                 self._insertions.add(self._work("check", "check", rig=source))
             case ask.PrepareRequest():
                 self.live.prepare(self._work("insert", "insertion", folder=str(self.runs.path)))
+                self._plans.cancel(*_SEARCHES, "row")
+            case ask.RetractRequest():
+                self.live.retract(self._work("retract", "retraction"))
                 self._plans.cancel(*_SEARCHES, "row")
             case ask.ArmRequest() if request.armed:
                 self.rig.arm(request.job)
@@ -281,9 +289,8 @@ class RequestHandler:
     def require_processor(self) -> None:
         """Raise Refusal during an insertion on the rig: a long computation would delay its loop."""
         if self.rig.active:
-            raise Refusal(
-                "an insertion is on the rig, and this would take processor time from it: wait for its end"
-            )
+            why = "is on the rig, and this would take processor time from it: wait for its end"
+            raise Refusal(f"{self.rig.what} {why}")
 
     def _order(self, action: Action, kind: JobKind) -> None:
         if action == "plan":
@@ -311,7 +318,7 @@ class RequestHandler:
             if kind is None:
                 continue
             if number == self.rig.job:
-                raise Refusal("it is an insertion on the rig: stop it instead")
+                raise Refusal(f"it is {self.rig.what} on the rig: stop it instead")
             if kind == "save":
                 raise Refusal("a run that is being saved is not cancelled: its data is nowhere else")
             jobs.cancel_job(number)
@@ -362,8 +369,10 @@ class RequestHandler:
     def _end_job(self, order: WorkOrder, state: str, text: str) -> None:
         if order.kind == "insertion":
             self.live.end(order, state, text)
-            if order.rig and not self._idle:
-                self._plan_if_missing()
+        if order.kind == "retraction":
+            self.rig.end(state, text)
+        if order.kind in _MOTIONS and order.rig and not self._idle:
+            self._plan_if_missing()
         if order.kind == "save":
             self._runs_changed.set()
 
@@ -383,17 +392,3 @@ class RequestHandler:
         if timer is not None:
             timer.cancel()
         return timer is not None
-
-    async def _watch_runs(self) -> None:
-        """Publish the folder of runs when it has changed; a thread reads it, since a disk may be slow."""
-        before: list[dict[str, Any]] | None = None
-        while True:
-            if self.clients.connected or before is None:
-                listed = await asyncio.to_thread(self.runs.list_runs)
-                if listed != before:
-                    before = listed
-                    self.hub.publish(RunsMessage(runs=listed))
-            self._runs_changed.clear()
-            with suppress(TimeoutError):
-                async with asyncio.timeout(self.limits.runs_s):
-                    await self._runs_changed.wait()

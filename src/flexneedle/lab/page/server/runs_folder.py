@@ -7,11 +7,13 @@ import os
 import re
 import stat
 import zipfile
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from flexneedle.lab.page.protocol import RunsMessage
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.process import run_module
 from flexneedle.record.folder import RUN_FILE, STUDY_FILE
@@ -40,6 +42,33 @@ class RunsFolder:
             key=lambda entry: float(entry["made"]),
             reverse=True,
         )
+
+    async def watch(
+        self,
+        changed: asyncio.Event,
+        seconds: float,
+        wanted: Callable[[], bool],
+        publish: Callable[[RunsMessage], None],
+    ) -> None:
+        """Publish runs and studies when they have changed; a thread reads them, since a disk may be slow.
+
+        Args:
+            changed: Set when they are read at once.
+            seconds: Time between two reads.
+            wanted: Whether anybody reads the messages.
+            publish: Called with each message.
+        """
+        before: list[dict[str, Any]] | None = None
+        while True:
+            if wanted() or before is None:
+                listed = await asyncio.to_thread(self.list_runs)
+                if listed != before:
+                    before = listed
+                    publish(RunsMessage(runs=listed))
+            changed.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    await changed.wait()
 
     def find_run(self, name: str) -> Path:
         """Return the folder of a run. Raises Refusal for an unknown name, and for a folder with links."""

@@ -1,10 +1,10 @@
 // The action bar: plan, insert, stop, pause, pace; on a rig check, prepare, arm, insert. Below it what runs, in words.
 
 import { button, make } from "./dom.js";
-import { confirmed, isArmed, isChecking, waits } from "./rig.js";
+import { confirmed, isArmed, isChecking, stateOf, waits } from "./rig.js";
 import { inWords } from "./insertion/words.js";
 import { planWords } from "./plans/words.js";
-import { SHOWN, isPrepared, maySteer, runs as isRunning, shownOf } from "./shown.js";
+import { SHOWN, isPrepared, maySteer, retracts, runs as isRunning, shownOf } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
 const SHOWN_BY = ["insertion live", "clients", "welcome", "rig", "job check", "view confirmed"];
@@ -30,8 +30,9 @@ export function mount(element, store, link) {
   });
   store.subscribe(SHOWN_BY, () => {
     const live = store.get("insertion live");
-    const [runs, prepared, rig] = [isRunning(live), isPrepared(store), store.get("rig")];
-    const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.state === "paused"];
+    const [withdraws, prepared, rig] = [retracts(store), isPrepared(store), store.get("rig")];
+    const [steers, real, paused] = [maySteer(store), withdraws || Boolean(live?.rig), live?.state === "paused"];
+    const runs = withdraws || isRunning(live);
     const signalled = steers && !BEFORE_IT.includes(live?.state); // before it moves it can only be stopped
     plan.disabled = !steers || (runs && real);
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
@@ -64,28 +65,30 @@ function pacing(store, link) {
   return [pause, step, pace];
 }
 
-// Check → Prepare → Arm → Insert, in the tab of the rig.
+// Check → Prepare → Arm → Insert, and Retract → Arm → Retract the needle, in the tab of the rig.
 function rigSteps(store, shows) {
   const step = (text, title, request) => button(text, shows("rig", request), { "data-step": text.toLowerCase(), title });
   const arm = () => ({ type: "arm", armed: !isArmed(store), job: store.get("rig").job });
   return [
     step("Check", "Compare the rig with its file and the scenario; nothing moves", () => ({ type: "check" })),
     step("Prepare", "Plan, open the rig, and measure the tip; nothing moves", () => ({ type: "prepare" })),
+    step("Retract", "Read the position and show the motion that withdraws the needle along its path; nothing moves", () => ({ type: "retract" })),
     step("Arm", "For one start, once the motions are confirmed in the tab of the rig", arm),
     step("Insert on the rig", "Motors are switched on, and the needle moves", () => ({ type: "go" })),
   ];
 }
 
-function showSteps([check, prepare, arm, go], store, rig, steers, runs) {
+function showSteps([check, prepare, retract, arm, go], store, rig, steers, runs) {
   const begun = Boolean(rig) && runs && (rig.begun || rig.state === "starting");
   const shown = Boolean(rig && store.get("welcome")?.rig);
   check.hidden = prepare.hidden = !shown || begun;
+  retract.hidden = !shown || runs || rig.job !== null;
   arm.hidden = go.hidden = !shown || (begun && !waits(rig));
   if (!shown) return;
-  check.disabled = prepare.disabled = !steers || runs || rig.job !== null || isChecking(store);
+  check.disabled = prepare.disabled = retract.disabled = !steers || runs || rig.job !== null || isChecking(store);
   arm.textContent = isArmed(store) ? "Disarm" : "Arm";
   arm.disabled = !steers || !waits(rig) || !(isArmed(store) || confirmed(store));
-  go.textContent = rig.begun ? "Continue" : "Insert on the rig";
+  go.textContent = retracts(store) ? "Retract the needle" : rig.begun ? "Continue" : "Insert on the rig";
   go.disabled = !steers || !isArmed(store);
   go.classList.toggle("danger", !go.disabled);
 }
@@ -96,10 +99,12 @@ function wordsOf(store) {
   const shown = shownOf(store);
   const real = Boolean(live?.rig) && store.get("view of") !== "scene"; // its needle may still be in the tissue
   const of = isRunning(live) || (shown === "scene" && real) ? "live" : shown;
+  const rig = store.get("rig");
+  if (retracts(store) || (of === "live" && rig?.motion === "retraction" && !isRunning(live))) return `${rig.name} ${stateOf(rig)}.`;
   if (of === "scene") return planWords(store).map(([text]) => text).join(" ") || "No plan yet.";
   const insertion = store.get(`insertion ${of}`);
   const name = of === "first" ? `${insertion.name}: ` : "";
-  return name + inWords(insertion, store.get(`rows ${of}`), of === "live" ? store.get("rig") : null);
+  return name + inWords(insertion, store.get(`rows ${of}`), of === "live" ? rig : null);
 }
 
 const nearest = (pace) => PACES.reduce((best, each) => (Math.abs(each - pace) < Math.abs(best - pace) ? each : best));

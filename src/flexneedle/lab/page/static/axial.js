@@ -11,10 +11,10 @@ import { SHOWN, mayMove, otherTargets, shownScene, shownTarget, targetEdit } fro
 
 const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
 
-// Half of the shown width (mm): the target with room to move it, and the reach.
-function halfAround(target, ends) {
+// Half of the shown width (mm): the targets with room to move them, and the reach.
+function halfAround(targets, ends) {
   const far = ([, y, z]) => Math.max(Math.abs(y), Math.abs(z));
-  return Math.max(LEAST, Math.ceil(far(target) + AROUND), ...ends.map((end) => Math.ceil(far(end) + EDGE)));
+  return Math.max(LEAST, ...targets.map((target) => Math.ceil(far(target) + AROUND)), ...ends.map((end) => Math.ceil(far(end) + EDGE)));
 }
 
 export function mount(element, store, link) {
@@ -28,12 +28,12 @@ export function mount(element, store, link) {
   const stage = new Stage(canvas, (pen, { width, height }) => {
     const [scene, target] = [shownScene(store), shownTarget(store)];
     if (!scene || !target) return;
-    const ends = endsOf(store, target);
-    if (!handles.dragged) half = halfAround(target, ends);
+    const [ends, others] = [endsOf(store, target), otherTargets(store)];
+    if (!handles.dragged) half = halfAround([target, ...others.map(({ position }) => position)], ends);
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
-    const reached = drawAxial(pen, { width, height, map, scene, target, others: otherTargets(store), parts, ends, store });
-    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached), otherTargets(store));
+    const reached = drawAxial(pen, { width, height, map, scene, target, others, parts, ends, store });
+    showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached), others);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());

@@ -10,6 +10,10 @@ const STATES = {
   holding: "holds: the needle rests where it is", stopped: "was stopped", fault: "has a fault",
   ended: "is at rest; the record is being written",
 };
+const RETRACTION = {
+  preparing: "is being prepared to retract: the position is read; nothing moves", starting: "starts: motors are switched on",
+  retracting: "withdraws the needle", ended: "is at rest",
+};
 const OVER = ["idle", "stopped", "fault"];
 
 export function mount(element, store) {
@@ -17,7 +21,7 @@ export function mount(element, store) {
   const [findings, moves] = [make("div.findings"), make("ul.moves", { "aria-label": "Motions" })];
   const free = make("input", { id: "rig-free", type: "checkbox" });
   const seen = make("label.tools", { for: "rig-free" }, free, "I have read the motions, their path is free, and I can see the rig and reach its emergency stop.");
-  const retract = make("p", { hidden: true }, "To withdraw the needle along its path, in a terminal: ", make("code", {}, "flexneedle rig retract RIG_FILE"));
+  const retract = make("p", { hidden: true }, "The needle may still be in the tissue: Retract withdraws it along its path.");
   element.append(name, state, moves, seen, retract, findings);
   let was = "";
   const show = () => {
@@ -27,17 +31,24 @@ export function mount(element, store) {
     if (rig.state !== was && waits(rig) && maySteer(store)) store.set("view tab", "rig"); // the motions must be read
     was = rig.state;
     name.textContent = rig.name;
-    state.textContent = `It ${STATES[rig.state] ?? rig.state}${rig.why ? `: ${rig.why}` : ""}.`;
+    state.textContent = `It ${stateOf(rig)}.`;
     moves.hidden = seen.hidden = !waits(rig);
     renew(moves, rig.moves.map((line) => make("li", {}, line)));
     free.checked = confirmed(store);
     const live = store.get("insertion live");
-    retract.hidden = !(OVER.includes(rig.state) && live?.rig && live.periods);
+    const withdrawn = rig.motion === "retraction" && rig.state === "idle";
+    retract.hidden = withdrawn || !(OVER.includes(rig.state) && live?.rig && live.periods);
   };
   free.addEventListener("change", () => store.set("view confirmed", free.checked ? motionsOf(store) : undefined));
   store.subscribe(["rig", "welcome", "view confirmed", "insertion live"], show);
   store.subscribe(["clients"], () => maySteer(store) || store.set("view confirmed", undefined)); // another page is in control
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
+}
+
+// State of the rig with its reason, in words.
+export function stateOf({ state, why, motion }) {
+  const words = (motion === "retraction" && RETRACTION[state]) || STATES[state] || state;
+  return `${words}${why ? `: ${why}` : ""}`;
 }
 
 export const isArmed = (store) => store.get("rig")?.state === "armed";

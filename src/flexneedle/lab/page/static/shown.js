@@ -14,10 +14,17 @@ const SAME = 1e-3; // s, largest difference between times of the same period
 // Return whether an insertion (message "insertion", or none) runs or waits.
 export const runs = (live) => RUNS.includes(live?.state);
 
-// Return whether an insertion on a rig is only prepared: nothing has moved, and nothing moves before it is started.
+// Return whether an insertion or retraction on a rig is only prepared: nothing moves before it is started.
 export function isPrepared(store) {
   const [live, rig] = [store.get("insertion live"), store.get("rig")];
-  return runs(live) && Boolean(live.rig) && BEFORE.includes(live.state) && PREPARED.includes(rig?.state) && !rig.begun;
+  const insertion = runs(live) && Boolean(live.rig) && BEFORE.includes(live.state);
+  return (insertion || retracts(store)) && PREPARED.includes(rig?.state) && !rig.begun;
+}
+
+// Return whether a retraction is prepared or runs.
+export function retracts(store) {
+  const rig = store.get("rig");
+  return rig?.motion === "retraction" && rig.job !== null;
 }
 
 // Keys to subscribe to for the functions of this module.

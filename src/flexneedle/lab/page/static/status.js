@@ -10,7 +10,7 @@ const CONNECTIONS = {
 };
 const JOBS = {
   needle: "Needle", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
-  insertion: "Insertion", check: "Check of the rig", recording: "Recorded run", study: "Study", row: "Computing again",
+  insertion: "Insertion", retraction: "Retraction", check: "Check of the rig", recording: "Recorded run", study: "Study", row: "Computing again",
   save: "Saving",
 };
 const CONTROL = {
@@ -18,7 +18,8 @@ const CONTROL = {
   release: "Lets another page take control. An insertion on a rig is then held.",
   over: "Control goes from the other page to this one at once. On a rig, nothing moves before its motions are confirmed here.",
 };
-const OWN_END = ["insertion", "save"]; // not cancelled: an insertion is stopped, and a run is saved completely
+const MOTIONS = ["insertion", "retraction"];
+const OWN_END = [...MOTIONS, "save"]; // not cancelled: a motion is stopped, and a run is saved completely
 const ENDED = ["stopped", "fault", "ended"]; // states of a rig
 const SHOWN_FOR = 12_000; // ms
 const LONG = 5; // s
@@ -72,6 +73,7 @@ function followSteering(element, store, link) {
 // Effect of a take-over on an insertion on the rig, as the end of the button's text: whoever confirmed its motions has lost control.
 function lossOf(rig) {
   if (!rig || rig.job === null || ENDED.includes(rig.state)) return "";
+  if (rig.begun && rig.motion === "retraction") return " and stop the retraction";
   return rig.begun ? " and hold the needle" : " and end the preparation";
 }
 
@@ -111,7 +113,7 @@ function followJobs(element, store, link) {
   function update(entry, job) {
     const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
-    if (kind === "insertion" && isPrepared(store)) entry.words = "Insertion: prepared, nothing moves";
+    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: prepared, nothing moves`;
     else entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     entry.counts = !failed && (job.share ?? null) === null;
     tell(entry);

@@ -15,6 +15,7 @@ from flexneedle.lab.page.worker.insertion_jobs import InsertionJobs
 from flexneedle.lab.page.worker.plan_jobs import estimate, needle, plan, warm_up
 from flexneedle.lab.page.worker.reach_job import reach
 from flexneedle.lab.page.worker.rig_insertion import check
+from flexneedle.lab.page.worker.rig_retraction import retract
 from flexneedle.lab.page.worker.study_jobs import ShownRows, list_rows
 from flexneedle.lab.page.worker.task import Cancelled, TaskQueue, WorkerTask
 from flexneedle.lab.process import open_channel
@@ -49,6 +50,7 @@ def main() -> int:
         "row": rows.recompute,
         "insert": insertions.insert,
         "check": check,
+        "retract": retract,
         "save": insertions.save,
         "save_row": rows.save,
     }

@@ -9,7 +9,7 @@ settings, and returns the device open and at rest. A package registers a factory
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import entry_points
@@ -55,6 +55,21 @@ class OpenTracker(Tracker, Protocol):
     def close(self) -> None:
         """Stop tracking and release the device."""
         ...
+
+
+def read_positions(rig: RigFile) -> dict[str, float]:
+    """Return the positions of the axes (mm or rad).
+
+    Raises DriverError if the driver lacks a channel, or cannot be read.
+    """
+    with closing(open_motors(rig)) as motors:
+        states = motors.read()
+    missing = [axis.channel for _, axis in rig.axes.items() if axis.channel not in states]
+    if missing:
+        raise DriverError(
+            f"the driver has no channel {', '.join(missing)}; it has {', '.join(states) or 'none'}"
+        )
+    return {name: states[axis.channel].position / axis.scale for name, axis in rig.axes.items()}
 
 
 def open_motors(rig: RigFile) -> Motors:

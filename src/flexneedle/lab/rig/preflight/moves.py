@@ -164,6 +164,12 @@ def withdrawn_position(rig: RigFile) -> float:
     return position_after_homing(axis) if axis.to_home < 0 else axis.limits[0]
 
 
+def describe_withdrawn(rig: RigFile, position: float) -> str:
+    """Return why there is nothing to retract from a position (mm)."""
+    at, end = map(rig.axes.insertion.to_text, (position, withdrawn_position(rig)))
+    return f"insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract"
+
+
 def plan_retraction(
     rig: RigFile, position: float, to_mm: float | None = None, speed: float | None = None
 ) -> AxisMove | None:

@@ -27,10 +27,13 @@ class SupervisorClient(SupervisorConnection):
     """
 
     @classmethod
-    def of_operator(cls, rig: RigFile) -> Self:
+    def of_operator(
+        cls, rig: RigFile, on_report: Callable[[protocol.TickReport], None] | None = None
+    ) -> Self:
         """Return the supervisor of a rig without its tracker, for motions of single axes."""
         monitor = MonitorSettings(enabled=False)
-        return cls(protocol.SupervisorTask(rig, monotonic(), 2, monitor, identity(), 0.0, inf, tracked=False))
+        task = protocol.SupervisorTask(rig, monotonic(), 2, monitor, identity(), 0.0, inf, tracked=False)
+        return cls(task, on_report)
 
     @property
     def positions(self) -> dict[str, float]:

@@ -18,7 +18,7 @@ export function outlineOf(plane, store) {
 }
 
 // outline: of the reach. Returns whether it was drawn.
-export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, others, parts, outline, store }) {
+export function drawSection(pen, { width, height, map, plane, name, layers, guide, scene, target, others = [], parts, outline, store }) {
   const place = (x, y, z) => [map.toX(x), map.toY(lateral(plane, x, y, z))];
   const row = shownRow(store);
   let reached = false;
