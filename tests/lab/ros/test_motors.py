@@ -23,6 +23,7 @@ from flexneedle.lab.ros.motors import (
     make_motors,
 )
 from flexneedle.lab.ros.profile import load_part, load_profile
+from flexneedle.lab.ros.records import JointReading
 from ros_peers import Joints
 
 PROFILE = load_part("neutral", publish=("joint_targets",), subscribe=("joint_states",))
@@ -135,6 +136,14 @@ def test_a_motion_is_a_stream_of_set_points_at_the_limited_speed(motors, joints)
     assert "roll" not in joints.targets[-1][1]
     for at, sent in joints.targets:  # they may arrive late, never early
         assert sent["insertion"] <= 0.010 + 0.020 * (at - begun) + 1e-9
+
+
+def test_the_last_set_point_is_sent_again_since_one_may_be_dropped(monkeypatch, motors, joints):
+    monkeypatch.setattr(module, "_REPEAT_S", 60.0)
+    advance(motors, goal=0.012, speed=0.020)
+    follow_until(motors, lambda s: not s["insertion"].moving and s["insertion"].position == 0.012)
+    joints.positions["insertion"] = 0.011  # as if the last had not arrived
+    follow_until(motors, lambda _: joints.positions["insertion"] == 0.012)
 
 
 def test_without_calls_the_joints_stop(motors, joints):
@@ -305,6 +314,7 @@ def test_joints_that_are_not_reported_are_named(monkeypatch, connected, joints):
         make_motors({}, ("insertion", "elbow"))
     monkeypatch.setattr(module, "_CONNECT_S", 0.3)
     joints.silent.set()
+    until(lambda: not any(isinstance(one, JointReading) for one in connected[1]._node.poll()))
     with pytest.raises(DriverError, match=r"^/flexneedle/rig/joint_states: no joint states"):
         make_motors({}, ("insertion",))
     for settings in ({"profile": "smartneedle"}, {"stale_ms": 0.0}):

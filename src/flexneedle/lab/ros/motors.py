@@ -25,6 +25,7 @@ from flexneedle.scenario.sections.fields import Section
 
 CONNECTING = "the ROS node is connecting"
 _CONNECT_S = 5.0
+_REPEAT_S = 1.0  # the last set point is sent for as long, since a busy machine may drop one
 _LARGEST = 1e9  # position, in any unit
 _LONGEST = 200  # characters of a list of joints
 
@@ -170,6 +171,7 @@ class RosMotors:
         self._speeds: dict[str, float] = {}
         self._offsets = dict.fromkeys(channels, 0.0)
         self._points: dict[str, SetPoint] = {}
+        self._send_until = 0.0
         self._link: JointLink | None = connect()
         self._newest: JointReading | None = None  # of the last call of `read`
         self._opening: Future[JointLink] | None = None
@@ -181,9 +183,9 @@ class RosMotors:
         self.close()
 
     def read(self) -> Mapping[str, MotorState]:
-        """Return the state of every channel, and send the set points of a motion."""
+        """Return the state of every channel, and send the set points of a motion, the last one repeatedly."""
         reading = self._get_link().read()
-        if any(point.moving for point in self._points.values()):
+        if any(point.moving for point in self._points.values()) or time.monotonic() < self._send_until:
             self._advance()
         repeated, self._newest = reading is self._newest, reading
         states = {channel: self._make_state(channel, reading) for channel in self._channels}
@@ -219,6 +221,7 @@ class RosMotors:
         self._get_link().poll()
         for channel, point in self._points.items():
             self._points[channel] = replace(point, goal=point.position)
+        self._send_until = time.monotonic() + _REPEAT_S
         self._send()
 
     def define(self, channel: str, position: float) -> None:
@@ -290,6 +293,8 @@ class RosMotors:
 
     def _send(self) -> None:
         if self._points:
+            if any(point.moving for point in self._points.values()):
+                self._send_until = time.monotonic() + _REPEAT_S
             positions = {channel: point.position for channel, point in self._points.items()}
             self._get_link().send(positions)
 
