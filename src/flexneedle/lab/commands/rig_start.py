@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,10 +14,14 @@ from flexneedle.lab.commands.confirmation import ARMS, confirm_motions
 from flexneedle.lab.commands.rig_parts import add_rig, add_yes, arm, print_findings, stop_on_error
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from flexneedle.lab.rig.preflight.axis_test import AxisRun, MotorHistory
     from flexneedle.lab.rig.preflight.moves import AxisMove
+    from flexneedle.lab.rig.rig_file import RigFile
     from flexneedle.lab.rig.supervisor.client import SupervisorClient
     from flexneedle.scenario.model import Scenario
-    from flexneedle.types import Point
+    from flexneedle.types import Floats, Point
 
 _TIP_S = 1.0  # for which the tip is measured at rest
 _IN_AIR = "Only with the needle in air, free by these distances in both directions of each axis."
@@ -70,41 +74,61 @@ def add_ready(commands: Commands) -> None:
 
 
 def _test(args: argparse.Namespace) -> int:
-    from flexneedle.lab.rig.preflight.axis_evidence import create_evidence, write_evidence
-    from flexneedle.lab.rig.preflight.axis_findings import describe_motions, measure_motion, share_after_probe
+    from flexneedle.lab.rig.preflight.axis_evidence import create_evidence
+    from flexneedle.lab.rig.preflight.axis_findings import share_after_probe
     from flexneedle.lab.rig.preflight.axis_test import (
+        AxisRun,
         MotorHistory,
         measure_rest,
         plan_axis_test,
-        run_axis_test,
+        run_axis_tests,
     )
-    from flexneedle.lab.rig.preflight.frame_turn import describe_frame
     from flexneedle.lab.rig.preflight.ready import require_air
     from flexneedle.lab.rig.preflight.tip_response import air_responses
     from flexneedle.lab.rig.rig_file import load_rig
     from flexneedle.lab.rig.tracked import open_tracked
+
+    rig, scenario, motors, runs = load_rig(args.rig), _load(args.scenario), MotorHistory(), list[AxisRun]()
+    try:
+        with open_tracked(rig, scenario, motors.add) as operator, stop_on_error(operator):
+            rest = measure_rest(operator, _TIP_S)
+            responses = air_responses(rig, scenario, float(rest.tip[0]))
+            plans = plan_axis_test(rig, operator.positions, rest, responses)
+            moves = [plan.move for plan in plans]
+            if scenario is not None:
+                farthest = max(abs(one.distance) for one in moves if one.axis.unit == "mm")
+                require_air(float(rest.tip[0]), farthest)
+            confirm_motions([*map(str, moves), _IN_AIR, ARMS], "" if args.yes else "Move?")
+            folder = create_evidence(rig, args.out)
+            _start(operator, moves)
+            run_axis_tests(operator, plans, partial(share_after_probe, rig, responses), runs)
+    finally:  # also after a fault, once all axes are stopped
+        failed = bool(runs) and _conclude(args.rig, folder, rig, scenario, responses, runs, motors)
+    return 1 if failed else 0
+
+
+def _conclude(
+    name: str,
+    folder: Path,
+    rig: RigFile,
+    scenario: Scenario | None,
+    responses: Mapping[str, Floats],
+    runs: Sequence[AxisRun],
+    motors: MotorHistory,
+) -> bool:
+    """Write and print the findings; return whether there is a problem."""
+    from flexneedle.lab.rig.preflight.axis_evidence import write_evidence
+    from flexneedle.lab.rig.preflight.axis_findings import describe_motions, measure_motion
+    from flexneedle.lab.rig.preflight.frame_turn import describe_frame
     from flexneedle.scenario.sections.settings import ControlSettings
 
-    rig, scenario, motors = load_rig(args.rig), _load(args.scenario), MotorHistory()
-    with open_tracked(rig, scenario, motors.add) as operator, stop_on_error(operator):
-        rest = measure_rest(operator, _TIP_S)
-        responses = air_responses(rig, scenario, float(rest.tip[0]))
-        plans = plan_axis_test(rig, operator.positions, rest, responses)
-        moves = [plan.move for plan in plans]
-        if scenario is not None:
-            require_air(float(rest.tip[0]), max(abs(one.distance) for one in moves if one.axis.unit == "mm"))
-        confirm_motions([*map(str, moves), _IN_AIR, ARMS], "" if args.yes else "Move?")
-        folder = create_evidence(rig, args.out)
-        _start(operator, moves)
-        share_of = partial(share_after_probe, rig, responses)
-        runs = [run_axis_test(operator, plan, share_of) for plan in plans]
     motions = {run.name: measure_motion(rig, responses, run, motors) for run in runs}
     control = ControlSettings() if scenario is None else scenario.control
     findings = [*describe_motions(rig, motions, control.stale_after_s), *describe_frame(motions)]
     write_evidence(folder, rig, runs, motors, findings)
-    print_findings(args.rig, findings)
+    print_findings(name, findings)
     print_line(f"evidence: {folder}")
-    return 1 if any(one.problem for one in findings) else 0
+    return any(one.problem for one in findings)
 
 
 def _ready(args: argparse.Namespace) -> int:

@@ -1,8 +1,8 @@
 """Diagnosis of an insertion: does its record fit a wrong scale, direction or channel in the rig file?
 
 The tip is predicted for the commanded travel, and for the travel that the motors would have made with each fault. A
-fault is named if it fits the readings far better than the right rig file (likelihood ratio), and to the noise. The
-start of the needle, the registration, the bevel and the stiffness of the tissue are unknown, each with its prior.
+fault is named if the right rig file does not fit the readings to their noise, and the fault fits far better. The start
+of the needle, the registration, the bevel and the stiffness of the tissue are unknown, each with its prior.
 """
 
 import math
@@ -20,11 +20,15 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Floats, VerdictKind, X, Z
 
 _RATIO = 30.0  # least logarithm of the likelihood ratio
-_MISFIT = 3.0  # largest mean square of a residual over its variance, with the fault
+# An error of the model is in many readings, and any scale fits a part of it. Least ratios of the misfits without and
+# with the fault: if the fault fits the readings to the noise, and if not.
+_GAIN, _ROUGH_GAIN = 1.5, 10.0
+_MISFIT = 5.0  # largest mean square of a residual over its variance, with the fault
 _TIMING = 0.2  # of a step: standard deviation of the part that is done at a reading in motion
 _MODEL = 0.1  # of the deflection in tissue: error of the model besides its parameters
 _LEAST_CHANGE = 0.05  # of a scale that is named
-_LARGEST_SCALE = 6.0
+_LARGEST_SCALE = 30.0  # 25.4 with counts in inches
+_NO_MOTION = 0.02  # scale of an axis that does not move the tip
 _ROLL = "roll"  # of a step, beside the travel of its axes
 _ROLLS = (-1.0, 0.0, 0.5, 0.8, 0.9, 1.1, 1.2, 2.0)
 _REGISTRATION = 0.01  # rad: standard deviation of its rotation
@@ -82,7 +86,9 @@ def find_fault(rig: RigFile, scenario: Scenario, insertion: Insertion) -> Fault 
     best = min(misfits)
     text, changes = hypotheses[misfits.index(best)]
     ratio = 0.5 * (null - best)
-    if ratio < _RATIO or best > _MISFIT * record.tips.size:
+    noise = float(record.tips.size)
+    least = max(noise, (_GAIN if best <= noise else _ROUGH_GAIN) * best)
+    if ratio < _RATIO or null < least or best > _MISFIT * noise:
         return None
     return Fault(tuple(name for name in changes if name != _ROLL), text, ratio)
 
@@ -187,15 +193,18 @@ class _Fit:
         return found
 
     def _shift(self, part: str) -> Floats:
-        """Return the change of the path by twice the offset of the bevel, or by twice the stiffness of the tissue."""
+        """Return the change of the path by the offset of the bevel, or by the stiffness of the tissue.
+
+        From half of it, which is allowed in every scenario.
+        """
         if part == "bevel":
-            values = {"needle.bevel.offset_mm": 2.0 * self._space.needle.bevel.offset_mm}
+            values = {"needle.bevel.offset_mm": 0.5 * self._space.needle.bevel.offset_mm}
         else:
             values = {
-                f"tissue.{number}.shear_modulus_kpa": 2.0 * layer.modulus * 1e3
+                f"tissue.{number}.shear_modulus_kpa": 0.5 * layer.modulus * 1e3
                 for number, layer in enumerate(self._space.tissue)
             }
-        return self._predict(Simulator(self._space.with_values(values)), {}) - self.null
+        return 2.0 * (self.null - self._predict(Simulator(self._space.with_values(values)), {}))
 
     def _drift(self) -> float:
         """Return the standard deviation (1/mm) of half of the path's curvature."""
@@ -226,14 +235,9 @@ def _hypotheses(
     for name in moved & axes.keys():
         if name == "rotation":
             continue
-        without = fit.predict({name: {}})
-        scale = fit.best_scale(fit.null, without)
-        if abs(scale - 1.0) < _LEAST_CHANGE or not 0.1 < abs(scale) < _LARGEST_SCALE:
-            continue
-        yield (
-            _describe_scale(name, scale, axes[name].scale * axes[name].size, axes[name].unit),
-            {name: {name: scale}},
-        )
+        for scale in _fitting_scales(fit, name):
+            counts = axes[name].scale * axes[name].size
+            yield _describe_scale(name, scale, counts, axes[name].unit), {name: {name: scale}}
     if _ROLL in moved or "rotation" in moved:
         for scale in _ROLLS:
             changed = {name: {name: scale} for name in (_ROLL, "rotation")}
@@ -250,10 +254,27 @@ def _hypotheses(
                 yield text, {one: {other: sign * ratio}, other: {one: sign / ratio}}
 
 
+def _fitting_scales(fit: _Fit, name: str) -> list[float]:
+    """Return the scales of an axis that may fit: by its share of the path, and by the path with that scale.
+
+    The first alone is wrong for a guide in tissue, which is not linear; a reversed axis may have the right counts.
+    """
+    without = fit.predict({name: {}})
+    scale = fit.best_scale(fit.null, without)
+    if abs(scale - 1.0) < _LEAST_CHANGE or abs(scale) > _LARGEST_SCALE:
+        return []
+    if abs(scale) < _NO_MOTION:
+        return [scale]
+    refined = scale * fit.best_scale(fit.predict({name: {name: scale}}), without)
+    return [scale, refined, *([-1.0] if scale < 0.0 else [])]
+
+
 def _describe_scale(name: str, scale: float, counts: float, unit: str) -> str:
+    if abs(scale) < _NO_MOTION:
+        return f"{name} does not move the tip, or its sensor is loose (axes.{name}.channel), which"
     if abs(abs(scale) - 1.0) < _LEAST_CHANGE and scale < 0.0:
         return f"{name} moves in the other direction (axes.{name}.direction), which"
     reverse = " in the other direction" if scale < 0.0 else ""
     key = f"axes.{name}.counts_per_{unit} = {abs(counts):g}"
-    fits = "" if scale == 0.0 else f", about {abs(counts / scale):.4g} would fit"
-    return f"{name} moves {abs(scale):.2g} times as far as commanded{reverse} ({key}{fits}), which"
+    fits = f", about {abs(counts / scale):.4g} would fit"
+    return f"{name} moves {round(abs(scale), 2):g} times as far as commanded{reverse} ({key}{fits}), which"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench_axes import AirRig
-from flexneedle.errors import InputError, RunError
+from flexneedle.errors import DriverError, InputError, RunError
 from flexneedle.lab.rig.preflight.axis_findings import (
     describe_motions,
     measure_motion,
@@ -15,6 +15,7 @@ from flexneedle.lab.rig.preflight.axis_test import (
     measure_rest,
     plan_axis_test,
     run_axis_test,
+    run_axis_tests,
 )
 from flexneedle.lab.rig.preflight.frame_turn import describe_frame
 from flexneedle.lab.rig.rig_file import load_rig
@@ -103,7 +104,11 @@ def test_lost_motion_is_a_problem_of_the_insertion_and_a_note_for_the_guide():
 
 def test_a_motor_that_does_not_drive_its_axis_and_a_tilted_frame_are_problems():
     assert set(outcome_of(AirRig(RIG, {"guide_y": 0.0}))[1]) == {("guide_y", "motion")}
-    assert ("insertion", "direction") in outcome_of(AirRig(RIG, tilt=0.3))[1]
+    _, problems, _ = outcome_of(AirRig(RIG, tilt=0.3))
+    directions = {(name, "direction") for name in ("insertion", "guide_y")}
+    assert set(problems) == {*directions, ("tracker", "frame")}, (
+        "and no scale, which follows from the directions"
+    )
 
 
 def test_late_readings_are_a_problem():
@@ -207,3 +212,19 @@ def test_a_turned_frame_of_the_tracker_is_named_beside_the_axes(about):
     if about.strip():
         axis, angle = about.split(" by ")
         assert turns == [f"turned by {angle} about {axis}"]
+
+
+def test_after_a_fault_the_axes_before_it_are_kept_and_the_one_that_did_not_come_back_is_named():
+    class Stuck(AirRig):
+        def move_to(self, axis, position, speed=None):
+            if axis == "rotation" and position > 1.0:
+                raise DriverError("rotation: at the forward limit")
+            super().move_to(axis, position, speed)
+
+    rig, runs = Stuck(RIG), []
+    plans = plan_axis_test(RIG, rig.positions, measure_rest(rig, 1.0), AIR)
+    with pytest.raises(
+        DriverError, match=r"forward limit; rotation was tested from 0 deg, and is not back: check "
+    ):
+        run_axis_tests(rig, plans, lambda run: share_after_probe(RIG, AIR, run), runs)
+    assert [run.name for run in runs] == ["insertion"]

@@ -246,7 +246,8 @@ def _describe_motion(
         found = "depends on needle and guide; give --scenario"
         yield UncheckedFinding(name, "scale", found)
         return
-    yield from _scale_findings(name, axis, motion, motion.scale)
+    crooked = any(one.tilt > MOST_TILT for one in motions.values())
+    yield from _scale_findings(name, axis, motion, motion.scale, crooked=crooked)
     if axis.unit == "mm":
         rule = (
             f"must be within {math.degrees(MOST_TILT):g}°: check registration"
@@ -280,7 +281,10 @@ def _delay_finding(name: str, delay: float, sd: float, most: float) -> Finding:
     return Finding(name, "delay", shown, "must be 0 or more: check the times of the tracker" if early else "")
 
 
-def _scale_findings(name: str, axis: Axis, motion: Motion, scale: float) -> Iterator[Finding]:
+def _scale_findings(
+    name: str, axis: Axis, motion: Motion, scale: float, *, crooked: bool
+) -> Iterator[Finding]:
+    """Yield sign and scale. crooked: a motion is not along its axis: the levers of guide and base are unknown."""
     if scale < 0.0:
         key = f"axes.{name}.direction = {axis.direction}"
         yield Finding(name, "sign", "reversed", f"{key}: must be {-axis.direction}")
@@ -288,6 +292,9 @@ def _scale_findings(name: str, axis: Axis, motion: Motion, scale: float) -> Iter
         yield Finding(name, "sign", "positive")
     size, unit = abs(scale), axis.unit
     counts = abs(axis.scale) * axis.size
+    if crooked and name != "insertion" and unit == "mm":
+        yield UncheckedFinding(name, "scale", f"{size:.4g}: repeat the test once all directions are right")
+        return
     off = abs(size - 1.0) > max(_SDS * SCALE_SD, _SDS * motion.sd)
     shown = f"{size:.4g} ± {motion.sd:.2g}"
     rule = f"axes.{name}.counts_per_{unit} = {counts:.6g}: must be about {counts / size:.4g}" if off else ""

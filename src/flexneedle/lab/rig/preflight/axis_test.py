@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from flexneedle.errors import InputError, RunError
+from flexneedle.errors import DriverError, InputError, RunError
 from flexneedle.geometry.quaternion import product
 from flexneedle.lab.rig.preflight.moves import AxisMove, plan_jog
 from flexneedle.lab.rig.rig_file import RigFile
@@ -254,6 +254,28 @@ def _largest_probe(rig: RigFile, name: str) -> float:
     axes = dict(rig.axes.items())
     others = (abs(axis.scale) for other, axis in axes.items() if other != name and axis.unit == "mm")
     return _MOST_MM * min(others, default=math.inf) / abs(axes[name].scale)
+
+
+def run_axis_tests(
+    operator: Operator, plans: Sequence[AxisPlan], share_of: Callable[[AxisRun], float], runs: list[AxisRun]
+) -> None:
+    """Test the axes one after another, and append their motions to `runs`.
+
+    share_of: as for `run_axis_test`. Raises DriverError after a fault, with the axis that did not come back.
+    """
+    for plan in plans:
+        try:
+            runs.append(run_axis_test(operator, plan, share_of))
+        except DriverError as error:
+            move = plan.move
+            key, back = (
+                f"axes.{move.name}.counts_per_{move.axis.unit}",
+                f"rig jog RIG {move.name} --to POSITION",
+            )
+            where = f"{move.name} was tested from {move.axis.to_text(move.start)} {move.axis.unit}"
+            raise DriverError(
+                f"{error}; {where}, and is not back: check {key}, channel and home; {back}"
+            ) from error
 
 
 def run_axis_test(operator: Operator, plan: AxisPlan, share_of: Callable[[AxisRun], float]) -> AxisRun:
