@@ -228,7 +228,9 @@ def warn_unstopped(
     homed = ", ".join(name for name, drive in drives.items() if drive.axis.home != "absolute")
     home = f"; after a restart of the controller home {homed} again" if homed else ""
     remedy = "press the emergency stop if an axis moves on, support a vertical axis, wait until all rest"
-    return f"{why}; {_UNSTOPPED}: {moves}; a controller that fails may do anything else: {remedy}{home}"
+    return (
+        f"{_UNSTOPPED}: {moves}; a controller that fails may do anything else: {remedy}{home}; cause: {why}"
+    )
 
 
 _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
