@@ -169,6 +169,40 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
     assert timing["ticks"]["count"] > 100
 
 
+def withdrawing(client):
+    client.do("retract")
+    (move, _switched_on) = rig_is(client, "ready")["moves"]
+    armed(client)
+    client.do("go")
+    rig_is(client, "retracting")
+    return move
+
+
+def test_the_needle_is_withdrawn_after_a_stop_and_the_retraction_is_stopped_and_repeated(tmp_path):
+    with bench(tmp_path, **LONGER) as one, one.visitor() as client, one.visitor() as watcher:
+        inserting(client.steer())
+        one.advanced(6.0)
+        client.do("stop")
+        client.job("insertion", "done")
+        rig_is(client, "stopped")
+        deepest = one.base[1].max()
+        assert withdrawing(client).startswith("insertion: from ")
+        until(lambda: one.base[1][-1] < deepest - 2.0, PATIENCE_S)
+        watcher.do("stop")
+        client.job("retraction", "cancelled")
+        assert rig_is(client, "stopped")["why"] == f"person {watcher.number} on the page"
+        stopped = monotonic()
+        Event().wait(RESTS_S + 0.5)
+        assert one.moved_after(stopped + RESTS_S) < 0.005
+        assert 1.0 < one.base[1][-1] < deepest - 1.0
+        withdrawing(client)
+        client.job("retraction", "done")
+        assert rig_is(client, "idle")["why"].startswith("the needle was withdrawn to ")
+        until(lambda: one.base[1][-1] < 0.5, PATIENCE_S)
+        client.do("retract")
+        assert "nothing to retract" in client.job("retraction", "failed")["text"]
+
+
 @pytest.mark.slow
 def test_a_steering_client_that_is_silent_is_lost(tmp_path):
     """Its computer has crashed or its line is cut: the connection stays open and silent."""
