@@ -30,6 +30,7 @@ def test_parts_of_a_column_fill_it_and_no_text_is_over_another(case):
     with figures_of_width(88 / 25.4):
         figure = CASES[case]()
     assert figure.get_figwidth() == pytest.approx(88 / 25.4)
+    assert figure.get_figheight() <= 250.0 / 25.4
     assert overlapping(figure) == []
     sizes = {text.get_fontsize() for text in figure.findobj(lambda part: hasattr(part, "get_fontsize"))}
     assert 7.0 <= min(sizes) <= max(sizes) <= 8.0 + 1e-9

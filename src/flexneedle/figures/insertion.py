@@ -43,10 +43,14 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         draw_depths([axes[name] for name in shown], scenario, list(shown.values()))
         for end, view in sections.items():
             _close_up(axes[f"end{end}"], scenario, insertion, view)
-        axes[f"end{end}"].set_xlabel("\n".join(_facts(scenario, insertion)))
+        facts = _facts(scenario, insertion)
+        if not is_column():
+            axes[f"end{end}"].set_xlabel("\n".join(facts))
         if len(field):
             _field(axes["field"], scenario, insertion, field)
         legend_of(figure, [*scenes, *(axes[name] for name in axes if name == "along")])
+        if is_column():  # where the close-ups leave no room
+            figure.legends[0].set_title("\n".join((", ".join(facts[:-2]), ", ".join(facts[-2:]))))
         figure.draw_without_rendering()
         for ax in scenes:
             scene.name_layers(ax, scenario)
@@ -219,8 +223,11 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) ->
     ax.set_ylim(centre[up] - half, centre[up] + half)
     ax.set(aspect="equal", anchor="N")
     seen = "" if scenario.setup.axes == 1 else f" in x–{'xyz'[up]}"
-    whole = f"The end{seen} (mm)" if is_column() else f"The end{seen}, magnified (mm)"
-    ax.set_title(whole if near else f"The tip{seen}, {format_mm(distance)} off")
+    if is_column() and seen:
+        ax.set_title(f"{'End' if near else 'Tip'}{seen}")
+    else:
+        whole = f"The end{seen}{'' if is_column() else ', magnified'} (mm)"
+        ax.set_title(whole if near else f"The tip{seen}, {format_mm(distance)} off")
     scene.tint_layers(ax, scenario)
     _paths(ax, insertion, view, scale=1.6)
     scene.draw_target(ax, target, view)

@@ -32,9 +32,12 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 _TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
 
-# Parts of a figure in a column, inches: all others are low.
-_HEIGHTS = {"along": 3.0, "end": 2.1, "cost": 2.7} | dict.fromkeys(("scene", *STRATEGIES), 1.3)
-_LOW, _OUTSIDE = 1.1, 1.1
+# Rows of a figure in a column, inches: all others are low. A figure above the height of a page is lowered.
+_HEIGHTS = {"cost": 1.7} | dict.fromkeys(("scene", *STRATEGIES), 1.3)
+_COSTS = 3.2  # of two plans
+_SQUARES = {1: 2.6, 2: 2.3, 3: 2.3}  # by their number in a row
+_SHARES = {1: (1,), 2: (1, 1), 3: (3, 2, 2)}  # of the width
+_LOW, _OUTSIDE, _PAGE, _LEAST = 1.1, 1.1, 9.4, 0.85
 _SMALLER = 1.25  # characters in a column for each at full width: of the sizes of fonts
 
 
@@ -62,7 +65,8 @@ def mosaic(
     """Return a figure with its title and the axes named in `rows`; heights, widths: relative to each other."""
     if is_column():
         rows, heights, widths = _stack(rows)
-        height = sum(heights) + _OUTSIDE
+        factor = max(_LEAST, min(1.0, (_PAGE - _OUTSIDE) / sum(heights)))
+        height = factor * sum(heights) + _OUTSIDE
     figure = new_figure(height)
     figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
     figure.suptitle(
@@ -74,13 +78,19 @@ def mosaic(
 
 
 def _stack(rows: Sequence[Sequence[str]]) -> tuple[list[list[str]], list[float], list[float]]:
-    """Return rows, heights (inches) and widths with each part in its own row, close-ups side by side."""
-    names = dict.fromkeys(row[k] for k in range(len(rows[0])) for row in rows)  # column by column
-    ends = [name for name in names if name.split()[0] == "end"]
-    alone = [name for name in names if name not in (*ends, ".")]
-    stacked = [*([name] * max(1, len(ends)) for name in alone), *([ends] if ends else [])]
-    heights = [max(_HEIGHTS.get(word, _LOW) for word in row[0].split()) for row in stacked]
-    return stacked, heights, [1.0] * len(stacked[0])
+    """Return rows, heights (inches) and widths with each part in its own row, squares side by side below."""
+    names = dict.fromkeys(
+        row[k] for k in range(len(rows[0])) for row in rows if row[k] != "."
+    )  # column by column
+    squares = [name for kind in ("along", "end") for name in names if kind in name.split()]
+    wide = [name for name in names if name not in squares]
+    heights = [max(_HEIGHTS.get(word, _LOW) for word in name.split()) for name in wide]
+    if "cost" in wide and all(any(name.startswith(each) for name in wide) for each in STRATEGIES):
+        heights[wide.index("cost")] = _COSTS
+    shares = _SHARES.get(len(squares), (1,))
+    last = [name for name, share in zip(squares, shares, strict=False) for _ in range(share)]
+    stacked = [*([name] * sum(shares) for name in wide), *([last] if last else [])]
+    return stacked, [*heights, *([_SQUARES[len(squares)]] if last else [])], [1.0] * sum(shares)
 
 
 def fit(characters: int) -> int:

@@ -27,7 +27,7 @@ _DEPTHS = LinearSegmentedColormap.from_list(
 )  # from the start to the end
 _RING = 0.9  # mm; radius of the guide along the axis
 _SCALE = (0.1, -0.33, 0.8, 0.035)  # the scale of depths, in shares of the axes
-_SCALE_IN_COLUMN = (0.0, -0.36, 1.0, 0.035)
+_SCALE_IN_COLUMN = (0.0, -0.58, 1.0, 0.035)
 _ROOM = 1.4  # mm around all that is drawn in the view along the axis
 
 
@@ -82,7 +82,7 @@ def set_up_along(ax: Axes, scenario: Scenario, paths: Sequence[Floats]) -> None:
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", anchor="N")
     ax.set(xlabel=scene.lateral_label(scenario, Z), ylabel=scene.lateral_label(scenario, Y))
     ax.set_title("View along the axis")
-    ax.locator_params(nbins=6)
+    ax.locator_params(nbins=4 if is_column() else 6)
     ax.grid(color="#e4e4e4", linewidth=0.6)
     ax.set_axisbelow(True)
     for side in ("top", "right"):
@@ -128,4 +128,4 @@ def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
     up = 1 if target[Y] < y[-1] else -1
     beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": small()}
     beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
-    ax.annotate("guide and its path", (z[-1], y[-1] + up * _RING), **beside)
+    ax.annotate("guide" if is_column() else "guide and its path", (z[-1], y[-1] + up * _RING), **beside)
