@@ -12,6 +12,7 @@ from flexneedle.errors import InputError
 from flexneedle.lab.ros.dds import (
     discovery_settings,
     get_type_hash,
+    join_domain,
     make_idl_type,
     make_user_data,
     to_dds_name,
@@ -98,6 +99,13 @@ def test_an_unknown_value_is_refused_with_the_choices(environment, line):
     with pytest.raises(InputError) as caught:
         discovery_settings(environment)
     assert str(caught.value).startswith(line)
+
+
+@pytest.mark.parametrize("peer", ["nosuch.invalid", "10.0.0.300", "fe80::1", "a..b"])
+def test_a_peer_without_an_address_is_refused_before_dds_aborts_the_process(monkeypatch, peer):
+    monkeypatch.setenv("ROS_STATIC_PEERS", f"127.0.0.1;{peer}")
+    with pytest.raises(InputError, match=f"ROS_STATIC_PEERS: '{peer}': must be a known host"):
+        join_domain()
 
 
 LO = '<NetworkInterface name="lo"/>'

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from socket import AF_INET, getaddrinfo
 from typing import Any, Self
 
 import cyclonedds.idl.types
@@ -180,11 +181,24 @@ def join_domain() -> DomainParticipant:
     given = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not given.isdecimal() or int(given) > _HIGHEST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID = {given!r}: must be a whole number from 0 to {_HIGHEST_DOMAIN}")
+    settings = discovery_settings(os.environ)
+    for peer in _find_range(os.environ)[1]:
+        if f'"{peer}"' in settings:
+            _require_host(peer)
     try:
-        with _cyclone_settings(discovery_settings(os.environ)):
+        with _cyclone_settings(settings):
             return DomainParticipant(int(given))
     except DDSException as error:
         raise RunError(f"ROS 2: no DDS participant in domain {given}: {error.msg or error}") from error
+
+
+def _require_host(peer: str) -> None:
+    """Raise InputError for a peer (HOST or HOST:PORT) without an address: Cyclone DDS would abort the process."""
+    host = peer.partition(":")[0] if peer.count(":") == 1 else peer
+    try:
+        getaddrinfo(host, None, AF_INET)
+    except (OSError, UnicodeError):
+        raise InputError(f"{_PEERS}: {shorten(peer)}: must be a known host or an IPv4 address") from None
 
 
 @contextmanager

@@ -246,16 +246,12 @@ class Supervisor:
             self._handle_lost_motors(str(error))
             return
         if self.state in _UNCHECKED:
-            self._check_rest()
+            moving = any(state.moving for state in axes.states.values())
+            if moving and self._stopping is None and self.state is not SupervisorState.IDLE:
+                self._halt_motors(self.why)  # again, after a stop or a fault
             return
         if problem := axes.first_problem(self._motion, stopping=self._stopping is not None):
             self._enter_fault(problem)
-
-    def _check_rest(self) -> None:
-        """Stop a motor again that moves after a stop or a fault."""
-        moving = any(state.moving for state in self._axes.states.values())
-        if moving and self._stopping is None and self.state is not SupervisorState.IDLE:
-            self._halt_motors(self.why)
 
     def _check_client(self, now: float) -> None:
         silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
