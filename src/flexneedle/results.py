@@ -62,6 +62,7 @@ class Plan:
         limit: Limit that binds if the target is out of reach, else "".
         seconds: Wall-clock time (s) of the search.
         scenario: Scenario of the plan, None if unknown.
+        versions: Versions that made a loaded plan, by package; empty for a new one.
     """
 
     strategy: str
@@ -81,6 +82,7 @@ class Plan:
     limit: str  # which limit binds if the target is out of reach, else ""
     seconds: float = field(default=0.0, compare=False)  # wall clock
     scenario: Scenario | None = None
+    versions: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     @property
     def tip_mm(self) -> Point:
@@ -225,6 +227,7 @@ class Insertion:
     dry_run: bool = False  # the rig did not move: the needle was the virtual phantom's
     disturbed: str = ""  # disturbances by a person, with times: the seed alone does not repeat this insertion
     controller_name: str = ""  # in figures and tables
+    versions: Mapping[str, str] = field(default_factory=dict, compare=False)  # as of a plan
 
     @property
     def target(self) -> Point:

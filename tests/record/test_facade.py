@@ -27,10 +27,10 @@ SHALLOW = {"target.depth_mm": 15.0, "target.lateral_mm": 2.0}
 
 
 def same(one, other):
-    """Compare two records, except for wall-clock times."""
+    """Compare two records, except for wall-clock times and versions."""
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
-        if field.name in ("durations", "seconds"):
+        if field.name in ("durations", "seconds", "versions"):
             continue
         if field.name in ("shape", "true_shape"):  # in a trace lengths are in m, angles are quaternions
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
@@ -214,3 +214,14 @@ def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
     folder = flexneedle.save(INSERTION, tmp_path / "run")
     (folder / TRACE_FILE).unlink()
     assert [path.name for path in draw_run(folder)] == ["plan.png", "plan.svg"]
+
+
+@pytest.mark.parametrize("record", [PLAN, INSERTION], ids=["plan", "insertion"])
+def test_a_loaded_record_keeps_the_versions_that_made_it(tmp_path, record):
+    path = flexneedle.save(record, tmp_path / "old") / "run.json"
+    path.write_text(path.read_text().replace(f'"numpy": "{np.__version__}"', '"numpy": "1.0"'))
+    again = flexneedle.save(flexneedle.load(path.parent), tmp_path / "new")
+    assert json.loads((again / "run.json").read_text())["versions"]["numpy"] == "1.0"
+    if record is INSERTION:
+        assert b"numpy" in (content := (again / TRACE_FILE).read_bytes())
+        assert np.__version__.encode() not in content

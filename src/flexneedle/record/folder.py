@@ -55,6 +55,7 @@ class RunFile:
     dry_run: bool = False
     disturbed: str = ""
     controller_name: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(eq=False)
@@ -73,10 +74,19 @@ class Folder:
     undrawn: list[str] = field(default_factory=list)
 
     @classmethod
-    def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
+    def claim(
+        cls,
+        out: Path | None,
+        name: str,
+        kind: str,
+        scenario: Scenario,
+        seed: int,
+        made_by: Mapping[str, str] | None = None,
+    ) -> "Folder":
         """Create the folder `out`, or one in `runs/` named by date, `name` and seed, with the status "running".
 
-        Raises InputError if the folder already contains a run or a study, or cannot be created.
+        made_by: versions that made a loaded record (default: the present ones). Raises InputError if the folder already
+        contains a run or a study, or cannot be created.
         """
         now = datetime.now(UTC)
         path = _make(create_folder(name, str(seed), now=now) if out is None else out)
@@ -86,7 +96,7 @@ class Folder:
             "status": "running",
             "reason": "",
             "seed": seed,
-            "versions": versions(),
+            "versions": dict(made_by or versions()),
             "scenario": scenario.values(),
             "result": None,
         }
@@ -173,9 +183,12 @@ def _check_run(path: Path, values: Any) -> RunFile:
             name: values.get(name, "")
             for name in ("controller", "controller_name", "phantom", "tracker", "rig", "disturbed")
         }
+        named["versions"] = dict(values["versions"])
         named["dry_run"] = values.get("dry_run", False) is True
         scenario = Scenario.from_values(values["scenario"])
-        plans = {name: _plan(plan, values["scenario"]) for name, plan in read}
+        plans = {
+            name: replace(_plan(plan, values["scenario"]), versions=named["versions"]) for name, plan in read
+        }
         return RunFile(path.parent, scenario=scenario, plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None

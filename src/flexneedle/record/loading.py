@@ -51,7 +51,7 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
     outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if lacking else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))
     ending = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario, run.rig)
-    more = {name: getattr(run, name) for name in ("dry_run", "disturbed", "controller_name")}
+    more = {name: getattr(run, name) for name in ("dry_run", "disturbed", "controller_name", "versions")}
     done = Insertion(plan, run.seed, trace.periods, *ending, **more)
     return done, "; ".join(filter(None, (lacking, trace.note)))
 

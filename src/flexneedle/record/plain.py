@@ -15,7 +15,7 @@ from flexneedle.results import Plan
 from flexneedle.types import COLUMNS
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
-_STORED_ELSEWHERE = ("seconds", "scenario")
+_STORED_ELSEWHERE = ("seconds", "scenario", "versions")
 
 
 def plain(value: Any) -> Any:

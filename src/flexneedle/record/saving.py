@@ -9,7 +9,7 @@ from flexneedle.arguments import check_path
 from flexneedle.control.controllers import with_controller_defaults
 from flexneedle.errors import RecordError, describe_error
 from flexneedle.record.figures import draw_run
-from flexneedle.record.folder import TRACE_FILE, Folder, versions
+from flexneedle.record.folder import TRACE_FILE, Folder
 from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.record.writer import TraceWriter
 from flexneedle.results import Insertion, Plan, scenario_of
@@ -22,17 +22,19 @@ PARTS = ("controller", "controller_name", "phantom", "tracker", "rig", "dry_run"
 def save(record: Plan | Insertion, folder: str | Path) -> Path:
     """Write a plan or an insertion to a folder, as the commands do, and return the folder.
 
-    The folder is created; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder
-    that already contains a run or cannot be created, and for a record without its scenario; RecordError if a file
-    cannot be written.
+    A loaded record keeps the versions that made it. The folder is created; `load`, `flexneedle view` and `flexneedle
+    export` read it. Raises InputError for a folder that already contains a run or cannot be created, and for a record
+    without its scenario; RecordError if a file cannot be written.
     """
     scenario, out = scenario_of(record), check_path("folder", folder)
     if isinstance(record, Plan):
-        claimed = Folder.claim(out, "", "plan", with_controller_defaults(scenario), record.seed)
+        claimed = Folder.claim(
+            out, "", "plan", with_controller_defaults(scenario), record.seed, record.versions
+        )
         keep_plan(claimed, record)
         finish_plans(claimed)
     else:
-        claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
+        claimed = Folder.claim(out, "", "insertion", scenario, record.seed, record.versions)
         parts = {name: getattr(record, name) for name in PARTS}
         claimed.values |= parts
         keep_plan(claimed, record.plan)
@@ -64,7 +66,13 @@ def open_trace(
 ) -> TraceWriter:
     """Return the writer of `trace.mcap`; parts: by the names of `PARTS`."""
     named = {name: str(part) for name, part in parts.items()}
-    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **named, **versions()}
+    about = {
+        "seed": str(seed),
+        "scenario": scenario.name,
+        "strategy": plan.strategy,
+        **named,
+        **folder.values["versions"],
+    }
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
 
 
