@@ -66,8 +66,9 @@ def test_a_width_that_cannot_be_drawn_is_one_line_with_the_rule(text, capsys):
 def test_a_run_is_drawn_again_for_a_column(tmp_path, capsys):
     plan = replace(PLANS[0], scenario=PLANE)
     assert flexneedle.plot(plan, width_mm=88.0).get_figwidth() == pytest.approx(88 / 25.4)
-    with pytest.raises(InputError, match=r"^width_mm = 0: must be from 60 to 600$"):
-        flexneedle.plot(plan, width_mm=0)
+    for wrong in (0, "88mm", None, float("nan")):
+        with pytest.raises(InputError, match=r"^width_mm = .*: must be a number from 60 to 600$"):
+            flexneedle.plot(plan, width_mm=wrong)
     folder = flexneedle.save(plan, tmp_path / "run")
     assert main(["view", str(folder), "--width", "88mm"]) == 0, capsys.readouterr().err
     assert 'width="249.' in (folder / "plan.svg").read_text()[:600]  # points

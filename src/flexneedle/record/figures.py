@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.arguments import NARROWEST_MM, WIDEST_MM, make_refusal
+from flexneedle.arguments import NARROWEST_MM, WIDEST_MM, make_refusal, read_numbers
 from flexneedle.errors import RunError
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
@@ -48,8 +48,8 @@ def plot(record: Plan | Insertion, width_mm: float = 25.4 * WIDTH) -> Figure:
         InputError: Not a plan or insertion, or without a scenario; a width outside 60 to 600 mm.
     """
     scenario = scenario_of(record)
-    if not NARROWEST_MM <= width_mm <= WIDEST_MM:
-        raise make_refusal("width_mm", width_mm, f"must be from {NARROWEST_MM:g} to {WIDEST_MM:g}")
+    if read_numbers([width_mm], 1) is None or not NARROWEST_MM <= width_mm <= WIDEST_MM:
+        raise make_refusal("width_mm", width_mm, f"must be a number from {NARROWEST_MM:g} to {WIDEST_MM:g}")
     with figures_of_width(width_mm / 25.4):
         if isinstance(record, Insertion) and record.periods:
             return insertion_figure(scenario, record)
