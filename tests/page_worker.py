@@ -127,7 +127,7 @@ class Worker:
         self.report(frame(0))
 
     def estimate(self, order):
-        self.report(EstimateMessage(revision=order.revision, error_mm=0.0, reached=True, roll_deg=0.0))
+        self.report(EstimateMessage(revision=order.revision, summary="", error_mm=0.0, roll_deg=0.0))
 
     def plan(self, order):
         if order.seed == CRASHES:

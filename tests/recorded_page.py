@@ -176,7 +176,9 @@ def plan(strategy="manipulation", **changes):
 
 
 def estimate(revision=1, roll_deg=0.0):
-    return EstimateMessage(revision=revision, error_mm=0.31, reached=True, roll_deg=roll_deg)
+    return EstimateMessage(
+        revision=revision, summary="ends 0.310 mm from the target", error_mm=0.31, roll_deg=roll_deg
+    )
 
 
 def row(index):

@@ -20,7 +20,7 @@ from flexneedle.planning.limit import find_limit
 from flexneedle.planning.primitives import Solution, search_primitives, widen_search
 from flexneedle.planning.problem import PlanProblem, make_problem
 from flexneedle.planning.steering import MOST_ROLLS, reach, search_rolls
-from flexneedle.results import Plan
+from flexneedle.results import TARGET_RADIUS_MM, Plan, format_mm
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
@@ -87,7 +87,7 @@ def _report_to(listeners: Sequence[Listener], strategy: str) -> OnIteration:
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """Result of one search, carried out without stops."""
+    """Result of a quick search, carried out without stops."""
 
     tips: Floats  # poses of the tip (m + 1, 5)
     needle: Floats  # nodes of the needle at the end (n, 5)
@@ -97,7 +97,13 @@ class Sketch:
     @property
     def reached(self) -> bool:
         """Whether the sketch ends within 1 mm of the target."""
-        return self.error_mm <= 1.0
+        return self.error_mm <= TARGET_RADIUS_MM
+
+    @property
+    def summary(self) -> str:
+        """One line: distance from its tip to the target. A sketch that misses leaves open whether a plan reaches it."""
+        ends = f"ends {format_mm(self.error_mm)} from the target"
+        return ends if self.reached else f"{ends}; whether a plan reaches it is not known yet"
 
 
 def sketch(
@@ -108,21 +114,30 @@ def sketch(
     threads: int | None = None,
     listeners: Sequence[Listener] = (),
 ) -> Sketch:
-    """Search once for an insertion to the scenario's target, as `plan` does, for a quick preview.
+    """Search for an insertion to the scenario's target, as `plan` does, for a quick preview.
 
-    A target that is missed is not searched again, and neither the states between nor what limits the plan are found.
-    The bevel alone gets at most one roll, which reaches every target that several reach.
+    Neither the states between nor what limits the plan are found. The bevel alone gets at most one roll, which reaches
+    every target that several reach.
     """
-    simulator, goal = Simulator(scenario, threads), scenario.target.position
-    problem = make_problem(scenario, goal, strategy)
+    simulator, rng = Simulator(scenario, threads), np.random.default_rng(seed)
+    problem = make_problem(scenario, scenario.target.position, strategy)
     progress = _report_to(listeners, strategy)
-    found = _search(simulator, problem, np.random.default_rng(seed), progress, _ENOUGH_ROLLS)
-    simulator, _ = _fix_entry(simulator, problem, found, strategy)
-    rows = _end_at_depth(simulator, found.controls, found.roll, goal[0])
-    start = simulator.start(found.roll)
+    solution = _search(simulator, problem, rng, progress, _ENOUGH_ROLLS)
+    found = _make_sketch(simulator, problem, strategy, solution)
+    if found.reached or problem.bevel_alone:
+        return found
+    solution = _search(simulator, widen_search(problem), rng, progress)
+    again = _make_sketch(simulator, problem, strategy, solution)
+    return min(found, again, key=lambda each: each.error_mm)
+
+
+def _make_sketch(simulator: Simulator, problem: PlanProblem, strategy: str, solution: Solution) -> Sketch:
+    simulator, _ = _fix_entry(simulator, problem, solution, strategy)
+    rows = _end_at_depth(simulator, solution.controls, solution.roll, problem.target[0])
+    start = simulator.start(solution.roll)
     end, tips = simulator.replay(start, rows)
-    error = math.dist(end.tip[: Z + 1].tolist(), goal)
-    return Sketch(np.vstack([start.tip, tips]), end.nodes, found.roll, error)
+    error = math.dist(end.tip[: Z + 1].tolist(), problem.target)
+    return Sketch(np.vstack([start.tip, tips]), end.nodes, solution.roll, error)
 
 
 def _choose_better(first: Plan, second: Plan) -> Plan:

@@ -144,12 +144,15 @@ class JobMessage(ServerMessage):
 
 
 class EstimateMessage(ServerMessage):
-    """First estimate of a plan by a few iterations of a small search: final error (mm), roll at the start."""
+    """First estimate of a plan by a few iterations of a small search: final error (mm), roll at the start.
+
+    It has no verdict: a target that it misses can be in reach.
+    """
 
     type: Literal["estimate"] = "estimate"
     revision: int
+    summary: str
     error_mm: float
-    reached: bool
     roll_deg: float
 
 

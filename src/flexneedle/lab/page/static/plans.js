@@ -48,7 +48,7 @@ const activeJobs = (store) => ["plan", "compare", "reach"].map((kind) => store.g
 
 function lines(store) {
   const reach = shownReach(store);
-  const words = reach ? [[`Reach: of targets ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; others were not searched.`, false]] : [];
+  const words = reach ? [[`Reach: found by small searches ${depth(reach.low[0])} to ${depth(reach.low.at(-1))} mm deep; beyond it, only a plan shows whether a target can be reached.`, false]] : [];
   return [...planWords(store), ...words];
 }
 

@@ -56,7 +56,7 @@ def needle(task: WorkerTask) -> None:
 
 
 def estimate(task: WorkerTask) -> None:
-    """Report a first estimate of the plan, by one small search."""
+    """Report a first estimate of the plan, by a small search."""
     order = task.order
     found = sketch(
         with_smaller_search(task.scenario, *_ESTIMATE),
@@ -70,8 +70,8 @@ def estimate(task: WorkerTask) -> None:
     task.report(
         EstimateMessage(
             revision=order.revision,
+            summary=found.summary,
             error_mm=found.error_mm,
-            reached=found.reached,
             roll_deg=math.degrees(found.roll),
         )
     )
