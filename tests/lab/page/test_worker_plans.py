@@ -69,7 +69,7 @@ def aimed(name, target):
 
 
 def check_estimate(scenario, strategy="manipulation"):
-    """Check the words of an estimate; return its error and that of the plan."""
+    """Check the words of an estimate; return its error and the error of the plan."""
     (message,) = done(estimate, task("estimate", scenario=scenario, strategy=strategy)).of("estimate")
     unknown = "; whether a plan reaches it is not known yet" if message.error_mm > 1.0 else ""
     assert re.fullmatch(ENDS + unknown, message.summary)
@@ -85,7 +85,7 @@ def test_an_estimate_comes_near_a_far_target_that_a_plan_reaches_and_denies_none
 
 @pytest.mark.long
 def test_an_estimate_denies_no_target_in_random_worlds():
-    """In nine of ten cases its error is at most 0.5 mm more than that of the plan."""
+    """In nine of ten cases its error is at most 0.5 mm more than the error of the plan."""
     rng, more = np.random.default_rng(39), []
     while len(more) < 60:
         name, rig = f"world:{rng.integers(TRAINING)}", str(rng.choice(RIGS))

@@ -243,6 +243,8 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
             server.send(rig("ready", *MOVES, job=7))
             page.wait_for_selector(f"{RIG} >> text=is prepared; nothing moves")
             assert not page.is_checked("#rig-free")
+    page.wait_for_selector("section.insertion:visible")
+    show(page, "rig")
     server.send(rig("inserting", job=7, begun=True), insertion("running", rig="Bench"))
     page.wait_for_selector("text=It inserts.")
     asked = [(each["type"], each.get("armed"), each.get("job")) for each in server.requests[-4:]]
@@ -262,7 +264,7 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
 
 
 def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_panel, server):
-    page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7))
+    page = rig_panel(insertion("holding", rig="Bench"), rig("ready", *MOVES, job=7), shows=["rig"])
 
     def shows(state, text, checked, why=""):
         server.send(rig(state, "Bench: further", job=7, begun=True, why=why))

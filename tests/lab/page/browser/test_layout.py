@@ -1,5 +1,6 @@
 """Each state and tab of the page at two sizes, light and dark: layout, names of controls, colours."""
 
+import numpy as np
 import pytest
 
 from browser_checks import arrived, painted, show, too_wide
@@ -100,28 +101,38 @@ STATES = {
         rows(0, 3, "first"),
     ],
 }
-TALLEST = 0.4
+TALLEST = 0.33
 """Least share of the screen's height for the scene."""
 
+SIZES = [(1440, 900), (1280, 800), (390, 844)]
 COCKPIT = """() => {
   const { scrollHeight, clientHeight } = document.documentElement;
-  const place = (selector) => document.querySelector(selector).getBoundingClientRect();
-  const [stage, stop, scrub] = [".scene > :not([hidden]) .stage", ".actions .stop", ".player"].map(place);
-  const inside = ({ width, top, left, bottom, right }) =>
-    width > 0 && top >= 0 && left >= 0 && bottom <= innerHeight && right <= innerWidth;
-  const scrolls = [...document.querySelectorAll("*")].filter((one) =>
-    one.clientHeight && one.scrollHeight > one.clientHeight + 1 && /auto|scroll/.test(getComputedStyle(one).overflowY));
+  const found = (selector) => [...document.querySelectorAll(selector)].filter((one) => one.checkVisibility())
+    .map((one) => [one.textContent || one.className, one.getBoundingClientRect()]);
+  const scrolls = (one) => one.checkVisibility() && one.clientHeight && one.scrollHeight > one.clientHeight + 1 &&
+    /auto|scroll/.test(getComputedStyle(one).overflowY);
+  const [[, stage]] = found(".scene > .space .stage, .scene > .section .stage");
+  const [[, stop]] = found(".actions .stop");
+  const beside = found(".player, .actions button, .actions .words, [role=tablist], [role=tabpanel]");
+  const parts = [["stage", stage], ...beside, ...found(".top, .scene .switch, .scene [role=toolbar], footer")];
+  const outside = ([, { width, top, left, bottom, right }]) =>
+    !width || Math.min(top, left, innerHeight - bottom, innerWidth - right) < 0;
+  const apart = (a, b) => Math.max(a.left - b.right, b.left - a.right, a.top - b.bottom, b.top - a.bottom);
+  const pairs = parts.flatMap((one, at) => parts.slice(at + 1).map((other) => [one, other]));
   return {
-    page: scrollHeight - clientHeight, scene: stage.height / innerHeight,
-    seen: [stage, stop, scrub].every(inside), scrolls: scrolls.length,
+    stop: [innerWidth - stop.right, stop.top], scene: stage.height / innerHeight,
+    outside: parts.filter(outside).map(([name]) => name),
+    overlaps: pairs.filter(([[, a], [, b]]) => apart(a, b) < -1).map(([[a], [b]]) => [a, b]),
+    scrolls: scrollHeight - clientHeight + [...document.querySelectorAll("*")].filter((one) => scrolls(one)).length,
   };
 }"""
+"""Rectangles of the parts that are always in view; the tabs are in the part beside the scene."""
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844)])
+@pytest.mark.parametrize("size", SIZES)
 def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictures, size, scheme):
-    """Nothing but the shown tab scrolls; controls have names; both schemes have their colours."""
+    """Nothing but the shown tab scrolls, nothing overlaps; controls have names; both schemes have their colours."""
     server.answers["study"] = study_rows
     server.news = [*planned(), REACH, whole_session(), RunsMessage(runs=[MANY])]
     page = visit(width=size[0], height=size[1], scheme=scheme, ready="[data-panel=form] details")
@@ -129,6 +140,7 @@ def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictur
     page.click("[aria-label='Rows of many']")
     page.wait_for_selector("text=Row 17")
     page.evaluate("document.querySelectorAll('.runs details').forEach((one) => { one.open = true; })")
+    stops = []
     for number, (state, news) in enumerate(STATES.items()):
         server.send(*news())
         arrived(page)
@@ -137,16 +149,18 @@ def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictur
             show(page, tab)
             painted(page)
             found = page.evaluate(COCKPIT)
-            assert (found["page"], found["seen"], found["scrolls"] <= 1) == (0, True, True), (
+            assert (found["outside"], found["overlaps"], found["scrolls"] <= 1) == ([], [], True), (
                 state,
                 tab,
                 found,
             )
             assert found["scene"] >= TALLEST, (state, tab)
+            stops.append(found["stop"])
             assert too_wide(page) == [], (state, tab)
         show(page, VIEWS_AND_TABS[number][1])
         check_names(page)
         pictures(page, f"{state}-{size[0]}-{scheme}")
+    assert np.ptp(stops, axis=0).max() <= 5.0  # its ring in the colour of danger
     before = page.evaluate(GROUND)
     page.click("#theme")
     assert page.evaluate(GROUND) != before

@@ -3,6 +3,7 @@
 import os
 import re
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -234,9 +235,9 @@ PLACE = "return view.camera.camera.position.toArray()"
 DISTANCE = "return view.camera.camera.position.distanceTo(view.camera.controls.target)"
 
 
-def drag_target(page, pixels):
-    """Drag the middle of the target's arrows to the right, in steps of one pixel."""
-    page.click("text=x–y")
+def drag_target(page, pixels, view="x–y", up=0):
+    """Drag the middle of the target's arrows to the right and upwards, in steps of one pixel."""
+    page.locator(SPACE).get_by_role("button", name=view, exact=True).click()
     painted(page)
     x, y = on_view(
         page,
@@ -248,7 +249,7 @@ def drag_target(page, pixels):
     )
     page.mouse.move(x, y)
     page.mouse.down()
-    page.mouse.move(x + pixels, y, steps=pixels)
+    page.mouse.move(x + pixels, y - up, steps=pixels)
     page.mouse.up()
 
 
@@ -289,6 +290,31 @@ def test_keys_pointer_and_wheel_move_the_camera_and_dragging_the_target_edits_th
     assert page.evaluate("flexneedle.store.get('scene').target[0]") == edits[-1]["target.depth_mm"]
     assert on_view(page, "return view.target.ball.position.x") == edits[-1]["target.depth_mm"]
     assert len(server.wait_for("rest")) == 1
+
+
+FAR = [(40.0, 5.0, 3.0), (6.0, -9.0, 8.0), (58.0, 12.0, -10.0)]
+
+
+@pytest.mark.parametrize(
+    ("axes", "view", "moved"), [(2, "x–y", (0, 1)), (2, "x–z", (0, 2)), (1, "x–y", (0, 1))]
+)
+def test_a_target_is_dragged_in_the_plane_of_the_view_wherever_it_is(space, server, axes, view, moved):
+    """An arrow towards the viewer covers the middle: it is not picked."""
+    page = space([*opening(), scene(axes=axes)])
+    until(page, f"flexneedle.store.get('scene')?.axes === {axes} && flexneedle.store.get('clients')")
+    for (width, height), place in product(SIZES.values(), FAR):
+        page.set_viewport_size({"width": width, "height": height})
+        target = (*place[:2], place[2] if axes == 2 else 0.0)
+        revision = page.evaluate("flexneedle.store.get('session').revision") + 1
+        server.send(session(revision, target), scene(revision, target, axes=axes))
+        arrived(page)
+        drag_target(page, 12, view, up=12)
+        until(page, "!flexneedle.store.get('draft')")
+        values = server.asked("edit")[-1]["values"]
+        keys = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
+        change = np.abs([values.get(key, 0.0) - before for key, before in zip(keys, target, strict=True)])
+        assert min(change[list(moved)]) > 0.2, (width, target, values)
+        assert np.delete(change, moved) == pytest.approx(0.0, abs=0.02), (width, target, values)
 
 
 def test_the_strip_of_the_reach_is_shown_while_the_target_is_in_its_plane(space, server):

@@ -74,7 +74,7 @@ function rigSteps(store, shows) {
     step("Prepare", "Plan, open the rig, and measure the tip; nothing moves", () => ({ type: "prepare" })),
     step("Retract", "Read the position and show the motion that withdraws the needle along its path; nothing moves", () => ({ type: "retract" })),
     step("Arm", "For one start, once the motions are confirmed in the tab of the rig", arm),
-    step("Insert on the rig", "Motors are switched on, and the needle moves", () => ({ type: "go" })),
+    button("Insert on the rig", () => shows(retracts(store) ? "rig" : "insertion", () => ({ type: "go" }))(), { "data-step": "insert on the rig", title: "Motors are switched on, and the needle moves" }),
   ];
 }
 

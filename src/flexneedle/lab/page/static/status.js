@@ -1,6 +1,7 @@
 // The bar at the bottom: connection, who is connected and in control, work with progress and cancel, refusals in words.
 
 import { button, make, renew } from "./dom.js";
+import { waits } from "./rig.js";
 import { isPrepared } from "./shown.js";
 
 const CONNECTIONS = {
@@ -113,7 +114,9 @@ function followJobs(element, store, link) {
   function update(entry, job) {
     const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
-    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: prepared, nothing moves`;
+    const rig = store.get("rig");
+    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: ${rig.state === "preparing" ? "being prepared" : "prepared"}, nothing moves`;
+    else if (kind === "insertion" && rig?.begun && waits(rig)) entry.words = `Insertion: held, ${job.text}`;
     else entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     entry.counts = !failed && (job.share ?? null) === null;
     tell(entry);
@@ -126,7 +129,7 @@ function followJobs(element, store, link) {
   // Without a share, the time since its beginning: it shows that slow work continues.
   function tell({ words, counts, text, begun }) {
     const seconds = Math.floor((performance.now() - begun) / 1000);
-    text.textContent = counts && seconds >= LONG ? `${words} (${seconds} s)` : words;
+    text.textContent = text.title = counts && seconds >= LONG ? `${words} (${seconds} s)` : words;
   }
   function remove(kind) {
     const { timer, clock, element: shown } = entries.get(kind);

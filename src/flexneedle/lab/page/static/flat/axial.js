@@ -7,6 +7,7 @@ import { area, cross, disc, grid, inside, pointsOf, polyline } from "./pen.js";
 import { reachAt } from "./reach.js";
 
 const READINGS = 40; // measured positions, as crosses; other points are discs
+const NARROW = 120; // px, without room for the unit
 const BEVEL = 26; // px, length of the arrow
 
 // Ends of the reach at the target's depth [[x, y, z], …], none unless it is shown.
@@ -19,7 +20,7 @@ export function endsOf(store, target) {
 export function drawAxial(pen, { width, height, map, scene, target, others, parts, ends, store }) {
   const place = (_x, y, z) => [map.toX(z), map.toY(y)];
   const [of, row] = [shownOf(store), shownRow(store)];
-  grid(pen, map, width, height, ["z (mm)", "y (mm)"]);
+  grid(pen, map, width, height, width < NARROW ? ["z", "y"] : ["z (mm)", "y (mm)"]);
   let reached = false;
   inside(pen, width, height, () => {
     reached = reach(pen, place, ends);

@@ -58,7 +58,7 @@ export function followDecisions(element, store) {
 
 function textOf({ decision, verdict, warning, late, decide_ms: decided }) {
   const parts = [decision];
-  if (verdict && verdict !== "ok") parts.push(`measurement ${verdict}`);
+  if (verdict && verdict !== "ok" && !decision.includes(verdict)) parts.push(`measurement ${verdict}`);
   if (late) parts.push(`decided late, after ${shown(decided, 0)} ms`);
   if (warning) parts.push(warning);
   return parts.join("; ");

@@ -8,7 +8,7 @@ const NO_FIELD = "The tracker of this scenario has no field that metal distorts.
 export function disturbForm(store, link) {
   const active = make("p.quiet", { role: "status" });
   const number = (label, value, more = {}) => make("input", { type: "number", min: "0", max: "10000", step: "any", required: true, value: String(value), "aria-label": label, ...more });
-  const [force, angle] = [number("Force on the tip in N", 0.02), number("Direction of the force in degrees", 0, { min: "-360", max: "360" })];
+  const [force, angle] = [number("Force on the tip in N", 0.02), number("Direction of the force in degrees", 0, { min: "-360", max: "360", title: "From y to z" })];
   const [layer, factor] = [make("select", { "aria-label": "Layer" }), number("Factor on its stiffness", 2)];
   const seconds = number("Seconds without the tracker", 1);
   const disturb = (what, size, more = {}) => {
@@ -25,10 +25,10 @@ export function disturbForm(store, link) {
 
   const form = make(
     "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb the insertion"),
-    line("Push the tip", force, "N at", angle, "° from y to z", button("Push", () => angle.reportValidity() && disturb("push", force, { angle_deg: angle.valueAsNumber })), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
-    line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
-    line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
-    line("Metal plate at", plate[0], "mm from the center of the tracker's workspace", plate[1], plate[2], why),
+    line("Push the tip", pair(force, "N"), pair("at", angle, "°"), button("Push", () => angle.reportValidity() && disturb("push", force, { angle_deg: angle.valueAsNumber })), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
+    line(layer, pair("×", factor), button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
+    line("Drop the tracker for", pair(seconds, "s"), button("Drop", () => disturb("drop", seconds))),
+    line("Metal plate at", pair(plate[0], "mm"), make("span.quiet", {}, "from the center of the tracker's workspace"), plate[1], plate[2], why),
     active,
   );
   store.subscribe(["disturbances"], () => {
@@ -45,6 +45,7 @@ export function disturbForm(store, link) {
 }
 
 const line = (...parts) => make("div.tools", {}, ...parts);
+const pair = (...parts) => make("span.pair", {}, ...parts); // not broken
 
 const hasField = (session) => Object.keys(session?.values ?? {}).some((key) => key.startsWith("tracker.environment."));
 

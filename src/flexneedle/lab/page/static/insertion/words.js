@@ -7,7 +7,8 @@ const STATES = {
   holding: "Holding", done: "Ended", held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
 };
 
-const COUNTED = ["paused", "holding", "done", "held", "failed", "interrupted"]; // else the player counts the periods
+const TOLD = /^(held|interrupted) /; // summaries that begin with the outcome
+const COUNTED = ["paused", "done", "held", "failed", "interrupted"]; // else the player counts the periods
 
 // insertion: the message of that type; rows: of its periods; rig: its state, if it is connected.
 export function inWords(insertion, rows = [], rig = null) {
@@ -15,11 +16,15 @@ export function inWords(insertion, rows = [], rig = null) {
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
   const state = insertion.rig && insertion.state === "ready" && rig?.state === "starting" ? "Starting" : STATES[insertion.state] ?? insertion.state;
   const to = insertion.target_name ? ` to ${insertion.target_name}` : "";
-  const parts = [`${state}${where}${to}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
+  const told = TOLD.test(insertion.summary);
+  const parts = told ? [] : [`${state}${where}${to}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
   if (state === "Prepared") parts.push("Nothing moves.");
-  if (insertion.summary) parts.push(insertion.summary);
+  if (insertion.summary) parts.push(sentence(insertion.summary));
   else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason in the decisions.");
   else if ((insertion.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(insertion.error_mm, 3)} mm from the target.`);
+  if (told) parts.push(`With ${insertion.controller}, seed ${insertion.seed}${where}${to}.`);
   if (insertion.folder) parts.push(`Recorded as ${insertion.folder}.`);
   return parts.join(" ");
 }
+
+const sentence = (text) => text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".");

@@ -94,6 +94,7 @@ export class SpaceView {
   #render() {
     cancelAnimationFrame(this.#frame);
     this.#frame = 0;
+    this.target.hideArrows();
     this.renderer.render(this.scene, this.camera.camera);
   }
 }
