@@ -63,6 +63,9 @@ def test_a_virtual_insertion_is_started_paused_paced_stepped_and_stopped(panel, 
     server.send(insertion("done", periods=3, pace=0.0, error_mm=0.0161))
     page.wait_for_selector("text=The tip ended 0.016 mm from the target.")
     until(page, f"{FOCUSED} === 'Insert'")
+    server.send(insertion("held", periods=9, summary="held 3.1 mm deep after 9 periods: no reading"))
+    whole = "Held 3.1 mm deep after 9 periods: no reading. With adaptive-mpc, seed 0."
+    page.wait_for_selector(f"{BAR} .words:text-is('{whole}')")
     server.send(clients(2, steering=2), insertion("running"))
     page.wait_for_selector(f"{BAR} button:text-is('Pause'):disabled")
     click(page, "Stop")  # which anybody may
@@ -145,6 +148,8 @@ def test_an_insertion_is_disturbed_and_its_decisions_are_listed_where_their_word
     page.wait_for_selector(f"{BAR} >> text=The needle is held, for the reason in the decisions.")
     server.send(rows(5, 1))
     until(page, f"!document.querySelector('{BAR} [role=status]').textContent.includes('held')")
+    server.send(some_rows(6, {"decision": "held: measurement missing", "verdict": "missing"}), rows(7, 1))
+    page.wait_for_selector(".decisions li span:text-is('held: measurement missing')")
     page.click(".decisions li:last-child button")
     until(page, "flexneedle.store.get('view period') === 0")
     page.wait_for_selector(f".decisions .now >> text=Period 1, 0.0 s: {SAID[0]}")
@@ -279,6 +284,9 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
         "nobody is in control",
     )
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
+    job = JobMessage(job=7, kind="insertion", state="running", share=0.5, text="tip at 3.1 mm")
+    server.send(insertion("holding", rig="Bench"), job)
+    page.wait_for_selector("footer >> text=Insertion: held, tip at 3.1 mm")
     page.check("#rig-free")
     shows("armed", "It is armed for one start", True)
     shows("holding", "not started within 60 s", False, "not started within 60 s: arm it again")
