@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from browser_checks import painted
+from browser_checks import painted, show
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRowsMessage
@@ -216,13 +216,18 @@ def saved(tmp_path):
     return download
 
 
-def test_pictures_are_of_the_scene_in_space_or_of_the_section(files, server, saved):
+def test_pictures_are_of_the_shown_view(files, server, saved):
     page = files(draws=True)
     page.wait_for_selector("[data-panel=space] .legend li")
     picture = imread(BytesIO(saved(page)))
-    size = page.eval_on_selector("[data-panel=space] canvas", "({ width, height }) => [height, width]")
-    assert list(picture.shape[:2]) == size
+    size = "({ width, height }) => [height, width]"
+    assert list(picture.shape[:2]) == page.eval_on_selector("[data-panel=space] canvas", size)
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+    show(page, "section")
+    page.set_viewport_size({"width": 1180, "height": 700})
+    painted(page)
+    picture = imread(BytesIO(saved(page)))
+    assert list(picture.shape[:2]) == page.eval_on_selector(f"{SECTION} canvas", size)
     page = files(width=390, before=NO_WEBGL)
     assert "no WebGL" in page.inner_text(".scene > [role=note]")
     page.wait_for_selector(f"{SECTION}:visible")

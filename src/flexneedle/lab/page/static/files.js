@@ -18,7 +18,7 @@ export function mount(element, store, link) {
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
   const status = make("span.quiet", { role: "status" });
-  const picture = button("Picture", savePicture, { title: "The scene as PNG: in space, or in section where WebGL is missing" });
+  const picture = button("Picture", () => savePicture(store), { title: "The shown view of the scene as PNG" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
   element.append(steered, make("div.tools", {}, save, picture, status), runs);

@@ -25,10 +25,11 @@ export async function fetched(address, name, what, status) {
   }
 }
 
-// Save the scene in space, or the section without WebGL, as a PNG on the ground of its stage.
-export async function savePicture() {
+// Save the shown view of the scene as a PNG on the ground of its stage.
+export async function savePicture(store) {
   const [{ spaceView }, { sectionView }] = await Promise.all([import("../space.js"), import("../section.js")]);
-  const canvas = (spaceView() ?? sectionView()).drawn(); // explicitly: a view off the screen is not drawn
+  const view = store.get("view scene") === "section" ? sectionView() : spaceView();
+  const canvas = view.drawn(); // explicitly: WebGL keeps no picture
   const picture = make("canvas", { width: canvas.width, height: canvas.height });
   const pen = picture.getContext("2d");
   pen.fillStyle = getComputedStyle(canvas.parentElement).backgroundColor;

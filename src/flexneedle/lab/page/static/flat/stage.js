@@ -1,12 +1,10 @@
-// A sharp drawing in two dimensions that fills its element, drawn only when it has changed and is on the screen, or for a
-// picture.
+// A sharp drawing in two dimensions that fills its element, drawn only when it has changed; hidden, it has no size.
 
 const SHARPEST = 2; // device pixels to a pixel of the page
 
 export class Stage {
   #draw;
   #frame = 0;
-  #onScreen = true;
   width = 0;
   height = 0;
 
@@ -15,15 +13,10 @@ export class Stage {
     [this.canvas, this.#draw] = [canvas, draw];
     this.pen = canvas.getContext("2d");
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
-    new IntersectionObserver(([{ isIntersecting }]) => {
-      this.#onScreen = isIntersecting;
-      if (isIntersecting) this.schedule();
-    }).observe(canvas);
   }
 
   // Draw before the next paint.
   schedule() {
-    if (!this.#onScreen) return;
     this.#frame ||= requestAnimationFrame(() => {
       this.#frame = 0;
       this.draw();
@@ -38,7 +31,7 @@ export class Stage {
     this.#draw(this.pen, this);
   }
 
-  // The canvas in its present state, also off the screen.
+  // The canvas in its present state.
   drawn() {
     this.draw();
     return this.canvas;
