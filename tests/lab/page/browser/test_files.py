@@ -227,7 +227,7 @@ def test_pictures_are_of_the_shown_view(files, server, saved):
     page.set_viewport_size({"width": 1180, "height": 700})
     painted(page)
     picture = imread(BytesIO(saved(page)))
-    assert list(picture.shape[:2]) == page.eval_on_selector(f"{SECTION} canvas", size)
+    assert list(picture.shape[:2]) == page.eval_on_selector(SECTION, size)
     page = files(width=390, before=NO_WEBGL)
     assert "no WebGL" in page.inner_text(".scene > [role=note]")
     page.wait_for_selector(f"{SECTION}:visible")
