@@ -153,3 +153,10 @@ def test_a_motion_is_described_in_one_line_with_its_uncertainty():
     )
     assert "uncertain by 0.45 deg" in turn
     assert guide == "guide_y: at 0 mm, moves at most at 5 mm/s"
+
+
+@pytest.mark.parametrize(("to", "what"), [(True, "position"), (False, "distance")])
+@pytest.mark.parametrize("text", ["0deg", "nan", "1,5mm", ""])
+def test_a_wrong_text_is_named_as_what_it_is(text, to, what):
+    with pytest.raises(InputError, match=f"^{what} '{text}': (must be a number|the unit of insertion is mm)"):
+        plan_jog(RIG, "insertion", text, 0.0, to=to)

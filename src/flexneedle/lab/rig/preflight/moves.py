@@ -126,14 +126,14 @@ def find_axis(rig: RigFile, name: str) -> Axis:
     return axes[name]
 
 
-def parse_distance(text: str, name: str, axis: Axis) -> float:
-    """Return the distance (mm or rad) of a text such as "5", "-2.5mm" or "90deg". Raises InputError."""
+def parse_distance(text: str, name: str, axis: Axis, what: str = "distance") -> float:
+    """Return the distance (mm or rad) of a text such as "5", "-2.5mm" or "90deg". Raises InputError, for `what`."""
     found = _DISTANCE.fullmatch(text.strip())
     units = (axis.unit, "°") if axis.unit == "deg" else (axis.unit,)
     if found is None or not isfinite(float(found[1])):
-        raise InputError(f"distance {text_of(text)}: must be a number, such as 5 or -5{axis.unit}")
+        raise InputError(f"{what} {text_of(text)}: must be a number, such as 5 or -5{axis.unit}")
     if found[2] not in ("", *units):
-        raise InputError(f"distance {text_of(text)}: the unit of {name} is {axis.unit}")
+        raise InputError(f"{what} {text_of(text)}: the unit of {name} is {axis.unit}")
     return float(found[1]) * axis.size
 
 
@@ -146,7 +146,7 @@ def plan_jog(
     InputError for another axis or unit, no distance, a goal beyond the soft limits, a speed above the axis's.
     """
     axis = find_axis(rig, name)
-    given = parse_distance(text, name, axis)
+    given = parse_distance(text, name, axis, "position" if to else "distance")
     move = _check_move(
         AxisMove(name, axis, position, given if to else position + given, _parse_speed(name, axis, speed))
     )
