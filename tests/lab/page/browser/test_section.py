@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from browser_checks import painted
+from browser_checks import arrived, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import RowsMessage
 from flexneedle.lab.page.shape_frames import FrameSource
@@ -28,6 +28,8 @@ from recorded_page import (
 pytestmark = pytest.mark.page
 
 SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
+
+SIZES = [(1440, 900), (1280, 800), (390, 844)]
 
 
 @pytest.fixture
@@ -170,6 +172,24 @@ def test_the_section_is_to_scale_and_its_labels_have_room(views, server):
     for one, other in itertools.combinations(words, 2):
         if one["y"] == other["y"]:
             assert abs(one["x"] - other["x"]) >= 3 * (len(one["text"]) + len(other["text"]))
+
+
+def test_the_view_along_the_axis_covers_no_target(views, server):
+    page = views()
+    apart = """() => {
+      const place = (one) => document.querySelector(one).getBoundingClientRect();
+      const [a, b] = [place(".section .handle.point"), place(".axial .stage")];
+      return Math.max(a.left - b.right, b.left - a.right, a.top - b.bottom, b.top - a.bottom);
+    }"""
+    for (width, height), target in itertools.product(
+        SIZES, [(58.0, 12.0, 0.0), (58.0, -12.0, 0.0), (40.0, 5.0, 0.0)]
+    ):
+        page.set_viewport_size({"width": width, "height": height})
+        revision = page.evaluate("flexneedle.store.get('session').revision") + 1
+        server.send(session(revision, target), scene(revision, target))
+        arrived(page)
+        painted(page)
+        assert page.evaluate(apart) > 0.0, (width, target)
 
 
 def test_keys_move_target_and_guide_in_the_planes_of_the_views(views, server):

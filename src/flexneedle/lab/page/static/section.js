@@ -79,7 +79,10 @@ class SectionView {
     const plane = this.#handles.dragged ? this.#frozen : planeOf(this.plane, scene, target);
     const others = otherTargets(this.#store);
     const outline = outlineOf(plane, this.#store);
-    if (!this.#handles.dragged) [this.#frozen, this.#box] = [plane, around(boxOf(scene, target, others), outline)];
+    if (!this.#handles.dragged) {
+      [this.#frozen, this.#box] = [plane, around(boxOf(scene, target, others), outline)];
+      this.#stage.canvas.closest(".section").dataset.target = lateral(plane, ...target) > 0 ? "above" : "below"; // the axis
+    }
     const map = mappingOf(this.#box, width, height, this.#stretch);
     const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
     const parts = partsOf(this.#store, scene);
