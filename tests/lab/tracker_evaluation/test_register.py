@@ -77,11 +77,13 @@ def test_ndis_code_is_a_missing_reading_and_zeros_are_noted(tmp_path):
     first, *others = rows()
     found = register(read_pairs(table(tmp_path, [(*first[:4], *[-3.697314e28] * 3, "ref1"), *others])))
     assert (found.pairs.missing, len(found.pairs.names), found.fre < 1e-9) == (1, 7, True)
-    zeros = [(*row[:4], 0, 0, 0, "ref1") for row in rows()[:1]]
-    found = read_pairs(table(tmp_path, [*rows(), *zeros]))
-    assert (found.coded, found.codes) == (1, (0.0,))
-    with pytest.raises(InputError, match="the fit has a residual of"):
-        register(found)
+    for code, problem in ((0, "the fit has a residual of"), (9999, "both must be in mm")):
+        coded = [(*row[:4], code, code, code, "ref1") for row in rows()[:1]]
+        found = read_pairs(table(tmp_path, [*rows(), *coded]))
+        assert (found.coded, found.codes) == (1, (code,))
+        position = rf"\({code}, {code}, {code}\)"
+        with pytest.raises(InputError, match=rf"^1 of \d+ positions are exactly {position}.*; .*{problem}"):
+            register(found)
 
 
 def test_points_in_a_plane_get_a_note_and_a_mirrored_plate_is_refused(tmp_path, capsys):

@@ -135,18 +135,21 @@ def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationRe
     Raises InputError for pairs that no rigid transform can map.
     """
     rigid = fit_rigid(pairs.tracker, pairs.stage)
-    check_pairs(pairs.tracker, pairs.stage, pairs.names)
+    codes = note_codes(pairs.coded, int(pairs.samples.sum()), pairs.codes)
+    try:
+        check_pairs(pairs.tracker, pairs.stage, pairs.names)
+    except InputError as error:
+        raise InputError("; ".join(filter(None, (codes, str(error))))) from None
     residuals = np.linalg.norm(rigid.apply(pairs.tracker) - pairs.stage, axis=1)
     fre = fiducial_error(rigid, pairs.tracker, pairs.stage)
     fle = localisation_error(fre, len(pairs.names))
     points = np.array(targets, dtype=float) if targets else pairs.stage.mean(axis=0, keepdims=True)
     tre = target_error(pairs.stage, fle, points)
-    notes = tuple(note for note in _find_notes(pairs, points) if note is not None)
+    notes = tuple(note for note in (codes, *_find_notes(pairs, points)) if note is not None)
     return RegistrationResult(pairs, rigid, residuals, _leave_one_out(pairs), fre, fle, points, tre, notes)
 
 
 def _find_notes(pairs: PointPairs, targets: Floats) -> Iterator[str | None]:
-    yield note_codes(pairs.coded, int(pairs.samples.sum()), pairs.codes)
     yield unknown_side(pairs.tracker, pairs.stage, targets)
     yield find_better_fit(pairs.tracker, pairs.stage, pairs.names)
 
