@@ -111,6 +111,15 @@ def test_a_motor_that_does_not_drive_its_axis_and_a_tilted_frame_are_problems():
     )
 
 
+@pytest.mark.parametrize("sd", [0.0, 0.04])
+def test_a_tip_that_moves_with_no_axis_is_a_problem_of_the_tracker(sd):
+    """A tracker that repeats its values, or a sensor beside the needle."""
+    loose = dict.fromkeys(("insertion", "guide_y", "guide_z"), 0.0)
+    _, problems, found = outcome_of(AirRig(RIG, loose, sd=sd))
+    assert set(problems) == {("tracker", "sensor tip")}
+    assert len(found) == 1
+
+
 def test_late_readings_are_a_problem():
     motions, problems, _ = outcome_of(AirRig(RIG, delay=0.3))
     assert motions["insertion"].delay[0] == pytest.approx(0.3, abs=0.01)

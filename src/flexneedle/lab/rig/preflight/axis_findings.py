@@ -14,7 +14,7 @@ from flexneedle.lab.rig.preflight.axis_test import MOST_SCALE, SCALE_SD, AxisRun
 from flexneedle.lab.rig.preflight.rig_check import Finding, UncheckedFinding
 from flexneedle.lab.rig.rig_axes import Axis
 from flexneedle.lab.rig.rig_file import RigFile
-from flexneedle.types import Floats
+from flexneedle.types import TIP, Floats
 
 _SDS = 4.0  # standard deviations beyond which a difference is certain
 MOST_TILT = math.radians(10.0)
@@ -218,6 +218,10 @@ def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> tuple[fl
 def describe_motions(rig: RigFile, motions: Mapping[str, Motion], most_delay: float) -> list[Finding]:
     """Return the findings of all axes; most_delay: age (s) from which readings are stale."""
     axes = dict(rig.axes.items())
+    linear = [one.moved for name, one in motions.items() if axes[name].unit == "mm"]
+    if len(linear) > 1 and not any(linear):
+        rule = "check that its readings change (flexneedle em watch) and that it is in the needle"
+        return [Finding("tracker", f"sensor {TIP}", f"does not move with any of {', '.join(motions)}", rule)]
     return [
         finding
         for name, motion in motions.items()
