@@ -122,7 +122,7 @@ def without_a_position():
         ("shape", shape(5.0, []), "0 poses: must be 1 to 10000"),
         ("shape", shape(5.0, [(0.0, 0.0, 0.0)] * (MOST_POSES + 1)), "10001 poses"),
         ("joint_states", joints(5.0, {}), "0 joints"),
-        ("joint_states", with_twice_the_name(), "2 joints: must be 1 to 64, each once"),
+        ("joint_states", with_twice_the_name(), "2 joints: must be 1 to 1000, each once"),
         ("joint_states", without_a_position(), "2 names, 1 positions: must be as many"),
         ("tip", b"\x00" * (LARGEST_BYTES + 1), "1000001 bytes"),
         ("tip", cdr(tip(5.0))[:-1], "not a geometry_msgs/msg/PoseStamped: "),
