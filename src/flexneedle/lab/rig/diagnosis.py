@@ -1,8 +1,8 @@
 """Diagnosis of an insertion: does its record fit a wrong scale, direction or channel in the rig file?
 
 The tip is predicted for the commanded travel, and for the travel that the motors would have made with each fault. A
-fault is named if the right rig file does not fit the readings to their noise, and the fault fits far better. The start
-of the needle, the registration, the bevel and the stiffness of the tissue are unknown, each with its prior.
+fault is named if it fits the readings far better than the right rig file. The start of the needle, the registration,
+the bevel and the stiffness of the tissue are unknown, each with its prior.
 """
 
 import math
@@ -21,8 +21,8 @@ from flexneedle.types import Control, Floats, VerdictKind, X, Z
 
 _RATIO = 30.0  # least logarithm of the likelihood ratio
 # An error of the model is in many readings, and any scale fits a part of it. Least ratios of the misfits without and
-# with the fault: if the fault fits the readings to the noise, and if not.
-_GAIN, _ROUGH_GAIN = 1.5, 10.0
+# with the fault: if only the fault fits the readings to their noise, and otherwise.
+_GAIN, _ROUGH_GAIN = 1.5, 3.5
 _MISFIT = 5.0  # largest mean square of a residual over its variance, with the fault
 _TIMING = 0.2  # of a step: standard deviation of the part that is done at a reading in motion
 _MODEL = 0.1  # of the deflection in tissue: error of the model besides its parameters
@@ -87,8 +87,8 @@ def find_fault(rig: RigFile, scenario: Scenario, insertion: Insertion) -> Fault 
     text, changes = hypotheses[misfits.index(best)]
     ratio = 0.5 * (null - best)
     noise = float(record.tips.size)
-    least = max(noise, (_GAIN if best <= noise else _ROUGH_GAIN) * best)
-    if ratio < _RATIO or null < least or best > _MISFIT * noise:
+    least = _GAIN if best <= noise < null else _ROUGH_GAIN
+    if ratio < _RATIO or null < least * best or best > _MISFIT * noise:
         return None
     return Fault(tuple(name for name in changes if name != _ROLL), text, ratio)
 
