@@ -121,7 +121,7 @@ def _draw_disturbance(browser: Browser, folder: Path) -> None:
     with _served("phantom") as address, _visited(browser, address, 1440, 1200, "light") as page:
         _press(page, "actions", "Start paused")
         _await(page, "flexneedle.store.get('insertion live')?.state === 'paused'")
-        page.locator("[aria-label=Pace]").select_option("1")  # a slow computer does not end it before the pause
+        page.locator("[aria-label=Pace]").select_option("1")  # so slow that it can be paused
         _press(page, "actions", "Continue")
         _await(page, "flexneedle.store.get('rows live')?.length > 30")
         _press(page, "actions", "Pause")
