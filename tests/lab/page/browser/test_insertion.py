@@ -342,3 +342,17 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     server.send(rig("idle", why="the needle was withdrawn to 2.4 mm", motion="retraction"))
     page.wait_for_selector(f"{BAR} >> text=Bench is not in use: the needle was withdrawn to 2.4 mm.")
     assert not hint.is_visible()
+
+
+@pytest.mark.parametrize("state", ["stopped", "fault", "ended"])
+def test_a_rig_that_stands_is_called_stopped_while_its_record_is_written(panel, server, state):
+    """Stop remains, but no longer in the colour of danger, which would say that something moves."""
+    server.news = [WELCOME.model_copy(update={"rig": "Bench"}), clients(), session()]
+    page = panel()
+    server.send(
+        insertion("running", rig="Bench"), RigStateMessage(name="Bench", state="inserting", job=7, begun=True)
+    )
+    page.wait_for_selector(f"{BAR} .stop.danger")
+    server.send(RigStateMessage(name="Bench", state=state, job=7, begun=True))
+    page.wait_for_selector(f"{BAR} >> text=Stopped on Bench")
+    page.wait_for_selector(f"{BAR} .stop:not(.danger)")

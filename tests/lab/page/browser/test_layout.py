@@ -169,6 +169,24 @@ def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictur
     assert page.evaluate(GROUND) != before
 
 
+REFUSED = """flexneedle.store.set("refusals",
+  [1, 2].map((number) => ({ number, problems: {}, reason: "an insertion runs ".repeat(9) })))"""
+COVERED = """() => {
+  const { left, right, top, bottom } = document.querySelector(".actions .stop").getBoundingClientRect();
+  const at = [top + 2, (top + bottom) / 2, bottom - 2].map((y) => document.elementFromPoint((left + right) / 2, y));
+  return at.filter((one) => !one.matches(".stop")).map((one) => one.outerHTML);
+}"""
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_no_refusal_covers_stop(visit, server, size):
+    server.news = [*planned(), *STATES["inserting"]()]
+    page = visit(width=size[0], height=size[1], ready=".actions .stop.danger")
+    page.evaluate(REFUSED)
+    until(page, "document.querySelectorAll('.refusal').length === 2")
+    assert page.evaluate(COVERED) == []
+
+
 def test_tabs_are_one_stop_and_arrow_keys_choose(visit):
     page = visit(ready="[role=tab]")
     chosen = "document.querySelector('[role=tab][aria-selected=true]').textContent"

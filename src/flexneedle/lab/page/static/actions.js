@@ -4,7 +4,7 @@ import { button, make } from "./dom.js";
 import { confirmed, isArmed, isChecking, stateOf, waits } from "./rig.js";
 import { inWords } from "./insertion/words.js";
 import { planWords } from "./plans/words.js";
-import { SHOWN, isPrepared, maySteer, retracts, runs as isRunning, shownOf } from "./shown.js";
+import { ENDED, SHOWN, isPrepared, maySteer, retracts, runs as isRunning, shownOf } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
 const SHOWN_BY = ["insertion live", "clients", "welcome", "rig", "job check", "view confirmed"];
@@ -39,7 +39,7 @@ export function mount(element, store, link) {
     start.textContent = store.get("welcome")?.rig ? "Insert virtually" : "Insert";
     stop.disabled = !runs;
     stop.textContent = prepared ? "End the preparation" : "Stop";
-    stop.classList.toggle("danger", runs && !prepared);
+    stop.classList.toggle("danger", runs && !prepared && !(real && ENDED.includes(rig?.state)));
     for (const each of [pause, step, pace]) each.hidden = !runs || real;
     pause.disabled = pace.disabled = !signalled;
     step.disabled = !signalled || !paused;

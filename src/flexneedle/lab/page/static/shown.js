@@ -8,6 +8,7 @@
 const RUNS = ["waiting", "planning", "ready", "running", "paused", "holding"];
 const BEFORE = ["waiting", "planning", "ready"];
 const PREPARED = ["preparing", "ready", "armed"]; // states of a rig
+export const ENDED = ["stopped", "fault", "ended"]; // states of a rig that stands
 const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
 const SAME = 1e-3; // s, largest difference between times of the same period
 

@@ -2,7 +2,7 @@
 
 import { button, make, renew } from "./dom.js";
 import { waits } from "./rig.js";
-import { isPrepared } from "./shown.js";
+import { ENDED, isPrepared } from "./shown.js";
 
 const CONNECTIONS = {
   connecting: "Connecting…",
@@ -21,7 +21,6 @@ const CONTROL = {
 };
 const MOTIONS = ["insertion", "retraction"];
 const OWN_END = [...MOTIONS, "save"]; // not cancelled: a motion is stopped, and a run is saved completely
-const ENDED = ["stopped", "fault", "ended"]; // states of a rig
 const SHOWN_FOR = 12_000; // ms
 const LONG = 5; // s
 const SHORT = 1_000; // ms: work that ends sooner is not shown

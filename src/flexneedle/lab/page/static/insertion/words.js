@@ -1,6 +1,7 @@
 // State or outcome of an insertion, in words.
 
 import { shown } from "../dom.js";
+import { ENDED } from "../shown.js";
 
 const STATES = {
   waiting: "Waiting for the computation", planning: "Planning", ready: "Prepared", running: "Running", paused: "Paused",
@@ -14,10 +15,13 @@ const COUNTED = ["paused", "done", "held", "failed", "interrupted"]; // else the
 export function inWords(insertion, rows = [], rig = null) {
   const where = insertion.rig ? ` on ${insertion.rig}` : "";
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
-  const state = insertion.rig && insertion.state === "ready" && rig?.state === "starting" ? "Starting" : STATES[insertion.state] ?? insertion.state;
+  const stands = insertion.rig && insertion.state === "running" && ENDED.includes(rig?.state);
+  const starts = insertion.rig && insertion.state === "ready" && rig?.state === "starting";
+  const state = stands ? "Stopped" : starts ? "Starting" : STATES[insertion.state] ?? insertion.state;
   const to = insertion.target_name ? ` to ${insertion.target_name}` : "";
   const told = TOLD.test(insertion.summary);
   const parts = told ? [] : [`${state}${where}${to}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
+  if (stands) parts.push("The record is being written.");
   if (state === "Prepared") parts.push("Nothing moves.");
   if (insertion.summary) parts.push(sentence(insertion.summary));
   else if (insertion.state === "running" && rows.at(-1)?.action === "hold") parts.push("The needle is held, for the reason in the decisions.");
