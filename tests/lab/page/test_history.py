@@ -111,8 +111,9 @@ def test_a_client_in_control_undoes_the_changes_of_all_but_not_during_an_inserti
         other.has("session", undoes=False, redoes=True)
         assert other.refused("undo") == "there is nothing to undo"
         other.do("undo", redo=True)
-        one.wait(lambda: one.newest["session"]["values"][DEPTH] == 36.0)
-        one.has("estimate", revision=one.has("session", undoes=True, redoes=True)["revision"])
+        other.wait(lambda: other.newest["session"]["values"][DEPTH] == 36.0)
+        session = other.has("session", undoes=True, redoes=True)
+        one.has("estimate", revision=session["revision"])  # not that of the same depth before
         other.inserts("paused", paused=True)
         for redo in (False, True):
             assert other.refused("undo", redo=redo).startswith("an insertion runs")
