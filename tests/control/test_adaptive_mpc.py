@@ -283,7 +283,7 @@ def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
 
 @pytest.mark.long
 def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
-    """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the mean of a few
+    """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the median of a few
     searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
     """
     plant = Simulator(PHANTOM, threads=1).with_adaptation(
@@ -295,13 +295,13 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     blind = abs(state.tip[Y] - 5.0)
     assert blind > 0.5
     misses = []
-    for seed in range(4):
+    for seed in range(5):
         decisions, truth, estimate = carried_out(quick_plan, ACCURATE, plant, seed=seed)
         misses.append(abs(truth.tip[Y] - 5.0))
         assert 0.0 <= travel_left(PHANTOM, quick_plan, estimate.state) <= PHANTOM.control.depth_tolerance_mm
         assert truth.tip[0] == pytest.approx(40.0, abs=0.05)
         assert len(decisions) <= 1.1 * len(quick_plan.controls)
-    assert np.mean(misses) < 0.4 * blind
+    assert np.median(misses) < 0.25 * blind
 
 
 def test_on_the_exact_model_it_ends_at_the_target_and_stays_as_certain(short_plan):
