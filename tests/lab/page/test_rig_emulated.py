@@ -154,7 +154,7 @@ def test_an_insertion_from_check_to_target_with_a_hold_when_the_steering_client_
         watcher.do("go")
         watcher.job("insertion", "done")
         live = watcher.newest["insertion live"]
-        assert live["state"] == "done", live
+        assert live["state"] == "done", live["summary"]
         assert live["rig"] == "Emulated rig"
         assert rig_is(watcher, "idle")["job"] is None
         assert watcher.refused("go") == "Emulated rig is not armed: arm it first"
