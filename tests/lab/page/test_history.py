@@ -113,7 +113,7 @@ def test_a_client_in_control_undoes_the_changes_of_all_but_not_during_an_inserti
         other.do("undo", redo=True)
         other.wait(lambda: other.newest["session"]["values"][DEPTH] == 36.0)
         session = other.has("session", undoes=True, redoes=True)
-        one.has("estimate", revision=session["revision"])  # not that of the same depth before
+        one.has("estimate", revision=session["revision"])  # the same depth was undone before
         other.inserts("paused", paused=True)
         for redo in (False, True):
             assert other.refused("undo", redo=redo).startswith("an insertion runs")
