@@ -217,6 +217,24 @@ def test_keys_move_target_and_guide_in_the_planes_of_the_views(views, server):
     assert edited(page, server) == {"setup.guide_to_skin_mm": 1}
 
 
+def test_keys_that_are_faster_than_the_drawing_all_count(views, server):
+    three = scene().model_copy(update={"layers": layers({"skin": 2.0, "fat": 18.0, "muscle": None})})
+    page = views([*opening(), three])
+    thrice = """(element) => {
+      const press = () => element.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+      for (let time = 0; time < 3; time += 1) press();
+    }"""
+    for panel, name, expected in (
+        (SECTION, "boundary-0", {"tissue.0.thickness_mm": 3.5, "tissue.1.thickness_mm": 16.5}),
+        (SECTION, "target", {"target.depth_mm": TARGET[0] + 1.5}),
+        (AXIAL, "target", {"target.lateral_z_mm": TARGET[2] + 1.5}),
+        (SECTION, "guide", {"setup.guide_to_skin_mm": 39.5}),
+    ):
+        handle(page, name, panel).evaluate(thrice)
+        values = edited(page, server)
+        assert {key: values[key] for key in expected} == pytest.approx(expected), name
+
+
 def test_the_pointer_moves_the_target_in_each_plane(views, server):
     page = views()
     action = "(element) => getComputedStyle(element).touchAction"

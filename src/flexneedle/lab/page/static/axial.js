@@ -39,12 +39,18 @@ export function mount(element, store, link) {
   store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());
 
   function handleOf(map, { axes }, target) {
-    const move = (y, z) => link.edit(targetEdit(store, [target[0], y, axes === 2 ? z : target[2]]));
+    const move = (y, z) => {
+      const [x, , out] = shownTarget(store); // now: keys may be faster than the drawing
+      link.edit(targetEdit(store, [x, y, axes === 2 ? z : out]));
+    };
     return {
       id: "target", form: "point", at: [map.toX(target[2]), map.toY(target[1])],
       name: `Target: y ${shown(target[1])} mm, z ${shown(target[2])} mm. ${KEYS}`,
       drag: (px, py) => move(map.fromY(py), map.fromX(px)),
-      nudge: (right, up) => move(target[1] + up, target[2] + right),
+      nudge: (right, up) => {
+        const [, y, z] = shownTarget(store);
+        move(y + up, z + right);
+      },
     };
   }
 }

@@ -88,31 +88,34 @@ class SectionView {
     const parts = partsOf(this.#store, scene);
     const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, others, parts, outline, store: this.#store });
     showLegend(this.#legend, entriesOf([...parts, ...measuredTip(this.#store)], reached), others);
-    this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
+    this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, target, height }) : []);
   }
 
   #handlesOf({ map, plane, layers, guide, target, height }) {
     const edit = (values) => this.#link.edit(values);
     const u = lateral(plane, ...target);
-    const move = (x, to) => edit(targetEdit(this.#store, lifted(plane, x, to, target)));
+    // What a handle moves is read when it is moved: keys may be faster than the drawing.
+    const [targetNow, sceneNow] = [() => shownTarget(this.#store), () => shownScene(this.#store)];
+    const move = (x, to) => edit(targetEdit(this.#store, lifted(plane, x, to, targetNow())));
     const handles = [{
       id: "target", form: "point", at: [map.toX(target[0]), map.toY(u)],
       name: `Target: depth ${shown(target[0])} mm, lateral ${target.slice(1).map((each) => shown(each)).join(" and ")} mm. ${KEYS}`,
       drag: (px, py) => move(map.fromX(px), map.fromY(py)),
-      nudge: (right, up) => move(target[0] + right, u + up),
+      nudge: (right, up) => move(targetNow()[0] + right, lateral(plane, ...targetNow()) + up),
     }];
     if (guide !== null) {
       handles.push({
         id: "guide", form: "bar", at: [map.toX(guide), height - 30], name: `Guide: ${shown(-guide)} mm before the skin. ${KEYS}`,
-        drag: (px) => edit(guideEdit(map.fromX(px))), nudge: (right) => edit(guideEdit(guide + right)),
+        drag: (px) => edit(guideEdit(map.fromX(px))), nudge: (right) => edit(guideEdit(guideOf(this.#store, sceneNow()) + right)),
       });
     }
     layers.slice(0, -1).forEach(({ name, bottom }, index) => {
-      const move = (x) => edit(boundaryEdit(layers, index, x));
+      const layersNow = () => layersOf(this.#store, sceneNow());
+      const move = (x) => edit(boundaryEdit(layersNow(), index, x));
       handles.push({
         id: `boundary-${index}`, form: "bar", at: [map.toX(bottom), height - 30],
         name: `Boundary between ${name} and ${layers[index + 1].name}: depth ${shown(bottom)} mm. ${KEYS}`,
-        drag: (px) => move(map.fromX(px)), nudge: (right) => move(bottom + right),
+        drag: (px) => move(map.fromX(px)), nudge: (right) => move(layersNow()[index].bottom + right),
       });
     });
     return handles;
