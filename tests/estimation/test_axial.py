@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.estimation.axial import axial_variance, fit_axial_error
+from flexneedle.estimation.axial import axial_variance, fit_axial_error, fit_even_advance
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.simulator import Simulator
@@ -39,6 +39,8 @@ def test_the_depth_of_the_tip_is_the_trackers_whatever_the_axis_makes_of_a_comma
     """The commands, whose limits count travel of the motors, remain as they were."""
     estimate, truth = followed(name, OBSERVERS[observer], factor, 50, late=2)
     assert estimate.axial_scale == pytest.approx(factor, abs=2e-3)
+    assert estimate.even_advance.scale == pytest.approx(factor, abs=2e-3)
+    assert estimate.even_advance.misfit < 0.02
     assert estimate.tip[X] == pytest.approx(truth.tip[X], abs=0.03)
     assert estimate.state.travel[DB_X] == pytest.approx(50.0, abs=1e-9)
 
@@ -58,3 +60,14 @@ def test_the_fit_is_the_least_squares_solution_with_the_prior():
     assert known.tolist() == [0.0, 0.0]
     sensitivity = np.array([1.0, 7.0])
     assert axial_variance(covariance, 7.0) == pytest.approx(sensitivity @ covariance @ sensitivity)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.1, -1.0, 25.4])
+def test_an_even_advance_has_any_scale_and_readings_that_jump_have_none(scale):
+    travel, prior = np.arange(12.0), np.diag([1.0, 1e-4])
+    noise = np.full(12, 1e-4)
+    found = fit_even_advance(0.3 + (scale - 1.0) * travel, travel, noise, prior)
+    assert found.scale == pytest.approx(scale, abs=1e-3)
+    assert found.misfit < 1e-3
+    jump = fit_even_advance(0.3 + (scale - 1.0) * travel - 0.6 * (travel > 6.0), travel, noise, prior)
+    assert jump.misfit == pytest.approx(0.6 * np.sqrt(1 / 4 - 3 / 16 * 144 / 143), abs=0.03)

@@ -181,6 +181,26 @@ class Longer(RecordedPhantom):
 
 
 @pytest.mark.parametrize("controller", ["adaptive-mpc", "ce-mpc"])
+def test_a_hold_for_readings_that_are_late_for_a_while_claims_no_scale(plan, controller):
+    """A busy computer: from 2 s on the readings are 0.3 s behind the needle, and dated as if they were not."""
+
+    def spoil(batch):
+        return [
+            replace(one, x=one.x - phantom.tip_at(one.time)[0] + phantom.tip_at(one.time - 0.3)[0])
+            if one.time > 2.0
+            else one
+            for one in batch
+        ]
+
+    recorded = RecordedPhantom(plan.roll, spoil=spoil)
+    phantom = recorded.phantom
+    done = run(plan, recorded.rig(), controller=controller)
+    assert done.outcome == "held"
+    assert "fit no even advance" in done.reason
+    assert "late now and then, as on a busy computer" in done.reason
+
+
+@pytest.mark.parametrize("controller", ["adaptive-mpc", "ce-mpc"])
 @pytest.mark.parametrize(
     ("factor", "outcome"), [(0.9, "held"), (1.1, "held"), (0.985, "done"), (1.02, "done")]
 )

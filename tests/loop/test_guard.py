@@ -211,11 +211,30 @@ def test_an_ordinary_insertion_is_not_held_by_it(real):
 @pytest.mark.parametrize("scale", [0.96, 1.04])
 def test_a_needle_that_advances_far_more_or_less_than_commanded_is_held(plan, scale):
     """The limit is three standard deviations of the scenario's prior of the scale."""
-    estimate = replace(estimate_at(Simulator(PHANTOM, 1).start()), axial_scale=scale)
+    even = [(travel, (scale - 1.0) * travel, 1e-4) for travel in np.arange(30.0)]
+    estimate = replace(
+        estimate_at(Simulator(PHANTOM, 1).start()), axial_scale=0.5 * (1.0 + scale), advances=(*even,)
+    )
+    assert guard_of(plan).refusal(estimate, Control(db_x=1.0)) == "", (
+        "the prior may keep the scale within the limit"
+    )
+    estimate = replace(estimate, axial_scale=scale)
     refusal = guard_of(plan).refusal(estimate, Control(db_x=1.0))
     assert refusal == (
-        f"guard: by the tracker the needle advances {scale:.3f} times as far as commanded (limit 1 ± 0.03): "
+        f"guard: by the tracker the needle advances {scale:.3g} times as far as commanded (limit 1 ± 0.03): "
         "check the insertion axis and the tracker"
     )
     wide = Guard.of(PHANTOM.with_values({"control.axial_scale_sd": 0.02}), plan)
     assert wide.refusal(estimate, Control(db_x=1.0)) == ""
+
+
+@pytest.mark.parametrize("off", [-0.5, 0.5])
+def test_readings_that_are_late_now_and_then_are_no_scale_of_the_advance(plan, off):
+    """The scale that fits them best is beyond its limit; the reason names what they are."""
+    late = [(travel, off * (travel > 20.0), 1e-4) for travel in np.arange(30.0)]
+    estimate = replace(
+        estimate_at(Simulator(PHANTOM, 1).start()), axial_scale=1.0 + 0.08 * off, advances=(*late,)
+    )
+    refusal = guard_of(plan).refusal(estimate, Control(db_x=1.0))
+    assert refusal.startswith("guard: the tracker's readings fit no even advance (off by 0.14 mm, limit ")
+    assert "late now and then, as on a busy computer" in refusal

@@ -4,12 +4,16 @@ Axial motion is rigid, so that both act on all depths alike. The scale is the ra
 advance: the error of the insertion axis in the rig file, or of the tracker.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import DB_X, Control, Floats
+
+_ANY_SCALE = 100.0  # standard deviation of a scale that may have any value
 
 
 def axial_prior(control: ControlSettings) -> Floats:
@@ -32,6 +36,28 @@ def fit_axial_error(ahead: Floats, travel: Floats, variance: Floats, prior: Floa
     weighted = columns / variance
     covariance: Floats = prior @ np.linalg.inv(np.eye(2) + weighted @ columns.T @ prior)  # a prior of 0 stays
     return covariance @ (weighted @ ahead), covariance
+
+
+class EvenAdvance(NamedTuple):
+    """Advance of a constant scale that fits the readings along the axis best, whatever the prior of the scale.
+
+    misfit: root mean square distance of the readings from it (mm); large if they are late now and then.
+    """
+
+    scale: float
+    misfit: float
+
+
+AS_COMMANDED = EvenAdvance(1.0, 0.0)
+"""Advance before any reading."""
+
+
+def fit_even_advance(ahead: Floats, travel: Floats, variance: Floats, prior: Floats) -> EvenAdvance:
+    """Return the even advance that fits readings; arguments as for `fit_axial_error`."""
+    wide = np.diag([prior[0, 0], _ANY_SCALE**2])
+    start, scale = fit_axial_error(ahead, travel, variance, wide)[0].tolist()
+    left = ahead - start - scale * travel
+    return EvenAdvance(1.0 + scale, float(np.sqrt(np.mean(left**2))) if len(left) else 0.0)
 
 
 def carry_out(simulator: Simulator, state: State, applied: Control, axial_scale: float = 1.0) -> State:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Protocol
 
+from flexneedle.estimation.axial import EvenAdvance
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import THETA, Floats, Measurement, Motion, Point
@@ -48,6 +49,11 @@ class Estimate(Protocol):
     @property
     def axial_scale(self) -> float:
         """Advance of the needle, as the tracker measures it, over the commanded advance."""
+        ...
+
+    @property
+    def even_advance(self) -> EvenAdvance:
+        """Advance of a constant scale that fits the readings along the axis best, whatever the prior of the scale."""
         ...
 
     def tip_at(self, time: float) -> Point:

@@ -19,7 +19,15 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.axial import axial_prior, axial_variance, fit_axial_error, replay_scaled
+from flexneedle.estimation.axial import (
+    AS_COMMANDED,
+    EvenAdvance,
+    axial_prior,
+    axial_variance,
+    fit_axial_error,
+    fit_even_advance,
+    replay_scaled,
+)
 from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.fit import ROUND, differentiate, improve_fit
 from flexneedle.estimation.fitted import FittedInsertion
@@ -73,6 +81,7 @@ class Identified(FittedInsertion):
     axial_covariance: Floats = field(
         default_factory=lambda: np.zeros((2, 2))
     )  # of axial (mm) and axial_scale
+    even_advance: EvenAdvance = AS_COMMANDED
     residual: complex = 0.0  # low-passed residual (mm)
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
     # tip measured at the end of the last move with a reading (mm), None before the first
@@ -149,7 +158,11 @@ class Identified(FittedInsertion):
         variance = readings.axial_variance(position.sd(scenario) or 0.0, unexplained)
         found, covariance = fit_axial_error(without, travel, variance, axial_prior(scenario.control))
         return replace(
-            self, axial=float(found[0]), axial_scale=1.0 + float(found[1]), axial_covariance=covariance
+            self,
+            axial=float(found[0]),
+            axial_scale=1.0 + float(found[1]),
+            axial_covariance=covariance,
+            even_advance=fit_even_advance(without, travel, variance, axial_prior(scenario.control)),
         )
 
     @cached_property

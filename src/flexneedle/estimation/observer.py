@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.axial import axial_prior, axial_variance, carry_out
+from flexneedle.estimation.axial import (
+    EvenAdvance,
+    axial_prior,
+    axial_variance,
+    carry_out,
+    fit_even_advance,
+)
 from flexneedle.estimation.estimate import describe_estimate
 from flexneedle.estimation.moves import Move, assign_readings, drop_roll_readings, position_along, tip_of
 from flexneedle.estimation.task import Task
@@ -59,6 +65,8 @@ class Corrected:
     tips: Floats  # estimated tip poses (k + 1, 5) at the ends of the moves, the start first
     drift: float  # standard deviation of the path's curvature (1/mm)
     axial_scale: float = 1.0  # advance of the needle over the commanded advance
+    # commanded advance, readings minus it (mm), and their variance (mm²), of the moves before `moves`
+    advances: tuple[tuple[float, float, float], ...] = ()
     moves: tuple[Move, ...] = ()  # moves whose readings may still arrive
     innovation: Point = (0.0, 0.0, 0.0)  # the last reading minus its prediction (mm)
     # tip measured at the end of the last move with a reading (mm), None before the first
@@ -82,6 +90,12 @@ class Corrected:
         axes = self.simulator.scenario.setup.axes
         axial = axial_variance(self.axial, float(self.state.travel[DB_X]))
         return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + axial))
+
+    @property
+    def even_advance(self) -> EvenAdvance:
+        """Advance of a constant scale that fits the readings along the axis best, whatever the prior of the scale."""
+        travel, ahead, variance = np.array(self.advances).reshape(-1, 3).T
+        return fit_even_advance(ahead, travel, variance, axial_prior(self.simulator.scenario.control))
 
     def _across(self, x: Floats, arms: Floats) -> Floats:
         """Return the variance (n,), mm², of positions on a lateral axis at x (n,), mm, `arms` (n,) from the base."""
@@ -135,6 +149,7 @@ class Corrected:
             covariance=past.covariance,
             axial=past.axial,
             axial_scale=past.axial_scale,
+            advances=past.advances,
             moves=moves[closed:],
             tips=np.array(tips[closed:]),
         )
@@ -189,8 +204,15 @@ def _correct_axially(at: Corrected, done: Move, off: float, noise: float) -> tup
     spread = at.axial @ sensitivity
     gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
     start, scale = (gain * off).tolist()
+    shifted = float(at.state.base[X]) - at.simulator.scenario.start_base_x - before
+    ahead = shifted + (at.axial_scale - 1.0) * float(sensitivity[1] - before) + off
     moved = at.state.with_estimate(base_x=float(at.state.base[X]) + start + scale * before)
-    corrected = replace(at, axial=at.axial - np.outer(gain, spread), axial_scale=at.axial_scale + scale)
+    corrected = replace(
+        at,
+        axial=at.axial - np.outer(gain, spread),
+        axial_scale=at.axial_scale + scale,
+        advances=(*at.advances, (float(sensitivity[1]), ahead, noise**2)),
+    )
     return corrected, carry_out(at.simulator, moved, done.applied, corrected.axial_scale)
 
 

@@ -16,10 +16,11 @@ from flexneedle.results import Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.state import State
-from flexneedle.types import Control, Floats, X
+from flexneedle.types import DB_X, Control, Floats, X
 
 _SHARE_OF_LAW = 0.95  # of the compression at which a law ends
 _SCALE_SDS = 3.0  # of the prior of the scale
+_UNEVEN = 0.1  # of the advance's error: larger distances of readings from an even advance are no scale
 _ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest
 
 
@@ -36,7 +37,8 @@ class Guard:
     """Limits of an insertion.
 
     Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), distance
-    (mm) of the tip past the target, which is at `depth` (mm), and error of the scale of the needle's advance.
+    (mm) of the tip past the target, which is at `depth` (mm), and error of the scale of the needle's advance; jitter
+    (mm) of a reading.
     """
 
     compression: Floats
@@ -45,6 +47,7 @@ class Guard:
     past: float
     depth: float
     scale: float
+    jitter: float
 
     @staticmethod
     def of(scenario: Scenario, plan: Plan) -> "Guard":
@@ -55,25 +58,37 @@ class Guard:
         force = math.inf if settings.guide_force_n is None else settings.guide_force_n
         strain, past = 1e-2 * settings.needle_strain_percent, settings.past_target_mm
         scale = _SCALE_SDS * scenario.control.axial_scale_sd
-        return Guard(np.array(compression), strain, force, past, plan.target[0], scale)
+        jitter = scenario.tracker.jitter_per_axis
+        return Guard(np.array(compression), strain, force, past, plan.target[0], scale, jitter)
 
     def refusal(self, estimate: Estimate, command: Control) -> str:
         """Return the reason to refuse a command, "" for none.
 
         Beyond a limit, which a reading may reveal, a command may lead back but not further.
         """
-        now, scale = estimate.state, estimate.axial_scale
-        if abs(scale - 1.0) > self.scale:
-            return (
-                f"guard: by the tracker the needle advances {scale:.3f} times as far as commanded "
-                f"(limit 1 ± {self.scale:g}): check the insertion axis and the tracker"
-            )
+        now = estimate.state
+        if abs(estimate.axial_scale - 1.0) > self.scale:
+            return f"guard: {self._describe_advance(estimate)}"
         then = carry_out(estimate.simulator, now, command)
         if not then.converged:
             return f"guard: the model does not converge: residual {then.residual:.3g} mm"
         both = zip(self._excesses(now), self._excesses(then), strict=True)
         worse = (new for old, new in both if new.beyond > max(old.beyond, 0.0) + _ROUNDING)
         return next((f"guard: {excess.text}" for excess in worse), "")
+
+    def _describe_advance(self, estimate: Estimate) -> str:
+        """Return what the readings of an advance that differs from the commanded one show: a scale, or none."""
+        scale, misfit = estimate.even_advance
+        most = self.jitter + _UNEVEN * abs((scale - 1.0) * estimate.state.travel[DB_X])
+        if misfit > most:
+            return (
+                f"the tracker's readings fit no even advance (off by {misfit:.2f} mm, limit {most:.2f} mm): late now "
+                "and then, as on a busy computer, or the needle slips; its depth is unknown"
+            )
+        return (
+            f"by the tracker the needle advances {scale:.3g} times as far as commanded "
+            f"(limit 1 ± {self.scale:g}): check the insertion axis and the tracker"
+        )
 
     def _excesses(self, state: State) -> Iterator[Excess]:
         yield self._compression_excess(state)

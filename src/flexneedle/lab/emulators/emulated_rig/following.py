@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable
-from math import floor, inf
+from math import floor
 
 import numpy as np
 
@@ -19,12 +19,12 @@ class TipHistory:
 
     The roll, which one coil does not measure, is the roll of the shortest rotation from the z axis to the needle's
     direction. The numbers of a record are position x, y, z (mm) and direction of the needle, in the tracker's frame.
-    A frame exists once the needle is known at its time, without extrapolation: during a motion a few milliseconds
-    after the frame was taken.
+    A frame exists once a record of its time or later has arrived, without extrapolation: a few milliseconds after it
+    was taken, or later on a busy computer. A needle at rest may move by a record that is still to come.
     """
 
     def __init__(self, power_on: float, first: Record) -> None:
-        self._power_on, self._known = power_on, -inf
+        self._power_on = power_on
         self._records = deque([first], maxlen=_LONGEST)
         self._last: tuple[int, tuple[Point, Quaternion]] | None = None
 
@@ -34,10 +34,7 @@ class TipHistory:
 
     def newest(self, number: int) -> int:
         """Return the number of the newest frame, up to this one, in which the pose is known; it never decreases."""
-        last = self._records[-1]
-        known = floor((last.time - self._power_on) * RATE_HZ) if last.moving else number
-        self._known = max(self._known, known)
-        return int(min(number, self._known))
+        return min(number, floor((self._records[-1].time - self._power_on) * RATE_HZ))
 
     def at(self, number: int) -> tuple[Point, Quaternion]:
         """Return position (mm) and orientation in a frame up to the newest, of the last 16 s of motion."""

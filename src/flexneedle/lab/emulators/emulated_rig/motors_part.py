@@ -20,7 +20,7 @@ from flexneedle.lab.rig.devices.galil.settings import split_address
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.lab.rig.rig_file import RigFile
 
-_REST_S = 0.05  # between two records at rest
+_REST_S = 0.02  # between two records at rest: a frame of the tracker waits for the next one
 
 
 def main(job: EmulationJob, parent: Parent, channels: list[MessageChannel]) -> None:

@@ -1,7 +1,7 @@
 """Records between the processes of an emulated rig.
 
-A record has a time (s, monotonic clock), numbers, and whether the described part moves from then on. While it moves,
-it is known up to the time of the newest record; at rest it is unchanged until the next one.
+A record has a time (s, monotonic clock), numbers, and whether the described part moves from then on. It is known up to
+the time of the newest record.
 """
 
 from typing import NamedTuple
