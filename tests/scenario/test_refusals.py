@@ -190,6 +190,19 @@ def test_a_syntax_error_names_its_line(scenario_file):
         load_scenario(scenario_file('name = "a"\nlength = 1 mm\n'))
 
 
+@pytest.mark.parametrize(
+    ("line", "number"),
+    [("a = 60,0  # note", "60,0"), ("a = {b = -1,5e1}", "-1,5e1"), ("a=1.000,5", "1.000,5")],
+)
+def test_a_decimal_comma_is_named_with_its_line(scenario_file, line, number):
+    rule = rf"\(at line 2, column \d+\): {number}: write a decimal point, not a comma$"
+    with pytest.raises(ScenarioError, match=rule):
+        load_scenario(scenario_file(f'name = "a"\n{line}\n'))
+    with pytest.raises(ScenarioError, match="not TOML") as caught:
+        load_scenario(scenario_file("a = 'x', 'y'\nb = 1.5"))
+    assert "write a decimal point" not in str(caught.value)
+
+
 def test_a_wrong_value_in_a_file_names_the_file(scenario_file):
     text = (files("flexneedle.scenario") / "presets" / "phantom.toml").read_text(encoding="utf-8")
     path = scenario_file(text.replace("offset_mm = 4.0", "offset_mm = inf"))

@@ -11,7 +11,7 @@ from flexneedle.geometry.rigid import fiducial_error, fit_rigid
 from flexneedle.types import Floats
 
 _SIZE_RATIO = 3.0  # largest ratio of the sizes of both sets of points
-_SMALLEST = 0.5  # mm: smaller sets of points are in metres, or useless
+_SMALLEST, _LARGEST = 0.5, 3000.0  # mm: other sets of points have another unit, or are useless
 _LOOSE = 0.1  # residual over size above which the fit is rejected
 _FALSE_ALARM = 1e-4  # probability that the test rejects a true hypothesis on the handedness of the frames
 _NEARER = -2.0 / 3.0  # slope at which a mirrored frame is five times as near as the frame
@@ -81,14 +81,20 @@ def _test_slope(proper: float, mirrored: float, sizes: Floats, freedom: int) -> 
 Names = tuple[str, ...] | None
 
 
+def check_size(points: Floats, name: str) -> None:
+    """Raise InputError for several points (n, 3) too near or far from each other to be in mm."""
+    size = _radius(points)
+    if not _SMALLEST <= size <= _LARGEST:
+        raise InputError(
+            f"{name} are within {size:.3g} mm (RMS) of their center, must be from {_SMALLEST:g} to {_LARGEST:g} mm: "
+            "is the unit right (--unit mm or m)?"
+        )
+
+
 def check_pairs(moving: Floats, fixed: Floats, names: Names = None) -> None:
     """Raise InputError for pairs (n, 3) not of one rigid body: different units, a mirrored frame, a poor fit."""
+    check_size(fixed, "the stage's points")
     moving_size, fixed_size = _radius(moving), _radius(fixed)
-    if fixed_size < _SMALLEST:
-        raise InputError(
-            f"the stage's points are within {fixed_size:.3g} mm (RMS) of their center, at least {_SMALLEST:g} mm "
-            "are needed: are they in metres?"
-        )
     if not 1.0 / _SIZE_RATIO < fixed_size / moving_size < _SIZE_RATIO:
         raise InputError(
             f"the tracker's points are within {moving_size:.3g} mm (RMS) of their center, the stage's within "

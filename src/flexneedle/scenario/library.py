@@ -1,5 +1,6 @@
 """TOML files of one kind: files of the package by name, files of a user by path."""
 
+import re
 import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
@@ -17,6 +18,7 @@ from flexneedle.scenario.problems import describe
 _SUFFIX = ".toml"
 # Such a file has a few kB; the limit keeps an endless one such as /dev/zero from filling the memory.
 _LARGEST_FILE = 1_000_000
+_LINE, _DECIMAL_COMMA = re.compile(r"\(at line (\d+),"), re.compile(r"=\s*([+-]?\d[\d_.]*,\d[\w+-]*)")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -84,14 +86,25 @@ class Library:
 
     def _parse(self, data: bytes, opening: str) -> dict[str, Any]:
         try:
-            return tomllib.loads(data.decode("utf-8-sig"))
+            return parse_toml(data.decode("utf-8-sig"))
         except UnicodeDecodeError as error:
             line = data.count(b"\n", 0, error.start) + 1
             raise self.error(f"{opening}: not UTF-8 (at line {line}): save the file as UTF-8") from None
-        except RecursionError:
-            raise self.error(f"{opening}: not TOML: nested too deeply") from None
         except ValueError as error:
-            raise self.error(f"{opening}: not TOML: {make_printable(str(error))}") from None
+            raise self.error(f"{opening}: {error}") from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the nested tables of a text. Raises ValueError with the problem in one line."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("not TOML: nested too deeply") from None
+    except ValueError as error:
+        place = _LINE.search(str(error))
+        comma = _DECIMAL_COMMA.search(text.split("\n")[int(place[1]) - 1]) if place else None
+        remedy = f": {comma[1]}: write a decimal point, not a comma" if comma else ""
+        raise ValueError(f"not TOML: {make_printable(str(error))}{remedy}") from None
 
 
 def label(source: str | Path) -> str:

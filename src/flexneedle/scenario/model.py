@@ -8,8 +8,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from flexneedle.arguments import make_refusal
 from flexneedle.errors import ScenarioError
+from flexneedle.scenario.alternatives import find_replaced, spell
 from flexneedle.scenario.dotted import flatten, set_value, split_key
-from flexneedle.scenario.problems import SHEAR, YOUNG, describe, key_path, refuse, to_line
+from flexneedle.scenario.problems import describe, key_path, refuse, to_line
 from flexneedle.scenario.rules import (
     entry_problems,
     geometry_problems,
@@ -108,18 +109,16 @@ class Scenario(Section):
     def with_values(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None removes a key.
 
+        A modulus of a layer replaces the other one, a gauge the diameters, and both diameters the gauge.
         Raises ScenarioError if a key is unknown or the copy breaks a rule.
         """
         if not isinstance(changes, Mapping):
             raise make_refusal(
                 "changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}'
             )
-        values = self.values()
-        for key, value in changes.items():
+        values, changes = self.values(), {spell(key): value for key, value in changes.items()}
+        for key, value in (dict.fromkeys(find_replaced(changes)) | changes).items():
             set_value(values, key, _expand_environment(key, value))
-            if key.startswith("tissue") and key.endswith(f".{YOUNG}") and value is not None:
-                shear = key.removesuffix(YOUNG) + SHEAR
-                set_value(values, shear, changes.get(shear))  # unless it is given, too
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

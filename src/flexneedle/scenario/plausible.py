@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import key_path
@@ -106,7 +107,9 @@ def _unusual(scenario: Scenario) -> Iterator[str]:
             else f"{_short(1.0 / ratio)} times below the smallest"
         )
         line = f"{off} usual value, {usual.low:g} to {usual.high:g} ({usual.source}): check the unit"
-        yield f"{key_path(split_key(key))} = {value:g}: {line}"
+        is_shear = key.endswith(f".{SHEAR}")
+        youngs = f" ({YOUNG} = {SHEARS_IN_YOUNGS * value:g}, E = 3μ)" if is_shear else ""
+        yield f"{key_path(split_key(key))} = {value:g}{youngs}: {line}"
 
 
 def _find_unused(scenario: Scenario) -> Iterator[str]:

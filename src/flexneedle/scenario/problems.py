@@ -9,10 +9,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from flexneedle.errors import make_printable
+from flexneedle.scenario.alternatives import SHEAR, YOUNG
 from flexneedle.scenario.dotted import split_key
-
-SHEAR, YOUNG = "shear_modulus_kpa", "youngs_modulus_kpa"
-"""Keys of a layer of which one is given."""
 
 _BROKEN = "broken_rules"
 _LONGEST_VALUE = 60
@@ -51,6 +49,7 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
     inner = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
     # pydantic also reports a list as too short when its items are refused: only the items are reported.
     reported = [d for d in details if not (d["type"] == "too_short" and d["loc"] in inner)]
+    reported = [d for d in reported if not (d["type"] == "missing" and _is_misspelt(d["loc"], details))]
     return [problem for detail in reported for problem in _problems(detail, model)]
 
 
@@ -79,6 +78,13 @@ def _problems(detail: ErrorDetails, model: type[BaseModel]) -> list[Problem]:
     if detail["type"] == "extra_forbidden":
         return [Problem(loc, detail["input"], _unknown(loc, model))]
     return [Problem(loc, detail["input"], _rule(detail))]
+
+
+def _is_misspelt(missing: tuple[int | str, ...], details: Sequence[ErrorDetails]) -> bool:
+    """Return whether an unknown key of the same table resembles a missing one, so that one line is enough."""
+    unknown = (d["loc"] for d in details if d["type"] == "extra_forbidden" and d["loc"][:-1] == missing[:-1])
+    valid = [SHEAR, YOUNG] if missing[-1] == SHEAR else [str(missing[-1])]
+    return any(get_close_matches(str(loc[-1]), valid, n=1) for loc in unknown)
 
 
 def _path(key: str | tuple[str | int, ...]) -> Sequence[str | int]:

@@ -207,7 +207,12 @@ BAD = [  # text and key named
     (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
     (axis("controler", '["ce-mpc"]'), "as an axis also seed, world"),
     (axis("plan.samples", "[]"), "axes[0].values = []"),
-    (axis("tissue.0.youngs_modulus_kpa", "[6, 12]"), "vary shear_modulus_kpa (μ = E/3)"),
+    (
+        axis("tissue.0.youngs_modulus_kpa", "[6]")
+        + TWO_CASES
+        + "values = {'tissue[0].shear_modulus_kpa' = 8}",
+        'cases[0].values = "tissue.0.shear_modulus_kpa": also set by an axis',
+    ),
     (axis("plan.samples", "'all'"), 'axes[0].values = "all"'),
     (axis("setup.stroke_mm", "[100, 100.0]"), "contains 100 twice"),
     (axis("target", "[[30, 0], [30.0, -0.0]]"), "contains [30, 0] twice"),

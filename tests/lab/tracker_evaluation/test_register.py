@@ -130,7 +130,7 @@ REFUSED = {
     "metres": ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
     "both in metres": (
         [(row[0], *(1e-3 * v for v in row[1:7]), "ref1") for row in rows()],
-        "are they in metres",
+        "is the unit right (--unit mm or m)?",
     ),
     "mirrored": ([(*row[:4], -row[4], *row[5:]) for row in rows()], "one of the two frames is left-handed"),
     "swapped": (

@@ -41,8 +41,9 @@ from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, find_plant
 from flexneedle.planning import STRATEGIES
 from flexneedle.plugins import digest_modules, is_own
 from flexneedle.record.plain import plain
+from flexneedle.scenario.alternatives import SHEAR, YOUNG, override, spell
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.problems import SHEAR, YOUNG, Problem, to_line
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.settings import Target
 from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
 
@@ -186,13 +187,11 @@ def _expand(file: StudyFile, base: Scenario) -> ExpandedStudy:
     total = math.prod((of_cases, repeats, *map(len, axes.values())))
     if total > _MAX_INSERTIONS:
         raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
-    if youngs := [key for key in axes if key.endswith(f".{YOUNG}")]:
-        raise InputError(f"axis {youngs[0]}: is not a column of the results: vary {SHEAR} (μ = E/3)")
     settings = {
         "name": file.name,
         "title": file.title,
         "scenario": base.values(),
-        "without": list(file.without),
+        "without": list(map(spell, file.without)),
         "values": _DEFAULTS | flatten_settings(file.values),
         "cases": {case.name: flatten_settings(case.values) for case in file.cases},
         "targets": targets,
@@ -256,7 +255,7 @@ def _list_values(axis: StudyAxis) -> list[Any]:
 
 def _check_without(keys: Sequence[str], base: Scenario) -> None:
     for key in keys:
-        if key not in base.flat():
+        if key.replace(YOUNG, SHEAR) not in base.flat():
             raise InputError(f"without = {json.dumps(key)}: not a key of the scenario")
 
 
@@ -322,7 +321,7 @@ def _list_choices(parts: _Parts, worlds: Callable[[int], Scenario]) -> Iterator[
         if key in TARGET_KEYS and key not in parts.left_out
     }
     for case, chosen in parts.choices():
-        settings = {**parts.fixed, **parts.cases[case], **flatten_settings(chosen)}
+        settings = override(override(parts.fixed, parts.cases[case]), flatten_settings(chosen))
         run = {key: settings.pop(key) for key in _DEFAULTS}
         number = settings.pop(WORLD, None)
         kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flexneedle.arguments import expand_home
 from flexneedle.errors import InputError
+from flexneedle.scenario.alternatives import find_replaced, spell
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.library import PRESETS, Library, label
@@ -44,7 +45,7 @@ def _check_seed(value: int) -> int:
 class StudyAxis(Section):
     """One `[[axes]]`: a key and its values; axes are combined in all ways."""
 
-    key: str
+    key: Annotated[str, AfterValidator(spell)]
     """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case,
     world_rig."""
     values: Any
@@ -142,7 +143,7 @@ def with_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
 
 def flatten_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by dotted key; a target [depth, y] or [depth, y, z] becomes the three keys of the scenario."""
-    flat = flatten(values)
+    flat = {spell(key): value for key, value in flatten(values).items()}
     if TARGET in flat:
         x, y, z = (*flat.pop(TARGET), 0.0)[:3]
         flat |= dict(zip(TARGET_KEYS, (x, y, z), strict=True))
@@ -228,9 +229,10 @@ def _check_keys(study: StudyFile) -> Iterator[Problem]:
     for key, times in axes.items():
         if times > 1:
             yield Problem("axes", key, "set by two axes")
+    taken = {*axes, *find_replaced(dict.fromkeys(axes, 0.0))}
     for number, case in enumerate(study.cases):
         for key in flatten_settings(case.values):
-            if key in axes:
+            if key in taken:
                 yield Problem(f"cases.{number}.values", key, "also set by an axis")
         if case.targets is not None and axes.keys() & {*TARGET_KEYS, WORLD}:
             yield Problem(f"cases.{number}.targets", None, "also set by an axis")

@@ -8,11 +8,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flexneedle.files import replace_file
-from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion
+from flexneedle.lab.study.grid import ExpandedStudy, StudyInsertion, StudyPoint
 from flexneedle.lab.study.jobs import TIMES
 from flexneedle.lab.study.plans import StudyPlans, digest_plan_inputs, digest_reach_inputs
 from flexneedle.record.folder import versions
 from flexneedle.record.results import RESULT_COLUMNS
+from flexneedle.scenario.alternatives import YOUNG
 
 RUNS_FILE, TIMING_FILE = "runs.parquet", "timing.parquet"
 _TYPES = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_()}
@@ -87,7 +88,7 @@ def _make_runs(
     plan_keys: Sequence[str],
     results: Sequence[Mapping[str, Any]],
 ) -> pa.Table:
-    flats = {id(point): point.scenario.flat() for point in study.points}
+    flats = {id(point): point.scenario.flat() | _list_youngs(point) for point in study.points}
     settings = [flats[id(insertion.point)] for insertion in insertions]
     conditions = [
         _list_conditions(insertion, key) for insertion, key in zip(insertions, plan_keys, strict=True)
@@ -101,6 +102,11 @@ def _make_runs(
         | _make_columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
         | {name: pa.array(values, pa.string()) for name, values in version_columns.items()}
     )
+
+
+def _list_youngs(point: StudyPoint) -> dict[str, float]:
+    """Return the values of axes of Young's moduli, which a scenario converts, by key."""
+    return {key: float(value) for key, value in point.varied.items() if key.endswith(f".{YOUNG}")}
 
 
 def _list_conditions(insertion: StudyInsertion, key: str) -> dict[str, Any]:

@@ -48,7 +48,8 @@ def _at_most(columns: str) -> Rule:
     sizes = ", ".join(f"abs({name})" for name in columns.split(", "))
     return (
         f"greatest({sizes}) > {FARTHEST_MM}",
-        f"{columns}: must be at most {FARTHEST_MM:g} mm (a code for a missing position? Leave it empty)",
+        f"{columns}: must be at most {FARTHEST_MM:g} mm: is the unit right? A code for a missing "
+        "position must be left empty",
     )
 
 

@@ -67,9 +67,8 @@ class Needle(Section):
             both = [
                 key for key in ("outer_diameter_mm", "inner_diameter_mm") if getattr(self, key) is not None
             ]
-            return [
-                Problem(key, getattr(self, key), f"leave it out: gauge {self.gauge} gives it") for key in both
-            ]
+            rule = f"leave it out: gauge {self.gauge} gives it; both diameters replace the gauge"
+            return [Problem(key, getattr(self, key), rule) for key in both]
         if outer is None:
             return [Problem("outer_diameter_mm", None, "missing: give it, or a gauge such as 21G")]
         if inner is not None and inner >= outer:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import ValidationError, model_validator
 
-from flexneedle.scenario.problems import SHEAR, YOUNG, Problem, problems_of, refuse
+from flexneedle.scenario.alternatives import SHEAR, SHEARS_IN_YOUNGS, YOUNG
+from flexneedle.scenario.problems import Problem, problems_of, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _BEVEL_MARGIN = 0.001
-_SHEARS_IN_YOUNGS = 3.0  # E = 3μ of an incompressible solid
 
 
 class _Young(Section):
@@ -66,7 +66,7 @@ class Layer(Section):
         except ValidationError as error:
             refuse(problems_of(error, _Young))
         others = {key: value for key, value in values.items() if key != YOUNG}
-        return others | {SHEAR: youngs / _SHEARS_IN_YOUNGS}
+        return others | {SHEAR: youngs / SHEARS_IN_YOUNGS}
 
     @property
     def shear_modulus(self) -> float:

@@ -118,6 +118,29 @@ def test_other_positions_beyond_10_m_are_refused(tmp_path, code):
         notes(tmp_path, rows)
 
 
+@pytest.mark.parametrize(
+    ("scale", "unit", "rule"),
+    [(1e-3, "mm", "the grid points of tip, ideal are within 0"), (1.0, "m", "must be at most 10000 mm"),
+     (0.1, "m", "mm (RMS) of their center, must be from 0.5 to 3000 mm")],
+)  # fmt: skip
+def test_another_unit_is_suspected(tmp_path, scale, unit, rule):
+    scaled = [
+        {key: scale * value if key.endswith("_mm") else value for key, value in row.items()}
+        for row in random_rows(0)
+    ]
+    with pytest.raises(InputError) as caught:
+        notes(tmp_path, scaled, unit=unit)
+    assert rule in str(caught.value)
+    assert "is the unit right" in str(caught.value)
+
+
+def test_missing_samples_are_counted_with_the_points_they_leave_unknown(tmp_path):
+    rows = random_rows(0)
+    gone = [row | dict.fromkeys(ZEROS, "") if row["point_id"] == rows[0]["point_id"] else row for row in rows]
+    (note,) = notes(tmp_path, gone)
+    assert note.endswith("; grid points without any position: 1 of 27")
+
+
 @pytest.mark.parametrize("option", ["ideal", "noisy"])
 def test_an_unknown_environment_in_an_option_is_refused(tmp_path, option):
     with pytest.raises(InputError, match=f"--{option}: no environment 'lab emty': choose from lab empty"):

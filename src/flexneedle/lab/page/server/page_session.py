@@ -2,7 +2,6 @@
 
 import json
 import re
-import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,14 +9,14 @@ from dataclasses import dataclass, field, fields, replace
 from hashlib import sha256
 from typing import Any
 
-from flexneedle.errors import ScenarioError, ScenarioWarning, make_printable
+from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.lab.page.protocol import SessionMessage, Strategy
 from flexneedle.lab.page.requests import OptionsRequest, RestoreRequest, TargetsRequest
 from flexneedle.lab.page.server.clients import Refusal
 from flexneedle.lab.page.server.named_targets import NamedTargets
 from flexneedle.scenario.dotted import nest, split_key
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.library import PRESETS, WORLD
+from flexneedle.scenario.library import PRESETS, WORLD, parse_toml
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.plausible import find_doubts
 from flexneedle.scenario.sections.needle import GAUGES, Needle
@@ -77,11 +76,9 @@ class PageSession:
         """Return the session with the scenario of a file (TOML). Raises Refusal with the problems by key."""
         _check_size(name, text)
         try:
-            values = tomllib.loads(text)
-        except RecursionError:
-            raise Refusal(f"{name}: not TOML: nested too deeply") from None
+            values = parse_toml(text)
         except ValueError as error:
-            raise Refusal(f"{name}: not TOML: {make_printable(str(error))}") from None
+            raise Refusal(f"{name}: {error}") from None
         with warnings.catch_warnings(record=True) as caught, _refuse_problems(name):
             warnings.simplefilter("always", ScenarioWarning)
             scenario = Scenario.from_values(values)

@@ -5,9 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
-from flexneedle.geometry.pair_checks import find_better_fit, mirrored_frame, misfit, unknown_side
+from flexneedle.geometry.pair_checks import check_size, find_better_fit, mirrored_frame, misfit, unknown_side
 from flexneedle.lab.tables.columns import OPTIONAL, REFERENCE, REQUIRED, map_columns
 from flexneedle.lab.tables.row_rules import note_codes
 from flexneedle.lab.tables.sample_table import open_table
@@ -144,8 +146,8 @@ def _find_notes(grid: MeasuredGrid) -> Iterator[str]:
     count, missing = grid.points.count, int(grid.points.missing.sum())
     if missing:
         yield (
-            f"{missing} of {missing + int(count.sum())} samples have no position (left out), "
-            f"all samples at {int((count == 0).sum())} of {len(count)} grid points"
+            f"{missing} of {missing + int(count.sum())} samples have no position (left out); grid points without "
+            f"any position: {int((count == 0).sum())} of {len(count)}"
         )
     coded = grid.points.coded
     if (codes := note_codes(int(coded.sum()), int(count.sum()), grid.points.code[coded > 0])) is not None:
@@ -200,7 +202,11 @@ def read_table(data: Path, options: EvaluationOptions) -> tuple[list[MeasuredGri
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
     with open_table(data, required, optional, mapping=mapping, labels=names, unit=options.unit) as table:
-        return read_grids(table)
+        grids, rows = read_grids(table)
+        for grid in grids:
+            if np.ptp(grid.points.true, axis=0).any():  # not a single point
+                check_size(grid.points.true, f"the grid points of {grid.title}")
+        return grids, rows
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
