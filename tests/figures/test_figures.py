@@ -47,6 +47,8 @@ CASES = {
     ),
     "without rolls": without_rolls,
 }
+HELD = "held for 10.00 s (limit 10 s)"
+PATHS = ("true path", "estimated path")
 ARRANGED = ("reached", "one period", "held from the start", "held on the way", "a long reason")
 
 
@@ -148,10 +150,7 @@ def test_an_unfinished_insertion_is_drawn_up_to_its_end(case):
         ("missed", "MISSED: the tip ended 1.410 mm from the target, more than 1 mm"),
         ("interrupted", "interrupted 11.5 mm deep after 40 periods: stopped by the user"),
         ("without truth", "held 40.0 mm deep after 69 periods: held for 1.00 s"),
-        (
-            "held from the start",
-            f"held 27.5 mm before the skin after 20 periods: held for 10.00 s (limit 10 s): {DISTORTED}",
-        ),
+        ("held from the start", f"held 27.5 mm before the skin after 20 periods: {HELD}: {DISTORTED}"),
     ],
 )
 def test_the_verdict_is_given_in_full(case, verdict):
@@ -160,19 +159,15 @@ def test_the_verdict_is_given_in_full(case, verdict):
 
 
 def test_a_miss_is_drawn_at_the_end():
-    assert lines(*axes(drawn("missed"), "end"), "miss")
-    assert not lines(*axes(drawn("reached"), "end"), "miss")
+    assert [bool(lines(*axes(drawn(case), "end"), "miss")) for case in ("missed", "reached")] == [True, False]
 
 
 @pytest.mark.parametrize(
     ("case", "missing"),
     [
         ("reached", {"tracker, rejected"}),
-        (
-            "one period",
-            {"tracker, rejected", "true path", "estimated path", "bevel flip, applied", "earlier shapes"},
-        ),
-        ("held from the start", {"tracker", "true path", "estimated path", "bevel flip, applied"}),
+        ("one period", {"tracker, rejected", *PATHS, "bevel flip, applied", "earlier shapes"}),
+        ("held from the start", {"tracker", *PATHS, "bevel flip, applied"}),
         ("without rolls", {"tracker, rejected", "bevel flip, planned", "bevel flip, applied"}),
     ],
 )
@@ -329,7 +324,8 @@ def test_a_layer_has_as_much_of_its_name_as_fits():
     assert {"air", "skin", "superficial, μ 1.82 kPa", "deep, μ 3.63 kPa"} <= set(texts(drawn("reached")))
     tissue = with_tissue(("wide", 20.0), ("narrow", 10.5), ("very narrow", 5.5), ("thin", 1.0), ("last", 0.0))
     named = [text for text in texts(insertion_figure(tissue, INSERTION)) if "kPa" in text]
-    assert named == ["wide, μ 1.25 kPa", "narrow\nμ 1.625 kPa", "μ 2 kPa", "last\nμ 2.75 kPa"]
+    below = "30.5 to 36 mm very narrow, μ 2 kPa; 36 to 37 mm thin, μ 2.375 kPa"
+    assert named == ["wide, μ 1.25 kPa", "narrow\nμ 1.625 kPa", "last\nμ 2.75 kPa", below]
 
 
 @unarranged()
@@ -368,8 +364,7 @@ def test_a_long_reason_of_a_miss_stays_within_the_figure():
     limit = "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.80 to 1.80 mm lateral)"
     figure = plan_figure(PHANTOM, [PLANS[0], replace(PLANS[1], target=(40.0, 12.0, 0.0), limit=limit)])
     assert overlapping(figure) == []
-    (title,) = figure.findobj(lambda artist: isinstance(artist, Text) and "MISSES" in artist.get_text())
-    assert title.get_window_extent().x1 <= figure.bbox.x1
+    assert "limited by needle.bevel.offset_mm = 4 (cost" in " ".join(" ".join(texts(figure)).split())
 
 
 @pytest.mark.long

@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flexneedle.figures import curves, scene, space
-from flexneedle.figures.layout import COLUMNS, fit, legend_of, mosaic, short
+from flexneedle.figures.labels import name_parts
+from flexneedle.figures.layout import COLUMNS, fit, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TRUE, apply_style, is_column, tone
@@ -48,12 +49,9 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
             axes[f"end{end}"].set_xlabel("\n".join(facts))
         if len(field):
             _field(axes["field"], scenario, insertion, field)
-        legend_of(figure, [*scenes, *(axes[name] for name in axes if name == "along")])
-        if is_column():  # where the close-ups leave no room
-            figure.legends[0].set_title("\n".join((", ".join(facts[:-2]), ", ".join(facts[-2:]))))
-        figure.draw_without_rendering()
-        for ax in scenes:
-            scene.name_layers(ax, scenario)
+        shown_axes = [*scenes, *(axes[name] for name in axes if name == "along")]
+        below = [", ".join(filter(None, part)) for part in (facts[:-2], facts[-2:]) if is_column()]
+        name_parts(figure, scenes, shown_axes, scenario, below)
     return figure
 
 

@@ -15,7 +15,7 @@ from matplotlib.legend_handler import HandlerBase, HandlerLine2D, HandlerPatch
 from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
 
-from flexneedle.figures.style import WIDTH, is_column, new_figure, width
+from flexneedle.figures.style import WIDTH, is_column, is_narrow, new_figure, width
 from flexneedle.planning import STRATEGIES
 
 Floats = NDArray[np.float64]
@@ -33,11 +33,14 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
 
 # Rows of a figure in a column, inches: all others are low. A figure above the height of a page is lowered.
-_HEIGHTS = {"cost": 1.7} | dict.fromkeys(("scene", *STRATEGIES), 1.3)
-_COSTS = 3.2  # of two plans
-_SQUARES = {1: 2.6, 2: 2.3, 3: 2.3}  # by their number in a row
+_HEIGHTS = {"cost": 1.7} | dict.fromkeys(("scene", *STRATEGIES), 0.9)
+_COSTS = 1.6  # of two plans
+_SQUARES = {1: 2.6, 2: 1.5, 3: 2.3}  # by their number in a row
 _SHARES = {1: (1,), 2: (1, 1), 3: (3, 2, 2)}  # of the width
-_LOW, _OUTSIDE, _PAGE, _LEAST = 1.1, 1.1, 9.4, 0.85
+_LOW, _OUTSIDE, _PAGE, _LEAST = 1.1, 1.1, 9.2, 0.5
+_FIXED = 0.4  # share of the height that does not shrink with the width
+TALLEST = 248.0 / 25.4
+"""Height (inches) of the tallest figure in a column."""
 _SMALLER = 1.25  # characters in a column for each at full width: of the sizes of fonts
 
 
@@ -67,8 +70,10 @@ def mosaic(
         rows, heights, widths = _stack(rows)
         factor = max(_LEAST, min(1.0, (_PAGE - _OUTSIDE) / sum(heights)))
         height = factor * sum(heights) + _OUTSIDE
+    else:
+        height *= min(1.0, _FIXED + (1.0 - _FIXED) * width() / WIDTH)
     figure = new_figure(height)
-    figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
+    figure.set_layout_engine("constrained", h_pad=0.03 if is_narrow() else 0.08, w_pad=0.08)
     figure.suptitle(
         fill(title, fit(_TITLE)), x=0.01, ha="left", fontsize=8 if is_column() else 11, weight="bold"
     )
@@ -128,13 +133,15 @@ class _ArrowHandle(HandlerPatch):
 _MARKS: dict[str | None, HandlerBase] = {UPRIGHT: _Upright(), ARROW: _ArrowHandle()}
 
 
-def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
-    """Name at the foot of the figure all artists of some of its axes, each label once."""
+def legend_of(figure: Figure, shown: Iterable[Axes], facts: Sequence[str] = ()) -> None:
+    """Name at the foot of the figure all artists of some of its axes, each label once, below lines of facts."""
     named: dict[str, Artist] = {}
     for ax in shown:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)
     legend(figure, list(named.values()))
+    if facts:
+        figure.legends[-1].set_title("\n".join(facts))
 
 
 def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = ()) -> None:

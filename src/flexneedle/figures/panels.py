@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
 from flexneedle.figures.scene import tint_layers
-from flexneedle.figures.style import BAD, QUIET, is_column, small
+from flexneedle.figures.style import BAD, QUIET, is_narrow, small
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
@@ -51,9 +51,15 @@ def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthP
     depth = np.concatenate([line.x for panel in shown for line in panel.lines])
     depth = depth[np.isfinite(depth)]
     room = 0.01 * float(np.ptp(depth))
+    named: list[tuple[str, str]] = []
     for ax, panel in zip(axes, shown, strict=True):
         ax.set_xlim(depth.min() - room, depth.max() + room)
         _draw_panel(ax, scenario, panel)
+        names = [(line.name, line.color) for line in panel.lines]
+        if is_narrow() and names == named and ax.get_legend():  # once is enough
+            ax.get_legend().remove()
+            ax.set_title(ax.get_title(loc="left"), pad=4.0)
+        named = names
         ax.tick_params(labelbottom=ax is axes[-1])
     axes[-1].set_xlabel("depth of the tip (mm)")
 
@@ -91,15 +97,15 @@ def _draw_lines(ax: Axes, title: str, lines: Sequence[Line]) -> None:
     for line in drawn:
         ax.plot(line.x, line.y, line.style, color=line.color, markersize=2.4, zorder=3, label=line.name)
     ax.set_title(title)
-    ax.locator_params(axis="y", nbins=4)
-    if drawn and is_column():
+    ax.locator_params(axis="y", nbins=3 if is_narrow() else 4)
+    if drawn and is_narrow():
         _name_above(ax)
     elif drawn:
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=1.4)
 
 
 def _name_above(ax: Axes) -> None:
-    """Name the lines of a panel of a column between title and panel."""
+    """Name the lines of a panel of a narrow figure between title and panel."""
     names = ax.get_legend_handles_labels()[1]
     columns = len(names) if sum(len(name) + _HANDLE for name in names) <= _ROW else 2
     rows = -(-len(names) // columns)

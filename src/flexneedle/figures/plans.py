@@ -10,15 +10,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flexneedle.figures import curves, scene, space
-from flexneedle.figures.layout import fit, legend_of, mosaic, short
+from flexneedle.figures.labels import name_parts
+from flexneedle.figures.layout import fit, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
 from flexneedle.figures.scene import View
 from flexneedle.figures.style import INK, STRATEGIES, apply_style, format_signed, is_column, small, tone
-from flexneedle.results import Plan
+from flexneedle.results import Plan, format_mm
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import X, Y
 
-_LINES = {1: 100, 2: 66}  # characters of a line above a plan, by the number of lateral axes
+_LINES = {1: 90, 2: 66}  # characters of a line above a plan, by the number of lateral axes
 _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the skin
 
 
@@ -37,15 +38,18 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
                 _draw_plan(ax, scenario, plan, color, view)
             title = fill(_result(scenario, plan), fit(_LINES[1 if is_column() else scenario.setup.axes]))
             scene.name_scenes(drawn, title, scene.color_of(plan), 9.5)
+            if is_column() and plan is not plans[-1]:
+                drawn[-1].set_xlabel("")
+                drawn[-1].tick_params(labelbottom=False)
             scenes += drawn
             if scenario.setup.axes == 2:
-                _draw_along(axes[f"{plan.strategy} along"], scenario, plan)
+                along = axes[f"{plan.strategy} along"]
+                _draw_along(along, scenario, plan, single=len(plans) == 1)
+                if is_column() and len(plans) > 1:
+                    along.set_title(f"Along: {plan.strategy}")
         draw_depths([axes[name] for name in panels], scenario, list(panels.values()))
         _draw_cost(axes["cost"], plans)
-        legend_of(figure, scenes)
-        figure.draw_without_rendering()
-        for ax in scenes:
-            scene.name_layers(ax, scenario)
+        name_parts(figure, scenes, scenes, scenario)
     return figure
 
 
@@ -75,13 +79,13 @@ def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View)
     _draw_entry(ax, plan, view)
 
 
-def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
+def _draw_along(ax: Axes, scenario: Scenario, plan: Plan, *, single: bool) -> None:
     """Draw the view along the axis: paths of tip and guide, directions of the bevel, target."""
     travel = np.column_stack([np.zeros(len(plan.guide)), plan.guide])
     space.set_up_along(ax, scenario, [plan.tips, travel, np.array([plan.target])])
     if scenario.setup.has_guide:
         space.draw_guide_along(ax, plan.guide, plan.target)
-    space.draw_along(ax, plan.tips)
+    space.draw_along(ax, plan.tips, scale=not is_column() or single)
     space.draw_planned(ax, scenario, plan, scene.ALONG, space.arrow_along(ax))
     scene.draw_target(ax, plan.target, scene.ALONG)
 
@@ -93,7 +97,20 @@ def _result(scenario: Scenario, plan: Plan) -> str:
         for angle in plan.entry_angles[: scenario.setup.axes]
     ]
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
-    return f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f}){entry}"
+    if is_column():
+        return f"{plan.strategy}: {_outcome(plan)}".replace(" mm", "\u00a0mm")
+    return f"{plan.strategy}: {_outcome(plan)} (cost {plan.cost:.2f}){entry}"
+
+
+def _outcome(plan: Plan) -> str:
+    """Return the summary of a plan, shorter for a miss."""
+    if plan.reached and not plan.limit:
+        return plan.summary
+    limit = f", limited by {plan.limit.partition(' (')[0]}" if plan.limit else ""
+    distance = format_mm(plan.error_mm)
+    if plan.reached:
+        return f"ends {distance} from the target{limit}"
+    return f"MISSES the target by {distance}{limit}"
 
 
 def _draw_entry(ax: Axes, plan: Plan, view: View) -> None:
@@ -139,6 +156,15 @@ def _energy(plans: Sequence[Plan]) -> DepthPanel:
     return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
 
 
+def _write_terms(ax: Axes, plans: Sequence[Plan], names: Sequence[str]) -> None:
+    """Write the values of each term beside its longest bar, in the order of the plans."""
+    for row, name in enumerate(names):
+        values = [plan.terms.get(name, 0.0) for plan in plans]
+        text = " and ".join(f"{value:.2f}" for value in values)
+        how: dict[str, Any] = {"va": "center", "fontsize": small(), "textcoords": "offset points"}
+        ax.annotate(text, (max(0.0, *values), row), (2, 0), **how)
+
+
 def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
     """Draw the terms of the cost as bars, one colour for each plan, with the values at their ends."""
     names = list(dict.fromkeys(name for plan in plans for name in plan.terms))
@@ -148,10 +174,14 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
         values = np.array([plan.terms.get(name, 0.0) for name in names])
         where = rows + (k - (len(plans) - 1) / 2) * thick
         bars = ax.barh(where, values, 0.9 * thick, color=STRATEGIES[k], label=plan.strategy)
-        ax.bar_label(bars, [f"{value:.2f}" for value in values], padding=2, fontsize=min(7.5, small()))
+        if not is_column():
+            ax.bar_label(bars, [f"{value:.2f}" for value in values], padding=2, fontsize=min(7.5, small()))
+    if is_column():
+        _write_terms(ax, plans, names)
     ax.set_yticks(rows, names)
     ax.tick_params(axis="y", length=0)
     ax.invert_yaxis()
-    ax.margins(x=0.2)
+    ax.margins(x=0.4 if is_column() else 0.2)
     ax.locator_params(axis="x", nbins=4)
-    ax.set_title("Terms of the cost")
+    costs = " and ".join(f"{plan.cost:.2f}" for plan in plans)
+    ax.set_title(f"Terms of the cost, {costs} in all" if is_column() else "Terms of the cost")

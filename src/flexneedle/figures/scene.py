@@ -4,7 +4,8 @@ A view is the pair of coordinates that are drawn: depth and y, and in space dept
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from math import inf
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,11 +13,22 @@ from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
-from flexneedle.figures.style import BAD, GUIDE, INK, NEEDLE, QUIET, TARGET, format_signed, is_column, small
+from flexneedle.figures.style import BAD, GUIDE, INK, NEEDLE, TARGET, format_signed, is_column, small
 from flexneedle.results import TARGET_RADIUS_MM, Insertion, Plan
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.types import THETA, Floats, Point, X, Y, Z
+
+
+class Strip(NamedTuple):
+    """A layer in axes from the side: name, modulus and depths as text; its ends (mm) within the axes; its color."""
+
+    name: str
+    modulus: str
+    depths: str
+    top: float
+    bottom: float
+    color: str
+
 
 View = tuple[int, int]
 """Columns of a point that are drawn to the right and upwards."""
@@ -26,7 +38,7 @@ ALONG: View = (Z, Y)
 """Along the axis, in the direction of insertion."""
 
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
-_SKIN, _BORDER, _NAME = "#8c5a36", "#c9a27f", "#6d4526"
+SKIN, _BORDER = "#8c5a36", "#c9a27f"
 _SHAPE = 0.2  # height of a scene by its width
 _OPENING, _BLOCK, _WIDE = 0.7, 2.2, 1.1  # half opening, length and half width of the guide's jaws (mm)
 
@@ -69,12 +81,7 @@ def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats], view: Vie
     """
     _frame(ax, scenario, np.concatenate([path[:, : 1 + scenario.setup.axes] for path in paths]), view)
     tint_layers(ax, scenario)
-    ax.axvline(0.0, color=_SKIN, linewidth=1.6, zorder=1)
-    ax.annotate(
-        "air", (0, 0), (4, 4), "axes fraction", color=QUIET, textcoords="offset points", fontsize=small()
-    )
-    above: dict[str, Any] = {"xycoords": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-    ax.annotate("skin", (0, 1), (-4, -3), color=_SKIN, **above, textcoords="offset points", fontsize=small())
+    ax.axvline(0.0, color=SKIN, linewidth=1.6, zorder=1)
     ax.set(xlabel="depth (mm)", ylabel=lateral_label(scenario, view[1]))
 
 
@@ -101,35 +108,23 @@ def _frame(ax: Axes, scenario: Scenario, points: Floats, view: View) -> None:
 
 def tint_layers(ax: Axes, scenario: Scenario) -> None:
     """Colour the layers as far as the axes reach, the stiffer the darker."""
+    for strip in strips(ax, scenario):
+        ax.axvspan(strip.top, strip.bottom, facecolor=strip.color, edgecolor="none", zorder=0)
+        if strip.top > 0.0:
+            ax.axvline(strip.top, color=_BORDER, linewidth=0.8, zorder=0.5)
+
+
+def strips(ax: Axes, scenario: Scenario) -> Iterator[Strip]:
+    """Yield the layers as far as the axes reach."""
     stiffness = sorted({layer.shear_modulus_kpa for layer in scenario.tissue})
-    for layer, top, bottom in _layers(ax, scenario):
+    right, tops = ax.get_xlim()[1], scenario.layer_tops
+    for layer, top, bottom in zip(scenario.tissue, tops, (*tops[1:], inf), strict=True):
         rank = stiffness.index(layer.shear_modulus_kpa) / max(1, len(stiffness) - 1)
         color = _TISSUES[round(rank * (min(len(stiffness), len(_TISSUES)) - 1))]
-        ax.axvspan(top, bottom, facecolor=color, edgecolor="none", zorder=0)
-        if top > 0.0:
-            ax.axvline(top, color=_BORDER, linewidth=0.8, zorder=0.5)
-
-
-def _layers(ax: Axes, scenario: Scenario) -> Iterator[tuple[Layer, float, float]]:
-    right = ax.get_xlim()[1]
-    tops = scenario.layer_tops
-    for layer, top, bottom in zip(scenario.tissue, tops, (*tops[1:], right), strict=True):
-        if top < right:
-            yield layer, top, min(bottom, right)
-
-
-def name_layers(ax: Axes, scenario: Scenario) -> None:
-    """Write name and μ of each layer as far as they fit into it. The layout of the figure must be final."""
-    for layer, top, bottom in _layers(ax, scenario):
-        right = ax.transData.transform((bottom, 0.0))[0]
+        depths = f"from {top:g} mm" if bottom == inf else f"{top:g} to {bottom:g} mm"
         modulus = f"μ {layer.shear_modulus_kpa:g} kPa"
-        how: dict[str, Any] = {"textcoords": "offset points", "fontsize": small(), "color": _NAME}
-        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), **how)
-        two_lines = [] if is_column() else [f"{layer.name}\n{modulus}"]
-        for text in (f"{layer.name}, {modulus}", *two_lines, modulus, ""):
-            name.set_text(text)
-            if name.get_window_extent().x1 < right or not text:
-                break
+        if top < right:
+            yield Strip(layer.name, modulus, depths, top, min(bottom, right), color)
 
 
 def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
@@ -144,10 +139,10 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
         how: dict[str, Any] = {"color": GUIDE, "linewidth": 1.0, "marker": "_", "gid": UPRIGHT}
         ax.plot([beside, beside], ends, label="guide travel", **how)
     ax.plot([beside], [y], color=GUIDE, marker=">", markersize=4, linestyle="none")
-    above: dict[str, Any] = {"xytext": (0, 3), "ha": "center", "va": "bottom"}
+    above: dict[str, Any] = {"xytext": (0, 3), "ha": "left", "va": "bottom"}
     ax.annotate(
         "guide",
-        (x, y + _OPENING + _BLOCK),
+        (x - _WIDE, y + _OPENING + _BLOCK),
         color=GUIDE,
         **above,
         textcoords="offset points",

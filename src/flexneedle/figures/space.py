@@ -94,22 +94,24 @@ def arrow_along(ax: Axes) -> float:
     return 0.15 * float(np.ptp(ax.get_xlim()))
 
 
-def draw_along(ax: Axes, path: Floats, planned: Floats | None = None) -> None:
-    """Draw along the axis the path of the tip (k, ≥ 3), coloured by depth with its scale, and the planned path."""
+def draw_along(ax: Axes, path: Floats, planned: Floats | None = None, *, scale: bool = True) -> None:
+    """Draw along the axis the path of the tip (k, ≥ 3), coloured by depth (with its scale), and the planned one."""
     if planned is not None:
         ax.plot(*planned[:, ALONG].T, "--", color=PLAN, linewidth=1.0, zorder=5)
     if len(path) > 1:
-        _draw_depths(ax, path)
+        _draw_depths(ax, path, scale=scale)
     ax.plot(*path[-1, ALONG], "o", color=TRUE, markersize=5, markeredgecolor="white", zorder=9)
 
 
-def _draw_depths(ax: Axes, path: Floats) -> None:
+def _draw_depths(ax: Axes, path: Floats, *, scale: bool) -> None:
     points = path[:, ALONG]
     how: dict[str, Any] = {"cmap": _DEPTHS, "linewidth": 2.2, "zorder": 4, "capstyle": "round"}
     line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), **how)
     line.set_array(0.5 * (path[:-1, X] + path[1:, X]))
     line.set_gid("path by depth")
     ax.add_collection(line, autolim=False)
+    if not scale:
+        return
     figure: Any = ax.figure
     bar = figure.colorbar(
         line, cax=ax.inset_axes(_SCALE_IN_COLUMN if is_column() else _SCALE), orientation="horizontal"

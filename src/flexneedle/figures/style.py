@@ -24,6 +24,7 @@ from flexneedle.types import Z
 _WINDOWS = ("macosx", "qtagg", "gtk4agg", "gtk3agg", "tkagg", "wxagg")  # backends, in the order of pyplot
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 COLUMN = 5.5  # inches; a narrower figure is one of a journal's column, with all parts one below another
+NARROW = 8.0  # inches; narrower figures have no room for names beside their panels
 _widths = [WIDTH]  # the last one is in use
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
@@ -76,7 +77,7 @@ _SETTINGS: Any = {
 }
 
 
-# In a column, where figures are not reduced: 7 to 8 points.
+# On a journal's page, where figures are not reduced: 7 to 8 points.
 _COLUMN_SETTINGS: Any = {
     "font.size": 7.5,
     "axes.titlesize": 7.5,
@@ -108,9 +109,14 @@ def is_column() -> bool:
     return width() < COLUMN
 
 
+def is_narrow() -> bool:
+    """Return whether new figures have the names of lines above their panels, not beside them."""
+    return width() < NARROW
+
+
 def small() -> float:
     """Return the font size of names inside a panel."""
-    return 7.0 if is_column() else 8.0
+    return 7.0 if is_narrow() else 8.0
 
 
 def tone(color: str, axis: int) -> str:
@@ -129,7 +135,7 @@ def apply_style() -> Iterator[None]:
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_SETTINGS | (_COLUMN_SETTINGS if is_column() else {}))
+        matplotlib.rcParams.update(_SETTINGS | (_COLUMN_SETTINGS if is_narrow() else {}))
         yield
 
 
