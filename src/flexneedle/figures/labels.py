@@ -6,6 +6,8 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.path import Path
 from matplotlib.quiver import Quiver
 from matplotlib.transforms import Affine2D, Bbox
@@ -102,7 +104,8 @@ def _write(
 
 def _obstacles(ax: Axes) -> Iterator[Path]:
     """Yield the paths (pixels) of all that is drawn over the tissue."""
-    for artist in (*ax.lines, *ax.patches):
+    drawn: tuple[Line2D | Patch, ...] = (*ax.lines, *ax.patches)
+    for artist in drawn:
         if artist.get_zorder() >= _TISSUE:
             yield artist.get_transform().transform_path(artist.get_path())
     for group in ax.collections:

@@ -56,8 +56,9 @@ def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthP
         ax.set_xlim(depth.min() - room, depth.max() + room)
         _draw_panel(ax, scenario, panel)
         names = [(line.name, line.color) for line in panel.lines]
-        if is_narrow() and names == named and ax.get_legend():  # once is enough
-            ax.get_legend().remove()
+        legend = ax.get_legend()
+        if is_narrow() and names == named and legend is not None:  # once is enough
+            legend.remove()
             ax.set_title(ax.get_title(loc="left"), pad=4.0)
         named = names
         ax.tick_params(labelbottom=ax is axes[-1])
