@@ -11,13 +11,19 @@ from flexneedle.types import TIP, Frame, Measurement, SensorReading
 
 DIRECTIONS = {"insertion": (1, 0, 0), "guide_y": (0, 1.2, 0), "guide_z": (0, 0, 1.2)}
 
+QUEUE_S = 0.1
+"""Motion that a motor has been sent ahead."""
+BURSTS = 0.05
+"""Share of the ticks of a busy computer after which there is none for a while."""
+
 
 class AirRig:
     """The part of a supervisor's client that moves axes, on its own clock.
 
     true: scale of each axis, or ("axis that moves", scale); lost: motion lost on reversal by axis (mm); roll: whether
     the sensor measures the roll; run_out: radius (mm); clearance: position of guide_y at which the needle passes
-    through its clearance, and the clearance (mm).
+    through its clearance, and the clearance (mm); busy: longest time (s) without a tick on a busy computer, in which
+    the motor stops at the end of its queue, or of a late tick.
     """
 
     def __init__(
@@ -32,9 +38,10 @@ class AirRig:
         seed=0,
         tilt=0.0,
         clearance=(0.0, 0.0),
+        busy=0.0,
     ):
         self.rig, self.true, self.lost, self.roll = rig, true or {}, lost or {}, roll
-        self.clearance = clearance
+        self.clearance, self.busy, self.silent, self.slow = clearance, busy, (0.0, 0.0), False
         self.run_out, self.sd, self.delay, self.tilt = run_out, sd, delay, tilt
         self.positions = {name: 0.0 for name, _ in rig.axes.items()}
         self.load = dict(self.positions)
@@ -70,7 +77,9 @@ class AirRig:
         self.moves.append((axis, position))
         while abs(position - self.positions[axis]) > 1e-9:
             step = min(speed / 40, abs(position - self.positions[axis]))
-            self._advance(axis, math.copysign(step, position - self.positions[axis]))
+            begun, ended = self.silent
+            if not begun + QUEUE_S < self.time < ended:
+                self._advance(axis, math.copysign(step, position - self.positions[axis]))
             self._tick()
 
     def _advance(self, axis, way):
@@ -85,9 +94,10 @@ class AirRig:
     def _tick(self):
         self.time += 0.025
         self.history.append((self.time, self.tip()))
-        if self.listener is not None:
+        work = self._draw_lateness()
+        if self.listener is not None and not self.silent[0] < self.time < self.silent[1]:
             axes = {name: AxisState(at, MotorState(0.0, 0.0)) for name, at in self.positions.items()}
-            self.listener(TickReport(self.time, SupervisorState.ARMED, axes=axes))
+            self.listener(TickReport(self.time - work, SupervisorState.ARMED, axes=axes, work=work))
         times = [time for time, _ in self.history]
         tips = np.array([tip for _, tip in self.history])
         x, y, z = (
@@ -99,3 +109,13 @@ class AirRig:
         self.frame += 1
         reading = SensorReading((x, y, z), (math.cos(angle), 0.0, 0.0, math.sin(angle)))
         self.found.append(Measurement(self.time, x, y, z, Frame(self.time, self.frame, {TIP: reading})))
+
+    def _draw_lateness(self):
+        """Return the duration of a tick (s); now and then begin a time without ticks, or a tick as long as that."""
+        work, (begun, ended) = 0.0, self.silent
+        if self.busy and self.time >= ended:
+            work, self.slow = (self.time - begun - 0.025 if self.slow else 0.0), False
+            if self.rng.random() < BURSTS:
+                self.silent = self.time, self.time + float(self.rng.uniform(0.2, 1.0) * self.busy)
+                self.slow = bool(self.rng.random() < 0.5)
+        return work

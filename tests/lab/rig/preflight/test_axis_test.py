@@ -1,5 +1,7 @@
 """Test of the axes: a wrong scale, direction, channel or lost motion is found, with the value that fits."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -124,6 +126,22 @@ def test_late_readings_are_a_problem():
     motions, problems, _ = outcome_of(AirRig(RIG, delay=0.3))
     assert motions["insertion"].delay[0] == pytest.approx(0.3, abs=0.01)
     assert ("insertion", "delay") in problems
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("busy", [0.1, 0.3, 0.5])
+def test_a_busy_computer_is_no_problem_of_the_rig(busy, seed):
+    """Times without a tick, in which the motors stop, and late ticks: correlated errors of the motors' times."""
+    motions, problems, found = outcome_of(AirRig(RIG, busy=busy, seed=seed))
+    assert problems == {}
+    lines = [one for one in found if one.item == "delay"]
+    assert len(lines) == 3
+    for name, line in zip(AIR, lines, strict=True):
+        if motions[name].delay is None:
+            assert re.search(r"the computer was busy \(late by up to \d+ ms\)", line.found)
+        else:
+            delay, sd = motions[name].delay
+            assert abs(delay - 0.02) < max(0.05, 4.0 * sd)
 
 
 def test_without_a_scenario_the_scale_of_the_base_is_not_checked():

@@ -5,7 +5,7 @@ the lost motion on the way back.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,10 @@ _SWAPPED = 0.25  # relative difference of a motion from another axis's
 _MOST_GAP = 0.31  # mm
 _AFTER_S = 0.4  # of rest after the way out, in which late readings show the motion
 _EARLY_S = 0.05  # two ticks
-_DELAYS = np.arange(-0.2, 0.8, 0.001)
+_LATE_S = 0.03  # beyond which the position of a motor between two ticks is not used
+_DELAYS = np.arange(-0.2, 0.8, 0.002)
+_LEAST_KNOWN = 0.7  # of the readings of a motion
+_TICK_S = 0.002  # least standard deviation of a delay
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,8 @@ class Motion:
 
     scale: measured over commanded travel, negative if reversed, None if unknown; tilt: angle from the expected
     direction (rad); lost: motion lost on reversal (mm or rad), with standard deviation; delay: of the readings (s),
-    with standard deviation; turn: expected and measured direction (2, 3) for a positive motion; unseen: largest motion
-    (mm) of the tip that would be noise, and the motor's.
+    with standard deviation; late: largest lateness of a tick (s); turn: expected and measured direction (2, 3) for a
+    positive motion; unseen: largest motion (mm) of the tip that would be noise, and the motor's.
     """
 
     moved: str
@@ -47,6 +50,7 @@ class Motion:
     tilt: float = 0.0
     lost: tuple[float, float] | None = None
     delay: tuple[float, float] | None = None
+    late: float = 0.0
     turn: Floats | None = None
     unseen: tuple[float, float] | None = None
 
@@ -96,14 +100,17 @@ def measure_motion(
         back = run.moved(1, 2)
         size = 0.5 * (size + float(np.linalg.norm(back)))
         return Motion(run.name, math.copysign(size, scale) / (gain * abs(travel)), sd, tilt, turn=turn)
-    delay = _measure_delay(run, motors, noise)
+    late = max(0.0, float(motors.lateness(run.times).max()))
+    delay = _measure_delay(run, motors, noise, late)
     if run.name == "insertion":
-        return Motion(run.name, scale, sd, tilt, _lost_motion(run, gain, abs(scale)), delay, turn)
-    at = motors.at(run.name, run.times - (delay[0] if delay else 0.0)) - run.rests[0].positions[run.name]
-    along_axis = (run.tips - run.rests[0].tip) @ response / gain**2
+        return Motion(run.name, scale, sd, tilt, _lost_motion(run, gain, abs(scale)), delay, late, turn)
+    behind = delay[0] if delay else 0.0
+    known = motors.lateness(run.times - behind) < _LATE_S
+    at = motors.at(run.name, run.times[known] - behind) - run.rests[0].positions[run.name]
+    along_axis = (run.tips[known] - run.rests[0].tip) @ response / gain**2
     scale, sd, gap = _fit_with_clearance(at, along_axis, float(run.rests[0].spread.max()) / gain)
     lost = gap, sd * abs(travel)
-    return Motion(run.name, scale, math.hypot(sd, _LATERAL_SD * scale), tilt, lost, delay, turn)
+    return Motion(run.name, scale, math.hypot(sd, _LATERAL_SD * scale), tilt, lost, delay, late, turn)
 
 
 def _fit_with_clearance(at: Floats, along: Floats, noise: float) -> tuple[float, float, float]:
@@ -122,8 +129,9 @@ def _fit_with_clearance(at: Floats, along: Floats, noise: float) -> tuple[float,
             residual = along - columns @ solution
             found.append((float(residual @ residual) / noise**2, float(solution[1]), float(gap)))
     misfit, scale, gap = min(found)
-    near = [other for one, other, _ in found if one < misfit + 4.0]
-    least = noise / (float(at.std()) * math.sqrt(len(at)))
+    rough = max(1.0, misfit / len(at))  # more than noise: readings or motors are late now and then
+    near = [other for one, other, _ in found if one < misfit + 4.0 * rough]
+    least = noise * math.sqrt(rough) / (float(at.std()) * math.sqrt(len(at)))
     return scale, max(least, 0.25 * (max(near) - min(near))), gap
 
 
@@ -190,29 +198,53 @@ def _fit_circle(
     return float(np.sum(np.abs(at - columns @ solution) ** 2)), float(abs(solution[1]))
 
 
-def _measure_delay(run: AxisRun, motors: MotorHistory, noise: float) -> tuple[float, float] | None:
-    """Return the delay (s) of the readings behind the motor, with its standard deviation.
+def _measure_delay(
+    run: AxisRun, motors: MotorHistory, noise: float, late: float
+) -> tuple[float, float] | None:
+    """Return the delay (s) of the readings behind the motor, with its standard deviation; None if it is not known.
 
-    It is the shift of the motor's path that fits them best.
+    It is the mean of the motions on the way out, and its standard deviation at least their scatter: on a busy computer
+    the errors of the times in a motion are alike, and up to the lateness of its ticks (s).
     """
-    if len(motors.times) < 2:
-        return None
     way = run.moved(0, -2)
-    along = (run.tips - run.rests[0].tip) @ way / float(np.linalg.norm(way))
-    if float(np.linalg.norm(way)) < 10.0 * noise:
+    if float(np.linalg.norm(way)) < 10.0 * noise or not len(motors.times):
         return None
-    # On the way out only: beyond a reversal lost motion would look like a delay.
+    along = (run.tips - run.rests[0].tip) @ way / float(np.linalg.norm(way))
+    # Beyond a reversal lost motion would look like a delay.
     gone = np.abs(motors.at(run.name, run.times) - run.plan.move.start)
-    chosen = run.times <= run.times[int(np.argmax(gone > 0.999 * gone.max()))] + _AFTER_S
-    misfit = []
-    for delay in _DELAYS:
-        path = motors.at(run.name, run.times[chosen] - delay)
-        columns = np.stack([np.ones(len(path)), path], axis=1)
-        residual = along[chosen] - columns @ np.linalg.lstsq(columns, along[chosen], rcond=None)[0]
-        misfit.append(float(residual @ residual))
+    last = run.times[int(np.argmax(gone > 0.999 * gone.max()))] + _AFTER_S
+    found = list[tuple[float, float]]()
+    for begun, ended in motors.motions(run.name):
+        near = (run.times > begun - _AFTER_S) & (run.times < min(ended + 2.0 * _AFTER_S, last))
+        if ended < last and (one := _fit_delay(run.name, run.times[near], along[near], motors)) is not None:
+            found.append(one)
+    if not found:
+        return None
+    delays, sds = np.array(found).T
+    weights = sds**-2.0
+    mean = float(delays @ weights / weights.sum())
+    scatter = float(((delays - mean) ** 2) @ weights) / max(len(found) - 1, 1)
+    return mean, math.hypot(math.sqrt(max(1.0, scatter) / float(weights.sum())), late / math.sqrt(12.0))
+
+
+def _fit_delay(name: str, times: Floats, along: Floats, motors: MotorHistory) -> tuple[float, float] | None:
+    """Return the shift of the motor's path (s) that fits readings best, with its standard deviation.
+
+    Readings while the path is not known are left out; None if they are too many.
+    """
+    shifted = times - _DELAYS[:, None]
+    known = (motors.lateness(shifted.ravel()) < _LATE_S).reshape(shifted.shape).astype(float)
+    path = motors.at(name, shifted.ravel()).reshape(shifted.shape)
+    count = np.maximum(known.sum(axis=1, keepdims=True), 1.0)
+    path, left = (known * (one - (known * one).sum(axis=1, keepdims=True) / count) for one in (path, along))
+    slope = (path * left).sum(axis=1) / np.maximum((path**2).sum(axis=1), 1e-12)
+    misfit = ((left - slope[:, None] * path) ** 2).sum(axis=1) / count[:, 0]
+    misfit[count[:, 0] < _LEAST_KNOWN * len(times)] = np.inf
+    if not np.isfinite(misfit).any():
+        return None
     best = int(np.argmin(misfit))
-    near = _DELAYS[np.array(misfit) < misfit[best] * (1.0 + 1.0 / np.count_nonzero(chosen))]
-    return float(_DELAYS[best]), 0.5 * float(near.max() - near.min())
+    near = _DELAYS[misfit < misfit[best] * (1.0 + 1.0 / len(times))]
+    return float(_DELAYS[best]), max(_TICK_S, 0.5 * float(near.max() - near.min()))
 
 
 def describe_motions(rig: RigFile, motions: Mapping[str, Motion], most_delay: float) -> list[Finding]:
@@ -262,7 +294,22 @@ def _describe_motion(
     if motion.lost is not None:
         yield _lost_finding(name, axis, *motion.lost)
     if motion.delay is not None:
-        yield _delay_finding(name, *motion.delay, most_delay)
+        scatter = _scatter(one.delay[0] for one in motions.values() if one.delay is not None)
+        yield _delay_finding(name, motion.delay[0], max(motion.delay[1], scatter), most_delay, motion.late)
+    elif axis.unit == "mm" and motion.late > _LATE_S:
+        yield UncheckedFinding(name, "delay", _describe_busy(motion.late))
+
+
+def _scatter(values: Iterable[float]) -> float:
+    """Return the standard deviation of delays of the same tracker, 0 of one alone."""
+    found = [*values]
+    return float(np.std(found, ddof=1)) if len(found) > 1 else 0.0
+
+
+def _describe_busy(late: float) -> str:
+    return (
+        f"the computer was busy (late by up to {1e3 * late:.0f} ms): end other programs, and repeat the test"
+    )
 
 
 def _unseen(name: str, axis: Axis, unseen: tuple[float, float] | None) -> Finding:
@@ -276,12 +323,17 @@ def _unseen(name: str, axis: Axis, unseen: tuple[float, float] | None) -> Findin
     return Finding(name, "motion", found, f"{rule}, and its motor must drive the axis")
 
 
-def _delay_finding(name: str, delay: float, sd: float, most: float) -> Finding:
-    """Return the delay of the readings; ahead of the motor beyond the noise, their times are wrong."""
+def _delay_finding(name: str, delay: float, sd: float, most: float, late: float) -> Finding:
+    """Return the delay of the readings; ahead of the motor beyond the noise, their times are wrong.
+
+    late: largest lateness of a tick (s), with which neither a delay nor its absence is certain.
+    """
     shown = f"readings are {1e3 * delay:.0f} ± {1e3 * sd:.0f} ms behind the motor"
+    early = delay < -max(_EARLY_S, _SDS * sd)
+    if (early or delay > most) and late > _EARLY_S:
+        return UncheckedFinding(name, "delay", _describe_busy(late))
     if delay > most:
         return Finding(name, "delay", shown, f"must be at most {most:g} s, control.stale_after_s")
-    early = delay < -max(_EARLY_S, _SDS * sd)
     return Finding(name, "delay", shown, "must be 0 or more: check the times of the tracker" if early else "")
 
 

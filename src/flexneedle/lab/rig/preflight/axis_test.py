@@ -26,6 +26,7 @@ _TURN_DEG, _LEAST_TURN_DEG, _PROBE_DEG, _FIRST_DEG = 180.0, 45.0, 10.0, 1.0
 _SEEN_DEG = 2.0  # more than the noise of a turn
 _SDS = 4.0  # standard deviations beyond which a motion is seen
 _LEAST_S, _MOST_S, _SETTLE_S = 1.0, 4.0, 0.4
+_MOVES = 1e-3  # of the largest travel, in a tick
 _LEAST_READINGS, _ENOUGH, _MOST_WAITS = 5, 0.8, 5
 
 
@@ -56,19 +57,40 @@ class Operator(Protocol):
 
 @dataclass
 class MotorHistory:
-    """Positions of the axes (mm or rad) with their times (s), of each tick of the supervisor."""
+    """Positions of the axes (mm or rad) with their times (s) and durations (s), of each tick of the supervisor."""
 
     times: list[float] = field(default_factory=list)
+    durations: list[float] = field(default_factory=list)
     positions: list[Mapping[str, float]] = field(default_factory=list)
 
     def add(self, report: TickReport) -> None:
         """Add the tick of a report."""
         self.times.append(report.time)
+        self.durations.append(report.work)
         self.positions.append({name: axis.position for name, axis in report.axes.items()})
 
     def at(self, name: str, times: Floats) -> Floats:
         """Return the positions of an axis at times (s)."""
         return np.interp(times, self.times, [found[name] for found in self.positions])
+
+    def lateness(self, times: Floats) -> Floats:
+        """Return by how much (s) the ticks around times (s) are further apart, or longer, than usual.
+
+        On a busy computer; positions between them, or in them, are as uncertain.
+        """
+        if len(self.times) < 2:
+            return np.full(len(times), np.inf)
+        apart = np.diff(self.times) + np.maximum(self.durations[:-1], self.durations[1:])
+        index = np.clip(np.searchsorted(self.times, times) - 1, 0, len(apart) - 1)
+        late: Floats = apart[index] - np.median(apart)
+        return late
+
+    def motions(self, name: str) -> list[tuple[float, float]]:
+        """Return begin and end (s) of each motion of an axis between two rests."""
+        at = np.array([found[name] for found in self.positions])
+        moved = np.flatnonzero(np.abs(np.diff(at)) > _MOVES * np.ptp(at))
+        parts = np.split(moved, np.flatnonzero(np.diff(np.array(self.times)[moved]) > _SETTLE_S) + 1)
+        return [(self.times[part[0]], self.times[part[-1] + 1]) for part in parts if len(part)]
 
 
 @dataclass(frozen=True, eq=False)
