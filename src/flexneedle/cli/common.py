@@ -38,7 +38,7 @@ class _Target(argparse.Action):
         except ValueError:
             given = []
         if len(given) not in (2, 3):
-            rule = "must be two or three numbers (depth, y and, in space, z); put SCENARIO before --target"
+            rule = "must be two or three numbers, X Y and in space Z; put SCENARIO before --target"
             raise argparse.ArgumentError(self, f"{' '.join(values)}: {rule}")
         setattr(namespace, self.dest, (*given, 0.0)[:3])
 
@@ -57,7 +57,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action=_Target,
         metavar=("X Y", "Z"),
-        help="depth and lateral offset of the target in mm, in space both offsets (default: scenario)",
+        help="target in mm: depth X, lateral offset Y, in space also Z (default: scenario)",
     )
     add_seed(parser, "random seed")
     parser.add_argument(

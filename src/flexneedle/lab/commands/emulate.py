@@ -41,7 +41,7 @@ def _add_aurora(commands: Commands) -> None:
         _emulate_aurora,
         "flexneedle emulate aurora --link /tmp/aurora",
         "flexneedle emulate aurora --still --sensors 2 --seed 3",
-        about="Print the path of the emulated device and serve it until Ctrl-C. The tip moves along an "
+        about="Print the path of the emulated device and serve it until Ctrl-C or SIGTERM. The tip moves along an "
         "arc; a line X Y Z on stdin (mm, tracker frame) stops it there.",
     )
     aurora.add_argument(
@@ -72,7 +72,7 @@ def _add_galil(commands: Commands) -> None:
         _emulate_galil,
         "flexneedle emulate galil --port 2323",
         "flexneedle emulate galil --port 2323 --fault stall=A@5",
-        about="Print the address of the emulated controller and serve it until Ctrl-C. Its four motors "
+        about="Print the address of the emulated controller and serve it until Ctrl-C or SIGTERM. Its four motors "
         "move in real time.",
     )
     galil.add_argument(
@@ -94,8 +94,8 @@ def _add_rig(commands: Commands) -> None:
         "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
         "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
         about="Emulate the controller and tracker of a rig file, with the virtual phantom of a scenario "
-        "between them, in three processes. Prints one line when all are ready, and one per event. A "
-        "line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
+        "between them, in three processes, until Ctrl-C or SIGTERM. Prints one line when all are ready, and one "
+        "per event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all faults.",
     )
     rig.add_argument("rig", metavar="RIG", help="path of a rig file, or emulated")
     rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")

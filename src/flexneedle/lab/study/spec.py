@@ -89,7 +89,7 @@ class StudyFile(Section):
     scenario: str = "phantom"
     """Base scenario: name of a preset, or path relative to the folder of the study file."""
     without: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Keys of the base to remove, for example diameters if a gauge is set."""
+    """Keys of the base to remove, for example `setup.guide_to_skin_mm`."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key for the whole study."""
     axes: Annotated[tuple[StudyAxis, ...], Field(strict=False)] = ()

@@ -134,13 +134,6 @@ def test_another_unit_is_suspected(tmp_path, scale, unit, rule):
     assert "is the unit right" in str(caught.value)
 
 
-def test_missing_samples_are_counted_with_the_points_they_leave_unknown(tmp_path):
-    rows = random_rows(0)
-    gone = [row | dict.fromkeys(ZEROS, "") if row["point_id"] == rows[0]["point_id"] else row for row in rows]
-    (note,) = notes(tmp_path, gone)
-    assert note.endswith("; grid points without any position: 1 of 27")
-
-
 @pytest.mark.parametrize("option", ["ideal", "noisy"])
 def test_an_unknown_environment_in_an_option_is_refused(tmp_path, option):
     with pytest.raises(InputError, match=f"--{option}: no environment 'lab emty': choose from lab empty"):
