@@ -1,9 +1,13 @@
 """Keys that give the same quantity: a change of one replaces the others, in a scenario and in a study."""
 
+import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import ScenarioError
 from flexneedle.lab.study.grid import load_study
+from flexneedle.lab.study.plans import StudyPlans
+from flexneedle.lab.study.tables import write_tables
+from flexneedle.record.results import RESULT_COLUMNS
 from flexneedle.scenario.alternatives import override
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.plausible import find_doubts
@@ -56,9 +60,14 @@ def test_later_settings_replace_earlier_ones():
 def test_a_study_varies_youngs_modulus_over_a_fixed_shear_modulus(tmp_path, key):
     path = tmp_path / "study.toml"
     path.write_text(f"name = 's'\n[values]\n{MU} = 9\n[[axes]]\nkey = '{key}'\nvalues = [6, 12]\n")
-    points = load_study(path).points
+    study = load_study(path)
+    points = study.points
     assert [point.scenario.tissue[1].shear_modulus_kpa for point in points] == pytest.approx([2.0, 4.0])
     assert [dict(point.varied) for point in points] == [{E: 6}, {E: 12}]
+    empty = {**dict.fromkeys(RESULT_COLUMNS), "outcome": "done", "reason": ""}
+    times = {"control_s": 0.1, "plant_s": 0.1, "total_s": 0.3}
+    write_tables(tmp_path, study, dict.fromkeys(range(2), empty | times), StudyPlans(tmp_path / "plans"))
+    assert pq.read_table(tmp_path / "runs.parquet").column(E).to_pylist() == [6.0, 12.0]
 
 
 def test_a_doubt_about_a_modulus_names_both_keys():
@@ -68,7 +77,8 @@ def test_a_doubt_about_a_modulus_names_both_keys():
 
 @pytest.mark.parametrize(
     ("right", "wrong"),
-    [("tissue.1.shear_modulus_kpa", "young_modulus_kpa"), ("tissue.1.engaged_width_mm", "engaged_with_mm"),
+    [("tissue.1.shear_modulus_kpa", "young_modulus_kpa"),
+     ("tissue.1.shear_modulus_kpa", "youngs_kpa"), ("tissue.1.engaged_width_mm", "engaged_with_mm"),
      ("setup.stroke_mm", "strok_mm"), ("tissue", "tisue"), ("needle", "needel")],
 )  # fmt: skip
 def test_a_misspelt_key_is_one_line_that_does_not_call_it_missing(right, wrong):
