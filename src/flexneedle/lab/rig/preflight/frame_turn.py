@@ -7,7 +7,7 @@ import numpy as np
 
 from flexneedle.geometry.quaternion import from_matrix
 from flexneedle.geometry.rigid import fit_rigid
-from flexneedle.lab.rig.preflight.axis_findings import MOST_TILT, Motion
+from flexneedle.lab.rig.preflight.axis_findings import CROOKED, Motion
 from flexneedle.lab.rig.preflight.rig_check import Finding
 from flexneedle.types import Floats
 
@@ -26,7 +26,8 @@ def describe_frame(motions: Mapping[str, Motion]) -> list[Finding]:
     fit = np.einsum("ij,ij->i", expected @ rotation.T, seen) / np.linalg.norm(seen, axis=1)
     w, *axis = from_matrix(rotation).tolist()
     angle = 2.0 * math.atan2(math.hypot(*axis), w)
-    if fit.min() < math.cos(MOST_TILT) or abs(math.remainder(angle, 2.0 * math.pi)) <= MOST_TILT:
+    least = max(motions[name].most_tilt for name in turns)
+    if fit.min() < math.cos(CROOKED) or abs(math.remainder(angle, 2.0 * math.pi)) <= least:
         return []
     found = f"turned by {math.degrees(angle):.0f}° about {_describe_axis(np.array(axis))}"
     names = ", ".join(turns)
@@ -37,6 +38,6 @@ def describe_frame(motions: Mapping[str, Motion]) -> list[Finding]:
 def _describe_axis(axis: Floats) -> str:
     unit = axis / np.linalg.norm(axis)
     nearest = int(np.abs(unit).argmax())
-    if abs(unit[nearest]) > math.cos(MOST_TILT):
+    if abs(unit[nearest]) > math.cos(CROOKED):
         return f"{'-' if unit[nearest] < 0.0 else ''}{'xyz'[nearest]}"
     return f"({', '.join(f'{one:.2f}' for one in unit)})"
