@@ -90,7 +90,7 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
     }
 
 
-def unfinished(row, outcome="held", reason="held for 1.03 s (limit 1 s): missing: no reading"):
+def unfinished(row, outcome="held", reason="held for 1.03 s (limit 1.00 s): missing: no reading"):
     """Return the row as one of an insertion that did not finish."""
     nothing = ("true_error_mm", "residual_mm", "tip_x_mm", "tip_y_mm", "flips", "strain_energy_mj", "periods")
     unknown = dict.fromkeys(nothing) if outcome in ("refused", "error") else {}

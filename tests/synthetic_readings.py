@@ -63,7 +63,7 @@ def held_from_the_start():
     first = held(insertion.periods[0], DISTORTED)
     still = [replace(first, index=k, time=0.2 * (k + 1)) for k in range(20)]
     rejected = tuple(with_readings(period, verdict=DISTORTED) for period in still)
-    reason = f"held for 10.00 s (limit 10 s): {DISTORTED}"
+    reason = f"held for 10.00 s (limit 10.00 s): {DISTORTED}"
     return replace(insertion, periods=rejected, outcome="held", reason=reason)
 
 

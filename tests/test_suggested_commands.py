@@ -73,6 +73,34 @@ def test_a_message_that_asks_for_a_motion_names_its_command():
     assert lacking == []
 
 
+def test_a_command_for_a_rig_names_it_and_begins_with_the_program():
+    lacking = [
+        f"{path.name}:{line}: {text}"
+        for path in SOURCES
+        for line, text in texts(path)
+        if re.search(
+            r"(?<!flexneedle )\brig (?:check|jog|ready|retract|test) (?:X|RIG)|\brig [a-z]+ RIG\b", text
+        )
+    ]
+    assert lacking == []
+
+
+_UNIT = r"(?:mm|s|N|%|mrad)?"
+_LIMITED = re.compile(
+    rf"\{{[^{{}}]+:(\.\d[fg]|g)\}}({_UNIT})[^{{}}]*limit \{{[^{{}}]+:(\.\d[fg]|g)\}}({_UNIT})"
+)
+
+
+def test_a_value_and_its_limit_have_one_format():
+    found = [
+        (path.name, *match)
+        for path in SOURCES
+        for match in _LIMITED.findall(path.read_text().replace('"\n', ""))
+    ]
+    assert len(found) > 6
+    assert [each for each in found if each[1] != each[3]] == []
+
+
 @pytest.mark.parametrize(
     ("words", "unknown"),
     [

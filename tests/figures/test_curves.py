@@ -40,7 +40,7 @@ def test_the_curve_is_the_largest_median_of_a_reference():
 
 def test_readings_that_the_monitor_excludes_do_not_count():
     frames = [frame_of(k, 0.1 * k, {"a": value}) for k, value in enumerate((0.01, 0.5, 0.6, 0.02))]
-    verdicts = ["ok", "stale: frame 1 after frame 1", "not a number", "innovation: 2.31 mm, limit 2 mm"]
+    verdicts = ["ok", "stale: frame 1 after frame 1", "not a number", "innovation: 2.31 mm, limit 2.00 mm"]
     np.testing.assert_allclose(indicators(frames, 1.0, verdicts), [[0.0, 0.01], [0.3, 0.015]])
 
 

@@ -47,7 +47,7 @@ CASES = {
     ),
     "without rolls": without_rolls,
 }
-HELD = "held for 10.00 s (limit 10 s)"
+HELD = "held for 10.00 s (limit 10.00 s)"
 PATHS = ("true path", "estimated path")
 ARRANGED = ("reached", "one period", "held from the start", "held on the way", "a long reason")
 

@@ -34,7 +34,9 @@ def missing(**how):
     return in_space(make_insertion(miss=1.4, **how), ANGLE)
 
 
-LONG = "held for 10.00 s (limit 10 s): field distorted: ref2 0.1457, to fall below 0.0492 (median over 1 s)"
+LONG = (
+    "held for 10.00 s (limit 10.00 s): field distorted: ref2 0.1457, to fall below 0.0492 (median over 1 s)"
+)
 CASES = {
     "reached": lambda: (SPACE, INSERTION),
     "half turns": lambda: (HALF_TURNS, missing(outcome="held", reason=LONG, periods=20)),

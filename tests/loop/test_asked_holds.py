@@ -57,7 +57,7 @@ def test_the_hold_counts_towards_the_limit_of_all_holds(plan):
     scenario = PHANTOM.with_values({"control.hold_total_s": 0.5})
     done, _ = inserted(plan, Asked(*range(6, 1000)), scenario)
     assert done.outcome == "held"
-    assert done.reason == f"held for {done.held_s:.2f} s in all (limit 0.5 s): {WHY}"
+    assert done.reason == f"held for {done.held_s:.2f} s in all (limit 0.50 s): {WHY}"
     assert done.held_s == pytest.approx(0.5, abs=READING)
 
 

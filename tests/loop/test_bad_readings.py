@@ -107,7 +107,7 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
     assert (done.outcome, done.reached) == ("held", False)
     assert done.reason.startswith("held for 1.0")
     assert verdict in done.reason
-    assert "limit 1 s" in done.reason
+    assert "limit 1.00 s" in done.reason
     assert failed[-1].index == done.periods[-1].index
     assert failed[-1].time - failed[0].time == pytest.approx(1.0, abs=1e-6)
     assert len(failed) == 41  # of 25 ms each after the first
@@ -131,7 +131,7 @@ def test_all_holds_together_have_a_limit(plan):
 
     done = run(plan, RecordedPhantom(plan.roll, spoil=spoil).rig(), scenario)
     assert done.outcome == "held"
-    assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.5 s): missing")
+    assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.50 s): missing")
     assert 0.5 - 1e-6 <= done.held_s <= 0.5 + READING + 1e-6
     held = [period.action == "hold" for period in done.periods]
     assert sum(one and not before for before, one in pairwise(held)) >= 3

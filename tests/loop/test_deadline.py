@@ -18,7 +18,7 @@ from phantoms import STRAIGHT
 DEADLINE_S, TAKEN_S = 0.2, 0.35
 LATE = 3  # the number of the decision
 IN_TISSUE = 32
-WARNED = "late: decided in 0.350 s, limit 0.2 s"
+WARNED = "late: decided in 0.350 s, limit 0.200 s"
 
 
 class Slow:

@@ -83,6 +83,6 @@ def test_a_delay_beyond_the_age_limit_holds_from_the_start(inserted):
     """All readings are older than the limit of 0.3 s and rejected, and nothing moves."""
     done = inserted(2001, phantom__delay_periods=1.75)
     assert done.outcome == "held"
-    assert "stale: 0.350 s old, limit 0.3 s" in done.reason
+    assert "stale: 0.350 s old, limit 0.300 s" in done.reason
     assert done.periods[-1].time == pytest.approx(1.0)
     assert {period.command for period in done.periods} == {STILL}

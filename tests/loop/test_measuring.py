@@ -96,11 +96,11 @@ def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
 def test_before_the_start_the_newest_frame_must_not_be_stale():
     """The tracker stopped a minute ago, after good frames."""
     observation = before(61.0, *second())
-    assert str(observation.verdict) == "stale: 60.000 s old, limit 0.3 s"
+    assert str(observation.verdict) == "stale: 60.000 s old, limit 0.300 s"
     blind = [*second()[:-1], measurement(1.0, measured=False)]
-    assert str(before(61.0, *blind).verdict) == "stale: 60.000 s old, limit 0.3 s"
+    assert str(before(61.0, *blind).verdict) == "stale: 60.000 s old, limit 0.300 s"
     undated = [replace(measurement(0.0), time=math.nan), *second()]
-    assert str(before(61.0, *undated).verdict) == "stale: 60.000 s old, limit 0.3 s"
+    assert str(before(61.0, *undated).verdict) == "stale: 60.000 s old, limit 0.300 s"
 
 
 def test_a_repeated_frame_without_the_tip_is_no_dropout():
@@ -171,7 +171,7 @@ def test_readings_in_transit_during_the_move_may_be_older_than_the_newest():
     observation = during(monitor, 1.2 + age, measurement(1.1), measurement(1.2))
     assert [str(reading.verdict) for reading in observation.readings] == [
         OK,
-        f"stale: {age:.3f} s old, limit 0.3 s",
+        f"stale: {age:.3f} s old, limit 0.300 s",
     ]
     assert observation.estimate.used is None
 

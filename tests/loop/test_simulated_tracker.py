@@ -59,7 +59,7 @@ def test_in_a_clean_field_there_is_no_hold(inserted):
 def test_over_metal_the_needle_is_held_and_the_insertion_aborted(inserted):
     held = inserted("noisy")
     assert held.outcome == "held"
-    assert held.reason.startswith("held for 10.00 s (limit 10 s): field distorted: ref")
+    assert held.reason.startswith("held for 10.00 s (limit 10.00 s): field distorted: ref")
     assert held.held_s == pytest.approx(10.0, abs=0.3)
     assert held.true_error_mm > 20.0  # before the skin
 
@@ -201,7 +201,7 @@ def test_alternating_causes_do_not_hold_the_needle_forever(plan):
     causes = {str(period.verdict).split(":")[0] for period in done.periods}
     assert causes == {"missing", "field not known"}
     assert done.outcome == "held"
-    assert "(limit 1 s): missing: tip not measured (out of volume)" in done.reason
+    assert "(limit 1.00 s): missing: tip not measured (out of volume)" in done.reason
     assert done.periods[-1].time < 2.0
 
 
@@ -239,7 +239,7 @@ def test_a_tracker_that_stops_in_a_distorted_field_is_reported_as_missing(plan):
 
     done = on_bench(plan, readings_at)
     assert done.outcome == "held"
-    assert done.reason.endswith("(limit 1 s): missing: no reading (unplugged)")
+    assert done.reason.endswith("(limit 1.00 s): missing: no reading (unplugged)")
     assert 1.5 < done.periods[-1].time < 2.0
     silent = [period for period in done.periods if not period.readings]
     assert {str(period.verdict).split(":")[0] for period in silent} == {"field distorted", "missing"}

@@ -151,7 +151,7 @@ def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, mea
     assert (again.measurement.x, again.measurement.z) == (measurement.x, measurement.z)
 
 
-@pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.4 mm", "ref1: 0.09", ": "])
+@pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.40 mm", "ref1: 0.09", ": "])
 def test_a_verdict_is_restored_from_its_text(reason):
     verdicts = [Verdict(kind, reason) for kind in VerdictKind]
     assert [parse_verdict(str(verdict)) for verdict in verdicts] == verdicts

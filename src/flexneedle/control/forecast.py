@@ -44,7 +44,7 @@ def reason_to_hold(decision: Decision, control: ControlSettings) -> str:
     return (
         f"no path to the target found: predicted miss {_format_prediction(decision)} is beyond "
         f"control.miss_limit_mm = {limit:g} with a probability of {probability:.3f} "
-        f"(limit {control.miss_confidence:g}); to insert anyway: flexneedle insert --force"
+        f"(limit {control.miss_confidence:.3f}); to insert anyway: flexneedle insert --force"
     )
 
 

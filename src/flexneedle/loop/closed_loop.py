@@ -196,10 +196,10 @@ def _hold_ending(scenario: Scenario, state: LoopState) -> _Ending | None:
     observation, held, refused = state.observation, state.held, state.refused
     limit, total = observation.hold_limit(scenario), scenario.control.hold_total_s
     if held is not None and held > limit - 1e-9:
-        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
+        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:.2f} s): {observation.verdict}"
     if state.held_in_all > total - 1e-9 and (held is not None or state.asked or refused.reason):
         why = state.asked or refused.reason if held is None else observation.verdict
-        return Outcome.HELD, f"held for {state.held_in_all:.2f} s in all (limit {total:g} s): {why}"
+        return Outcome.HELD, f"held for {state.held_in_all:.2f} s in all (limit {total:.2f} s): {why}"
     return refused.ending(scenario.control.hold_limit_s)
 
 

@@ -102,7 +102,7 @@ def prepare(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) ->
     check_choices(scenario, plan.strategy, choices)
     if not (plan.reached or choices.force or chosen.predicts):
         raise RunError(
-            f"plan misses the target by {format_mm(plan.error_mm)} (limit {TARGET_RADIUS_MM:g} mm), "
+            f"plan misses the target by {format_mm(plan.error_mm)} (limit {format_mm(TARGET_RADIUS_MM)}), "
             f"limited by {plan.limit}; to insert anyway: flexneedle insert --force (force=True)"
         )
     task = controller_tables.make_task(

@@ -86,7 +86,7 @@ class Steering:
         counted, taken = replace(state, late=None, moves=state.moves + 1), rig.clock.now() - begun
         if rig.deadline is None or taken <= rig.deadline:
             return self._act_on(counted, decision, memory)
-        why = f"late: decided in {taken:.3f} s, limit {rig.deadline:g} s"
+        why = f"late: decided in {taken:.3f} s, limit {rig.deadline:.3f} s"
         resting = Step(Action.REST, replace(decision, command=STILL, why=why), 0.0, late=True)
         return resting, replace(counted, late=LateDecision.of(decision, memory, estimate))
 

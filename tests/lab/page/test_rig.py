@@ -236,7 +236,7 @@ def test_a_worker_that_ends_leaves_a_fault_and_starts_nothing_again(server, clie
     client.has("rig", state="fault")
     summary = client.has("insertion live", state="failed")["summary"]
     assert summary.startswith("the worker has ended (exit status -9)")
-    assert summary.endswith("flexneedle rig retract bench.toml")
+    assert summary.endswith("withdraw it with the button Retract")
     refuses_to_go(client)
     prepared(client)
 

@@ -6,9 +6,11 @@ from unittest.mock import Mock
 import pytest
 
 from flexneedle.lab.page.job_orders import RigReport, WorkOrder
+from flexneedle.lab.page.protocol import RigCheckMessage
 from flexneedle.lab.page.server.clients import PageLimits, Refusal
 from flexneedle.lab.page.server.connected_rig import ConnectedRig, RigReference
 from flexneedle.lab.page.server.hub import Hub
+from recorded_page import insertion
 
 JOB, NOBODY = 4, "nobody is in control"
 
@@ -157,3 +159,25 @@ def test_the_deadline_is_for_the_motors_and_the_end_is_shown(bench, state, shown
             bench.stop("person 3")
     bench.end("done", "the supervisor has ended")
     assert (bench.shown, bench.active) == (shown, False)
+
+
+@pytest.mark.parametrize(
+    ("motion", "marked"),
+    [("insertion", ["check"]), ("retraction", ["check", "insertion live"])],
+)
+def test_a_check_and_a_drawn_needle_are_outdated_once_the_rig_moves(bench, motion, marked):
+    keys = ("check", "insertion live")
+    bench.hub.publish(RigCheckMessage(revision=1, findings=[]))
+    bench.hub.publish(insertion("held", rig="Bench"))
+    bench.motion = motion
+    bench.reports("idle", waits=1)
+    bench.arm(JOB)
+    assert not any(bench.hub.newest(key).moved for key in keys)
+    bench.go()
+    assert [key for key in keys if bench.hub.newest(key).moved] == marked
+
+
+def test_a_refused_preparation_makes_a_check_outdated(bench):
+    bench.hub.publish(RigCheckMessage(revision=1, findings=[]))
+    bench.end("failed", "guide_y: at 1.5 mm")
+    assert bench.hub.newest("check").moved

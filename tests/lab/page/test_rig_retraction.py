@@ -16,7 +16,8 @@ from flexneedle.lab.page.worker.rig_retraction import retract
 from flexneedle.lab.page.worker.task import Cancelled, JobControl
 from flexneedle.lab.rig.notices import SWITCHED_ON
 from flexneedle.lab.rig.supervisor.machine import SupervisorState
-from flexneedle.lab.rig.supervisor.protocol import TickReport
+from flexneedle.lab.rig.supervisor.protocol import AxisState, TickReport
+from flexneedle.ports import MotorState
 from page_tasks import Reported, short, task
 
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
@@ -47,7 +48,8 @@ class RecordingSupervisor:
 
     def retract(self, position, speed):
         self.calls.append(("retract", position, speed))
-        self.tick(TickReport(0.0, SupervisorState.RETRACTING, ""))
+        halfway = {"insertion": AxisState(16.2, MotorState(0.0, 0.0))}
+        self.tick(TickReport(0.0, SupervisorState.RETRACTING, "", halfway))
         self.on_retract()
 
     def request_stop(self, who):
@@ -107,9 +109,17 @@ def test_the_motion_is_that_of_the_command(monkeypatch, capsys, supervisor):
         ("idle", "", 1),
         ("idle", "", 0),
         ("armed", "", 0),
-        ("retracting", "", 0),
+        ("retracting", "14 mm left", 0),
         ("ended", "the needle was withdrawn to 2.4 mm", 0),
     ]
+
+
+@pytest.mark.usefixtures("supervisor")
+def test_a_retraction_that_begins_is_not_called_withdrawn():
+    one = order(go)
+    retract(one)
+    jobs = [(job.text, job.share) for job in one.report.of("job") if job.state == "running"]
+    assert jobs[-2:] == [("motors are switched on", None), ("withdrawing, 14 mm left", pytest.approx(0.5))]
 
 
 def test_nothing_is_opened_or_moved_before_go(supervisor, motors):

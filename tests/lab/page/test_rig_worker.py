@@ -129,7 +129,7 @@ def test_it_waits_with_its_motions_until_it_may_go(calls, in_tmp):
     assert "switched on" in waiting.moves[-1]
     assert (waiting.waits, goes.waits, goes.moves) == (1, 0, ())
     assert len(one.report.rows) == last.periods > 10
-    assert last.summary.endswith("flexneedle rig retract rig.toml")  # the needle is left in
+    assert last.summary.endswith("withdraw it with the button Retract")  # the needle is left in
     with pytest.raises(InputError, match="no insertion to save"):  # it is recorded already
         InsertionJobs().save(task("save", folder=str(in_tmp / "again")))
 
@@ -206,7 +206,7 @@ def test_a_failure_reports_that_the_needle_is_left_in(calls, in_tmp):
         inserted(one)
     last = one.report.of("insertion")[-1]
     assert (last.state, last.summary.split("; ")[0]) == ("failed", "the motor is off")
-    assert last.summary.endswith("flexneedle rig retract rig.toml")
+    assert last.summary.endswith("withdraw it with the button Retract")
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ def test_a_wrong_scale_or_direction_of_the_insertion_is_named(plans, preset, fac
         assert at == "2000"
         assert float(moved) == pytest.approx(factor, rel=0.01)
         assert float(counts) == pytest.approx(2000.0 / factor, rel=0.02)
-    assert text.endswith("flexneedle rig test RIG")
+    assert text.endswith("flexneedle rig test emulated")
 
 
 @pytest.mark.parametrize(

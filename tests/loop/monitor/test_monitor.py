@@ -182,9 +182,9 @@ def test_a_tracker_that_reports_only_the_tip_is_accepted():
         (Measurement(1.0, math.nan, 1.0), "not a number: x nan"),
         (Measurement(1.0, 30.0, 1.0, direction=(0.1, math.nan)), "not a number: direction nan"),
         (Measurement(1.0, None, None, frame=frame(1.0, tip=None)), str(MISSED)),
-        (Measurement(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
-        (Measurement(1.0, 33.0, 1.0), "innovation: 3.00 mm, limit 2 mm"),
-        (Measurement(0.5, 30.0, 1.0), "stale: 0.500 s old, limit 0.3 s"),
+        (Measurement(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5.00 mm"),
+        (Measurement(1.0, 33.0, 1.0), "innovation: 3.00 mm, limit 2.00 mm"),
+        (Measurement(0.5, 30.0, 1.0), "stale: 0.500 s old, limit 0.300 s"),
     ],
 )
 def test_each_fault_of_a_reading_is_reported(measurement, verdict):

@@ -64,7 +64,7 @@ def frame(number, time=1.0):
         (rules.check_not_a_number, (without_tip(),), OK),
         (rules.check_stale, (9.5, 10.0, 0.5), OK),
         (rules.check_stale, (10.5, 10.0, 0.5), OK),
-        (rules.check_stale, (9.4, 10.0, 0.5), "stale: 0.600 s old, limit 0.5 s"),
+        (rules.check_stale, (9.4, 10.0, 0.5), "stale: 0.600 s old, limit 0.500 s"),
         (rules.check_stale, (10.6, 10.0, 0.5), "stale: dated 0.600 s ahead"),
         (rules.check_repeated, (frame(8, 1.025), frame(7)), OK),
         (rules.check_repeated, (frame(7, 1.025), frame(7)), "stale: frame 7 after frame 7"),
@@ -74,8 +74,8 @@ def frame(number, time=1.0):
         (rules.check_out_of_plane, (5.0, 5.0), OK),
         (rules.check_out_of_plane, (-5.0, 5.0), OK),
         (rules.check_out_of_plane, (None, 5.0), OK),
-        (rules.check_out_of_plane, (-5.1, 5.0), "out of plane: -5.10 mm, limit 5 mm"),
-        (rules.check_out_of_plane, (5.1, 5.0), "out of plane: 5.10 mm, limit 5 mm"),
+        (rules.check_out_of_plane, (-5.1, 5.0), "out of plane: -5.10 mm, limit 5.00 mm"),
+        (rules.check_out_of_plane, (5.1, 5.0), "out of plane: 5.10 mm, limit 5.00 mm"),
         (rules.check_jump, (replace(GOOD, z=4.0), GOOD, 3.0), "jump: 4.00 mm, limit 3.00 mm"),
         (rules.check_jump, (replace(GOOD, z=None), replace(GOOD, z=4.0), 3.0), OK),
         (rules.check_frozen, (4, 0.3, 0.3), OK),
@@ -144,7 +144,7 @@ def test_distances_are_accepted_up_to_their_limit_in_any_direction(direction):
         return str(rules.check_jump(tip, GOOD, 3.0))
 
     assert innovation(2.0 - 1e-12) == jump(2.99) == OK
-    assert innovation(5.0) == "innovation: 5.00 mm, limit 2 mm"
+    assert innovation(5.0) == "innovation: 5.00 mm, limit 2.00 mm"
     assert innovation(2.0 + 1e-6).startswith("innovation")
     assert jump(3.01) == "jump: 3.01 mm, limit 3.00 mm"
 

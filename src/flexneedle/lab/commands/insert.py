@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 from contextlib import ExitStack
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.cli.commands import Commands
@@ -153,7 +154,7 @@ class RigConnection(RosConnection):
     def end(self) -> None:
         """Print how the needle is withdrawn."""
         if self._rig.moves:
-            print_note(STILL_IN.format(rig=self.args.rig))
+            print_note(STILL_IN.format(command=f"flexneedle rig retract {quote(self.args.rig)}"))
 
 
 def interrupt_on_signals(stack: ExitStack) -> None:

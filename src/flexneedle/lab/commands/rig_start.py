@@ -97,7 +97,7 @@ def _test(args: argparse.Namespace) -> int:
             moves = [plan.move for plan in plans]
             if scenario is not None:
                 farthest = max(abs(one.distance) for one in moves if one.axis.unit == "mm")
-                require_air(float(rest.tip[0]), farthest)
+                require_air(rig, float(rest.tip[0]), farthest)
             confirm_motions([*map(str, moves), _IN_AIR, ARMS], "" if args.yes else "Move?")
             folder = create_evidence(rig, args.out)
             _start(operator, moves)
@@ -159,7 +159,7 @@ def _advance(operator: SupervisorClient, scenario: Scenario, forward: Sequence[A
     tip = _measure_tip(operator)
     for move in forward:
         operator.move_to(move.name, move.goal, move.speed)
-        tip = check_advance(scenario, move, tip, _measure_tip(operator))
+        tip = check_advance(operator.rig, scenario, move, tip, _measure_tip(operator))
 
 
 def _measure_tip(operator: SupervisorClient) -> Point | None:

@@ -29,6 +29,8 @@ Action = Literal[
 ]
 BEAT_S = 0.25
 """Time between two beats of the server to a worker whose job moves a rig."""
+RETRACT_BUTTON = "the button Retract"
+"""Remedy for a needle that is left in, on the page."""
 SILENT_S = 1.5
 """Time without a beat after which the worker stops the rig: nobody could stop it any more."""
 

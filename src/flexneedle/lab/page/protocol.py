@@ -238,6 +238,7 @@ class InsertionMessage(ServerMessage):
         folder: Name of the run that records it, "" without one.
         row: Row of a study that was computed again and can be saved as a run.
         target_name: Name of the target, "" without other targets.
+        moved: Whether the rig has withdrawn the needle since, wholly or in part.
     """
 
     by = "of"
@@ -258,6 +259,7 @@ class InsertionMessage(ServerMessage):
     row: int | None = None
     target_name: str = ""
     scene: SceneMessage | None = None
+    moved: bool = False
 
 
 class ClosedMessage(ServerMessage):
@@ -303,11 +305,16 @@ class RigStateMessage(ServerMessage):
 
 
 class RigCheckMessage(ServerMessage):
-    """Findings of the last check of the rig: part, item, found value, and problem ("" without one) of each."""
+    """Findings of the last check of the rig: part, item, found value, and problem ("" without one) of each.
+
+    made: s since 1970; moved: whether the rig has moved since, or has refused a motion.
+    """
 
     type: Literal["check"] = "check"
     revision: int
     findings: list[dict[str, str]]
+    made: float = 0.0
+    moved: bool = False
 
 
 class StudyRow(ProtocolMessage):

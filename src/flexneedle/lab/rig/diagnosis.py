@@ -70,7 +70,7 @@ def explain_record(rig: RigFile, insertion: Insertion) -> str:
     if fault is None:
         return ""
     sure = f"fits the readings better (log-likelihood ratio {fault.ratio:.0f})"
-    return f"{fault.text} {sure}: withdraw the needle, then check it with flexneedle rig test RIG"
+    return f"{fault.text} {sure}: withdraw the needle, then check it with flexneedle rig test {rig.source}"
 
 
 def find_fault(rig: RigFile, scenario: Scenario, insertion: Insertion) -> Fault | None:

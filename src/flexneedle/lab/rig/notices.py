@@ -5,5 +5,5 @@ SWITCHED_ON = (
     "off and on again at its present position: support a vertical axis."
 )
 """Notice before any motion."""
-STILL_IN = "the needle stays in place: withdraw it with flexneedle rig retract {rig}"
-"""Notice of a needle that is left in; rig: as the user gave it."""
+STILL_IN = "the needle stays in place: withdraw it with {command}"
+"""Notice of a needle that is left in."""

@@ -5,10 +5,12 @@ A driver or tracker has further settings besides `kind`, and checks them itself.
 
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
+from os import fspath
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from flexneedle.errors import RigError
 from flexneedle.lab.rig.rig_axes import Axes, Axis
@@ -111,6 +113,12 @@ class RigFile(Section):
     loop: LoopSettings = LoopSettings()
     ros: RosSettings | None = None
     """Not set: no connection to ROS 2."""
+    _source: str = PrivateAttr("RIG")
+
+    @property
+    def source(self) -> str:
+        """Name or path of the rig for suggested commands, quoted for a shell; RIG for a rig without a file."""
+        return self._source
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -144,4 +152,6 @@ def load_rig(path: str | Path) -> RigFile:
 
     Raises RigError with one line for each problem: file, key, value, rule.
     """
-    return RIGS.load(path, RigFile)
+    rig = RIGS.load(path, RigFile)
+    rig._source = quote(fspath(path))
+    return rig

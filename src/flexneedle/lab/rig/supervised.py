@@ -178,7 +178,7 @@ def check_room(supervisor: SupervisorClient, scenario: Scenario, plan: Plan, *, 
         *start_problems(supervisor.rig, scenario, positions, need),
         *(
             f"tip = {', '.join(f'{one:.1f}' for one in measured.point)} mm: {line}"
-            for line in tip_problems(scenario, measured, positions.get("rotation", 0.0))
+            for line in tip_problems(supervisor.rig, scenario, measured, positions.get("rotation", 0.0))
         ),
     ]:
         raise RigError(*problems)

@@ -55,7 +55,7 @@ def check_not_a_number(measurement: Measurement) -> Verdict:
 def check_stale(time: float, now: float, limit: float) -> Verdict:
     """Require a time stamp at most `limit` (s) in the past or in the future."""
     if now - time > limit:
-        return Verdict(VerdictKind.STALE, f"{now - time:.3f} s old, limit {limit:g} s")
+        return Verdict(VerdictKind.STALE, f"{now - time:.3f} s old, limit {limit:.3f} s")
     if time > now + limit:
         return Verdict(VerdictKind.STALE, f"dated {time - now:.3f} s ahead")
     return OK
@@ -73,14 +73,14 @@ def check_innovation(measured: Position, predicted: Position, limit: float) -> V
     distance = math.dist(measured, predicted)
     if distance <= limit:
         return OK
-    return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:.3g} mm")
+    return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:.2f} mm")
 
 
 def check_out_of_plane(z: float | None, limit: float) -> Verdict:
     """Require a tip at most `limit` (mm) from the plane of the insertion; OK for a tracker without z."""
     if z is None or abs(z) <= limit:
         return OK
-    return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:g} mm")
+    return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:.2f} mm")
 
 
 def check_jump(measurement: Measurement, previous: Measurement, limit: float) -> Verdict:

@@ -89,6 +89,7 @@ def test_a_page_takes_over_control_and_another_takes_it_back(visit, server):
     assert server.wait_for("stop") == [{"type": "stop"}]
     for state, begun, job, text in (
         ("ready", False, 7, "Take over and end the preparation"),
+        ("starting", False, 7, "Take over and stop the insertion"),
         ("stopped", False, 7, "Take over"),
         ("idle", False, None, "Take over"),
     ):

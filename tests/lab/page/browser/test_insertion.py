@@ -211,6 +211,9 @@ def check_the_rig(page, server):
     assert page.locator(".findings details[open]").count() == 1
     server.send(*opening(revision=2)[2:3])
     page.wait_for_selector("text=The check has found 1 problem, for an earlier state of the scenario.")
+    server.send(RigCheckMessage(revision=2, findings=findings[:1], moved=True))
+    page.wait_for_selector("text=The check is out of date: the rig has moved since")
+    assert page.locator(".findings li").count() == 0
 
 
 def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_panel, server):
@@ -326,7 +329,7 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     server.send(rig("starting", **motion))
     page.wait_for_selector(f"{BAR} >> text=Bench starts: motors are switched on.")
     server.send(rig("retracting", begun=True, **motion))
-    page.wait_for_selector(f"{BAR} >> text=Bench withdraws the needle.")
+    page.wait_for_selector(f"{BAR} >> text=Bench is withdrawing the needle.")
     page.wait_for_selector(f"{BAR} .stop.danger")
     assert shown_buttons(page) == {}
     assert not page.locator("[aria-label=Pace]").is_visible()
@@ -335,6 +338,9 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     assert [each["type"] for each in server.requests if each["type"] in ("arm", "go")] == ["arm", "go"]
     server.send(clients(2, steering=2))
     page.wait_for_selector("text=Take over and stop the retraction")
+    assert page.locator(".scene p.moved").count() == 0
+    server.send(left_in.model_copy(update={"moved": True}))
+    page.wait_for_selector(".scene p.moved >> text=the rig has moved since")
     server.send(clients(), rig("stopped", why="person 1 on the page", motion="retraction"))
     page.wait_for_selector(f"{BAR} >> text=Bench was stopped: person 1 on the page.")
     assert hint.is_visible()

@@ -88,6 +88,12 @@ WAITS = RigStateMessage(name="Bench", state="ready", job=7, moves=["The motors a
 STATES = {
     "planned": list,
     "inserting": inserting,
+    "idle rig": lambda: [
+        WELCOME.model_copy(update={"rig": "Bench"}),
+        clients(),
+        whole_session(),
+        RigStateMessage(name="Bench", state="idle"),
+    ],
     "rig": lambda: [
         WELCOME.model_copy(update={"rig": "Bench"}),
         clients(),
@@ -122,6 +128,10 @@ COCKPIT = """() => {
   return {
     stop: [innerWidth - stop.right, stop.top], scene: stage.height / innerHeight,
     outside: parts.filter(outside).map(([name]) => name),
+    rows: new Set(found(".actions .tools > :not(.stop)").map(([, { top }]) => Math.round(top))).size,
+    cut: [...document.querySelectorAll(".title, .actions .words, .actions button, [role=tab]")]
+      .filter((one) => one.checkVisibility() && (one.scrollWidth > one.clientWidth + 1 || one.scrollHeight > one.clientHeight + 2))
+      .map((one) => one.textContent),
     overlaps: pairs.filter(([[, a], [, b]]) => apart(a, b) < -1).map(([[a], [b]]) => [a, b]),
     scrolls: scrollHeight - clientHeight + [...document.querySelectorAll("*")].filter((one) => scrolls(one)).length,
   };
@@ -155,6 +165,7 @@ def test_scene_and_stop_stay_in_view_in_each_state_and_tab(visit, server, pictur
                 found,
             )
             assert found["scene"] >= TALLEST, (state, tab)
+            assert (found["rows"] <= 2, found["cut"]) == (True, []), (state, tab, found)
             stops.append(found["stop"])
             assert too_wide(page) == [], (state, tab)
         show(page, VIEWS_AND_TABS[number][1])

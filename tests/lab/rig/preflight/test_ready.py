@@ -47,7 +47,7 @@ def test_the_insertion_goes_back_first_and_forward_last(tip, positions, expected
 @pytest.mark.parametrize(
     ("tip", "line"),
     [
-        ((12.3, 0.0, 0.0), r"tip: 12\.3 mm deep: .*flexneedle rig retract RIG"),
+        ((12.3, 0.0, 0.0), r"tip: 12\.3 mm deep: .*flexneedle rig retract emulated"),
         ((-1.0, 0.0, 0.0), r"tip: 1\.0 mm before the skin: must be 3 mm or more"),
         (None, "tip: not measured"),
     ],
@@ -69,7 +69,7 @@ def test_an_axis_that_does_not_move_as_far_as_commanded_goes_no_further(moved, r
     move = plan_way_to_start(RIG, PLANE, AT, (-38.5, 0.0, 0.0)).forward[0]  # by 5 mm
     before, after = (-38.5, 0.0, 0.0), (-38.5 + moved, 0.0, 0.0)
     if right:
-        assert check_advance(PLANE, move, before, after) == after
+        assert check_advance(RIG, PLANE, move, before, after) == after
         return
-    with pytest.raises(RigError, match=r"tip: moved .* must be 5\.00 mm .* flexneedle rig test RIG"):
-        check_advance(PLANE, move, before, after)
+    with pytest.raises(RigError, match=r"tip: moved .* must be 5\.00 mm .* flexneedle rig test emulated"):
+        check_advance(RIG, PLANE, move, before, after)

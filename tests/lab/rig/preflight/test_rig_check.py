@@ -186,7 +186,7 @@ def test_an_axis_off_its_start_is_a_problem_whether_or_not_the_scenario_moves_it
         (
             "guide_z",
             "start",
-        ): "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_z --to 0mm"
+        ): "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig jog RIG guide_z --to 0mm"
     }
     assert found_of(findings, "rotation", "start").startswith("at 30 deg, rolled to the plan's angle")
     assert ("guide_z", "start") not in problems(check_motors(made, device, ManualClock()))
@@ -233,7 +233,7 @@ def reading(where, tip):
     ],
 )
 def test_a_tracker_that_is_not_ready_is_a_problem(device, seconds, problem):
-    found = problems(check_tracker(device, device.clock, seconds, PLANE))
+    found = problems(check_tracker(rig(), device, device.clock, seconds, PLANE))
     (line,) = [f"{item}: {line}" for (_, item), line in found.items()] or [""]
     assert line.startswith(problem)
     assert bool(line) == bool(problem)
@@ -256,7 +256,7 @@ def test_a_tracker_that_is_not_ready_is_a_problem(device, seconds, problem):
 def test_a_tip_that_is_not_at_the_start_of_the_scenario_is_a_problem(place, turn, changes, problem):
     device = ChangedTracker(reading(lambda _: True, SensorReading(place, turn)))
     wanted = replace(PLANE, scenario=PLANE.scenario.with_values(changes))
-    found = problems(check_tracker(device, device.clock, 1.0, wanted))
+    found = problems(check_tracker(rig(), device, device.clock, 1.0, wanted))
     assert found.get(("tip", "start"), "").startswith(problem)
     assert set(found) <= {("tip", "start")}
     assert bool(found) == bool(problem)
@@ -264,7 +264,7 @@ def test_a_tip_that_is_not_at_the_start_of_the_scenario_is_a_problem(place, turn
 
 def test_the_rate_missed_frames_and_positions_are_measured():
     device = ChangedTracker(lambda frame: frame if frame.number % 4 else None)
-    findings = check_tracker(device, device.clock, 1.0)
+    findings = check_tracker(rig(), device, device.clock, 1.0)
     rate, frames = found_of(findings, "tracker", "frames").split(" Hz, ")
     assert float(rate) == pytest.approx(0.75 * 40.0, rel=0.05)
     assert frames == "29 frames, 9 missed"
@@ -278,4 +278,4 @@ def test_the_references_that_the_monitor_needs_are_counted():
         (("tip", "ref1", "ref2", "ref3"), set()),
     ):
         device = Tracker(ManualClock(), sensors=sensors)
-        assert set(problems(check_tracker(device, device.clock, 1.0, needs))) == expected
+        assert set(problems(check_tracker(rig(), device, device.clock, 1.0, needs))) == expected

@@ -1,12 +1,16 @@
 """Start of an insertion: limits of axes and tip, which follow from the scenario and the rig."""
 
 import math
+import shlex
 
 import numpy as np
 import pytest
+import tomli_w
 
+import bench_rig
 from bench_rig import rig
 from flexneedle.lab.rig.preflight.start import StartLimits, _Mount, axis_start_problem, tip_problems
+from flexneedle.lab.rig.rig_file import load_rig
 from flexneedle.phantom.tracking.stage import median_pose, tilt_of
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.simulator import Simulator
@@ -33,7 +37,7 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
             {},
             "guide_y",
             -0.03,
-            "must be within 0.02 mm of 0, on the needle's axis: rig jog RIG guide_y --to 0mm",
+            "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig jog RIG guide_y --to 0mm",
         ),
         ({}, "guide_z", 1.5, "must be within 0.02 mm"),
         ({}, "base_y", 0.3, "must be within 0.02 mm"),
@@ -45,9 +49,10 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
     ],
 )
 def test_a_lateral_axis_starts_where_a_motion_to_0_may_end(changes, name, position, problem):
-    axes = dict(rig(**changes).axes.items())
+    made = rig(**changes)
+    axes = dict(made.axes.items())
     axis = axes.get(name, axes["guide_y"])
-    found = axis_start_problem(name, axis, position)
+    found = axis_start_problem(made, name, axis, position)
     assert found.startswith(problem)
     assert bool(found) == bool(problem)
 
@@ -106,7 +111,7 @@ def start_of(scenario, x=0.0, y=0.0, z=0.0, theta=0.0, psi=0.0):
     [
         ({}, ""),
         ({"x": -2.9, "y": 0.5}, ""),
-        ({"x": 3.2}, "x must be within 3.0 mm of -28.5: rig ready RIG"),
+        ({"x": 3.2}, "x must be within 3.0 mm of -28.5: flexneedle rig ready RIG --scenario SCENARIO"),
         ({"y": -3.6}, "y must be within"),
         ({"z": 1.7}, "z must be within"),
         ({"theta": 0.02, "psi": 0.02}, ""),
@@ -116,7 +121,7 @@ def start_of(scenario, x=0.0, y=0.0, z=0.0, theta=0.0, psi=0.0):
     ],
 )
 def test_a_tip_that_is_elsewhere_or_turned_is_a_line(scenario, off, line):
-    found = tip_problems(scenario, start_of(scenario, **off))
+    found = tip_problems(rig(), scenario, start_of(scenario, **off))
     assert len(found) == bool(line)
     assert all(line in one for one in found)
 
@@ -145,5 +150,17 @@ def test_a_sensor_that_points_elsewhere_is_a_line_also_where_its_sides_are_noise
     ]
     slopes = [tilt_of(axis + jitter * rng.standard_normal(3)) for axis in axes]
     pose = median_pose(Measurement(0.0, x, 0.0, 0.0, direction=slope) for slope in slopes)
-    assert any("mrad: must be within" in line for line in tip_problems(PLANE, pose))
+    assert any("mrad: must be within" in line for line in tip_problems(rig(), PLANE, pose))
     assert all(map(math.isnan, UNKNOWN))
+
+
+@pytest.mark.parametrize("name", ["rig.toml", "my rig.toml"])
+def test_a_suggested_command_names_the_rig_as_the_user_did(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text(tomli_w.dumps(bench_rig.VALUES))
+    made = load_rig(name)
+    command = f"flexneedle rig jog {shlex.quote(name)} guide_y --to 0mm"
+    assert axis_start_problem(made, "guide_y", made.axes.guide_y, 1.5).endswith(f": {command}")
+    assert (
+        f"flexneedle rig ready {shlex.quote(name)}" in tip_problems(made, PLANE, start_of(PLANE, y=-3.6))[0]
+    )

@@ -350,7 +350,7 @@ def test_a_motion_is_stopped_after_a_long_time_without_ticks(bench):
     bench.tick(20)
     bench.clock.wait(0.6)
     bench.core.tick()
-    assert (bench.state, bench.why) == (SupervisorState.STOPPED, "no tick for 0.60 s, limit 0.5 s")
+    assert (bench.state, bench.why) == (SupervisorState.STOPPED, "no tick for 0.60 s, limit 0.50 s")
     assert bench.until(1).state is SupervisorState.STOPPED
     assert bench.position("insertion") < 4.0
 

@@ -142,12 +142,12 @@ def test_cases_are_compared_with_the_base_for_each_controller(read):
 def test_endings_that_differ_only_in_numbers_are_grouped(read):
     rows = make_rows(targets=TARGETS, repeats=5)
     for k, seconds in ((1, 1.03), (4, 1.2), (7, 12.0)):
-        rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1 s)")
+        rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1.00 s)")
     rows[5] = unfinished(rows[5], "error", "ValueError: x")
     rows[8]["reason"] = "missed the target by 1.20 mm"
     found = count_endings(read(rows).rows)
     assert [(kind.outcome, kind.count, kind.first, kind.reason) for kind in found] == [
-        ("held", 3, 1, "held for 1.03 s (limit 1 s)"),
+        ("held", 3, 1, "held for 1.03 s (limit 1.00 s)"),
         ("error", 1, 5, "ValueError: x"),
         ("done", 1, 8, "missed the target by 1.20 mm"),
     ]

@@ -70,7 +70,7 @@ def test_a_drifting_stage_is_reported_and_the_point_retried(grid, out):
     (report,) = stage.reports
     assert report == (
         "no 6 good samples within 2 s: tip drifts by 0.50 mm from the first to the last third of samples, "
-        "limit 0.2 mm; retrying"
+        "limit 0.20 mm; retrying"
     )
     assert stage.moves == [(1, 1), *ALL]
     assert_complete(out)

@@ -103,6 +103,7 @@ class ConnectedRig:
         self._set_armed(None)
         self._gone = self._report.waits
         self._change(go=True)
+        self._mark_moved("check", *(["insertion live"] if self.motion == "retraction" else []))
         self._refresh()
 
     def stop(self, why: str) -> None:
@@ -152,6 +153,8 @@ class ConnectedRig:
     def end(self, state: str, text: str) -> None:
         """Handle the end of the insertion's job. text: its outcome in one line."""
         found, self._report, self.job = self._report, None, None
+        if state == "failed":
+            self._mark_moved("check")
         self._set_armed(None)
         if self._beat is not None:
             self._beat.cancel()
@@ -162,6 +165,12 @@ class ConnectedRig:
         else:
             done = "" if found is None else found.why
             self._publish("idle", text if state == "failed" else self._stopped or done)
+
+    def _mark_moved(self, *keys: str) -> None:
+        """Mark messages whose needle or axes are elsewhere now."""
+        for key in keys:
+            if (newest := self._hub.newest(key)) is not None:
+                self._hub.publish(newest.model_copy(update={"moved": True}))
 
     @property
     def _state(self) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from flexneedle.lab.page.job_orders import Report, RigReport, WorkOrder
+from flexneedle.lab.page.job_orders import RETRACT_BUTTON, Report, RigReport, WorkOrder
 from flexneedle.lab.page.protocol import DisturbancesMessage, InsertionMessage
 from flexneedle.lab.page.requests import DisturbRequest
 from flexneedle.lab.page.server.clients import PageLimits, Refusal
@@ -121,7 +121,7 @@ class LiveInsertion:
             return
         periods = max(len(self._hub.rows(_ROWS).texts), last.periods)  # the report may precede the newest row
         if state == "failed" and order.rig and periods:
-            text = "; ".join((text, STILL_IN.format(rig=order.rig)))
+            text = "; ".join((text, STILL_IN.format(command=RETRACT_BUTTON)))
         outcome = "failed" if state == "failed" and not self._stopped else "interrupted"
         text = "; ".join(filter(None, (self._stopped, text))) or outcome
         over = {"state": outcome, "summary": text, "pace": 0.0, "periods": periods}

@@ -4,11 +4,12 @@ import { button, make } from "./dom.js";
 import { confirmed, isArmed, isChecking, stateOf, waits } from "./rig.js";
 import { inWords } from "./insertion/words.js";
 import { planWords } from "./plans/words.js";
-import { ENDED, SHOWN, isPrepared, maySteer, retracts, runs as isRunning, shownOf } from "./shown.js";
+import { ENDED, SHOWN, STEERING, allow, isCut, isPrepared, maySteer, retracts, runs as isRunning, shownOf } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const SHOWN_BY = ["insertion live", "clients", "welcome", "rig", "job check", "view confirmed"];
+const SHOWN_BY = ["insertion live", ...STEERING, "rig", "job check", "view confirmed"];
 const BEFORE_IT = ["waiting", "planning"];
+const CUT = "There is no connection to the server, and what is shown may be out of date.";
 
 export function mount(element, store, link) {
   const shows = (tab, request) => () => {
@@ -34,23 +35,27 @@ export function mount(element, store, link) {
     const [steers, real, paused] = [maySteer(store), withdraws || Boolean(live?.rig), live?.state === "paused"];
     const runs = withdraws || isRunning(live);
     const signalled = steers && !BEFORE_IT.includes(live?.state); // before it moves it can only be stopped
-    plan.disabled = !steers || (runs && real);
-    for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
+    allow(store, plan, !(runs && real));
+    for (const each of [start, slowly]) {
+      allow(store, each);
+      each.hidden = runs;
+    }
     start.textContent = store.get("welcome")?.rig ? "Insert virtually" : "Insert";
     stop.disabled = !runs;
-    stop.textContent = prepared ? "End the preparation" : "Stop";
+    stop.textContent = runs && isCut(store) ? "Stop: not connected" : prepared ? "End the preparation" : "Stop";
     stop.classList.toggle("danger", runs && !prepared && !(real && ENDED.includes(rig?.state)));
     for (const each of [pause, step, pace]) each.hidden = !runs || real;
-    pause.disabled = pace.disabled = !signalled;
-    step.disabled = !signalled || !paused;
+    for (const each of [pause, pace]) allow(store, each, signalled);
+    allow(store, step, signalled && paused);
     pause.dataset.next = paused ? "go" : "pause";
     pause.textContent = paused ? "Continue" : "Pause";
     if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
-    showSteps(steps, store, rig, steers, runs);
+    showSteps(steps, store, rig, runs);
     if (element.contains(focused) && focused.matches(":disabled, [hidden], [hidden] *")) (runs ? stop : start).focus({ preventScroll: true });
   });
-  store.subscribe([...SHOWN, "rows live", "rig"], () => {
-    const text = wordsOf(store);
+  store.subscribe([...SHOWN, "rows live", "rig", "connection"], () => {
+    const text = isCut(store) ? cutWords(store) : wordsOf(store);
+    words.classList.toggle("bad", store.get("connection") === "lost");
     if (words.textContent !== text) words.textContent = words.title = text; // a text that is set again is read out again
   });
 }
@@ -78,19 +83,29 @@ function rigSteps(store, shows) {
   ];
 }
 
-function showSteps([check, prepare, retract, arm, go], store, rig, steers, runs) {
+function showSteps([check, prepare, retract, arm, go], store, rig, runs) {
   const begun = Boolean(rig) && runs && (rig.begun || rig.state === "starting");
   const shown = Boolean(rig && store.get("welcome")?.rig);
   check.hidden = prepare.hidden = !shown || begun;
   retract.hidden = !shown || runs || rig.job !== null;
   arm.hidden = go.hidden = !shown || (begun && !waits(rig));
   if (!shown) return;
-  check.disabled = prepare.disabled = retract.disabled = !steers || runs || rig.job !== null || isChecking(store);
+  for (const each of [check, prepare, retract]) allow(store, each, !(runs || rig.job !== null || isChecking(store)));
+  for (const each of [arm, go]) each.classList.toggle("later", !waits(rig));
   arm.textContent = isArmed(store) ? "Disarm" : "Arm";
-  arm.disabled = !steers || !waits(rig) || !(isArmed(store) || confirmed(store));
+  allow(store, arm, waits(rig) && (isArmed(store) || confirmed(store)));
   go.textContent = retracts(store) ? "Retract the needle" : rig.begun ? "Continue" : "Insert on the rig";
-  go.disabled = !steers || !isArmed(store);
+  go.dataset.title = rig.begun ? "The needle moves on" : "Motors are switched on, and the needle moves";
+  allow(store, go, isArmed(store));
   go.classList.toggle("danger", !go.disabled);
+}
+
+// Without a connection the state is unknown. The server stops or holds a rig that nobody controls.
+function cutWords(store) {
+  const live = store.get("insertion live");
+  if (!store.get("welcome")) return "Connecting to the server.";
+  if (!retracts(store) && !isRunning(live)) return CUT;
+  return `${CUT} Stop cannot reach it${retracts(store) || live.rig ? ": use the rig's own stop." : "."}`;
 }
 
 // The insertion that runs or is shown, else the plan.

@@ -7,7 +7,7 @@ import { entriesOf, measuredTip, partsOf } from "./flat/parts.js";
 import { mappingOf } from "./flat/plane.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
-import { SHOWN, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
+import { SHOWN, STEERING, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 
 const [LEAST, AROUND, EDGE] = [4, 3, 0.5]; // mm; around the target, around the reach
 
@@ -36,7 +36,7 @@ export function mount(element, store, link) {
     showLegend(legend, entriesOf([...parts, ...measuredTip(store)], reached), others);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
-  store.subscribe([...SHOWN, "clients", "welcome"], () => stage.schedule());
+  store.subscribe([...SHOWN, ...STEERING], () => stage.schedule());
 
   function handleOf(map, { axes }, target) {
     const move = (y, z) => {

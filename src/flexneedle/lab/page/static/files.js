@@ -3,7 +3,7 @@
 import { button, make } from "./dom.js";
 import { savePicture } from "./files/download.js";
 import { showRuns } from "./files/runs.js";
-import { maySteer } from "./shown.js";
+import { STEERING, allow, isCut, whyNot } from "./shown.js";
 
 const LARGEST = 200_000; // characters of a scenario file
 const MOST_WORLDS = 1e9;
@@ -20,14 +20,15 @@ export function mount(element, store, link) {
   const status = make("span.quiet", { role: "status" });
   const picture = button("Picture", () => savePicture(store), { title: "The shown view of the scene as PNG" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
-  const runs = make("div.runs");
+  const runs = make("fieldset.bare.runs");
   element.append(steered, make("div.tools", {}, save, picture, status), runs);
 
   file.addEventListener("change", () => loadFile(file, store, link, status));
   acceptDrops(element, store, link, status);
   store.subscribe(["welcome", "session"], () => choosePreset(preset, store));
-  store.subscribe(["clients", "welcome"], () => {
-    steered.disabled = !maySteer(store);
+  store.subscribe(STEERING, () => {
+    allow(store, steered);
+    Object.assign(runs, { disabled: isCut(store), title: isCut(store) ? whyNot(store) : "" });
   });
   showRuns(runs, store, link);
 }

@@ -5,7 +5,7 @@ import { FieldView } from "./form/field.js";
 import { editOf, sectionsOf, shownOf, valueOf, withLaw } from "./form/fields.js";
 import { followOptions } from "./form/options.js";
 import { followTargets } from "./form/targets.js";
-import { maySteer } from "./shown.js";
+import { STEERING, allow } from "./shown.js";
 
 const ORDER = ["target", "needle", "needle.bevel", "tissue", "setup", "entry", "plan", "control", "tracker", "phantom"];
 const LAW = /^(tissue\.\d+)\.law$/;
@@ -36,9 +36,7 @@ export async function mount(element, store, link) {
     if (form.update()) find();
     showDoubts(doubts, store.get("session")?.doubts ?? []);
   });
-  store.subscribe(["clients", "welcome"], () => {
-    fields.disabled = !maySteer(store);
-  });
+  store.subscribe(STEERING, () => allow(store, fields));
 }
 
 function showDoubts(element, doubts) {
@@ -181,7 +179,10 @@ class Form {
     this.#problems = newest.problems;
     const keys = Object.keys(newest.problems);
     const first = this.#sections.find(({ fields }) => fields.some((field) => keys.includes(field.key) || this.#problemOf(field)));
-    if (first) first.element.open = true;
+    if (!first) return;
+    first.element.open = true;
+    this.#fill(first);
+    first.views.find(({ element }) => element.matches(".refused"))?.element.scrollIntoView({ block: "nearest" });
   }
 
   #layerTools(name) {

@@ -1,7 +1,7 @@
 // Undo and redo of changes of the scenario and the options, by buttons and Ctrl+Z, Ctrl+Shift+Z.
 
 import { button } from "./dom.js";
-import { maySteer, retracts, runs } from "./shown.js";
+import { STEERING, allow, retracts, runs } from "./shown.js";
 
 const TYPED = "input:not([type=checkbox], [type=radio], [type=range]), textarea, select, [contenteditable]";
 
@@ -10,11 +10,11 @@ export function mount(element, store, link) {
   const undo = button("Undo", () => ask(false), { title: "Undo the last change of the scenario (Ctrl+Z)" });
   const redo = button("Redo", () => ask(true), { title: "Redo the change that was undone (Ctrl+Shift+Z)" });
   element.append(undo, redo);
-  store.subscribe(["session", "clients", "welcome", "insertion live", "rig", "connection"], () => {
+  store.subscribe(["session", ...STEERING, "insertion live", "rig"], () => {
     const session = store.get("session");
-    const may = maySteer(store) && !runs(store.get("insertion live")) && !retracts(store) && store.get("connection") === "open";
-    undo.disabled = !may || !session?.undoes;
-    redo.disabled = !may || !session?.redoes;
+    const may = !runs(store.get("insertion live")) && !retracts(store);
+    allow(store, undo, may && session?.undoes);
+    allow(store, redo, may && session?.redoes);
   });
   document.addEventListener("keydown", (event) => {
     const again = stepOf(event);

@@ -4,7 +4,7 @@ import { make } from "./dom.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
 import { inWords } from "./insertion/words.js";
-import { maySteer, runs } from "./shown.js";
+import { STEERING, allow, runs } from "./shown.js";
 
 const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 
@@ -18,9 +18,9 @@ export function mount(element, store, link) {
     const live = store.get("insertion live");
     state.textContent = live ? inWords(live, store.get("rows live"), store.get("rig")) : NONE;
   });
-  store.subscribe(["insertion live", "clients", "welcome"], () => {
+  store.subscribe(["insertion live", ...STEERING], () => {
     const live = store.get("insertion live");
     disturb.hidden = !runs(live) || Boolean(live.rig);
-    disturb.disabled = !maySteer(store) || ["waiting", "planning"].includes(live?.state);
+    allow(store, disturb, !["waiting", "planning"].includes(live?.state));
   });
 }

@@ -10,6 +10,7 @@ const MOST_REFUSALS = 20;
 const ANSWER_WITHIN = 10_000; // ms
 const LOOK_EVERY = 1000; // ms between two checks of the server
 const MOST_SILENT = 4; // checks without a message: more, and the line is dead, which a browser notices after minutes
+const NO_STOP = "There is no connection to the server: the stop was not sent. On a rig, use its own stop.";
 const FREE = ["steer", "stop", "ping", "restore"]; // requests that need no control
 
 export class Link {
@@ -100,7 +101,7 @@ export class Link {
 
   #send(message) {
     if (this.#socket?.readyState !== WebSocket.OPEN) {
-      return Promise.resolve({ done: false, reason: "There is no connection to the server.", problems: {} });
+      return Promise.resolve({ done: false, reason: message.type === "stop" ? NO_STOP : "There is no connection to the server.", problems: {} });
     }
     const request = ++this.#number;
     this.#socket.send(JSON.stringify({ ...message, request }));

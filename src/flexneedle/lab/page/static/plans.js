@@ -5,7 +5,7 @@ import { CostPlot } from "./plans/cost.js";
 import { SweepView } from "./plans/sweep.js";
 import { termsTable } from "./plans/terms.js";
 import { STRATEGIES, planWords } from "./plans/words.js";
-import { maySteer, shownReach } from "./shown.js";
+import { STEERING, allow, shownReach } from "./shown.js";
 
 const WORK = [["Both strategies", "compare"], ["Reach", "reach"]];
 const ACTIVE = ["waiting", "running"];
@@ -22,13 +22,13 @@ export function mount(element, store, link) {
 
   const plot = new CostPlot(cost, store, STRATEGIES);
   const sweeps = STRATEGIES.map((strategy) => new SweepView(figures, store, strategy));
-  store.subscribe(["clients", "welcome"], () => {
-    for (const each of starts) each.disabled = !maySteer(store);
+  store.subscribe(STEERING, () => {
+    for (const each of starts) allow(store, each);
   });
-  store.subscribe(["job ", "clients", "welcome"], () => {
+  store.subscribe(["job ", ...STEERING], () => {
     const [job] = activeJobs(store);
     cancel.hidden = progress.hidden = !job;
-    cancel.disabled = !maySteer(store);
+    allow(store, cancel);
     if ((job?.share ?? null) === null) progress.removeAttribute("value");
     else progress.value = job.share;
   });

@@ -1,7 +1,7 @@
 // The connected rig: its state, the findings of a check, and the motions that are confirmed before it is armed.
 
 import { make, renew } from "./dom.js";
-import { isStale, maySteer } from "./shown.js";
+import { STEERING, isStale, maySteer } from "./shown.js";
 
 const STATES = {
   idle: "is not in use", preparing: "is being prepared: the path is planned, the devices are opened; nothing moves",
@@ -12,7 +12,7 @@ const STATES = {
 };
 const RETRACTION = {
   preparing: "is being prepared to retract: the position is read; nothing moves", starting: "starts: motors are switched on",
-  retracting: "withdraws the needle", ended: "is at rest",
+  retracting: "is withdrawing the needle", ended: "is at rest",
 };
 const OVER = ["idle", "stopped", "fault"];
 
@@ -41,14 +41,14 @@ export function mount(element, store) {
   };
   free.addEventListener("change", () => store.set("view confirmed", free.checked ? motionsOf(store) : undefined));
   store.subscribe(["rig", "welcome", "view confirmed", "insertion live"], show);
-  store.subscribe(["clients"], () => maySteer(store) || store.set("view confirmed", undefined)); // another page is in control
+  store.subscribe(STEERING, () => maySteer(store) || store.set("view confirmed", undefined)); // another page is in control
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
 }
 
 // State of the rig with its reason, in words.
 export function stateOf({ state, why, motion }) {
   const words = (motion === "retraction" && RETRACTION[state]) || STATES[state] || state;
-  return `${words}${why ? `: ${why}` : ""}`;
+  return `${words}${why && state !== "armed" ? `: ${why}` : ""}`;
 }
 
 export const isArmed = (store) => store.get("rig")?.state === "armed";
@@ -72,9 +72,11 @@ function inLines(store) {
   if (!found) return [];
   const problems = found.findings.filter(({ problem }) => problem);
   const counted = problems.length ? `${problems.length} ${problems.length > 1 ? "problems" : "problem"}` : "no problem";
+  const at = found.made ? ` at ${new Date(1000 * found.made).toLocaleTimeString([], { timeStyle: "short" })}` : "";
+  if (found.moved) return [make("p.bad", { role: "status" }, `The check${at} is out of date: the rig has moved since, or has refused a motion. Check it again.`)];
   const of = isStale(store, found) ? ", for an earlier state of the scenario" : "";
   return [
-    make("p", { role: "status" }, `The check has found ${counted}${of}.`),
+    make("p", { role: "status" }, `The check${at} has found ${counted}${of}.`),
     make("ul", {}, ...problems.map((one) => make("li.bad", {}, inWords(one)))),
     make("details", {}, make("summary", {}, `All ${found.findings.length} findings`), make("ul", {}, ...found.findings.map((one) => make("li", {}, inWords(one))))),
   ];

@@ -9,7 +9,7 @@ import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
 import { drawSection, outlineOf } from "./flat/section.js";
 import { Stage } from "./flat/stage.js";
 import { showLegend } from "./legend.js";
-import { SHOWN, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
+import { SHOWN, STEERING, mayMove, otherTargets, shownScene, shownTarget, targetEdit } from "./shown.js";
 import { stillNote } from "./still.js";
 
 const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Target", "target"]];
@@ -54,7 +54,7 @@ class SectionView {
     [this.#legend, this.#store, this.#link] = [legend, store, link];
     this.#handles = new Handles(stage, () => link.rest());
     this.#stage = new Stage(canvas, (pen, { width, height }) => this.#draw(pen, width, height));
-    store.subscribe([...SHOWN, "clients", "welcome"], () => this.#stage.schedule());
+    store.subscribe([...SHOWN, ...STEERING], () => this.#stage.schedule());
   }
 
   choose(plane) {

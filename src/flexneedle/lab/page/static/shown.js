@@ -116,10 +116,27 @@ export function targetEdit(store, point) {
   return Object.fromEntries(keys.map((key, axis) => [key, Math.round(point[axis] * 100) / 100]));
 }
 
-// Return whether this client is in control, or can take control.
-export function maySteer(store) {
+// Keys to subscribe to for the next functions.
+export const STEERING = ["clients", "welcome", "connection"];
+
+// Return whether there is no connection to the server, although this page needs one.
+export const isCut = (store) => ["connecting", "lost"].includes(store.get("connection"));
+
+// Return why this client can neither be in control nor take control, or "".
+export function whyNot(store) {
   const [clients, welcome] = [store.get("clients"), store.get("welcome")];
-  return Boolean(clients) && (clients.steering === null || clients.steering === welcome?.client);
+  if (isCut(store) || !clients) return "There is no connection to the server.";
+  return clients.steering === null || clients.steering === welcome?.client ? "" : `Person ${clients.steering} is in control.`;
+}
+
+// Return whether this client is in control, or can take control.
+export const maySteer = (store) => !whyNot(store);
+
+// Enable a control of a client that may steer, under a condition; otherwise its title is the reason.
+export function allow(store, control, condition = true) {
+  const why = whyNot(store);
+  control.dataset.title ??= control.title;
+  Object.assign(control, { disabled: Boolean(why) || !condition, title: why || control.dataset.title });
 }
 
 // Return whether this client is in control.

@@ -16,7 +16,7 @@ const JOBS = {
 };
 const CONTROL = {
   take: "Needed to change the scenario, plan and insert. Anyone can stop an insertion.",
-  release: "Lets another page take control. An insertion on a rig is then held.",
+  release: "Lets another page take control. On a rig, an insertion is then held; a retraction, a start or a preparation is ended.",
   over: "Control goes from the other page to this one at once. On a rig, nothing moves before its motions are confirmed here.",
 };
 const MOTIONS = ["insertion", "retraction"];
@@ -73,7 +73,8 @@ function followSteering(element, store, link) {
 // Effect of a take-over on an insertion on the rig, as the end of the button's text: whoever confirmed its motions has lost control.
 function lossOf(rig) {
   if (!rig || rig.job === null || ENDED.includes(rig.state)) return "";
-  if (rig.begun && rig.motion === "retraction") return " and stop the retraction";
+  if (rig.motion === "retraction" && (rig.begun || rig.state === "starting")) return " and stop the retraction";
+  if (rig.state === "starting") return " and stop the insertion"; // motors are being switched on
   return rig.begun ? " and hold the needle" : " and end the preparation";
 }
 
@@ -114,7 +115,7 @@ function followJobs(element, store, link) {
     const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
     const rig = store.get("rig");
-    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: ${rig.state === "preparing" ? "being prepared" : "prepared"}, nothing moves`;
+    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: ${{ preparing: "being prepared", armed: "armed" }[rig.state] ?? "prepared"}, nothing moves`;
     else if (kind === "insertion" && rig?.begun && waits(rig)) entry.words = `Insertion: held, ${job.text}`;
     else entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     entry.counts = !failed && (job.share ?? null) === null;

@@ -1,7 +1,7 @@
-// A line that explains why a shown insertion cannot be edited, with a button back to the scene.
+// A line that explains why a shown insertion cannot be edited, with a button back to the scene, or that its needle is outdated.
 
 import { button, make } from "./dom.js";
-import { SHOWN, maySteer, runs, shownOf } from "./shown.js";
+import { SHOWN, STEERING, maySteer, runs, shownOf } from "./shown.js";
 
 export const TARGET_AND_PLAN = "Target and plan";
 
@@ -14,10 +14,16 @@ export function stillNote(store) {
   });
   const words = make("span");
   const note = make("p.tools.quiet", { hidden: true }, words, back);
-  store.subscribe([...SHOWN, "clients", "welcome"], () => {
-    const still = Boolean(store.get("scene")) && shownOf(store) !== "scene"; // a replay has no scene
-    words.textContent = `This is ${shownOf(store) === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
-    note.hidden = !still || !maySteer(store) || runs(store.get("insertion live"));
+  store.subscribe([...SHOWN, ...STEERING], () => {
+    const of = shownOf(store);
+    const still = Boolean(store.get("scene")) && of !== "scene"; // a replay has no scene
+    const moved = of === "live" && Boolean(store.get("insertion live")?.moved);
+    back.hidden = !still || !maySteer(store) || runs(store.get("insertion live"));
+    const at = "The needle is drawn where the insertion ended: the rig has moved since.";
+    const kind = moved ? at : `This is ${of === "first" ? "a recorded run" : "an insertion"}.`;
+    words.textContent = back.hidden ? kind : `${kind} To move the target:`;
+    note.classList.toggle("moved", moved);
+    note.hidden = back.hidden && !moved;
   });
   return note;
 }

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from flexneedle.control.interface import Decision
 from flexneedle.estimation.estimate import Estimate
+from flexneedle.lab.page.job_orders import RETRACT_BUTTON
 from flexneedle.lab.page.protocol import InsertionMessage, RowsMessage, describe_scene
 from flexneedle.lab.page.shape_frames import FrameSource
 from flexneedle.lab.page.worker.plan_jobs import samples_of, shapes_of
@@ -43,7 +44,7 @@ class InsertionReporter:
         running = state in ("running", "paused")
         error = None if ended is None or ended.error_mm != ended.error_mm else ended.error_mm
         left_in = self.rig and self.periods and state in _ENDED
-        lines = (summary, *self.notes, STILL_IN.format(rig=order.rig) if left_in else "")
+        lines = (summary, *self.notes, STILL_IN.format(command=RETRACT_BUTTON) if left_in else "")
         self.task.report(
             InsertionMessage(
                 of="live",

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from time import monotonic
+from time import monotonic, time
 from typing import Any
 
 from flexneedle.control.controllers import with_controller_defaults
@@ -52,7 +52,11 @@ def check(task: WorkerTask) -> None:
     task.report_job("running", text="each device is read, nothing moves")
     findings = [*check_rig(rig, clock, _CHECKED_S, wanted), *check_ros(rig, clock, _CHECKED_S)]
     task.report(
-        RigCheckMessage(revision=task.order.revision, findings=[asdict(finding) for finding in findings])
+        RigCheckMessage(
+            revision=task.order.revision,
+            findings=[asdict(finding) for finding in findings],
+            made=time(),
+        )
     )
 
 

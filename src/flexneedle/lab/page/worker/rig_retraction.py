@@ -42,6 +42,7 @@ def retract(task: WorkerTask) -> None:
 def _carry_out(rig: RigFile, move: AxisMove, guard: "RetractionGuard") -> None:
     with SupervisorClient.of_operator(rig, guard.take) as supervisor:
         guard.follow_stops(supervisor)
+        guard.follow_motion(move)
         require_start(move, supervisor.positions[move.name])
         supervisor.arm()
         supervisor.retract(move.goal, move.speed)
@@ -55,7 +56,9 @@ class RetractionGuard:
         self._task, self._control = task, task.control
         self._supervisor: SupervisorClient | None = None
         self._ended = False
+        self._move: AxisMove | None = None
         self._last: RigReport | None = None
+        self._text = ""
 
     def wait_for_go(self, moves: list[str]) -> None:
         """Report the motion and wait. Raises StoppedError after a stop, and without a signal of the server."""
@@ -67,7 +70,7 @@ class RetractionGuard:
                 raise StoppedError(silence)
             self._control.wait(_POLL_S)
         self.report(str(SupervisorState.IDLE))
-        self._task.report_job("running", text="the needle is withdrawn")
+        self._task.report_job("running", text="motors are switched on")
 
     def follow_stops(self, supervisor: SupervisorClient) -> None:
         """Stop the motors from now on as soon as the job is stopped. Raises StoppedError if it is stopped already."""
@@ -81,7 +84,25 @@ class RetractionGuard:
             self._control.stopped = silence
             self._supervisor.request_stop(silence)
         if not self._ended:
-            self.report(str(found.state), found.why)
+            self.report(str(found.state), found.why or self._left(found))
+
+    def follow_motion(self, move: AxisMove) -> None:
+        """Report from now on how far the needle is still to be withdrawn."""
+        self._move = move
+
+    def _left(self, found: TickReport) -> str:
+        """Return the remaining way in words while the needle is withdrawn, "" otherwise."""
+        move, axes = self._move, found.axes
+        if found.state is not SupervisorState.RETRACTING or move is None or move.name not in axes:
+            return ""
+        left = abs(axes[move.name].position - move.goal)
+        text = f"{left:.0f} mm left"
+        if text != self._text:
+            self._text = text
+            self._task.report_job(
+                "running", 1.0 - min(left / abs(move.distance), 1.0), f"withdrawing, {text}"
+            )
+        return text
 
     def end(self, text: str) -> None:
         """Report that the needle is withdrawn."""

@@ -255,7 +255,8 @@ def _plan_axis(
     if (back if sign < 0.0 else ahead) < wanted:
         free = f"{axis.to_text(wanted)} {axis.unit} to a side are needed within range_{axis.unit}"
         raise InputError(
-            f"{name}: at {axis.to_text(position)} {axis.unit}: {free}: rig jog RIG {name} --to POSITION"
+            f"{name}: at {axis.to_text(position)} {axis.unit}: {free}: "
+            f"flexneedle rig jog {rig.source} {name} --to POSITION"
         )
     move = plan_jog(rig, name, axis.to_text(sign * wanted), position)
     if move is None:
@@ -292,7 +293,7 @@ def run_axis_tests(
             move = plan.move
             key, back = (
                 f"axes.{move.name}.counts_per_{move.axis.unit}",
-                f"rig jog RIG {move.name} --to POSITION",
+                f"flexneedle rig jog {operator.rig.source} {move.name} --to POSITION",
             )
             where = f"{move.name} was tested from {move.axis.to_text(move.start)} {move.axis.unit}"
             raise DriverError(

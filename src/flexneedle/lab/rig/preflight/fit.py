@@ -72,8 +72,8 @@ def start_problems(
     for name, axis in rig.axes.items():
         at = f"{name}: at {axis.to_text(positions[name])} {axis.unit}"
         if problem := limits_problem(axis, positions[name]):
-            found.append(f"{at}: {problem}: rig jog RIG {name} --to POSITION")
-        elif problem := axis_start_problem(name, axis, positions[name]):
+            found.append(f"{at}: {problem}: flexneedle rig jog {rig.source} {name} --to POSITION")
+        elif problem := axis_start_problem(rig, name, axis, positions[name]):
             found.append(f"{at}: {problem}")
     room = _room_problem(rig, scenario, positions["insertion"], advance)
     return [*found, *([f"insertion: {room}"] if room else [])]

@@ -38,10 +38,12 @@ def plan_way_to_start(
     or may be in tissue, InputError for a start beyond the soft limits.
     """
     if tip is None:
-        raise RigError("tip: not measured: the start of the insertion axis is unknown; look at rig check RIG")
+        raise RigError(
+            f"tip: not measured: the start of the insertion axis is unknown: flexneedle rig check {rig.source}"
+        )
     start, here = scenario.setup.start_tip_x, tip[0]
     margin = min(_SDS * scenario.control.start_axial_sd_mm, -_HALF * start)
-    require_air(here, margin)
+    require_air(rig, here, margin)
     at = positions["insertion"]
     goal = _within_limits(rig, scenario, at, at + (start - here) * axis_stretch(scenario.entry.slope))
     across = [_move(rig, name, positions[name], 0.0) for name, _ in rig.axes.items() if name != "insertion"]
@@ -53,12 +55,12 @@ def plan_way_to_start(
     return WayToStart((along,) if along else (), tuple(filter(None, across)), ())
 
 
-def require_air(tip_x: float, margin: float) -> None:
+def require_air(rig: RigFile, tip_x: float, margin: float) -> None:
     """Raise RigError for a tip that is at x = `tip_x`, less than `margin` mm before the skin."""
     if tip_x > -margin:
         where = f"{tip_x:.1f} mm deep" if tip_x > 0.0 else f"{-tip_x:.1f} mm before the skin"
         rule = f"must be {margin:.2g} mm or more before the skin, so that nothing bends the needle in tissue"
-        remedy = "withdraw it first: flexneedle rig retract RIG"
+        remedy = f"withdraw it first: flexneedle rig retract {rig.source}"
         raise RigError(
             f"tip: {where}: {rule}: {remedy}; or, in air, register the tracker again ([registration])"
         )
@@ -74,16 +76,20 @@ def _within_limits(rig: RigFile, scenario: Scenario, position: float, goal: floa
     return nearest if abs(nearest - goal) <= _SDS * scenario.control.start_axial_sd_mm else goal
 
 
-def check_advance(scenario: Scenario, move: AxisMove, before: Point | None, after: Point | None) -> Point:
+def check_advance(
+    rig: RigFile, scenario: Scenario, move: AxisMove, before: Point | None, after: Point | None
+) -> Point:
     """Return the tip (mm) after a motion forward. Raises RigError if it is not as far ahead as its axis has moved."""
     if before is None or after is None:
-        raise RigError("tip: not measured during the motion forward: stopped; look at rig check RIG")
+        raise RigError(
+            f"tip: not measured during the motion forward: stopped: flexneedle rig check {rig.source}"
+        )
     way = move.distance / axis_stretch(scenario.entry.slope)
     off, limit = after[0] - before[0] - way, max(_OFF * abs(way), _SDS * scenario.tracker.jitter_mm)
     if abs(off) > limit:
         rule = f"must be {way:.2f} mm with {move.name}, limit {limit:.2f} mm off"
         moved = f"tip: moved {after[0] - before[0]:.2f} mm"
-        raise RigError(f"{moved}: {rule}: the rig file does not fit: flexneedle rig test RIG")
+        raise RigError(f"{moved}: {rule}: the rig file does not fit: flexneedle rig test {rig.source}")
     return after
 
 

@@ -77,7 +77,7 @@ def check_rig(
         "tracker",
         rig.tracker.kind,
         lambda: open_tracker(rig, clock),
-        lambda t: check_tracker(t, clock, seconds, wanted, rolls[-1]),
+        lambda t: check_tracker(rig, t, clock, seconds, wanted, rolls[-1]),
     )
     return found
 
@@ -147,7 +147,7 @@ def _start_finding(rig: RigFile, name: str, axis: Axis, position: float, scenari
         return Finding(name, "room", "from here", room_problem(rig, scenario, position))
     if name == "rotation":
         return Finding(name, "start", f"{shown}, rolled to the plan's angle before the insertion")
-    return Finding(name, "start", shown, axis_start_problem(name, axis, position))
+    return Finding(name, "start", shown, axis_start_problem(rig, name, axis, position))
 
 
 def _read_roll(rig: RigFile, device: Motors) -> float:
@@ -230,6 +230,7 @@ def _following_finding(name: str, axis: Axis, state: MotorState) -> Finding:
 
 
 def check_tracker(
+    rig: RigFile,
     device: OpenTracker,
     clock: Clock,
     seconds: float,
@@ -247,7 +248,7 @@ def check_tracker(
         Finding("tracker", "status", status, "" if status == VISIBLE else "must be ok while frames arrive"),
         *_sensor_findings(frames),
         *_needed_sensor_findings(frames, wanted),
-        *_tip_findings(frames, wanted, roll),
+        *_tip_findings(rig, frames, wanted, roll),
     ]
 
 
@@ -300,7 +301,7 @@ def _needed_sensor_findings(frames: Sequence[Frame], wanted: IntendedInsertion |
 
 
 def _tip_findings(
-    frames: Sequence[Frame], wanted: IntendedInsertion | None, roll: float
+    rig: RigFile, frames: Sequence[Frame], wanted: IntendedInsertion | None, roll: float
 ) -> Iterator[Finding]:
     """Yield the findings of the tip as the start of an insertion."""
     if wanted is None:
@@ -315,7 +316,7 @@ def _tip_findings(
             yield Finding("tip", "start", "not known", rule)
         return
     place = "{:.2f}, {:.2f}, {:.2f} mm in the frame of the insertion".format(*tip.point)
-    for line in tip_problems(wanted.scenario, tip, roll) or [""]:
+    for line in tip_problems(rig, wanted.scenario, tip, roll) or [""]:
         yield Finding("tip", "start", place, line)
 
 

@@ -17,17 +17,18 @@ from flexneedle.types import Lateral, Pose
 SDS = 3.0
 """Standard deviations by which a start may be off."""
 _FAR = 1e6  # mm, where the error of a registration is its rotation's
-_MOUNT = "rig ready RIG --scenario S, check the mount of the needle, or register the tracker again"
+_MOUNT = "check the mount of the needle, or register the tracker again"
 
 
-def axis_start_problem(name: str, axis: Axis, position: float) -> str:
+def axis_start_problem(rig: RigFile, name: str, axis: Axis, position: float) -> str:
     """Return the problem of a lateral axis that does not rest at 0, or ""; position: mm.
 
     It may be off by its uncertainty, as after a motion to 0.
     """
     if name not in LINEAR_AXES[1:] or abs(position) <= axis.uncertainty:
         return ""
-    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: rig jog RIG {name} --to 0mm"
+    remedy = f"flexneedle rig jog {rig.source} {name} --to 0mm"
+    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: {remedy}"
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
@@ -143,7 +144,7 @@ def _sensor_tilt(scenario: Scenario) -> float:
     return 1e-3 * float(given.get("tilt_sd_mrad", Priors().tilt_sd_mrad))
 
 
-def tip_problems(scenario: Scenario, tip: Pose, roll: float = 0.0) -> list[str]:
+def tip_problems(rig: RigFile, scenario: Scenario, tip: Pose, roll: float = 0.0) -> list[str]:
     """Return lines for a measured tip that is not at the scenario's start; slopes that are not known are NaN.
 
     roll: of the needle (rad). The scenario has the registration of the rig.
@@ -159,15 +160,16 @@ def tip_problems(scenario: Scenario, tip: Pose, roll: float = 0.0) -> list[str]:
         ("dy/dx", 1e3 * tip.theta, 1e3 * slope.real, 1e3 * limits.slope[0]),
         ("dz/dx", 1e3 * tip.psi, 1e3 * slope.imag, 1e3 * limits.slope[1]),
     ]
-    remedies = {"x": "rig ready RIG --scenario S (setup.tip_to_skin_mm)"}
+    ready = f"flexneedle rig ready {rig.source} --scenario SCENARIO"
+    remedies, mount = {"x": f"{ready} (setup.tip_to_skin_mm)"}, f"{ready}, {_MOUNT}"
     found = [
-        f"{name} must be within {limit:.1f} mm of {start:.1f}: {remedies.get(name, _MOUNT)}"
+        f"{name} must be within {limit:.1f} mm of {start:.1f}: {remedies.get(name, mount)}"
         for name, value, start, limit in places
         if not abs(value - start) <= limit
     ]
     known = [one for one in slopes if not math.isnan(one[1])]
     return found + [
-        f"{name} = {value:.0f} mrad: must be within {limit:.0f} of {start:.0f}, the needle's axis: {_MOUNT}"
+        f"{name} = {value:.0f} mrad: must be within {limit:.0f} of {start:.0f}, the needle's axis: {mount}"
         for name, value, start, limit in known
         if not abs(value - start) <= limit
     ]

@@ -200,7 +200,7 @@ class Supervisor:
         self._ticked_at = now
         if self._motion is not None and self._motion.leg is not None and now - before > _STALL_S:
             # The motors have stopped at the end of their queue.
-            self.stop(f"no tick for {now - before:.2f} s, limit {_STALL_S:g} s")
+            self.stop(f"no tick for {now - before:.2f} s, limit {_STALL_S:.2f} s")
         self._read_tracker(now)
         self._check_motors()
         self._check_client(now)
@@ -258,7 +258,7 @@ class Supervisor:
         if self._motion is not None and silent > HEARTBEAT_S:
             self.stop(f"no heartbeat from the controller for {silent:.2f} s")
         elif self.state in (SupervisorState.INSERTING, SupervisorState.HOLDING) and silent > limit:
-            self.stop(f"no command from the controller for {silent:.2f} s, limit {limit:g} s")
+            self.stop(f"no command from the controller for {silent:.2f} s, limit {limit:.2f} s")
 
     # Faults and stops
 

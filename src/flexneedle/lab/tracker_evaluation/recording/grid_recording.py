@@ -222,7 +222,7 @@ def _find_drift(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -
         positions = _stack_positions(frames, name)
         drift = dist(positions[:third].mean(axis=0), positions[-third:].mean(axis=0))
         if drift > limit:
-            return f"{name} drifts by {drift:.2f} mm from the first to the last third of samples, limit {limit:g} mm"
+            return f"{name} drifts by {drift:.2f} mm from the first to the last third of samples, limit {limit:.2f} mm"
     return ""
 
 

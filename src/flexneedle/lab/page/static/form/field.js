@@ -11,6 +11,8 @@ export class FieldView {
   #problem = make("p.problem.bad", { hidden: true });
   #shown; // value of the scenario, or of the draft
   #taken = false; // whether the text is the user's, and pending or refused
+  #open; // shown problem
+  #own; // problem of the text, which was not sent
   #dismissed; // problem that was left with Escape
   #before = ""; // text when the field got the focus
 
@@ -29,7 +31,7 @@ export class FieldView {
     const range = rangeOf(field, value);
     if (range) this.#slider = this.#sliderOf(range);
     this.element = make("div.field", { "data-key": field.key }, name, make("span.value", {}, this.input, unit));
-    this.element.append(...[this.#slider, this.#problem, help].filter(Boolean));
+    this.element.append(...[this.#problem, this.#slider, help].filter(Boolean));
   }
 
   // Text for the search.
@@ -41,12 +43,12 @@ export class FieldView {
   // Show a value. state: {changed: differs from the file's, problem: of the server, pending: not answered yet}. Text
   // that is being written, or was refused, stays.
   update(value, { changed, problem, pending }) {
-    this.element.classList.toggle("changed", changed);
     if (problem !== this.#dismissed) this.#dismissed = undefined;
-    const open = this.#dismissed ? undefined : problem;
-    this.#show(open);
+    const open = this.#own ?? (this.#dismissed ? undefined : problem);
     this.#shown = value;
-    if (!problem && !pending) this.#taken = false;
+    this.#show(open);
+    this.element.classList.toggle("changed", changed && !open);
+    if (!problem && !pending && !this.#own) this.#taken = false;
     if (open && this.#taken) return;
     if (this.#field.kind === "switch") this.input.checked = Boolean(value);
     else if (this.#field.kind === "choice" || document.activeElement !== this.input) this.input.value = written(value);
@@ -55,7 +57,9 @@ export class FieldView {
 
   #show(problem) {
     this.#problem.hidden = !problem;
+    this.#open = problem;
     this.#problem.textContent = problem ?? "";
+    this.element.classList.toggle("refused", Boolean(problem));
     this.input.setAttribute("aria-invalid", problem ? "true" : "false");
   }
 
@@ -98,6 +102,7 @@ export class FieldView {
   #take() {
     const { value, problem } = read(this.#field, this.input.value);
     this.#taken = true;
+    this.#own = problem;
     this.#show(problem);
     if (problem === undefined) this.edit(value);
   }
@@ -112,7 +117,8 @@ export class FieldView {
   #key({ key }) {
     if (key !== "Escape") return;
     this.#taken = false;
-    this.#dismissed = this.#problem.textContent || undefined;
+    this.#own = undefined;
+    this.#dismissed = this.#open || undefined;
     this.input.value = written(this.#shown);
     this.#show(undefined);
   }

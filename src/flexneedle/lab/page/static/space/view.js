@@ -3,7 +3,7 @@
 import { AmbientLight, DirectionalLight, Scene, WebGLRenderer } from "../vendor/three.js";
 import { boxOf } from "../box.js";
 import { showLegend } from "../legend.js";
-import { SHOWN, otherTargets, shownOf, shownScene, shownTarget } from "../shown.js";
+import { SHOWN, STEERING, otherTargets, shownOf, shownScene, shownTarget } from "../shown.js";
 import { Camera } from "./camera.js";
 import { Labels } from "./labels.js";
 import { Room } from "./room.js";
@@ -35,7 +35,7 @@ export class SpaceView {
     this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.target.group, ...lights(this.camera.camera));
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
     new IntersectionObserver(([{ isIntersecting }]) => this.#appear(isIntersecting)).observe(canvas);
-    store.subscribe([...SHOWN, "clients", "welcome"], () => this.#update());
+    store.subscribe([...SHOWN, ...STEERING], () => this.#update());
   }
 
   // Draw the scene and return its canvas. Read it before returning to the browser, which clears it.
