@@ -350,6 +350,37 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     assert not hint.is_visible()
 
 
+def test_without_a_connection_nothing_looks_usable_and_the_rigs_own_stop_is_named(rig_panel, server):
+    page = rig_panel(insertion("running", rig="Bench"), rig("inserting", job=7, begun=True))
+    page.wait_for_selector(f"{BAR} .stop.danger")
+    page.evaluate("flexneedle.store.set('connection', 'lost')")
+    page.wait_for_selector(f"{BAR} .bad >> text=Stop cannot reach it: use the rig's own stop.")
+    page.wait_for_selector(f"{BAR} >> text=Stop: not connected")
+    page.wait_for_selector(f"{RIG} >> text=Without a connection its state is not known")
+    assert page.locator(f"{BAR} button:visible:enabled").all_inner_texts() == ["Stop: not connected"]
+    assert (
+        page.get_attribute(f"{BAR} button:text-is('Plan')", "title")
+        == "There is no connection to the server."
+    )
+    page.evaluate("flexneedle.store.set('connection', 'open')")
+    page.wait_for_selector(f"{BAR} .stop:text-is('Stop')")
+
+
+@pytest.mark.parametrize(
+    ("of", "state", "words"),
+    [
+        ("ready", "ready", "Prepared, not armed on Bench"),
+        ("ready", "armed", "Armed for one start on Bench"),
+        ("ready", "starting", "Starting on Bench"),
+        ("holding", "holding", "Holding on Bench"),
+        ("holding", "armed", "Holding, armed to continue on Bench"),
+    ],
+)
+def test_prepared_armed_starting_and_holding_have_their_words(rig_panel, of, state, words):
+    page = rig_panel(insertion(of, rig="Bench"), rig(state, *MOVES, job=7, begun=of == "holding"))
+    page.wait_for_selector(f"{BAR} >> text={words}")
+
+
 @pytest.mark.parametrize("state", ["stopped", "fault", "ended"])
 def test_a_rig_that_stands_is_called_stopped_while_its_record_is_written(panel, server, state):
     """Stop remains, but no longer in the colour of danger, which would say that something moves."""

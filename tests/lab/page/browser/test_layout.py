@@ -103,6 +103,7 @@ STATES = {
     ],
     "recorded": lambda: [
         insertion("interrupted", rig="Bench"),
+        RigStateMessage(name="Bench", state="stopped", why="person 1 on the page"),
         insertion("done", of="first", name="mine"),
         rows(0, 3, "first"),
     ],
@@ -130,7 +131,8 @@ COCKPIT = """() => {
     outside: parts.filter(outside).map(([name]) => name),
     rows: new Set(found(".actions .tools > :not(.stop)").map(([, { top }]) => Math.round(top))).size,
     cut: [...document.querySelectorAll(".title, .actions .words, .actions button, [role=tab]")]
-      .filter((one) => one.checkVisibility() && (one.scrollWidth > one.clientWidth + 1 || one.scrollHeight > one.clientHeight + 2))
+      .filter((one) => one.checkVisibility())
+      .filter((one) => one.scrollWidth > one.clientWidth + 1 || one.scrollHeight > one.clientHeight + 2)
       .map((one) => one.textContent),
     overlaps: pairs.filter(([[, a], [, b]]) => apart(a, b) < -1).map(([[a], [b]]) => [a, b]),
     scrolls: scrollHeight - clientHeight + [...document.querySelectorAll("*")].filter((one) => scrolls(one)).length,

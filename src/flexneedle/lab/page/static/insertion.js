@@ -4,7 +4,7 @@ import { make } from "./dom.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
 import { inWords } from "./insertion/words.js";
-import { STEERING, allow, runs } from "./shown.js";
+import { STEERING, allow, isCut, runs } from "./shown.js";
 
 const NONE = "No insertion yet. “Insert” makes a plan and carries it out.";
 
@@ -14,9 +14,10 @@ export function mount(element, store, link) {
   const decisions = make("div.decisions");
   element.append(state, disturb, decisions);
   followDecisions(decisions, store);
-  store.subscribe(["insertion live", "rows live", "rig"], () => {
+  store.subscribe(["insertion live", "rows live", "rig", "connection"], () => {
     const live = store.get("insertion live");
-    state.textContent = live ? inWords(live, store.get("rows live"), store.get("rig")) : NONE;
+    const last = runs(live) && isCut(store) ? "Before the connection was lost: " : "";
+    state.textContent = live ? last + inWords(live, store.get("rows live"), store.get("rig")) : NONE;
   });
   store.subscribe(["insertion live", ...STEERING], () => {
     const live = store.get("insertion live");

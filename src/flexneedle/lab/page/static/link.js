@@ -2,7 +2,7 @@
 
 import { unpacked } from "./frames.js";
 import { afterRestart, restoreOf } from "./restart.js";
-import { runs } from "./shown.js";
+import { retracts, runs } from "./shown.js";
 
 const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
 const EDIT_EVERY = 50; // ms
@@ -164,7 +164,8 @@ export class Link {
   #sessionBefore({ started }) {
     const [welcome, session, live] = ["welcome", "session", "insertion live"].map((key) => this.#store.get(key));
     if (!welcome || welcome.started === started) return null;
-    return session ? { welcome, session, ran: runs(live) } : this.#before;
+    const left = retracts(this.#store) || Boolean(runs(live) && live.rig);
+    return session ? { welcome, session, ran: left || runs(live), left } : this.#before;
   }
 
   async #recover(session) {

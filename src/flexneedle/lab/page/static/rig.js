@@ -1,7 +1,7 @@
 // The connected rig: its state, the findings of a check, and the motions that are confirmed before it is armed.
 
 import { make, renew } from "./dom.js";
-import { STEERING, isStale, maySteer } from "./shown.js";
+import { STEERING, isCut, isStale, maySteer } from "./shown.js";
 
 const STATES = {
   idle: "is not in use", preparing: "is being prepared: the path is planned, the devices are opened; nothing moves",
@@ -31,7 +31,7 @@ export function mount(element, store) {
     if (rig.state !== was && waits(rig) && maySteer(store)) store.set("view tab", "rig"); // the motions must be read
     was = rig.state;
     name.textContent = rig.name;
-    state.textContent = `It ${stateOf(rig)}.`;
+    state.textContent = isCut(store) ? `Without a connection its state is not known. The last was: it ${stateOf(rig)}.` : `It ${stateOf(rig)}.`;
     moves.hidden = seen.hidden = !waits(rig);
     renew(moves, rig.moves.map((line) => make("li", {}, line)));
     free.checked = confirmed(store);
@@ -40,7 +40,7 @@ export function mount(element, store) {
     retract.hidden = withdrawn || !(OVER.includes(rig.state) && live?.rig && live.periods);
   };
   free.addEventListener("change", () => store.set("view confirmed", free.checked ? motionsOf(store) : undefined));
-  store.subscribe(["rig", "welcome", "view confirmed", "insertion live"], show);
+  store.subscribe(["rig", ...STEERING, "view confirmed", "insertion live"], show);
   store.subscribe(STEERING, () => maySteer(store) || store.set("view confirmed", undefined)); // another page is in control
   store.subscribe(["check", "session", "job check"], () => renew(findings, inLines(store)));
 }

@@ -18,10 +18,9 @@ export function stillNote(store) {
     const of = shownOf(store);
     const still = Boolean(store.get("scene")) && of !== "scene"; // a replay has no scene
     const moved = of === "live" && Boolean(store.get("insertion live")?.moved);
-    back.hidden = !still || !maySteer(store) || runs(store.get("insertion live"));
+    back.hidden = moved || !still || !maySteer(store) || runs(store.get("insertion live"));
     const at = "The needle is drawn where the insertion ended: the rig has moved since.";
-    const kind = moved ? at : `This is ${of === "first" ? "a recorded run" : "an insertion"}.`;
-    words.textContent = back.hidden ? kind : `${kind} To move the target:`;
+    words.textContent = moved ? at : `This is ${of === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
     note.classList.toggle("moved", moved);
     note.hidden = back.hidden && !moved;
   });
