@@ -350,13 +350,13 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     assert not hint.is_visible()
 
 
-def test_without_a_connection_nothing_looks_usable_and_the_rigs_own_stop_is_named(rig_panel, server):
+def test_without_a_connection_nothing_looks_usable_and_the_rigs_own_stop_is_named(rig_panel):
     page = rig_panel(insertion("running", rig="Bench"), rig("inserting", job=7, begun=True))
     page.wait_for_selector(f"{BAR} .stop.danger")
     page.evaluate("flexneedle.store.set('connection', 'lost')")
     page.wait_for_selector(f"{BAR} .bad >> text=Stop cannot reach it: use the rig's own stop.")
     page.wait_for_selector(f"{BAR} >> text=Stop: not connected")
-    page.wait_for_selector(f"{RIG} >> text=Without a connection its state is not known")
+    page.wait_for_selector(f"{RIG} >> text=Without a connection its state is not known", state="attached")
     assert page.locator(f"{BAR} button:visible:enabled").all_inner_texts() == ["Stop: not connected"]
     assert (
         page.get_attribute(f"{BAR} button:text-is('Plan')", "title")

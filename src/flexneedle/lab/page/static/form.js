@@ -182,7 +182,7 @@ class Form {
     if (!first) return;
     first.element.open = true;
     this.#fill(first);
-    first.views.find(({ element }) => element.matches(".refused"))?.element.scrollIntoView({ block: "nearest" });
+    first.views.find(({ element }) => element.matches(".refused"))?.element.scrollIntoView({ block: "center" });
   }
 
   #layerTools(name) {
