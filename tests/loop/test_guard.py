@@ -222,7 +222,7 @@ def test_a_needle_that_advances_far_more_or_less_than_commanded_is_held(plan, sc
     refusal = guard_of(plan).refusal(estimate, Control(db_x=1.0))
     assert refusal == (
         f"guard: by the tracker the needle advances {scale:.3g} times as far as commanded (limit 1 ± 0.03): "
-        "check insertion axis and tracker (flexneedle rig test RIG)"
+        "check insertion axis and tracker (flexneedle rig test)"
     )
     wide = Guard.of(PHANTOM.with_values({"control.axial_scale_sd": 0.02}), plan)
     assert wide.refusal(estimate, Control(db_x=1.0)) == ""

@@ -87,7 +87,7 @@ class Guard:
             )
         return (
             f"by the tracker the needle advances {scale:.3g} times as far as commanded "
-            f"(limit 1 ± {self.scale:g}): check insertion axis and tracker (flexneedle rig test RIG)"
+            f"(limit 1 ± {self.scale:g}): check insertion axis and tracker (flexneedle rig test)"
         )
 
     def _excesses(self, state: State) -> Iterator[Excess]:

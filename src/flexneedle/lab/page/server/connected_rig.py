@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flexneedle.lab.page.job_orders import BEAT_S, RigReport, WorkOrder
-from flexneedle.lab.page.protocol import RigStateMessage
+from flexneedle.lab.page.protocol import InsertionMessage, RigCheckMessage, RigStateMessage
 from flexneedle.lab.page.server.clients import PageLimits, Refusal
 from flexneedle.lab.page.server.hub import Hub
 from flexneedle.lab.page.server.job_queue import JobQueue
@@ -169,7 +169,7 @@ class ConnectedRig:
     def _mark_moved(self, *keys: str) -> None:
         """Mark messages whose needle or axes are elsewhere now."""
         for key in keys:
-            if (newest := self._hub.newest(key)) is not None:
+            if isinstance(newest := self._hub.newest(key), RigCheckMessage | InsertionMessage):
                 self._hub.publish(newest.model_copy(update={"moved": True}))
 
     @property

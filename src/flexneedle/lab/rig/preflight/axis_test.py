@@ -34,6 +34,11 @@ class Operator(Protocol):
     """A rig that is armed; `SupervisorClient`."""
 
     @property
+    def rig(self) -> RigFile:
+        """The rig."""
+        ...
+
+    @property
     def positions(self) -> Mapping[str, float]:
         """Positions of the axes, mm or rad."""
         ...
