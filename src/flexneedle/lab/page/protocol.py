@@ -237,8 +237,7 @@ class InsertionMessage(ServerMessage):
         rig: Name of the rig, "" for a virtual one.
         folder: Name of the run that records it, "" without one.
         row: Row of a study that was computed again and can be saved as a run.
-        target_name: Name of the target, "" without other targets.
-        moved: Whether the rig has withdrawn the needle since, wholly or in part.
+        target_name: Name of the target, "" without other targets. moved: Whether a retraction has begun since.
     """
 
     by = "of"
