@@ -88,7 +88,8 @@ RULES = [
     ("needle.stylet", 1, "must be true or false"),
     ("needle.bevel", 4.0, "must be a table"),
     ("needle", "21G", "must be a table"),
-    ("tissue", {"alpha": 1.0}, "must be a list"),
+    ("tissue", {"alpha": 1.0}, "must be a list: write [[tissue]]"),
+    ("needle.length_mm", 12.0, "the base would start beyond the guide: must be above 12.5 with this start"),
     ("tissue", [], "needs at least one layer"),
     ("tissue[0]", 5, "must be a table"),
     ("name", 5, "must be text in quotes"),
@@ -96,6 +97,7 @@ RULES = [
     ("name", "two\nlines", "must be one line of printable text"),
     ("name", "x" * 201, "must have at most 200 characters"),
     ("phantom.bevel_factor", 1.0, "must be a list"),
+    ("plan.own_terms", {"term": "a:B"}, "must be a list: write [[plan.own_terms]]"),
     ("phantom.bevel_factor", [1.0, 2.0, 3.0], "must be two numbers"),
     ("phantom.bevel_factor[1]", True, NUMBER),
     # not finite

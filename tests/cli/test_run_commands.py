@@ -266,6 +266,18 @@ def test_bad_input_is_one_line_with_status_2_and_writes_nothing(argv, capsys, in
 
 
 @pytest.mark.parametrize(
+    ("target", "misplaced"),
+    [(["40,5"], False), (["40", "5mm"], False), (["40", "1,5"], False), (["40", "5", "./a.toml"], True)],
+)
+def test_a_wrong_target_blames_the_order_only_if_a_scenario_follows(target, misplaced, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["plan", "--target", *target])
+    err = capsys.readouterr().err
+    assert "with spaces between and decimal points" in err
+    assert ("put SCENARIO before --target" in err) is misplaced
+
+
+@pytest.mark.parametrize(
     "argv",
     [
         ["insert", "--seed", "-1"],

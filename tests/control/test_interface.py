@@ -44,9 +44,11 @@ def test_another_command_is_refused(command):
     ("key", "values"),
     [
         ("miss_sd", {"miss": 0.1, "miss_sd": -0.1}),
-        *(("rest", {"rest": one}) for one in (-1.0, math.inf, math.nan)),
+        *(("rest", {"rest": one}) for one in (-1.0, math.inf, math.nan, "1")),
+        *((key, {key: None}) for key in ("why", "cost", "spread", "miss", "miss_sd")),
+        ("miss", {"miss": [0.1, 0.2], "miss_sd": 0.1}),
     ],
 )
-def test_a_negative_deviation_or_rest_is_refused(key, values):
+def test_a_value_of_another_kind_or_range_is_refused(key, values):
     with pytest.raises(InputError, match=f"^{key} = "):
-        Decision(STILL, "", **values)
+        Decision(STILL, **{"why": "", **values})

@@ -117,6 +117,8 @@ def test_changes_by_dotted_key_leave_the_original_unchanged():
     [
         ({"needle.bevel.offset_mm": -1.0}, "needle.bevel.offset_mm = -1.0: must be at least 0"),
         ({"tissue.2.alpha": 1.0}, "tissue.2.alpha: no such key: the list has items 0 to 1"),
+        ({"tissue.2.youngs_modulus_kpa": 5.0}, "tissue.2.youngs_modulus_kpa: no such key"),
+        ({2: 1.0}, "2: must be a dotted key in quotes"),
         ({"tissue.alpha": 1.0}, "tissue.alpha: no such key: the list has items 0 to 1"),
         ({"name.first": "a"}, "name.first: no such key: the value above it is not a table"),
         ({"needle.colour": "red"}, 'needle.colour = "red": unknown key'),
@@ -187,14 +189,14 @@ NO_GUIDE = {"setup.guide_to_skin_mm": None, "setup.max_base_travel_mm": 6.0}
     [
         *(({}, target, None) for target in ((25, -5), (81.5, 15), (1e-3, 0))),
         ({}, (0, 0), "target.depth_mm = 0.0: must be above 0"),
-        ({}, (math.nan, 0), "target.depth_mm = nan: must be above 0"),
+        ({}, (math.nan, 0), "target.depth_mm = nan: must be a finite number"),
         ({}, (81.6, 0), "target.depth_mm = 81.6: beyond the stroke: must be at most 81.5"),
         (
             {},
             (40, -15.1),
             "target.lateral_mm = -15.1: must be at most 15 in size, the lateral travel of the guide",
         ),
-        ({}, (40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
+        ({}, (40, math.inf), "target.lateral_mm = inf: must be a finite number"),
         ({}, (40, 0, -3.0), "target.lateral_z_mm = -3.0: must be 0 with setup.axes = 1"),
         (SPACE, (40, 7, -15), None),
         (SPACE, (40, 7, -15.1), "target.lateral_z_mm = -15.1: must be at most 15 in size"),

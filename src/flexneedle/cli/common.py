@@ -38,8 +38,9 @@ class _Target(argparse.Action):
         except ValueError:
             given = []
         if len(given) not in (2, 3):
-            rule = "must be two or three numbers, X Y and in space Z; put SCENARIO before --target"
-            raise argparse.ArgumentError(self, f"{' '.join(values)}: {rule}")
+            rule = "must be two or three numbers in mm, X Y and in space Z, with spaces between and decimal points"
+            remedy = "; put SCENARIO before --target" if not values[-1].lstrip("+-.")[:1].isdigit() else ""
+            raise argparse.ArgumentError(self, f"{' '.join(values)}: {rule}{remedy}")
         setattr(namespace, self.dest, (*given, 0.0)[:3])
 
 

@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
+from numbers import Complex, Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,7 +46,8 @@ class Decision:
         samples: Samples of the search, None without one; not compared.
 
     Raises:
-        InputError: Another command, or a number that is negative or not finite where it may not be.
+        InputError: Another command, a value of another type, or a number that is negative or not finite where it may
+            not be.
     """
 
     command: Control
@@ -60,6 +62,17 @@ class Decision:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "command", _plain_command(self.command))
+        if not isinstance(self.why, str):
+            raise InputError(f"why = {self.why!r}: must be text, the reason of the command")
+        for name, kind in (
+            ("cost", Real),
+            ("spread", Real),
+            ("miss", Complex),
+            ("miss_sd", Real),
+            ("rest", Real),
+        ):
+            if not isinstance(value := getattr(self, name), kind):
+                raise InputError(f"{name} = {value!r}: must be a number")
         if self.miss_sd < 0.0:
             raise InputError(
                 f"miss_sd = {self.miss_sd}: must be at least 0, or NaN where nothing is predicted"

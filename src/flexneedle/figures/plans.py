@@ -99,7 +99,7 @@ def _result(scenario: Scenario, plan: Plan) -> str:
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
     if is_column():
         return f"{plan.strategy}: {_outcome(plan)}".replace(" mm", "\u00a0mm")
-    return f"{plan.strategy}: {_outcome(plan)} (cost {plan.cost:.2f}){entry}"
+    return f"{plan.strategy}: {_outcome(plan)} (cost {plan.cost:.3f}){entry}"
 
 
 def _outcome(plan: Plan) -> str:
@@ -160,7 +160,7 @@ def _write_terms(ax: Axes, plans: Sequence[Plan], names: Sequence[str]) -> None:
     """Write the values of each term beside its longest bar, in the order of the plans."""
     for row, name in enumerate(names):
         values = [plan.terms.get(name, 0.0) for plan in plans]
-        text = " and ".join(f"{value:.2f}" for value in values)
+        text = " and ".join(f"{value:.3f}" for value in values)
         how: dict[str, Any] = {"va": "center", "fontsize": small(), "textcoords": "offset points"}
         ax.annotate(text, (max(0.0, *values), row), (2, 0), **how)
 
@@ -175,7 +175,7 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
         where = rows + (k - (len(plans) - 1) / 2) * thick
         bars = ax.barh(where, values, 0.9 * thick, color=STRATEGIES[k], label=plan.strategy)
         if not is_column():
-            ax.bar_label(bars, [f"{value:.2f}" for value in values], padding=2, fontsize=min(7.5, small()))
+            ax.bar_label(bars, [f"{value:.3f}" for value in values], padding=2, fontsize=min(7.5, small()))
     if is_column():
         _write_terms(ax, plans, names)
     ax.set_yticks(rows, names)
@@ -183,5 +183,5 @@ def _draw_cost(ax: Axes, plans: Sequence[Plan]) -> None:
     ax.invert_yaxis()
     ax.margins(x=0.4 if is_column() else 0.2)
     ax.locator_params(axis="x", nbins=4)
-    costs = " and ".join(f"{plan.cost:.2f}" for plan in plans)
+    costs = " and ".join(f"{plan.cost:.3f}" for plan in plans)
     ax.set_title(f"Terms of the cost, {costs} in all" if is_column() else "Terms of the cost")

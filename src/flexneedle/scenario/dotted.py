@@ -7,7 +7,9 @@ from flexneedle.errors import ScenarioError
 
 
 def split_key(key: str) -> list[str | int]:
-    """Return the parts of a dotted key, indices as int."""
+    """Return the parts of a dotted key, indices as int. Raises ScenarioError for a key that is not text."""
+    if not isinstance(key, str):
+        raise ScenarioError(f"{key!r}: must be a dotted key in quotes, such as tissue.0.alpha")
     parts = key.replace("[", ".").replace("]", "").split(".")
     return [int(part) if part.isascii() and part.isdigit() else part for part in parts]
 

@@ -117,7 +117,7 @@ class Scenario(Section):
                 "changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}'
             )
         values, changes = self.values(), {spell(key): value for key, value in changes.items()}
-        for key, value in (dict.fromkeys(find_replaced(changes)) | changes).items():
+        for key, value in (changes | dict.fromkeys(find_replaced(changes))).items():
             set_value(values, key, _expand_environment(key, value))
         return self.from_values(values)
 

@@ -77,7 +77,10 @@ def _problems(detail: ErrorDetails, model: type[BaseModel]) -> list[Problem]:
         return [Problem(loc, None, "missing")]
     if detail["type"] == "extra_forbidden":
         return [Problem(loc, detail["input"], _unknown(loc, model))]
-    return [Problem(loc, detail["input"], _rule(detail))]
+    rule = _rule(detail)
+    if detail["type"] == "tuple_type" and isinstance(detail["input"], Mapping) and _section_at(loc, model):
+        rule += f": write [[{'.'.join(map(str, loc))}]]"
+    return [Problem(loc, detail["input"], rule)]
 
 
 def _is_misspelt(missing: tuple[int | str, ...], details: Sequence[ErrorDetails]) -> bool:

@@ -33,8 +33,13 @@ def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
         rule = f"must not be set where the needle rolls by half turns ({setup.half_turns_by})"
         yield Problem("setup.max_rotation_deg", setup.max_rotation_deg, rule)
     room = needle.length_mm + tip - (guide or 0.0)
-    if setup.stroke_mm >= room:
-        stop = "skin" if guide is None else "guide"
+    stop = "skin" if guide is None else "guide"
+    if room <= 0.0:
+        rule = (
+            f"the base would start beyond the {stop}: must be above {(guide or 0.0) - tip:g} with this start"
+        )
+        yield Problem("needle.length_mm", needle.length_mm, rule)
+    elif setup.stroke_mm >= room:
         yield Problem(
             "setup.stroke_mm",
             setup.stroke_mm,
@@ -69,7 +74,13 @@ def entry_problems(setup: Setup, entry: Entry) -> Iterator[Problem]:
 def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Problem]:
     """Yield the reasons why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
-    if not (isfinite(depth) and depth > 0):
+    unknown = {key: value for key, value in vars(target).items() if not isfinite(value)}
+    if unknown:
+        yield from (
+            Problem(f"target.{key}", value, "must be a finite number") for key, value in unknown.items()
+        )
+        return
+    if depth <= 0:
         yield Problem("target.depth_mm", depth, "must be above 0")
     elif depth > setup.max_depth:
         rule = (

@@ -217,6 +217,7 @@ BAD = [  # text and key named
     (axis("setup.stroke_mm", "[100, 100.0]"), "contains 100 twice"),
     (axis("target", "[[30, 0], [30.0, -0.0]]"), "contains [30, 0] twice"),
     (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), 'controller = "x"'),
+    (axis("controller", '"al"'), 'axes[0].values = "al": must be a list of at least one value, or "all"'),
     (axis("target", "[[30, 0], 40]"), "axes[0].values = 40"),
     (in_space("targets = 3"), "cases[0].targets = 3"),
     (in_space("targets = [[30]]"), "cases[0].targets = [30]"),

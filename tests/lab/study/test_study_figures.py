@@ -112,6 +112,17 @@ def test_circles_have_a_radius_of_1_mm_to_scale():
         assert window.width / (right - left) == pytest.approx(window.height / (high - low), rel=1e-6)
 
 
+def test_panels_of_one_target_are_not_taller_than_wide():
+    own = target_panel()
+    targets = np.full_like(own.content.targets, 40.0)
+    tips = TipPositions(targets, targets + np.array([0.0, 6.0]), own.content.done)
+    (low, high), (left, right) = (
+        limits(draw_targeting([replace(own, content=tips)] * 2).axes[0])
+        for limits in (lambda ax: ax.get_ylim(), lambda ax: ax.get_xlim())
+    )
+    assert (high - low, right - left) == pytest.approx((8.0, 8.0))
+
+
 def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
     own = target_panel(unfinished=(0, 7))
     ax = draw_targeting([own]).axes[0]

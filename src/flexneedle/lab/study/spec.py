@@ -161,7 +161,8 @@ def _check_axis_values(key: str, values: Any, name: str = "values") -> Iterator[
     if key in _LARGEST and isinstance(values, dict):
         yield from _check_range(values, _LARGEST[key])
     elif not isinstance(values, list) or not values:
-        yield Problem(name, values, "must be a list of at least one value")
+        choice = f', or "{ALL}"' if key in NAMED else ""
+        yield Problem(name, values, f"must be a list of at least one value{choice}")
     elif (twice := _find_duplicate(values)) is not None:
         yield Problem(name, values, f"contains {twice!r} twice")
     elif key == TARGET:

@@ -166,6 +166,12 @@ def test_the_headline_compares_the_default_with_the_others(report_on, error, ver
     assert f"{OURS} is better than {verdict}" in report_on(rows)[1].text
 
 
+def test_the_headline_of_few_phantoms_names_no_verdict(report_on):
+    text = report_on(make_rows((OURS, "open-loop"), targets=TARGETS[:1], repeats=2))[1].text
+    assert f"{OURS} cannot be compared with the other controllers in mean true error." in text
+    assert "is better than" not in text
+
+
 def test_effort_is_reported_relative_to_the_plan(report_on):
     rows = make_rows(targets=TARGETS, repeats=4)
     for row in rows:

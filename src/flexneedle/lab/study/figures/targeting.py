@@ -74,7 +74,10 @@ def _find_window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Float
     low, high = targets.min(axis=0), targets.max(axis=0)
     below = np.clip(low - ends.min(axis=0) + 0.5, _MARGIN, _FAR)
     above = np.clip(ends.max(axis=0) - high + 0.5, _MARGIN, _FAR)
-    return low - below, high + above
+    low, high = low - below, high + above
+    wide, tall = (high - low).tolist()
+    extra = np.array([max(0.0, 0.5 * (tall - wide)), 0.0])  # a panel is not taller than wide
+    return low - extra, high + extra
 
 
 def _with_close_up(panel: Panel[TipPositions], ratio: float) -> tuple[Figure, list[Axes]]:

@@ -105,7 +105,7 @@ class _Facts:
         errors = self.error[own & self.known]
         if len(errors) == 0:
             return f"n = {int(own.sum())}"
-        return f"mean {errors.mean():.2f}, 95 % {np.quantile(errors, 0.95):.2f}, max {errors.max():.2f} mm"
+        return f"mean {errors.mean():.3f}, 95 % {np.quantile(errors, 0.95):.3f}, max {errors.max():.3f} mm"
 
     def alarm(self, own: Flags) -> str:
         """Return the number of rows (n,) that did not finish as text, or ""."""
@@ -154,7 +154,7 @@ def _list_entries(f: _Facts) -> list[_Entry]:
         _Entry(
             "errors-by-depth", "True error by target depth",
             any_known, f"Every finished insertion is a dot{f.name_pooled(f.panel_factor)}. {_LOGARITHMIC}",
-            partial(_by_depth, f, depth), partial(draw_errors, label=depth.label),
+            partial(_by_depth, f, depth), partial(draw_errors, label=depth.label if depth.varies else ""),
         ),
         *(_make_axis_entry(f, axis, number) for number, axis in enumerate(found.design.axes, 1)),
         _Entry(
