@@ -124,6 +124,12 @@ IMPORTS = [  # the module, its source, further files, the files that are found a
         ["gains.json"],
     ),
     ("mine_a", "HERE / 'data' / 'gains.csv'", {"data/gains.csv": "1"}, ["data/gains.csv"]),
+    (
+        "mine_a",
+        "HERE / 'data' / 'sub' / 'gains.csv', '..', '/', 'sub/..'",
+        {"data/sub/gains.csv": "1", "data/sub/other.csv": "1"},
+        ["data/sub/gains.csv"],
+    ),
     ("mine_a", "runpy.run_path('mine_b.py')", {"mine_b.py": ""}, ["mine_b.py"]),
     (
         "mine.part",

@@ -126,17 +126,25 @@ def _add_module(found: dict[str, str], name: str, place: _Place, as_loaded: bool
 
 
 def _find_data(tree: ast.Module, folder: Path) -> set[str]:
-    """Return the paths, relative to a folder, of the files in it or in its folders that a source names."""
+    """Return the paths, relative to a folder, of the files in it or in its folders that a source names.
+
+    Of a path such as HERE / "data" / "sub" / "gains.json", each part is named.
+    """
     texts = {
         node.value
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
     names = {text for text in texts if text.isprintable() and len(text) <= _LONGEST_NAME}
-    folders = [folder, *(folder / name for name in names if (folder / name).is_dir())]
-    paths = ((each / name).resolve() for each in folders for name in names if (each / name).is_file())
     home = folder.resolve()
-    return {str(path.relative_to(home)) for path in paths if path.is_relative_to(home)}
+    found, waiting = set[Path](), [home]
+    while waiting:
+        each = waiting.pop()
+        paths = {path.resolve() for name in names if (path := each / name).exists()}
+        inside = {path for path in paths if path.is_relative_to(home)} - found
+        found |= inside
+        waiting += [path for path in inside if path.is_dir() and path != home]
+    return {str(path.relative_to(home)) for path in found if path.is_file()}
 
 
 def _digest_bytes(content: bytes) -> str:

@@ -101,10 +101,17 @@ def test_an_unknown_value_is_refused_with_the_choices(environment, line):
     assert str(caught.value).startswith(line)
 
 
-@pytest.mark.parametrize("peer", ["nosuch.invalid", "10.0.0.300", "fe80::1", "a..b"])
+@pytest.mark.parametrize("peer", ["nosuch.invalid", "10.0.0.300", "fe80::1", "a..b", "0", "0.0.0.0:7400"])
 def test_a_peer_without_an_address_is_refused_before_dds_aborts_the_process(monkeypatch, peer):
     monkeypatch.setenv("ROS_STATIC_PEERS", f"127.0.0.1;{peer}")
     with pytest.raises(InputError, match=f"ROS_STATIC_PEERS: '{peer}': must be a known host"):
+        join_domain()
+
+
+@pytest.mark.parametrize("port", ["", "0", "-1", "65536", "abc", "9" * 5000])
+def test_a_port_of_a_peer_that_would_abort_the_process_is_refused(monkeypatch, port):
+    monkeypatch.setenv("ROS_STATIC_PEERS", f"127.0.0.1;127.0.0.1:{port}")
+    with pytest.raises(InputError, match="the port must be from 1 to 65535"):
         join_domain()
 
 

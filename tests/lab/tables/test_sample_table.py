@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.errors import InputError
+from flexneedle.lab.tables.columns import map_columns
 from flexneedle.lab.tables.row_rules import POSITIONS, require_numbers, require_text
 from flexneedle.lab.tables.sample_table import open_table
 from flexneedle.lab.tables.write import write_table
@@ -16,8 +17,8 @@ COMMAS, SEMICOLONS = "sensor,x_mm,y_mm\n", "sensor;x_mm;y_mm\n"
 ONE = [("a", 1.0, 2.0)]
 
 
-def read(path, rules=()):
-    with open_table(path, ("sensor", "x_mm", "y_mm"), ("z_mm",)) as table:
+def read(path, rules=(), mapping=None):
+    with open_table(path, ("sensor", "x_mm", "y_mm"), ("z_mm",), mapping=mapping) as table:
         table.refuse(rules)
         found = table.arrays("SELECT sensor, x_mm, y_mm, z_mm FROM samples")
     assert np.isnan(found.pop("z_mm").astype(float)).all()
@@ -226,6 +227,12 @@ def test_a_mapped_column_with_another_unit_in_its_name_is_refused(written, unit,
 def test_a_row_counts_only_with_the_status_ok_or_none(written, head, status, measured):
     path = written(f"sensor,status,x_mm,y_mm\n{head}a,{status},1,2\n")
     assert read(path) == (ONE if measured else [("a", None, None)])
+
+
+@pytest.mark.parametrize("name", ["Status", "STATUS", "State"])
+def test_the_status_of_another_program_counts_in_any_case_or_mapped(written, name):
+    path = written(f"sensor,{name},x_mm,y_mm\na,Missing,1,2\n")
+    assert read(path, mapping=map_columns(["State=status"] if name == "State" else [])) == [("a", None, None)]
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -124,6 +124,7 @@ _URI, _RANGE, _PEERS, _LOCAL = (
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 _MOST_PARTICIPANTS = 32  # of one machine that are searched there
 _ADDRESS = re.compile(r"[\w.:%\[\]-]+", re.ASCII)
+_ANY_ADDRESS, _PORT, _HIGHEST_PORT = "0.0.0.0", re.compile(r"[0-9]{1,5}"), 65535
 _QUIET = "<General><AllowMulticast>false</AllowMulticast></General>"
 
 
@@ -193,12 +194,18 @@ def join_domain() -> DomainParticipant:
 
 
 def _require_host(peer: str) -> None:
-    """Raise InputError for a peer (HOST or HOST:PORT) without an address: Cyclone DDS would abort the process."""
-    host = peer.partition(":")[0] if peer.count(":") == 1 else peer
+    """Raise InputError for a peer (HOST or HOST:PORT) to which Cyclone DDS cannot send: it would end the process."""
+    host, mark, port = peer.partition(":") if peer.count(":") == 1 else (peer, "", "")
     try:
-        getaddrinfo(host, None, AF_INET)
+        addresses = {address[0] for *_, address in getaddrinfo(host, None, AF_INET)}
     except (OSError, UnicodeError):
-        raise InputError(f"{_PEERS}: {shorten(peer)}: must be a known host or an IPv4 address") from None
+        addresses = set()
+    if not addresses or _ANY_ADDRESS in addresses:
+        raise InputError(
+            f"{_PEERS}: {shorten(peer)}: must be a known host or an IPv4 address (not {_ANY_ADDRESS})"
+        )
+    if mark and not (_PORT.fullmatch(port) and 0 < int(port) <= _HIGHEST_PORT):
+        raise InputError(f"{_PEERS}: {shorten(peer)}: the port must be from 1 to {_HIGHEST_PORT}")
 
 
 @contextmanager

@@ -29,6 +29,12 @@ OPTIONAL = ("qw", "qx", "qy", "qz")
 
 COLUMNS = REQUIRED + OPTIONAL
 
+STATUS = "status"
+"""Optional column of tables from other programs, also written `Status` or `STATUS`: ok, empty, or why a row has no
+position."""
+
+_MAPPED = (*COLUMNS, STATUS)
+
 REFERENCE = "reference"
 """Name in the column `sensor` of the 6-DOF sensor (paper, Table II); the 5-DOF sensor is `types.TIP` (Table I)."""
 
@@ -44,8 +50,8 @@ def map_columns(given: Iterable[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     for text in given:
         name, mark, column = (part.strip() for part in text.rpartition("="))
-        if not mark or column not in COLUMNS:
-            raise InputError(f"{_OPTION}: {text!r}: COLUMN must be one of {', '.join(COLUMNS)}")
+        if not mark or column not in _MAPPED:
+            raise InputError(f"{_OPTION}: {text!r}: COLUMN must be one of {', '.join(_MAPPED)}")
         if column in names:
             raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
         names[column] = name
@@ -73,6 +79,8 @@ def choose_columns(
     """
     mapped = mapping or {}
     names = {column: mapped.get(column, column) for column in (*required, *optional)}
+    if names.get(STATUS) == STATUS and STATUS not in header:
+        names[STATUS] = next((name for name in header if name.lower() == STATUS), STATUS)
     needed = {*required, *mapped}
     missing = [
         _describe(column, name) for column, name in names.items() if column in needed and name not in header

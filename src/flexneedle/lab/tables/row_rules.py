@@ -32,7 +32,8 @@ def note_codes(count: int, total: int, codes: Iterable[float]) -> str | None:
     """Return one line on `count` of `total` positions with coordinates that are codes, None without any."""
     if not count:
         return None
-    found = " or ".join(f"({code:g}, {code:g}, {code:g})" for code in sorted({*codes}, key=abs))
+    values = sorted({code + 0.0 for code in codes}, key=abs)  # 0, not -0
+    found = " or ".join(f"({code:g}, {code:g}, {code:g})" for code in values)
     return (
         f"{count} of {total} positions are exactly {found}, a code for missing? They count as measured: if they are "
         "missing, leave them empty"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flexneedle.arguments import require_extra
 from flexneedle.errors import InputError
-from flexneedle.lab.tables.columns import check_units, choose_columns
+from flexneedle.lab.tables.columns import STATUS, check_units, choose_columns
 from flexneedle.lab.tables.layout import CsvLayout, has_decimal_commas, read_layout
 from flexneedle.lab.tables.plain_copy import EMPTY, is_regular, write_copy
 from flexneedle.types import BAD_FLOAT, BAD_FLOAT_TOLERANCE, VISIBLE
@@ -153,7 +153,7 @@ def _open(
         raise InputError("is empty")
     source: _Source = _Parquet(path) if start == _MAGIC else _Csv(path, folder / "copy.csv")
     required, optional = requested
-    optional = tuple(dict.fromkeys((*optional, "status")))
+    optional = tuple(dict.fromkeys((*optional, STATUS)))
     fields = source.open(connection, lambda header: choose_columns(header, mapping, required, optional))
     given = [name for name in labels if name in fields]
     if given:

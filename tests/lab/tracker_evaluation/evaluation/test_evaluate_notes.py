@@ -73,6 +73,15 @@ def test_a_note_reports_a_poor_rigid_fit(tmp_path, change, message):
     assert notes(tmp_path, rows) == notes(tmp_path, random_rows(0), register=True) == []
 
 
+def test_a_poor_fit_of_points_in_another_order_says_nothing_of_their_plane(tmp_path):
+    """The residual is large because of the order: it is no sign of a thin set of points."""
+    points = [[0, 0, 0], [50, 0, 0], [50, 30, 0], [0, 30, 5], [20, 10, 20], [40, -20, -15], [10, -25, 12]]
+    points = np.array([*points, [60, 15, -8.5]], float)
+    rows = rows_of(points, np.repeat(np.roll(points, 1, axis=0)[:, None], 2, axis=1))
+    (found,) = (note for note in notes(tmp_path, rows, register=True) if "exactly" not in note)
+    assert "the list shifted by one" in found
+
+
 def test_a_mirrored_frame_is_refused_with_register_and_noted_without(tmp_path):
     positions = (GRID + np.random.default_rng(0).normal(0.0, 0.1, GRID.shape)) * (1, 1, -1)
     rows = rows_of(GRID, np.repeat(positions[:, None], 2, axis=1))
@@ -83,6 +92,7 @@ def test_a_mirrored_frame_is_refused_with_register_and_noted_without(tmp_path):
 
 
 ZEROS = dict.fromkeys(("x_mm", "y_mm", "z_mm"), 0.0)
+NEGATIVE_ZEROS = dict.fromkeys(("x_mm", "y_mm", "z_mm"), -0.0)
 NINES = dict.fromkeys(("x_mm", "y_mm", "z_mm"), -9999.0)
 NO_TURN = dict.fromkeys(("qw", "qx", "qy", "qz"), 0.0)
 BAD_FLOAT = dict.fromkeys(("x_mm", "y_mm", "z_mm"), -3.697314e28)
@@ -95,6 +105,7 @@ BAD_FLOAT = dict.fromkeys(("x_mm", "y_mm", "z_mm"), -3.697314e28)
         (BAD_FLOAT | NO_TURN, "27 of 540 samples have no position (left out)"),
         (ZEROS | NO_TURN, "27 of 540 samples have no position (left out)"),
         (ZEROS, "27 of 540 positions are exactly (0, 0, 0), a code for missing?"),
+        (NEGATIVE_ZEROS, "27 of 540 positions are exactly (0, 0, 0), a code for missing?"),
         (NINES, "27 of 540 positions are exactly (-9999, -9999, -9999), a code for missing?"),
     ],
 )

@@ -165,7 +165,10 @@ def _check_frames(grid: MeasuredGrid) -> Iterator[str | None]:
         yield mirrored_frame(*pairs)
         return
     names = tuple(grid.name_of(k) for k in range(len(measured)))
-    yield misfit(*pairs, names) or find_better_fit(*pairs, names)
+    if (problem := misfit(*pairs, names)) is not None:
+        yield problem
+        return
+    yield find_better_fit(*pairs, names)
     yield unknown_side(*pairs, measured.true)
 
 
