@@ -352,4 +352,4 @@ def scenario_of(record: Plan | Insertion) -> Scenario:
 def _mm(position: Sequence[float]) -> str:
     """Return a position as text, without z in the plane."""
     x, y, *out = position[:3]
-    return f"({', '.join(f'{value:.4g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"
+    return f"({', '.join(f'{value:g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"
