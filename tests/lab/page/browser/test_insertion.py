@@ -312,9 +312,11 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
         {"job": 7, "motion": "retraction"},
         "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s",
     )
-    server.send(JobMessage(job=7, kind="retraction", state="running"), rig("ready", move, **motion))
+    refused = JobMessage(job=6, kind="insertion", state="failed", text="guide_y: at 0.1 mm")
+    server.send(refused, JobMessage(job=7, kind="retraction", state="running"), rig("ready", move, **motion))
     page.wait_for_selector(f"{BAR} >> text=Bench is prepared; nothing moves before it is armed and started.")
     page.wait_for_selector("footer >> text=Retraction: prepared, nothing moves")
+    page.wait_for_selector("footer >> text=Insertion: guide_y: at 0.1 mm")
     assert page.locator(".rig .moves li").all_inner_texts() == [move]
     assert shown_buttons(page) == {
         "Check": False, "Prepare": False, "Arm": False, "Retract the needle": False,
@@ -381,8 +383,10 @@ def test_prepared_armed_starting_and_holding_have_their_words(rig_panel, of, sta
     page.wait_for_selector(f"{BAR} >> text={words}")
 
 
-@pytest.mark.parametrize("state", ["stopped", "fault", "ended"])
-def test_a_rig_that_stands_is_called_stopped_while_its_record_is_written(panel, server, state):
+@pytest.mark.parametrize(
+    ("state", "word"), [("stopped", "Stopped"), ("fault", "Stopped"), ("ended", "Ended")]
+)
+def test_a_rig_that_stands_is_called_stopped_or_ended_while_its_record_is_written(panel, server, state, word):
     """Stop remains, but no longer in the colour of danger, which would say that something moves."""
     server.news = [WELCOME.model_copy(update={"rig": "Bench"}), clients(), session()]
     page = panel()
@@ -391,5 +395,5 @@ def test_a_rig_that_stands_is_called_stopped_while_its_record_is_written(panel, 
     )
     page.wait_for_selector(f"{BAR} .stop.danger")
     server.send(RigStateMessage(name="Bench", state=state, job=7, begun=True))
-    page.wait_for_selector(f"{BAR} >> text=Stopped on Bench")
+    page.wait_for_selector(f"{BAR} >> text={word} on Bench")
     page.wait_for_selector(f"{BAR} .stop:not(.danger)")

@@ -186,7 +186,7 @@ def test_an_axis_off_its_start_is_a_problem_whether_or_not_the_scenario_moves_it
         (
             "guide_z",
             "start",
-        ): "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig jog RIG guide_z --to 0mm"
+        ): "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig ready RIG --scenario SCENARIO"
     }
     assert found_of(findings, "rotation", "start").startswith("at 30 deg, rolled to the plan's angle")
     assert ("guide_z", "start") not in problems(check_motors(made, device, ManualClock()))

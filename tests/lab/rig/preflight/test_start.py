@@ -37,7 +37,7 @@ BACKLASH = {"axes__guide_y__backlash_mm": 0.1}
             {},
             "guide_y",
             -0.03,
-            "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig jog RIG guide_y --to 0mm",
+            "must be within 0.02 mm of 0, on the needle's axis: flexneedle rig ready RIG --scenario SCENARIO",
         ),
         ({}, "guide_z", 1.5, "must be within 0.02 mm"),
         ({}, "base_y", 0.3, "must be within 0.02 mm"),
@@ -126,6 +126,18 @@ def test_a_tip_that_is_elsewhere_or_turned_is_a_line(scenario, off, line):
     assert all(line in one for one in found)
 
 
+@pytest.mark.parametrize("scenario", [PLANE, SPACE, FREE])
+@pytest.mark.parametrize("x", [-1.0, 15.0])
+def test_a_needle_that_may_be_in_tissue_is_withdrawn_before_anything_else(scenario, x):
+    """Motions of a guide would bend it."""
+    found = tip_problems(
+        rig(), scenario, start_of(scenario, x=x - scenario.setup.start_tip_x, y=4.0, theta=0.2)
+    )
+    assert len(found) == 3
+    assert all("withdraw it first: flexneedle rig retract RIG" in line for line in found)
+    assert not any("jog" in line or "ready" in line for line in found)
+
+
 def test_the_pose_of_the_tip_is_the_median_of_what_is_measured():
     found = [
         Measurement(0.0, 1.0, 2.0, 3.0, direction=(0.1, 0.2)),
@@ -159,7 +171,7 @@ def test_a_suggested_command_names_the_rig_as_the_user_did(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).write_text(tomli_w.dumps(bench_rig.VALUES))
     made = load_rig(name)
-    command = f"flexneedle rig jog {shlex.quote(name)} guide_y --to 0mm"
+    command = f"flexneedle rig ready {shlex.quote(name)} --scenario SCENARIO"
     assert axis_start_problem(made, "guide_y", made.axes.guide_y, 1.5).endswith(f": {command}")
     assert (
         f"flexneedle rig ready {shlex.quote(name)}" in tip_problems(made, PLANE, start_of(PLANE, y=-3.6))[0]

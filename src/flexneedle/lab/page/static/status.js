@@ -115,7 +115,7 @@ function followJobs(element, store, link) {
     const { kind, text, bar, cancel } = entry;
     const failed = job.state === "failed";
     const rig = store.get("rig");
-    if (MOTIONS.includes(kind) && isPrepared(store)) entry.words = `${JOBS[kind]}: ${{ preparing: "being prepared", armed: "armed" }[rig.state] ?? "prepared"}, nothing moves`;
+    if (kind === rig?.motion && isPrepared(store)) entry.words = `${JOBS[kind]}: ${{ preparing: "being prepared", armed: "armed" }[rig.state] ?? "prepared"}, nothing moves`;
     else if (kind === "insertion" && rig?.begun && waits(rig)) entry.words = `Insertion: held, ${job.text}`;
     else entry.words = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     entry.counts = !failed && (job.share ?? null) === null;

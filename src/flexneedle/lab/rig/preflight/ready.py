@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from flexneedle.errors import RigError
 from flexneedle.lab.rig.preflight.fit import axis_stretch
 from flexneedle.lab.rig.preflight.moves import AxisMove, plan_jog
+from flexneedle.lab.rig.preflight.start import air_margin, withdrawal
 from flexneedle.lab.rig.rig_file import RigFile
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Point
@@ -42,8 +43,7 @@ def plan_way_to_start(
             f"tip: not measured: the start of the insertion axis is unknown: flexneedle rig check {rig.source}"
         )
     start, here = scenario.setup.start_tip_x, tip[0]
-    margin = min(_SDS * scenario.control.start_axial_sd_mm, -_HALF * start)
-    require_air(rig, here, margin)
+    require_air(rig, here, air_margin(scenario))
     at = positions["insertion"]
     goal = _within_limits(rig, scenario, at, at + (start - here) * axis_stretch(scenario.entry.slope))
     across = [_move(rig, name, positions[name], 0.0) for name, _ in rig.axes.items() if name != "insertion"]
@@ -60,10 +60,7 @@ def require_air(rig: RigFile, tip_x: float, margin: float) -> None:
     if tip_x > -margin:
         where = f"{tip_x:.1f} mm deep" if tip_x > 0.0 else f"{-tip_x:.1f} mm before the skin"
         rule = f"must be {margin:.2g} mm or more before the skin, so that nothing bends the needle in tissue"
-        remedy = f"withdraw it first: flexneedle rig retract {rig.source}"
-        raise RigError(
-            f"tip: {where}: {rule}: {remedy}; or, in air, register the tracker again ([registration])"
-        )
+        raise RigError(f"tip: {where}: {rule}: {withdrawal(rig)}")
 
 
 def _within_limits(rig: RigFile, scenario: Scenario, position: float, goal: float) -> float:

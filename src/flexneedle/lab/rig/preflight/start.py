@@ -23,12 +23,27 @@ _MOUNT = "check the mount of the needle, or register the tracker again"
 def axis_start_problem(rig: RigFile, name: str, axis: Axis, position: float) -> str:
     """Return the problem of a lateral axis that does not rest at 0, or ""; position: mm.
 
-    It may be off by its uncertainty, as after a motion to 0.
+    It may be off by its uncertainty, as after a motion to 0. The remedy refuses to bend a needle in tissue; a jog does
+    not.
     """
     if name not in LINEAR_AXES[1:] or abs(position) <= axis.uncertainty:
         return ""
-    remedy = f"flexneedle rig jog {rig.source} {name} --to 0mm"
-    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: {remedy}"
+    return f"must be within {axis.to_text(axis.uncertainty)} mm of 0, on the needle's axis: {_ready(rig)}"
+
+
+def _ready(rig: RigFile) -> str:
+    return f"flexneedle rig ready {rig.source} --scenario SCENARIO"
+
+
+def air_margin(scenario: Scenario) -> float:
+    """Return the distance (mm) before the skin within which a tip may be in tissue."""
+    return min(SDS * scenario.control.start_axial_sd_mm, -0.5 * scenario.setup.start_tip_x)
+
+
+def withdrawal(rig: RigFile) -> str:
+    """Return what to do about a tip that may be in tissue."""
+    remedy = f"withdraw it first: flexneedle rig retract {rig.source}"
+    return f"{remedy}; or, in air, register the tracker again ([registration])"
 
 
 def with_registration(rig: RigFile, scenario: Scenario) -> Scenario:
@@ -160,10 +175,11 @@ def tip_problems(rig: RigFile, scenario: Scenario, tip: Pose, roll: float = 0.0)
         ("dy/dx", 1e3 * tip.theta, 1e3 * slope.real, 1e3 * limits.slope[0]),
         ("dz/dx", 1e3 * tip.psi, 1e3 * slope.imag, 1e3 * limits.slope[1]),
     ]
-    ready = f"flexneedle rig ready {rig.source} --scenario SCENARIO"
-    remedies, mount = {"x": f"{ready} (setup.tip_to_skin_mm)"}, f"{ready}, {_MOUNT}"
+    along, mount = f"{_ready(rig)} (setup.tip_to_skin_mm)", f"{_ready(rig)}, {_MOUNT}"
+    if tip.x > -air_margin(scenario):
+        along = mount = withdrawal(rig)
     found = [
-        f"{name} must be within {limit:.1f} mm of {start:.1f}: {remedies.get(name, mount)}"
+        f"{name} must be within {limit:.1f} mm of {start:.1f}: {along if name == 'x' else mount}"
         for name, value, start, limit in places
         if not abs(value - start) <= limit
     ]

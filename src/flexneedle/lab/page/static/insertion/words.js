@@ -18,7 +18,7 @@ export function inWords(insertion, rows = [], rig = null) {
   const count = COUNTED.includes(insertion.state) ? `, ${insertion.periods} periods` : "";
   const stands = insertion.rig && insertion.state === "running" && ENDED.includes(rig?.state);
   const armed = insertion.rig && ARMED[insertion.state]?.[rig?.state];
-  const state = stands ? "Stopped" : armed || (STATES[insertion.state] ?? insertion.state);
+  const state = stands ? (rig.state === "ended" ? "Ended" : "Stopped") : armed || (STATES[insertion.state] ?? insertion.state);
   const to = insertion.target_name ? ` to ${insertion.target_name}` : "";
   const told = TOLD.test(insertion.summary);
   const parts = told ? [] : [`${state}${where}${to}: ${insertion.controller}, seed ${insertion.seed}${count}.`];
