@@ -236,7 +236,7 @@ def test_a_base_at_its_lowest_position_is_not_retracted(capsys, file, device, su
     device.set("A", position=2_000.0, commanded=2_000.0)
     status, _, err = run(capsys, "rig", "retract", file(), "--yes")
     assert (status, supervisor.calls) == (0, [])
-    assert "nothing to retract" in err
+    assert "nothing to retract; if the needle is in tissue, the position is wrong" in err
 
 
 def test_all_axes_but_those_with_absolute_encoders_are_homed_one_after_another(capsys, file, supervisor):

@@ -38,6 +38,7 @@ def way(tip, **positions):
         ),
         ((-27.0, 0.0, 0.0), {"insertion": 0.0}, []),  # the start is not known better than 3 mm
         ((-27.0, 0.0, 0.0), {"insertion": 1.0}, [("insertion", 0.0)]),
+        ((-28.0, 0.0, 0.0), {"insertion": -1.0}, [("insertion", -0.5), ("insertion", 0.0)]),
     ],
 )
 def test_the_insertion_goes_back_first_and_forward_last(tip, positions, expected):

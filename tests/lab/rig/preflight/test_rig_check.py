@@ -103,7 +103,7 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
         ({}, {"position": 120_021.0}, "position", "beyond the soft limits, 0 to 120 mm"),
         ({"axes__insertion__backlash_mm": 0.05}, {"position": -50.0}, "position", "beyond the soft limits"),
         ({}, {"position": math.nan}, "position", "is not a number"),
-        ({}, {"moving": True}, "motor", "moves, though this command does not move it"),
+        ({}, {"moving": True}, "motor", "reported as moving, as also at rest"),
         ({}, {"stopped": "position error"}, "motor", "position error"),
         ({}, {"forward_limit": True}, "limit switches", "the forward limit switch is active at 0.000 mm"),
         ({}, {"forward_limit": True, "reverse_limit": True}, "limit switches", "both limit switches are"),

@@ -245,6 +245,17 @@ def test_a_dry_run_moves_no_motors_and_a_supervisor_that_is_killed_is_an_error(s
     assert notes_of(shared) == before
 
 
+def test_a_supervisor_that_is_killed_leaves_what_may_still_move_and_what_to_do(make_task):
+    with SupervisorClient(make_task(f"killed {os.getpid()}")) as made:
+        made.arm()
+        os.kill(made.pid, signal.SIGKILL)
+        with pytest.raises(
+            DriverError, match=r"it was killed; motors may continue for \d+ ms .*insertion by at most "
+        ):
+            made.wait(60.0)
+        assert "press the emergency stop" in str(made.ended)
+
+
 @pytest.mark.parametrize("how", ["close", "end of the client", "error in the supervisor"])
 def test_motors_are_stopped_at_the_end_whatever_it_is(make_task, how):
     wakeup = signal.set_wakeup_fd(-1)

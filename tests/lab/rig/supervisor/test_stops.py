@@ -166,7 +166,7 @@ def test_a_controller_that_dies_leaves_what_may_still_move_and_what_to_do(bench,
     assert (bench.state, cause) == (SupervisorState.FAULT, "no reply within 100 ms")
     assert rest.startswith(moves)
     assert "press the emergency stop if an axis moves on" in rest
-    assert rest.endswith("home insertion, rotation, guide_y again")
+    assert rest.endswith("withdraw the needle by hand, then home insertion, rotation, guide_y again")
     assert (step is None) == (leg is None)
     if step is not None:
         assert bench.sent[-1].why == bench.why

@@ -302,7 +302,7 @@ def run_axis_tests(
             )
             where = f"{move.name} was tested from {move.axis.to_text(move.start)} {move.axis.unit}"
             raise DriverError(
-                f"{error}; {where}, and is not back: check {key}, channel and home; {back}"
+                f"{error}; {where}, and is not back: check {key}, direction, channel and home; {back}"
             ) from error
 
 

@@ -167,7 +167,9 @@ def withdrawn_position(rig: RigFile) -> float:
 def describe_withdrawn(rig: RigFile, position: float) -> str:
     """Return why there is nothing to retract from a position (mm)."""
     at, end = map(rig.axes.insertion.to_text, (position, withdrawn_position(rig)))
-    return f"insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract"
+    found = f"insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract"
+    lost = "if the needle is in tissue, the position is wrong, as after a restart of the controller"
+    return f"{found}; {lost}: withdraw it by hand, then flexneedle rig home {rig.source}"
 
 
 def plan_retraction(

@@ -45,7 +45,7 @@ def plan_way_to_start(
     start, here = scenario.setup.start_tip_x, tip[0]
     require_air(rig, here, air_margin(scenario))
     at = positions["insertion"]
-    goal = _within_limits(rig, scenario, at, at + (start - here) * axis_stretch(scenario.entry.slope))
+    goal = _within_limits(rig, scenario, at + (start - here) * axis_stretch(scenario.entry.slope))
     across = [_move(rig, name, positions[name], 0.0) for name, _ in rig.axes.items() if name != "insertion"]
     along = _move(rig, "insertion", at, goal)
     if along and along.distance > 0.0:
@@ -63,13 +63,13 @@ def require_air(rig: RigFile, tip_x: float, margin: float) -> None:
         raise RigError(f"tip: {where}: {rule}: {withdrawal(rig)}")
 
 
-def _within_limits(rig: RigFile, scenario: Scenario, position: float, goal: float) -> float:
+def _within_limits(rig: RigFile, scenario: Scenario, goal: float) -> float:
     """Return the goal (mm) of the insertion axis, or the soft limit before it if the tip is near enough to the start.
 
-    An axis beyond its limits goes no further out, and returns.
+    An axis beyond its limits returns to them.
     """
     low, high = rig.axes.insertion.limits
-    nearest = min(max(goal, min(low, position)), max(high, position))
+    nearest = min(max(goal, low), high)
     return nearest if abs(nearest - goal) <= _SDS * scenario.control.start_axial_sd_mm else goal
 
 

@@ -169,7 +169,8 @@ def _read_motors(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState]
 
 
 def _axis_findings(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
-    moving = "moves, though this command does not move it" if state.moving else ""
+    known = "reported as moving, as also at rest after its program was killed"
+    moving = f"{known}; this command does not move it" if state.moving else ""
     problem = "; ".join(filter(None, (moving, state.stopped)))
     yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", problem)
     position = state.position / axis.scale

@@ -218,7 +218,7 @@ class SupervisorConnection:
     # The thread
 
     def _receive(self) -> None:
-        why = "it was killed"
+        why = f"it was killed; {self._describe_queues()}"
         while not self._process.channel.ended:
             for message in self._process.channel.receive(None):
                 if isinstance(message, protocol.SupervisorEnded):
@@ -229,6 +229,18 @@ class SupervisorConnection:
         with self._changed:
             self._ended = why
             self._changed.notify_all()
+
+    def _describe_queues(self) -> str:
+        """Return what may still move once the supervisor cannot stop it, for messages."""
+        if self._task.dry:
+            return "nothing moves in a dry run"
+        loop = self.rig.loop
+        queues = ", ".join(
+            f"{name} by at most {axis.to_text(loop.queue_of(axis, axis.speed))} {axis.unit}"
+            for name, axis in self.rig.axes.items()
+        )
+        then = "press the emergency stop if an axis moves on"
+        return f"motors may continue for {1e3 * loop.queue:g} ms and brake (loop.queue_ms): {queues}; {then}"
 
     def _take(self, message: protocol.TickReport | protocol.MotionResult | protocol.RequestRefused) -> None:
         with self._changed:

@@ -226,7 +226,8 @@ def warn_unstopped(
     queue = "" if leg is None else leg.describe_queue(states)
     moves = f"may still move to their last targets: {queue}" if queue else "nothing had a target ahead"
     homed = ", ".join(name for name, drive in drives.items() if drive.axis.home != "absolute")
-    home = f"; after a restart of the controller home {homed} again" if homed else ""
+    lost = "positions are wrong: withdraw the needle by hand"
+    home = f"; after a restart of the controller {lost}, then home {homed} again" if homed else ""
     remedy = "press the emergency stop if an axis moves on, support a vertical axis, wait until all rest"
     return (
         f"{_UNSTOPPED}: {moves}; a controller that fails may do anything else: {remedy}{home}; cause: {why}"
