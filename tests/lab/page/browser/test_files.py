@@ -145,7 +145,9 @@ def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, vis
     )
     page.fill("[aria-label='Name of the run to save']", "../x")
     page.click("text=Save the insertion")
-    page.wait_for_selector("text=The name must begin with a letter or digit")
+    page.wait_for_selector(
+        "text=The name must begin with a letter (A–Z, a–z) or digit, and have at most 80 of these"
+    )
     page.fill("[aria-label='Name of the run to save']", "my run")
     page.click("text=Save the insertion")
     server.wait_for("save")

@@ -6,7 +6,7 @@ import { showStudy } from "./study.js";
 
 const DOWNLOADS = [["Figure", "figure.png"], ["CSV", "trace.csv"], ["Run folder", "run.zip"], ["Replay as HTML", "replay.html"]];
 const NAME = /^[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}$/;
-const RULE = "The name must begin with a letter or digit, and have only letters, digits, spaces, points, - and _.";
+const RULE = "The name must begin with a letter (A–Z, a–z) or digit, and have at most 80 of these, spaces, points, - and _.";
 const ENDED = ["done", "held", "failed", "interrupted"];
 const REPLAYED = ["insertion"]; // kinds of runs that can be shown
 const MOST = 100; // runs in the list
