@@ -151,6 +151,7 @@ MOTIONS = [
         ("move_to", "rotation", -math.pi / 20, 0.4 * math.pi),
         "rotation: from 0 to -9 deg",
     ),
+    (("jog", "guide_y", "1mm"), ("move_to", "guide_y", 1.0, 1.0), "Only without a needle in tissue"),
     (("retract", "--to", "12.5", "--speed", "0.5"), ("retract", 12.5, 0.5), "insertion: from 30 to 12.5 mm"),
 ]
 

@@ -239,8 +239,10 @@ def _jog(args: argparse.Namespace) -> int:
     if move is None:
         print_note(f"{args.axis} is at {axis.to_text(at)} {axis.unit}: nothing to move")
         return 0
+    bends = args.axis not in ("insertion", "rotation")
+    notes = ["Only without a needle in tissue, which this bends."] if bends else []
     return _confirm_and_move(
-        rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed)
+        rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal, move.speed), *notes
     )
 
 
