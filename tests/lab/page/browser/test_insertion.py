@@ -352,6 +352,11 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     assert not hint.is_visible()
 
 
+def test_a_needle_that_was_not_measured_is_not_drawn_as_if_it_were(rig_panel):
+    page = rig_panel(insertion("refused", rig="Bench", periods=0, summary="the tip may be in tissue"))
+    page.wait_for_selector(".scene p.moved >> text=where it is now has not been measured")
+
+
 def test_without_a_connection_nothing_looks_usable_and_the_rigs_own_stop_is_named(rig_panel):
     page = rig_panel(insertion("running", rig="Bench"), rig("inserting", job=7, begun=True))
     page.wait_for_selector(f"{BAR} .stop.danger")

@@ -4,6 +4,7 @@ import { button, make } from "./dom.js";
 import { SHOWN, STEERING, maySteer, runs, shownOf } from "./shown.js";
 
 export const TARGET_AND_PLAN = "Target and plan";
+const MOVED = "The needle is drawn where the insertion ended: the rig has moved since.";
 
 // The line of a view with handles; hidden while there are handles, and while an insertion runs.
 export function stillNote(store) {
@@ -17,12 +18,20 @@ export function stillNote(store) {
   store.subscribe([...SHOWN, ...STEERING], () => {
     const of = shownOf(store);
     const still = Boolean(store.get("scene")) && of !== "scene"; // a replay has no scene
-    const moved = of === "live" && Boolean(store.get("insertion live")?.moved);
-    back.hidden = moved || !still || !maySteer(store) || runs(store.get("insertion live"));
-    const at = "The needle is drawn where the insertion ended: the rig has moved since.";
-    words.textContent = moved ? at : `This is ${of === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
-    note.classList.toggle("moved", moved);
-    note.hidden = back.hidden && !moved;
+    const elsewhere = of === "live" ? whereNotNow(store) : "";
+    back.hidden = elsewhere === MOVED || !still || !maySteer(store) || runs(store.get("insertion live"));
+    words.textContent = elsewhere || `This is ${of === "first" ? "a recorded run" : "an insertion"}. To move the target:`;
+    note.classList.toggle("moved", Boolean(elsewhere));
+    note.hidden = back.hidden && !elsewhere;
   });
   return note;
+}
+
+// Where the needle of a rig is drawn if it may be elsewhere now; "" if it is there.
+function whereNotNow(store) {
+  const live = store.get("insertion live");
+  if (live?.moved) return MOVED;
+  const unseen = live?.rig && !runs(live) && !store.get("rows live")?.length; // refused, or stopped before its first period
+  if (unseen) return "The needle is drawn at the start of the plan: where it is now has not been measured.";
+  return "";
 }
