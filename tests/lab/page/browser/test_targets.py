@@ -1,5 +1,7 @@
 """Several targets: added, chosen and removed; the views draw the others, plans and insertions name theirs."""
 
+import threading
+
 import pytest
 
 from browser_checks import added, painted
@@ -39,6 +41,20 @@ def test_targets_are_added_chosen_and_removed(visit, server):
         {"type": "targets", "what": "remove", "name": "Target 2"},
         {"type": "targets", "what": "choose", "name": "Target 2"},
     ]
+
+
+def test_a_name_written_while_a_target_is_added_stays(visit, server):
+    page = visit([*opening(), with_targets(1)], shows=["form"])
+    field = "[aria-label='Name of the target to add']"
+    answered = threading.Event()
+    server.answers["targets"] = lambda _: [with_targets(1)] if answered.wait(60) else []
+    page.click("text=Add a target")
+    server.wait_for("targets")
+    page.fill(field, "Deep")
+    answered.set()
+    server.send(with_targets(2, (30.0, -4.0, 0.0)))
+    page.wait_for_selector(".targets input[value='Target 2']")
+    assert page.input_value(field) == "Deep"
 
 
 def test_other_targets_are_faint_in_all_views_and_results_name_theirs(visit, server):

@@ -110,10 +110,11 @@ function saveForm(link, of, proposed, text) {
   const form = make("form.tools", {}, name, make("button", { type: "submit" }, text), problem);
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
-    const valid = NAME.test(name.value.trim());
+    const written = name.value;
+    const valid = NAME.test(written.trim());
     name.setAttribute("aria-invalid", valid ? "false" : "true");
     problem.hidden = valid;
-    if (valid && (await link.ask({ type: "save", name: name.value.trim(), of })).done) name.value = "";
+    if (valid && (await link.ask({ type: "save", name: written.trim(), of })).done && name.value === written) name.value = "";
   });
   return form;
 }

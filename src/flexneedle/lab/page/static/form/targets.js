@@ -8,8 +8,10 @@ export function followTargets(element, store, link) {
   const form = make("form.tools", {}, name, make("button", { type: "submit", title: "Another target, at the place of the present one" }, "Add a target"));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
-    const given = name.value.trim();
-    if ((await link.ask({ type: "targets", what: "add", ...(given && { name: given }) })).done) name.value = "";
+    const written = name.value;
+    const given = written.trim();
+    const { done } = await link.ask({ type: "targets", what: "add", ...(given && { name: given }) });
+    if (done && name.value === written) name.value = ""; // not what was written since
   });
   element.append(list, form);
   let made = "";
