@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from browser_checks import show
+from browser_checks import painted, show
 from chromium import ARGUMENTS, CHROMIUM
 from fake_page import PATIENCE_S, FakePage
 
@@ -134,6 +134,9 @@ def visit(server, tab):
         page = tab(width, height, scheme, before, **how)
         page.goto(server.url)
         page.wait_for_selector("[data-panel=status] .connection")
+        if shows:
+            page.wait_for_selector("[data-panel=rig]:not(:empty)", state="attached")  # the last panel
+            painted(page)  # a rig with motions to read has shown its own tab
         for panel in shows:
             show(page, panel)
         for selector in [ready] if isinstance(ready, str) else ready:
