@@ -1,5 +1,7 @@
 """Checks of a page in a browser: pixels that a part adds to its drawings, and parts that are wider than their box."""
 
+from fake_page import until
+
 PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 FLAT = ("[data-panel=section] canvas", "[data-panel=axial] canvas")
 
@@ -68,6 +70,18 @@ def added(page, server, tone, *news, canvases=FLAT):
     server.send(*news)
     arrived(page)
     return page.evaluate(_ADDED, [list(canvases), tone])
+
+
+_ALL_PANELS = """flexneedle.store.get('connection') === 'open' &&
+  document.querySelectorAll('[data-panel]:empty').length === (flexneedle.store.get('view notice') ? 1 : 0)"""
+"""The view in space stays empty without WebGL, which a notice reports."""
+
+
+def loaded(page):
+    """Wait until a page has all its panels, and what the server has sent until now is received and painted."""
+    page.wait_for_selector("[data-panel=status] .connection")
+    until(page, _ALL_PANELS)
+    arrived(page)
 
 
 _TOO_WIDE = """() => {

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from browser_checks import painted, show
+from browser_checks import loaded, show
 from chromium import ARGUMENTS, CHROMIUM
 from fake_page import PATIENCE_S, FakePage
 
@@ -113,7 +113,7 @@ def tab(browser, kept_tabs):
 
 @pytest.fixture
 def visit(server, tab):
-    """A function that opens the page and returns it.
+    """A function that opens the page and returns it once its panels and the news are there.
 
     news: messages and frames for it (default: an opening); before: a script that runs first; ready: awaited selectors;
     shows: view and tab to show, by their panels.
@@ -126,17 +126,14 @@ def visit(server, tab):
         height=800,
         scheme="light",
         before=None,
-        ready=("[data-panel=status] .connection",),
+        ready=(),
         shows=(),
         **how,
     ):
         server.news = news or server.news
         page = tab(width, height, scheme, before, **how)
         page.goto(server.url)
-        page.wait_for_selector("[data-panel=status] .connection")
-        if shows:
-            page.wait_for_selector("[data-panel=rig]:not(:empty)", state="attached")  # the last panel
-            painted(page)  # a rig with motions to read has shown its own tab
+        loaded(page)
         for panel in shows:
             show(page, panel)
         for selector in [ready] if isinstance(ready, str) else ready:

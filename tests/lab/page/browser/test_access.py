@@ -24,12 +24,10 @@ def tab_to(page, name):
 
 
 def test_an_insertion_is_started_and_stopped_by_keys(visit, server):
-    page = visit(ready="[data-panel=actions] button:visible")
-    page.wait_for_selector("[data-panel=space] .legend li")
-    page.wait_for_selector("text=nobody is in control")
+    page = visit(ready="[data-panel=space] .legend li")
     tab_to(page, "Skip to the scene")
     page.keyboard.press("Enter")
-    assert page.evaluate("document.activeElement.id") == "main"
+    until(page, "document.activeElement.id === 'main'")
     tab_to(page, "Insert")
     page.keyboard.press("Enter")
     assert server.wait_for("insert") == [{"type": "insert"}]

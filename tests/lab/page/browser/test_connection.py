@@ -1,12 +1,13 @@
 """Connection, control, refusals, work in the status bar, and recovery after a lost connection."""
 
+import threading
 from contextlib import ExitStack
 from typing import get_args
 
 import pytest
 
-from browser_checks import arrived
-from fake_page import until
+from browser_checks import arrived, loaded
+from fake_page import PATIENCE_S, until
 from flexneedle.lab.page.protocol import ClosedMessage, JobMessage, RefusedMessage, RigStateMessage
 from flexneedle.lab.page.shape_frames import FrameSource
 from page_clients import port_of, served
@@ -21,7 +22,7 @@ FOCUSED = "document.activeElement.textContent"
 
 def test_control_is_taken_shared_released_and_taken_by_edits_which_are_merged(visit, server):
     page = visit()
-    page.wait_for_selector("text=Connected")
+    assert "Connected" in page.inner_text(STATUS)
     assert "Two-layer tissue phantom in space · seed 0" in page.inner_text("#title")
     assert "1 person connected, nobody is in control" in page.inner_text(STATUS)
     page.click("text=Take control")
@@ -68,6 +69,24 @@ def test_control_is_taken_shared_released_and_taken_by_edits_which_are_merged(vi
     page.wait_for_selector("[role=alert] >> text=must be above 0", state="detached")
 
 
+def test_requests_keep_their_order_while_control_is_taken(visit, server):
+    """Messages to all report the control of the page before its request for control is answered."""
+    page, answered = visit(), threading.Event()
+
+    def answer_late(_request):
+        answered.wait(PATIENCE_S)
+        return ()
+
+    server.answers["steer"] = answer_late
+    ask = "(redo) => { flexneedle.link.ask({ type: 'undo', redo }); }"
+    page.evaluate(ask, False)
+    page.wait_for_selector("text=you are in control")
+    page.evaluate(ask, True)
+    answered.set()
+    assert [each["redo"] for each in server.wait_for("undo", 2)] == [False, True]
+    assert len(server.asked("steer")) == 1
+
+
 def test_a_page_takes_over_control_and_another_takes_it_back(visit, server):
     moving = insertion("running", rig="Bench")
     rig = RigStateMessage(name="Bench", state="inserting", job=7, begun=True)
@@ -84,7 +103,7 @@ def test_a_page_takes_over_control_and_another_takes_it_back(visit, server):
     server.send(clients(2, steering=2))
     page.wait_for_selector("[role=alert] >> text=Person 2 has taken over control. This page can still stop")
     page.wait_for_selector("[data-step=arm]:disabled")
-    assert not page.is_checked("#rig-free")
+    page.wait_for_selector("#rig-free:not(:checked)")
     page.click("[data-panel=actions] >> text=Stop")
     assert server.wait_for("stop") == [{"type": "stop"}]
     for state, begun, job, text in (
@@ -142,8 +161,9 @@ def test_after_a_restart_a_dead_line_and_a_lost_connection_the_state_is_recovere
     page.wait_for_selector("text=seed 0")
     assert not page.evaluate("flexneedle.store.get('refusals')")
     arrived(page)
+    pings = len(server.asked("ping"))
     page.evaluate("look(); look();")  # while all is quiet
-    server.wait_for("ping", 2)
+    server.wait_for("ping", pings + 1)
     arrived(page)
     server.news = [*planned()[:1], clients(clients=3), session(revision=9, seed=4)]
     server.cut()
@@ -243,10 +263,15 @@ def test_a_restarted_server_gets_the_scenario_of_the_open_pages_back_but_not_ano
     address, pages = restarted(), [tab(1280, 800, "light"), tab(1280, 800, "light")]
     for page in pages:
         page.goto(address)
-        page.wait_for_selector("#field-target-depth_mm", state="attached")  # the last file is loaded
-        until(page, "[...document.querySelectorAll('[data-panel]')].every(({ children }) => children.length)")
+        loaded(page)
+        for last in (
+            "#field-target-depth_mm",
+            "[data-panel=space] .legend li",
+        ):  # schema and WebGL are loaded
+            page.wait_for_selector(last, state="attached")
     page, _other = pages
     page.evaluate("flexneedle.link.edit({ 'target.depth_mm': 35 })")
+    until(page, f"!flexneedle.store.get('draft') && {DEPTH} === 35")
     page.evaluate("flexneedle.link.ask({ type: 'insert', paused: true })")
     for each in pages:
         until(each, f"{DEPTH} === 35 && flexneedle.store.get('insertion live')?.state === 'paused'")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from browser_checks import painted, show
+from browser_checks import arrived, painted, show
 from chromium import NO_WEBGL
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage, RunsMessage, StudyRowsMessage
@@ -24,9 +24,7 @@ def files(visit, server):
     server.files["/scenario.toml"] = TEXT
 
     def opened(**how):
-        page = visit(ready=f"{FILES} li", shows=["files"], **how)
-        page.wait_for_selector("text=nobody is in control")
-        return page
+        return visit(shows=["files"], **how)
 
     return opened
 
@@ -66,12 +64,11 @@ def test_a_scenario_is_begun_from_preset_world_and_file_and_saved_and_changes_ar
     download.value.save_as(tmp_path / "saved.toml")
     assert (tmp_path / "saved.toml").read_text() == TEXT
     server.send(session(2).model_copy(update={"changed": ["target.depth_mm"]}))
-    until(page, "flexneedle.store.get('session').changed.length")
-    painted(page)  # presets chosen
+    arrived(page)
+    assert page.input_value("#files-preset") == "phantom"  # as chosen
 
     def begin(kind):
         if kind == "preset":
-            page.select_option("#files-preset", "phantom")
             page.click("[aria-label='Begin with the preset']")
         else:
             page.set_input_files(f"{FILES} input[type=file]", payload("my.toml", TEXT.encode()))
@@ -160,6 +157,8 @@ def test_a_run_is_opened_compared_closed_downloaded_and_saved(files, server, vis
     name = page.locator("[aria-label='Name to save many row 17 as']")
     assert name.input_value() == "many row 17"
     name.fill("worst")
+    server.send(insertion("done", of="first", name="other"))
+    page.wait_for_selector("text=Shown: other")
     page.click("text=Save as a run")
     assert server.wait_for("save", 2) == [
         {"type": "save", "name": "my run", "of": "live"},
@@ -235,5 +234,5 @@ def test_pictures_are_of_the_shown_view(files, server, saved):
     page.wait_for_selector(f"{SECTION}:visible")
     before = saved(page)
     server.send(insertion("done", of="first"), rows(0, 4, "first"), *period_frames(3, FrameSource.FIRST))
-    until(page, "flexneedle.store.get('rows first')?.length === 4")
+    arrived(page)
     assert saved(page) != before

@@ -204,7 +204,9 @@ def test_a_named_table_keeps_its_values_and_points_are_written_one_after_the_oth
     own = noisy.with_values(edit_of(page, server))
     assert own.tracker.environment == noisy.tracker.environment.model_copy(update={"name": "own"})
     server.send(session(2, **own.flat()))
-    until(page, "document.querySelector('#field-tracker-environment').value === 'own values'")
+    until(page, "flexneedle.store.get('session').revision === 2")
+    painted(page)
+    assert choice.input_value() == "own values"
     search(page, "fiducials_mm")
     given = page.locator("#field-tracker-registration-fiducials_mm")
     assert given.input_value() == "0, 0, 0; 100, 0, 0; 0, 100, 0.5"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from browser_checks import show
+from browser_checks import loaded, painted, show
 from fake_page import until
 from page_clients import served
 from page_worker import Worker
@@ -26,7 +26,7 @@ def address(tmp_path, monkeypatch):
 def page(address, tab):
     page = tab(1280, 800, "light")
     page.goto(address)
-    page.wait_for_selector("[data-panel=status] .connection")
+    loaded(page)
     show(page, "section")
     page.wait_for_selector(HANDLE)
     return page
@@ -38,6 +38,7 @@ def is_at(page, depth):
 
 def drag(page, right):
     """Drag the target, and return its depth afterwards."""
+    painted(page)
     box = page.locator(HANDLE).bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)

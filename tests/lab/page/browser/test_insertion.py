@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from browser_checks import painted, show
+from browser_checks import arrived, painted, show
 from fake_page import until
 from flexneedle.lab.page.protocol import (
     DisturbancesMessage,
@@ -22,7 +22,7 @@ BAR, PANEL, RIG = (f"[data-panel={name}]" for name in ("actions", "insertion", "
 
 @pytest.fixture
 def panel(visit):
-    return partial(visit, ready=(f"{BAR} button:visible", "text=person"), shows=["insertion"])
+    return partial(visit, shows=["insertion"])
 
 
 def click(page, text, panel=BAR):
@@ -255,7 +255,9 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     show(page, "rig")
     server.send(rig("inserting", job=7, begun=True), insertion("running", rig="Bench"))
     page.wait_for_selector("text=It inserts.")
-    asked = [(each["type"], each.get("armed"), each.get("job")) for each in server.requests[-4:]]
+    server.wait_for("go")
+    steps = [each for each in server.requests if each["type"] in ("arm", "go")]
+    asked = [(each["type"], each.get("armed"), each.get("job")) for each in steps]
     assert asked == [("arm", True, 7), ("arm", False, 7), ("arm", True, 7), ("go", None, None)]
     assert shown_buttons(page) == {}
     assert page.locator(f"{BAR} .stop.danger").is_visible()
@@ -266,7 +268,7 @@ def test_a_rig_is_checked_prepared_armed_after_a_confirmation_and_started(rig_pa
     server.send(ended, rig("stopped", why="person 1 on the page"))
     page.wait_for_selector("text=It was stopped: person 1 on the page.")
     page.wait_for_selector(f"{BAR} >> text=Recorded as 2026-rig.")
-    assert len(server.asked("stop")) == 1
+    assert len(server.wait_for("stop")) == 1
     assert shown_buttons(page) == beginning
     assert page.locator(RIG).get_by_text("The needle may still be in the tissue").is_visible()
 
@@ -294,6 +296,7 @@ def test_a_rig_that_holds_is_confirmed_again_and_others_can_only_stop_it(rig_pan
     shows("armed", "It is armed for one start", True)
     shows("holding", "not started within 60 s", False, "not started within 60 s: arm it again")
     server.send(clients(2, steering=2))
+    arrived(page)
     page.check("#rig-free")
     assert shown_buttons(page) == {"Arm": False, "Continue": False}
     click(page, "Stop")

@@ -60,7 +60,9 @@ FOUND = {
 
 def named(page):
     """(role, name) of all that Chromium hands to a screen reader; what is in an image is a part of it."""
-    nodes = page.context.new_cdp_session(page).send("Accessibility.getFullAXTree")["nodes"]
+    reader = page.context.new_cdp_session(page)
+    nodes = reader.send("Accessibility.getFullAXTree")["nodes"]
+    reader.detach()
     by_id = {node["nodeId"]: node for node in nodes}
 
     def in_image(node):

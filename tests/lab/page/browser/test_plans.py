@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from browser_checks import added, painted
+from browser_checks import added, arrived, painted
 from fake_page import until
 from flexneedle.lab.page.protocol import JobMessage
 from flexneedle.lab.page.shape_frames import FrameSource
@@ -31,7 +31,7 @@ PLANS = "[data-panel=plans]"
 
 @pytest.fixture
 def plans(visit):
-    return partial(visit, ready=(f"{PLANS} button:visible", "text=in control"), shows=["plans"])
+    return partial(visit, shows=["plans"])
 
 
 def table(page):
@@ -83,7 +83,7 @@ def test_a_search_is_started_and_its_cost_falls_with_each_iteration(plans, serve
     assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
     server.send(JobMessage(job=4, kind="compare", state="cancelled"))
     page.wait_for_selector(f"{PLANS} progress", state="hidden")
-    assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
+    assert server.wait_for("cancel") == [{"type": "cancel", "job": 4}]
     for number in range(4):
         server.send(iteration(number), samples(number))
         until(page, f"flexneedle.store.get('iteration manipulation')?.iteration === {number}")
@@ -138,7 +138,7 @@ def test_results_are_drawn_once_and_strategies_are_side_by_side_with_their_terms
     page.wait_for_selector(f"{PLANS} >> text=Steering: ends 0.001 mm off.")
     assert page.evaluate("window.changes") > 0
     server.send(*planned())
-    page.wait_for_selector(f"{PLANS} table")
+    arrived(page)
     page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
     cells = table(page)
     assert cells["Cost: accuracy"] == ["0.020", "4.000"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from browser_checks import painted, show
+from browser_checks import arrived, painted, show
 from fake_page import until
 from flexneedle.lab.page.protocol import ClosedMessage
 from flexneedle.lab.page.shape_frames import FrameKind, FrameSource, make_frame, pack_frame
@@ -79,7 +79,7 @@ def test_a_run_is_scrubbed_and_played_and_a_period_without_a_shape_shows_none(pl
     path = np.zeros((1, 3), np.float32)
     shapes = make_frame(FrameKind.PREDICTED, FrameSource.FIRST, 2, path + 2, path + np.nan, path + 4)
     server.send(pack_frame(shapes))
-    until(page, "flexneedle.store.track('predicted', 'first', 4)")
+    arrived(page)
     read = "[2, 3, 4, 1].map((period) => flexneedle.store.track('predicted', 'first', period)?.values[0] ?? null)"
     assert page.evaluate(read) == [2, None, 4, None]
 
@@ -144,6 +144,34 @@ def test_after_a_lost_connection_the_same_is_shown_unless_an_insertion_has_begun
     shows(page, "live")
     page.wait_for_selector(f"{SCRUB}[aria-valuetext^='period 3 of 3']")
     assert page.evaluate(PERIOD) is None
+
+
+REPORTED_BY_HAND = """window.reports = [];
+window.IntersectionObserver = class {
+  constructor(report) { window.reports.push(report); }
+  observe() {}
+};"""
+"""Nothing is reported as on the screen or off it but by `reports`."""
+FRAMES = """async () => {
+  const { spaceView } = await import("/static/space.js");
+  return spaceView().renderer.info.render.frame;
+}"""
+
+
+def test_a_view_that_was_hidden_and_shown_between_two_reports_is_drawn(player, server):
+    """A busy browser reports several changes at once, the newest last."""
+    page = player(before=REPORTED_BY_HAND)
+    page.wait_for_selector("[data-panel=space] .legend li")
+    see_plots(page)
+    entries = "[false, true].map((isIntersecting) => ({ isIntersecting }))"
+    assert page.evaluate(f"reports.map((report) => report({entries})).length") == 2
+    painted(page)
+    before = page.evaluate(FRAMES)
+    server.send(insertion("running"), rows(0, 10))
+    page.wait_for_selector(f"{PLOTS} [aria-label='Roll (°) at 1.8 s: roll 27.000']")
+    arrived(page)
+    painted(page)
+    assert page.evaluate(FRAMES) > before
 
 
 ERROR = "Error from the planned path (mm)"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from browser_checks import PAINTED
+from browser_checks import arrived, painted
 from fake_page import until
 from recorded_page import TARGET, insertion, period_frames, rows
 
@@ -36,19 +36,19 @@ def test_by_finger_the_target_is_dragged_and_an_insertion_stopped_and_scrubbed(v
     page = visit(
         width=390, height=844, touch=True, ready=f"{SECTION} [data-handle=target]", shows=["section"]
     )
-    page.evaluate(PAINTED)
+    painted(page)
     scrolled = page.evaluate("scrollY")
     drag(page, middle(page.locator(f"{SECTION} [data-handle=target]")), 24, 12)
+    assert len(server.wait_for("rest")) == 1
     until(page, "!flexneedle.store.get('draft')")
     assert server.asked("edit")[-1]["values"]["target.depth_mm"] > TARGET[0] + 4.0
-    assert len(server.wait_for("rest")) == 1
     assert page.evaluate("scrollY") == scrolled
     frames = [frame for period in range(PERIODS) for frame in period_frames(period)]
     server.send(insertion("running", periods=PERIODS), rows(0, PERIODS), *frames)
     page.locator(ACTIONS).get_by_role("button", name="Stop", exact=True).tap()
     assert server.wait_for("stop") == [{"type": "stop"}]
     scrub = page.locator(f"{PLAYER} input[type=range]")
-    page.evaluate(PAINTED)
+    arrived(page)
     box = scrub.bounding_box()
     right, height = box["x"] + box["width"] - 4, box["y"] + box["height"] / 2
     drag(page, (right, height), 4 - box["width"] / 2)

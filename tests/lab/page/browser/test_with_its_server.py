@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from browser_checks import show
+from browser_checks import loaded, show
 from fake_page import until
 from flexneedle.lab.page.server.clients import PageLimits
 from page_clients import PATIENCE_S, served
@@ -46,7 +46,7 @@ def downloaded(page, name, path):
 def test_from_a_plan_to_the_files_of_a_saved_run(address, tab, tmp_path):
     page = tab(1280, 800, "light")
     page.goto(address)
-    page.wait_for_selector("[data-panel=status] .connection")
+    loaded(page)
     show(page, "plans")
     show(page, "section")
     see(page, f"{PLANS} >> text=Manipulation:")

@@ -35,9 +35,13 @@ export function mount(element, store, link) {
 
 function choosePreset(select, store) {
   const names = store.get("welcome")?.presets ?? [];
-  if (select.options.length !== names.length) select.replaceChildren(...names.map((name) => make("option", {}, name)));
+  if (select.options.length !== names.length) {
+    select.replaceChildren(...names.map((name) => make("option", {}, name)));
+    delete select.dataset.session;
+  }
   const { name } = store.get("session") ?? {};
-  if (names.includes(name)) select.value = name;
+  if (!names.includes(name) || name === select.dataset.session) return; // what the user has chosen stays
+  select.value = select.dataset.session = name;
 }
 
 function beginWorld(input, begins) {

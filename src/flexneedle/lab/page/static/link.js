@@ -23,6 +23,7 @@ export class Link {
   #before = null; // session of this page before the server was restarted, until the new one's arrives
   #silent = 0; // checks since the last message; not a time, since a page that was suspended has messages pending
   #waiting = new Map(); // by number of the request: {resolve, timer}
+  #taking = null; // answer to the request for control
   #edits = {};
   #editTimer = 0;
   #lastEdit = -Infinity;
@@ -49,10 +50,12 @@ export class Link {
   }
 
   // Send a request. Resolves to {done: true} or {done: false, reason, problems}; never rejects. A request that
-  // needs control takes it first if nobody is in control. A refusal is shown to the user unless `quiet`.
+  // needs control takes it first if nobody is in control; those made meanwhile follow it. A refusal is shown to the user
+  // unless `quiet`.
   async ask(message, { quiet = false } = {}) {
-    if (this.#mustSteer(message)) {
-      const steering = await this.#send({ type: "steer", take: true });
+    if (this.#mustSteer(message)) this.#taking ??= this.#take();
+    if (this.#taking && !FREE.includes(message.type)) {
+      const steering = await this.#taking;
       if (!steering.done) return this.#judged(steering, quiet);
     }
     return this.#judged(await this.#send(message), quiet);
@@ -97,6 +100,12 @@ export class Link {
   #mustSteer(message) {
     const clients = this.#store.get("clients");
     return !FREE.includes(message.type) && clients?.steering === null;
+  }
+
+  async #take() {
+    const answer = await this.#send({ type: "steer", take: true });
+    this.#taking = null;
+    return answer;
   }
 
   #send(message) {

@@ -59,8 +59,8 @@ export function mount(element, store) {
   function schedule() {
     timer ||= setTimeout(draw, Math.max(0, last + EVERY - performance.now()));
   }
-  new IntersectionObserver(([{ isIntersecting }]) => {
-    onScreen = isIntersecting;
+  new IntersectionObserver((entries) => {
+    onScreen = entries.at(-1).isIntersecting; // the newest: a busy browser reports several at once
     if (onScreen) schedule();
   }).observe(element);
   store.subscribe(SHOWN, schedule);

@@ -31,7 +31,8 @@ export function showRuns(element, store, link) {
   const show = () => showList(list, entries, search.value.trim().toLowerCase(), store, link);
   search.addEventListener("input", show);
   store.subscribe(["runs"], show);
-  store.subscribe(["insertion first", "insertion second"], () => showOpened(opened, store, link));
+  const shown = new Map(); // by opened run
+  store.subscribe(["insertion first", "insertion second"], () => showOpened(opened, shown, store, link));
 }
 
 // Entries that remain keep their focus and an open list of downloads.
@@ -92,15 +93,24 @@ function defaultName({ name, controller, target_name: target }) {
   return text.replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "").slice(-80);
 }
 
-function showOpened(element, store, link) {
+// A run that stays open keeps the focus and a name that is being written.
+function showOpened(element, shown, store, link) {
   const lines = [["first", false, "Shown"], ["second", true, "Compared with"]].flatMap(([of, second, what]) => {
     const insertion = store.get(`insertion ${of}`);
     if (!insertion) return [];
-    const close = button("Close", () => link.ask({ type: "open", name: null, second }), { "aria-label": `Close ${insertion.name}` });
-    const line = make("p.tools", {}, make("span", {}, `${what}: ${insertion.name} (${insertion.controller}, seed ${insertion.seed})`), close);
-    return insertion.row === null ? [line] : [line, saveForm(link, of, insertion.name.replaceAll(",", ""), "Save as a run")];
+    const { name, controller, seed, row } = insertion;
+    const key = JSON.stringify([of, name, controller, seed, row]);
+    return [[key, shown.get(key) ?? linesOf(of, second, what, insertion, link)]];
   });
-  element.replaceChildren(...lines);
+  shown.clear();
+  for (const [key, line] of lines) shown.set(key, line);
+  arrange(element, lines.flatMap(([, line]) => line));
+}
+
+function linesOf(of, second, what, { name, controller, seed, row }, link) {
+  const close = button("Close", () => link.ask({ type: "open", name: null, second }), { "aria-label": `Close ${name}` });
+  const line = make("p.tools", {}, make("span", {}, `${what}: ${name} (${controller}, seed ${seed})`), close);
+  return row === null ? [line] : [line, saveForm(link, of, name.replaceAll(",", ""), "Save as a run")];
 }
 
 // The last insertion, or the shown row of a study.

@@ -34,7 +34,7 @@ export class SpaceView {
     this.scene = new Scene();
     this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.target.group, ...lights(this.camera.camera));
     new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
-    new IntersectionObserver(([{ isIntersecting }]) => this.#appear(isIntersecting)).observe(canvas);
+    new IntersectionObserver((entries) => this.#appear(entries.at(-1).isIntersecting)).observe(canvas);
     store.subscribe([...SHOWN, ...STEERING], () => this.#update());
   }
 
