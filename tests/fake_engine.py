@@ -41,9 +41,9 @@ def carry_out(_scenario, plan, choices, stream, *, miss=0.06, stop=None, outcome
 
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
-    from flexneedle.record import recording
+    from flexneedle.record import plans, recording
 
-    setattr_(recording, "make_plan", partial(plan, miss=options.pop("plan_miss", 0.0)))
+    setattr_(plans, "make_plan", partial(plan, miss=options.pop("plan_miss", 0.0)))
     setattr_(recording, "carry_out", partial(carry_out, **options))
 
 

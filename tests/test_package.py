@@ -25,6 +25,9 @@ print(*sys.modules)
 
 flexneedle.load_scenario("phantom")
 print(*sys.modules)
+
+import flexneedle.control.controllers, flexneedle.phantom.kernels, flexneedle.record.plans
+print(*sys.modules)
 print(flexneedle.devices.Bridge.__name__, flexneedle.testing.PlantConformance.__name__)
 """
 
@@ -51,7 +54,13 @@ def test_loading_a_scenario_does_not_load_the_compiler(printed):
 
 
 def test_public_modules_are_imported_on_first_use(printed):
-    assert printed[3] == {"Bridge", "PlantConformance"}
+    assert printed[4] == {"Bridge", "PlantConformance"}
+
+
+def test_a_plan_loads_no_loop_and_no_messages(printed):
+    assert {"numba", "matplotlib"} < printed[3]
+    assert not printed[3] & {"rosbags", "mcap", "scipy.special", "flexneedle.loop.rig"}
+    assert "flexneedle.phantom.phantom" not in printed[3]
 
 
 def test_public_names_are_listed():

@@ -15,6 +15,7 @@ from commands import names, run
 from flexneedle.cli import main as cli
 from flexneedle.control.controllers import CONTROLLERS, DEFAULT
 from flexneedle.errors import RunError
+from flexneedle.phantom import kernels
 from flexneedle.record.reader import read_trace
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -108,12 +109,27 @@ def test_the_plan_may_have_its_own_seed(engine, capsys):
         assert (stored["seed"], stored["plans"]["manipulation"]["seed"]) == (5, seed)
 
 
-def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("argv", "made", "names"),
+    [
+        ("plan phantom", "", "the plane (first run only, about 15 s)"),
+        ("plan phantom3d", "the plane, the exact phantom", "space (first run only, about 15 s)"),
+        ("insert phantom", "", "the plane and the exact phantom (first run only, about 30 s)"),
+        ("insert phantom", "the plane", "the exact phantom (first run only, about 15 s)"),
+        ("insert phantom3d", "the plane, the exact phantom", "space (first run only, about 15 s)"),
+        ("plan phantom", "the plane", ""),
+        ("insert phantom3d", "space, the exact phantom", ""),
+    ],
+)
+def test_the_first_compilation_is_announced(engine, capsys, monkeypatch, tmp_path, argv, made, names):
+    """With what is compiled, and about how long it takes."""
     engine()
-    for compiled in (False, True):
-        monkeypatch.setattr("flexneedle.phantom.kernels.all_compiled", lambda _axes, done=compiled: done)
-        monkeypatch.setattr("flexneedle.phantom.kernels.compile_kernels", lambda _axes: None)
-        assert ("Compiling kernels (first run only) …" in run(capsys, "plan")[2]) is not compiled
+    monkeypatch.setattr(
+        kernels, "_mark", lambda name: tmp_path / ("" if name in made.split(", ") else "none")
+    )
+    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes, **_: None)
+    announced = [line for line in run(capsys, *argv.split())[2].splitlines() if "Compiling" in line]
+    assert announced == ([f"Compiling kernels for {names} …"] if names else [])
 
 
 def test_a_target_in_space_has_two_lateral_offsets_and_two_entry_angles(engine, capsys):
@@ -221,7 +237,7 @@ def test_ctrl_c_keeps_and_marks_the_record(engine, capsys, monkeypatch):
     assert err.splitlines()[-1] == f"flexneedle: {summary}; record: here"
     assert (read("here")["status"], read("here")["result"]["steps"]) == ("interrupted", 12)
     assert names(Path("here")) == INSERTION_FILES
-    monkeypatch.setattr("flexneedle.record.recording.make_plan", interrupt)
+    monkeypatch.setattr("flexneedle.record.plans.make_plan", interrupt)
     status, out, err = run(capsys, "insert", "--out", "unplanned")
     assert (status, out, err.splitlines()[-1]) == (130, "", "flexneedle: interrupted")
     assert read("unplanned")["status"] == "interrupted"

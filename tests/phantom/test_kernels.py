@@ -8,8 +8,8 @@ from contextlib import nullcontext
 import pytest
 from numba.core import config
 
-from flexneedle.phantom import kernels
-from flexneedle.phantom.kernels import all_compiled, compile_kernels
+from flexneedle.phantom import kernels, plants
+from flexneedle.phantom.kernels import compile_kernels, find_uncompiled
 
 EVERYTHING = """
 import sys
@@ -19,7 +19,7 @@ from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.mechanics import insertion, shape
 from flexneedle.phantom import equilibrium, rod, space
 from flexneedle.phantom.plants import PLANTS
-from flexneedle.phantom.kernels import all_compiled, compile_kernels
+from flexneedle.phantom.kernels import compile_kernels, find_uncompiled
 
 def signatures():
     parts = {"insertion": insertion, "shape": shape, "equilibrium": equilibrium, "rod": rod, "space": space}
@@ -29,7 +29,7 @@ def signatures():
 preset, axes = sys.argv[1], int(sys.argv[2])
 compile_kernels(axes)
 before = signatures()
-assert all_compiled(axes)
+assert not find_uncompiled(axes)
 entries = "insertion.settle", "insertion.rollout", "insertion.energies", "shape.equal_arc_nodes"
 entries += "equilibrium.step", "rod._frames", "rod.tip_angles"
 assert all(before[name] == 1 for name in entries), before
@@ -61,7 +61,7 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the second process
     monkeypatch.setattr(kernels, "Simulator", lambda _scenario, threads: Compiled())  # noqa: ARG005
-    monkeypatch.setattr(kernels, "PLANTS", ())
+    monkeypatch.setattr(plants, "PLANTS", ())
     return tmp_path
 
 
@@ -74,11 +74,13 @@ def _one_process(monkeypatch):
 @pytest.mark.usefixtures("_one_process")
 def test_kernels_are_compiled_for_their_sources_and_axes(cache, monkeypatch):
     """Kernels of the plane are not those in space."""
-    assert not all_compiled(1)
+    assert [*find_uncompiled(1, 2)] == ["the plane", "space", "the exact phantom"]
+    compile_kernels(1, phantoms=False)
+    assert [*find_uncompiled(1, 2)] == ["space", "the exact phantom"]
     compile_kernels(1)
-    assert (all_compiled(1), all_compiled(2)) == (True, False)
+    assert [*find_uncompiled(1, 2)] == ["space"]
     monkeypatch.setattr(kernels, "cache_folder", lambda home: str(cache / home.name))
-    assert not all_compiled(1)
+    assert [*find_uncompiled(1)] == ["the plane", "the exact phantom"]
 
 
 @pytest.mark.usefixtures("_one_process", "cache")
@@ -86,7 +88,14 @@ def test_sources_written_again_are_not_compiled(monkeypatch):
     """Numba compares their time."""
     compile_kernels(1)
     monkeypatch.setattr(kernels, "source_stamp", lambda _home: "later")
-    assert not all_compiled(1)
+    assert find_uncompiled(1)
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_plan_compiles_no_phantom(monkeypatch):
+    monkeypatch.setattr(kernels, "_compiling_exact_plant", None)
+    monkeypatch.setattr(plants, "PLANTS", None)
+    compile_kernels(1, phantoms=False)
 
 
 @pytest.mark.usefixtures("_one_process")

@@ -53,7 +53,7 @@ def motors(monkeypatch):
         calls.append("apply")
         return apply(phantom, *given)
 
-    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes: None)  # moves another phantom
+    monkeypatch.setattr(kernels, "compile_kernels", lambda _axes, **_: None)  # moves another phantom
     monkeypatch.setattr(Phantom, "apply", applied)
     monkeypatch.setattr(Phantom, "stop", lambda _phantom: calls.append("stop"))
     return calls

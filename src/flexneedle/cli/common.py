@@ -132,16 +132,20 @@ def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
     ]
 
 
-def compile_first(*axes: int) -> None:
-    """Compile the kernels for values of `setup.axes`, with a progress line if they are not in the cache."""
+def compile_first(*axes: int, phantoms: bool = True) -> None:
+    """Compile the kernels for values of `setup.axes`, with a progress line if they are not in the cache.
+
+    phantoms: include the virtual phantoms, which a plan does not need.
+    """
     from flexneedle.cli.progress import Progress
-    from flexneedle.phantom.kernels import all_compiled, compile_kernels
+    from flexneedle.phantom.kernels import compile_kernels, find_uncompiled
 
     with Progress() as progress:
-        if not all(map(all_compiled, axes)):
-            progress.begin("Compiling kernels (first run only)")
+        if lacking := find_uncompiled(*axes, phantoms=phantoms):
+            about = f"first run only, about {sum(lacking.values()):.0f} s"
+            progress.begin(f"Compiling kernels for {' and '.join(lacking)} ({about})")
         for each in axes:
-            compile_kernels(each)
+            compile_kernels(each, phantoms=phantoms)
 
 
 def run_name(args: argparse.Namespace) -> str:

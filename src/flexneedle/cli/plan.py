@@ -46,10 +46,10 @@ def _plan(args: argparse.Namespace) -> int:
     from flexneedle.cli.progress import Progress
     from flexneedle.planning.events import Event, Iterated
     from flexneedle.record.folder import Folder
-    from flexneedle.record.recording import record_plans
+    from flexneedle.record.plans import record_plans
 
     scenario = choose_scenario(args)
-    compile_first(scenario.setup.axes)
+    compile_first(scenario.setup.axes, phantoms=False)
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with print_problems(folder), Progress() as progress:

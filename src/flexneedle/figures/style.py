@@ -196,8 +196,10 @@ def new_figure(height: float) -> StyledFigure:
 
 def settle(figure: Figure) -> None:
     """Arrange the parts of a figure and fix them, rounded: the solver's last digits differ between runs."""
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    engine = figure.get_layout_engine()
+    if engine is not None and figure.axes:
+        engine.execute(figure)
+    figure.set_layout_engine(None)  # "none" would lay out again before each file
     for part in figure.subfigs:
         part.bbox_relative.p0, part.bbox_relative.p1 = np.round(part.bbox_relative.get_points(), 6)
     for ax in figure.axes:

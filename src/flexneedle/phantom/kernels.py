@@ -9,9 +9,6 @@ from pathlib import Path
 
 from flexneedle import phantom
 from flexneedle.mechanics.compile import cache_folder, source_stamp
-from flexneedle.phantom.draw import Truth
-from flexneedle.phantom.phantom import Phantom
-from flexneedle.phantom.plants import PLANTS
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
@@ -19,32 +16,44 @@ from flexneedle.types import STILL
 
 _SCENARIOS = {1: "phantom", 2: "phantom3d"}
 """Lateral positions are real numbers in the plane and complex ones in space: the kernels are others, and in each the
-same for every scenario."""
+same for every scenario. The exact plant has the same kernels in the plane and in space."""
+_MODEL, _EXACT = {1: "the plane", 2: "space"}, "the exact phantom"
+_SECONDS = {"the plane": 15.0, "space": 15.0, _EXACT: 15.0}
 
 
-def all_compiled(axes: int) -> bool:
-    """Return whether the kernels for scenarios with `setup.axes` are in the cache, so that no compilation is needed."""
-    return _mark(axes).exists()
+def find_uncompiled(*axes: int, phantoms: bool = True) -> dict[str, float]:
+    """Return names of the kernels that are not in the cache, with the time (s) to compile them on an idle core.
 
-
-def compile_kernels(axes: int) -> None:
-    """Compile all kernels for scenarios with `setup.axes`, or load them from the cache, ahead of their first call.
-
-    One caller at a time: compiling in many processes at once is slow, and has crashed. The other callers load what the
-    first has compiled.
+    axes: values of `setup.axes`; phantoms: include the virtual phantoms.
     """
-    scenario, mark = load_scenario(_SCENARIOS[axes]), _mark(axes)
-    with _alone(mark.with_name("lock")):
-        # The exact plant has the same kernels in the plane and in space.
-        with nullcontext() if any(map(all_compiled, _SCENARIOS)) else _compiling_exact_plant():
+    names = [_MODEL[each] for each in axes] + [_EXACT] * phantoms
+    return {name: _SECONDS[name] for name in names if not _mark(name).exists()}
+
+
+def compile_kernels(axes: int, *, phantoms: bool = True) -> None:
+    """Compile the kernels for scenarios with `setup.axes`, or load them from the cache, ahead of their first call.
+
+    phantoms: compile the virtual phantoms too, which a plan does not need. One caller at a time: compiling in many
+    processes at once is slow, and has crashed. The other callers load what the first has compiled.
+    """
+    scenario = load_scenario(_SCENARIOS[axes])
+    with _alone(_mark("").with_name("lock")):
+        with _compiling_exact_plant() if _EXACT in find_uncompiled(phantoms=phantoms) else nullcontext():
             Simulator(scenario, threads=1).compile()
-        for kind in PLANTS:
-            compile_plant(scenario, kind)
-        mark.touch()
+            _mark(_MODEL[axes]).touch()
+        if phantoms:
+            from flexneedle.phantom.plants import PLANTS
+
+            for kind in PLANTS:
+                compile_plant(scenario, kind)
+            _mark(_EXACT).touch()
 
 
 def compile_plant(scenario: Scenario, kind: str) -> None:
     """Compile the kernels of a plant, or load them from the cache."""
+    from flexneedle.phantom.draw import Truth  # here, since a plan needs no plant
+    from flexneedle.phantom.phantom import Phantom
+
     Phantom(Truth(scenario), 0.0, kind).apply(STILL, 0.0)
 
 
@@ -57,10 +66,10 @@ def _compiling_exact_plant() -> Iterator[None]:
         yield
 
 
-def _mark(axes: int) -> Path:
+def _mark(name: str) -> Path:
     """Return a file beside the kernels of the phantoms; names of folder and file change where Numba compiles again."""
     home = Path(str(phantom.__file__)).parent
-    return Path(cache_folder(home)) / f"axes-{axes}-{source_stamp(home)}"
+    return Path(cache_folder(home)) / f"{name.replace(' ', '-')}-{source_stamp(home)}"
 
 
 @contextmanager

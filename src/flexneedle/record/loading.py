@@ -6,7 +6,6 @@ from pathlib import Path
 from flexneedle.arguments import check_path
 from flexneedle.errors import InputError, RunError
 from flexneedle.record.folder import TRACE_FILE, RunFile, read_run
-from flexneedle.record.reader import read_trace
 from flexneedle.results import Insertion, Outcome, Plan
 
 _UNFINISHED = "no end is recorded: the run was killed, its disk was full, or it is still running"
@@ -47,6 +46,8 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
 
     Without a recorded end it has the periods of the trace and the outcome "interrupted".
     """
+    from flexneedle.record.reader import read_trace  # loads the ROS messages, which a plan does not need
+
     trace, lacking = read_trace(run.folder / TRACE_FILE), unfinished_note(run)
     outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if lacking else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))

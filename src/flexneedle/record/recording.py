@@ -1,7 +1,10 @@
-"""Plan and insert with a record on disk: the work of the commands `plan` and `insert`."""
+"""Plan and insert with a record on disk: the work of the command `insert`."""
+
+from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_line
 from flexneedle.loop.choices import Choices
@@ -9,41 +12,17 @@ from flexneedle.loop.events import Ended, Gate, PeriodEnded, Planned, Stream
 from flexneedle.loop.insertions import carry_out, check_choices
 from flexneedle.planning.events import Event, Listener
 from flexneedle.planning.origin import with_planned_entry
-from flexneedle.planning.planner import plan as make_plan
 from flexneedle.record.folder import Folder
-from flexneedle.record.saving import (
-    PARTS,
-    finish,
-    finish_insertion,
-    finish_plans,
-    keep_plan,
-    note_result,
-    open_trace,
-)
-from flexneedle.record.writer import TraceWriter
+from flexneedle.record.plans import add_plan, record_status
+from flexneedle.record.saving import PARTS, finish_insertion, note_result, open_trace
 from flexneedle.results import Insertion, Outcome, Period, Plan
 from flexneedle.scenario.model import Scenario
 
+if TYPE_CHECKING:
+    from flexneedle.record.writer import TraceWriter
+
 BY_USER = "stopped by the user"
 """Reason of an insertion that was interrupted by Ctrl-C."""
-
-
-def record_plans(
-    folder: Folder,
-    scenario: Scenario,
-    strategies: Sequence[str],
-    seed: int,
-    listeners: Sequence[Listener] = (),
-) -> dict[str, Plan]:
-    """Plan with each strategy and write `run.json` and `plan.png`, `.svg` to the folder.
-
-    An error or an interruption is recorded in `run.json` and re-raised.
-    """
-    with _record_status(folder):
-        for strategy in strategies:
-            _plan(folder, scenario, strategy, seed, Stream(tuple(listeners)))
-        finish_plans(folder)
-    return folder.plans
 
 
 def record_insertion(
@@ -73,23 +52,17 @@ def record_insertion(
         gate: As for `insert`.
     """
     folder.values |= dict.fromkeys(PARTS, "") | {"dry_run": False} | choices.parts
-    with _record_status(folder):
+    with record_status(folder):
         check_choices(scenario, strategy, choices)
         stream = Stream(tuple(listeners), gate or Gate())
         seed = choices.seed if plan_seed is None else plan_seed
-        plan = _plan(folder, scenario, strategy, seed, stream)
+        plan = add_plan(folder, scenario, strategy, seed, stream.listeners)
         scenario = with_planned_entry(scenario, plan)
         folder.values["scenario"] = scenario.values()
         stream.send(Planned(plan))
         insertion = _insert(folder, scenario, plan, choices, stream)
         finish_insertion(folder, insertion)
     return insertion
-
-
-def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, stream: Stream) -> Plan:
-    made = make_plan(scenario, strategy=strategy, seed=seed, listeners=stream.listeners)
-    keep_plan(folder, made)
-    return made
 
 
 def _insert(folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) -> Insertion:
@@ -133,16 +106,3 @@ def _close_at_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWriter]:
             trace.close()
         except RecordError as problem:
             folder.problems.append(str(problem))
-
-
-@contextmanager
-def _record_status(folder: Folder) -> Iterator[None]:
-    """If the block raises, record status and reason in the folder and draw the available figures."""
-    try:
-        yield
-    except BaseException as error:
-        if folder.values["status"] == "running":
-            interrupted = isinstance(error, KeyboardInterrupt | StoppedError)
-            status = "interrupted" if interrupted else "failed"
-            finish(folder, status, str(error) or type(error).__name__)
-        raise

@@ -1,9 +1,11 @@
 """Write plans and insertions to the folder of a run, step by step or at once."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.arguments import check_path
 from flexneedle.control.controllers import with_controller_defaults
@@ -11,9 +13,11 @@ from flexneedle.errors import RecordError, describe_error
 from flexneedle.record.figures import draw_run
 from flexneedle.record.folder import TRACE_FILE, Folder
 from flexneedle.record.results import insertion_result, insertion_timing, plan_result, plan_timing
-from flexneedle.record.writer import TraceWriter
 from flexneedle.results import Insertion, Plan, scenario_of
 from flexneedle.scenario.model import Scenario
+
+if TYPE_CHECKING:
+    from flexneedle.record.writer import TraceWriter
 
 PARTS = ("controller", "controller_name", "phantom", "tracker", "rig", "dry_run", "disturbed")
 """Fields of `Insertion` that name its parts, in `run.json` and `trace.mcap`."""
@@ -65,6 +69,8 @@ def open_trace(
     folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, Any]
 ) -> TraceWriter:
     """Return the writer of `trace.mcap`; parts: by the names of `PARTS`."""
+    from flexneedle.record.writer import TraceWriter  # loads the ROS messages, which a plan does not need
+
     named = {name: str(part) for name, part in parts.items()}
     about = {
         "seed": str(seed),

@@ -17,7 +17,6 @@ from typing import cast
 import numpy as np
 from pydantic import Field
 
-from flexneedle.control.forecast import format_miss, probability_beyond
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook
@@ -92,6 +91,9 @@ def decide(
     task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Memory]:
     """Return the first step of the best path found, and the memory after it."""
+    # The loop has loaded it; a plan, which knows only the settings below, needs none of its scipy.
+    from flexneedle.control.forecast import format_miss, probability_beyond
+
     fitted = cast(Identified, estimate)  # CONTROLLER below names its observer
     settings = task.settings
     current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled

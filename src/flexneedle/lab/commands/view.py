@@ -79,7 +79,6 @@ def _has_study(folder: Path) -> bool:
 
 def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
     """Return the folder of a row's run, and the figures drawn with it: none if it was computed before."""
-    from flexneedle.cli.common import compile_first
     from flexneedle.lab.study.recompute import row_folder
     from flexneedle.record.folder import RUN_FILE
     from flexneedle.record.saving import save
@@ -90,7 +89,6 @@ def _row(study: Path, index: int, out: Path | None) -> tuple[Path, list[Path]]:
             raise InputError(f"{out}: already contains a run ({RUN_FILE}): choose another folder")
         print_note(f"{folder}: computed before: remove it to compute the row again")
         return folder, []
-    compile_first()
     save(_recompute_row(study, index), folder)
     return folder, sorted(path for path in folder.iterdir() if path.suffix in _FIGURES)
 
