@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo kernels test test-all test-page slow bench bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo kernels test test-all test-page quick slow bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -8,6 +8,22 @@ STAMP := .venv/.installed
 PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 # True for an interpreter that runs, fits, and can make a virtual environment.
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
+
+# Targets that run scripts, each with a quick mode.
+SCRIPTS := bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning slow docs
+
+# With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
+quick = $(if $(QUICK),$(1))
+RUNS := $(if $(QUICK),$(shell mktemp -d),runs)
+OUT = $(or $(DIR),$(RUNS)/$@)
+
+# Run a study, and write its report: $(call study,NAME,FOLDER)
+define study
+$(call quick,$(BIN)/python studies/shorten.py $(1) --out $(RUNS)/$(1).toml)
+$(BIN)/flexneedle study $(or $(call quick,$(RUNS)/$(1).toml --workers 1),$(1)) --resume --out $(2)
+$(BIN)/flexneedle report $(2)
+
+endef
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -50,106 +66,108 @@ test-all: kernels  ## run all tests but the slow ones and the page's: statistics
 test-page: kernels  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "page and not slow" tests/lab/page $(PYTEST_ARGS)
 
-bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
-	$(BIN)/python benchmarks/bench.py
-	$(BIN)/python benchmarks/plant.py
-	$(BIN)/python benchmarks/periods.py
-	$(BIN)/python benchmarks/em.py
-	$(BIN)/python benchmarks/aurora.py
-	$(BIN)/python benchmarks/galil.py
-	$(BIN)/python benchmarks/ros.py
-	$(BIN)/python benchmarks/ros_stop.py
+quick: kernels  ## run every target below with QUICK=1: all it does on a few cases; QUICK=1 also works with one target
+	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
+	  $(MAKE) --jobs 3 --keep-going --output-sync=target QUICK=1 RUNS="$$folder" $(SCRIPTS)
 
-bench-page: setup  ## measure the page in a browser against its bars; needs chromium on the path (half an hour; ARGS=--quick)
-	$(BIN)/python benchmarks/page.py $(ARGS)
+bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
+	$(BIN)/python benchmarks/bench.py $(call quick,--quick)
+	$(BIN)/python benchmarks/plant.py $(call quick,--phantoms 2)
+	$(BIN)/python benchmarks/periods.py $(call quick,--worlds 100120 1)
+	$(BIN)/python benchmarks/em.py $(call quick,--rows 2000 --times 1)
+	$(BIN)/python benchmarks/aurora.py $(call quick,--quick)
+	$(BIN)/python benchmarks/galil.py $(call quick,--quick)
+	$(BIN)/python benchmarks/ros.py $(call quick,--periods 20 --stops 3)
+	$(BIN)/python benchmarks/ros_stop.py $(call quick,--stops 2)
+
+compare: setup  ## compare the speed of this checkout with another one in pairs (BEFORE=path; an hour)
+	$(BIN)/python benchmarks/compare.py --before $(or $(BEFORE),$(call quick,.)) $(call quick,--quick)
+
+bench-page: setup  ## measure the page in a browser against its bars; needs chromium on the path (half an hour)
+	$(call quick,@command -v chromium >/dev/null || { echo 'bench-page: NOT TRIED: chromium is not installed' >&2; exit 0; };) \
+	  $(BIN)/python benchmarks/page.py $(call quick,--quick)
 
 rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
-	$(BIN)/python campaigns/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)
+	$(BIN)/python campaigns/rig_demo.py --insertions $(or $(N),1) --out $(OUT) $(call quick,--quick)
 
 rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (an hour and more)
-	$(BIN)/python campaigns/rig_faults.py --out $(or $(DIR),runs/rig-faults)
+	$(BIN)/python campaigns/rig_faults.py --out $(OUT) $(call quick,--timings 1 --only Ctrl-C)
 
 rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decision 0, 50 and 150 ms longer (hours)
-	$(BIN)/python campaigns/rig_wall_clock.py --out $(or $(DIR),runs/rig-wall-clock)
+	$(BIN)/python campaigns/rig_wall_clock.py --out $(OUT) $(call quick,--quick --pairs 1)
 
 rig-families: setup  ## insertions on 100 random rigs, emulated and in simulated time (hours)
-	$(BIN)/python campaigns/rig_families.py --out $(or $(DIR),runs/rig-families)
+	$(BIN)/python campaigns/rig_families.py --out $(OUT) $(call quick,--first 23 --rigs 1)
 
 rig-ros: setup  ## cost of ROS subscribers for an insertion on an emulated rig, and stops over ROS (an hour)
-	$(BIN)/python campaigns/rig_ros.py --pairs 5 --out $(or $(DIR),runs/rig-ros)
+	$(BIN)/python campaigns/rig_ros.py --out $(OUT) $(or $(call quick,--quick --pairs 1 --stops 1),--pairs 5)
 
 fuzz: setup  ## a million random and damaged inputs each to the readers of the Galil, the Aurora and rig files
-	$(BIN)/python campaigns/fuzz_galil.py
-	$(BIN)/python campaigns/fuzz_aurora.py
-	$(BIN)/python campaigns/fuzz_rig_file.py
+	$(BIN)/python campaigns/fuzz_galil.py $(call quick,--inputs 1000)
+	$(BIN)/python campaigns/fuzz_aurora.py $(call quick,--inputs 30 --seconds 2)
+	$(BIN)/python campaigns/fuzz_rig_file.py $(call quick,--inputs 100)
 
 fuzz-ros: setup  ## a million random and damaged messages to the readers of ROS topics, and to a running node
-	$(BIN)/python campaigns/fuzz_ros.py
+	$(BIN)/python campaigns/fuzz_ros.py $(call quick,--inputs 100)
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
-	$(BIN)/python studies/robustness.py
-	$(BIN)/python studies/robustness.py --space
-	$(BIN)/python studies/robustness.py --adapted
-	$(BIN)/python studies/robustness.py --space --adapted
-	$(BIN)/python studies/plant_robustness.py
+	$(BIN)/python studies/robustness.py $(call quick,--sequences 200)
+	$(BIN)/python studies/robustness.py --space $(call quick,--sequences 200)
+	$(BIN)/python studies/robustness.py --adapted $(call quick,--sequences 200)
+	$(BIN)/python studies/robustness.py --space --adapted $(call quick,--sequences 200)
+	$(BIN)/python studies/plant_robustness.py $(call quick,--insertions 5)
 
 validation: setup  ## compare the exact plant with closed forms and a second solver; writes docs/validation.md
-	$(BIN)/python studies/validation.py
+	$(BIN)/python studies/validation.py $(call quick,--quick --out $(OUT))
 
 accuracy: setup  ## the paper's experiment, 150 insertions with the exact plant, and its report (DIR=runs/accuracy)
-	$(BIN)/flexneedle study phantom --resume --out $(or $(DIR),runs/accuracy)
-	$(BIN)/flexneedle report $(or $(DIR),runs/accuracy)
+	$(call study,phantom,$(OUT))
 
 controllers: setup  ## every controller on the same phantoms, and the report (DIR=runs/controllers; long)
-	$(BIN)/flexneedle study controllers --resume --out $(or $(DIR),runs/controllers)
-	$(BIN)/flexneedle report $(or $(DIR),runs/controllers)
+	$(call study,controllers,$(OUT))
+
+STUDIES := phantom-published odd-targets mismatch mismatch-doubled imperfections guide-distance gauges
 
 studies: setup  ## 15,000 insertions with other plants, guides and needles, and their reports (two hours)
-	for study in phantom-published odd-targets mismatch mismatch-doubled imperfections guide-distance gauges; do \
-	  $(BIN)/flexneedle study $$study --resume --out runs/$$study && \
-	  $(BIN)/flexneedle report runs/$$study || exit 1; \
-	done
-	$(BIN)/python studies/worst.py runs/mismatch-doubled --out docs/images
+	$(foreach each,$(or $(call quick,mismatch-doubled imperfections),$(STUDIES)),$(call study,$(each),$(RUNS)/$(each)))
+	$(BIN)/python studies/worst.py $(RUNS)/mismatch-doubled $(or $(call quick,--study $(RUNS)/mismatch-doubled.toml --samples 1),--out docs/images)
 
 tracker: setup  ## compare the simulated tracker with the paper's tables; its estimators, its monitor, and insertions with it (long)
-	$(BIN)/python studies/environments.py
-	$(BIN)/python studies/em_coverage.py
-	$(BIN)/flexneedle study tracker --resume --out runs/tracker
-	$(BIN)/flexneedle report runs/tracker
-	$(BIN)/python studies/monitor.py
+	$(BIN)/python studies/environments.py $(call quick,--seeds 1)
+	$(BIN)/python studies/em_coverage.py $(call quick,--sets 10)
+	$(call study,tracker,$(RUNS)/tracker)
+	$(BIN)/python studies/monitor.py $(call quick,--runs 1 --out $(RUNS)/monitor)
 
 steering: setup  ## steering plans on 100 random worlds, replayed on the exact plant
-	$(BIN)/python studies/steering.py
+	$(BIN)/python studies/steering.py $(call quick,--worlds 100000 1)
 
 far-targets: setup  ## plans to targets up to the edge of the reach, near the skin and deep, of 40 random worlds
-	$(BIN)/python studies/far_targets.py
+	$(BIN)/python studies/far_targets.py $(call quick,--worlds 100000 1)
 
 worlds: setup  ## 200 random worlds in three cases with four controllers, and the report (DIR=runs/worlds; hours)
-	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)
-	$(BIN)/flexneedle report $(or $(DIR),runs/worlds)
+	$(call study,worlds,$(OUT))
 
 space: setup  ## insertions in space with three drivers and four controllers, and the report (DIR=runs/space; hours)
-	$(BIN)/flexneedle study space --resume --out $(or $(DIR),runs/space)
-	$(BIN)/flexneedle report $(or $(DIR),runs/space)
+	$(call study,space,$(OUT))
 
 worlds-space: setup  ## 200 random worlds in space, each with every driver, and the report (DIR=runs/worlds-space; hours)
-	$(BIN)/flexneedle study worlds-space --resume --out $(or $(DIR),runs/worlds-space)
-	$(BIN)/flexneedle report $(or $(DIR),runs/worlds-space)
+	$(call study,worlds-space,$(OUT))
 
 tuning: setup  ## tune each controller with 200 insertions; writes studies/tuning (long)
 	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
-	  $(BIN)/python studies/tune.py $$method || exit 1; \
+	  $(BIN)/python studies/tune.py $$method $(call quick,--quick --jobs 1 --out $(OUT)) || exit 1; \
 	done
 
 slow: kernels  ## the longest tests: a thousand insertions against the reference, every fault of a device, examples of the docs
-	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m slow $(or $(call quick,tests/simulator/test_reference.py -k test_random_insertions_agree[4-1]),-n auto --dist worksteal) $(PYTEST_ARGS)
 
 docs: setup  ## build the documentation site into site/; warnings are errors
-	$(BIN)/python tools/docs/scenario_reference.py
-	$(BIN)/python tools/docs/rig_reference.py
-	$(BIN)/python tools/docs/command_reference.py
-	$(BIN)/python tools/docs/rig_states.py
-	PYTHONPATH=tools/docs $(BIN)/zensical build --strict --clean
+	$(call quick,mkdir -p $(OUT) && cp -r docs src tools zensical.toml $(OUT))
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/scenario_reference.py
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_reference.py
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/command_reference.py
+	$(call quick,cd $(OUT) &&) $(abspath $(BIN))/python tools/docs/rig_states.py
+	$(call quick,cd $(OUT) &&) PYTHONPATH=tools/docs $(abspath $(BIN))/zensical build --strict --clean
 
 lint: setup  ## style, types, layers, words
 	$(BIN)/ruff check .

@@ -1,9 +1,9 @@
-"""Read an emulated Aurora for a minute: python benchmarks/aurora.py [--seconds S] [--json].
+"""Read an emulated Aurora for a minute: python benchmarks/aurora.py [--seconds S] [--quick] [--json].
 
 Received and lost frames at 40 Hz, duration of `read()`, and deviation of the frame times from equal intervals; then the
 same with a tracker that stops responding. To judge the machine: largest wake-up delay of the caller, which only sleeps,
 and processor time taken by the host (Linux in a virtual machine). A process that is stopped for the 25 ms of a frame
-loses it. Exit status 1 if a frame was lost.
+loses it. Exit status 1 if a frame was lost, or with --quick, in two seconds, if half of the frames were.
 """
 
 import sys
@@ -22,11 +22,13 @@ def main() -> int:
     """Run both measurements and print them."""
     parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--quick", action="store_true", help="two seconds")
     args = parser.parse_args()
-    normal = measure(args.seconds)
+    normal = measure(2.0 if args.quick else args.seconds)
     silent = measure(6.0, "--fault", "silence@1:3")
+    most_lost = normal["frames"] if args.quick else 0
     show({"normal operation": normal, "silent from 1 to 4 s": silent}, as_json=args.json)
-    return 1 if normal["frames lost"] else 0
+    return 1 if normal["frames lost"] > most_lost else 0
 
 
 def measure(seconds: float, *arguments: str) -> dict[str, float]:

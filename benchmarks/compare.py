@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compare_side import SHORT
 from measuring import parser_of
 
 HERE = Path(__file__).resolve().parent
@@ -50,10 +51,11 @@ class Size:
     sequences: tuple[int, ...]
     insertions: int
     study_pairs: int
+    first_world: int = FIRST_WORLD
 
 
 FULL = Size(15, 3, 20, 40, (64, 256), 150, 3)
-QUICK = Size(1, 1, 1, 1, (64,), 2, 1)
+QUICK = Size(1, 1, 1, 1, (64,), 1, 1, first_world=SHORT)
 
 
 @dataclass(frozen=True)
@@ -202,9 +204,9 @@ def measure_threads(pair: SidePair, size: Size) -> Iterator[Row]:
 
 
 def measure_periods(pair: SidePair, size: Size) -> Iterator[Row]:
-    """Yield median and 99 % of the times of control periods (ms); ratios in pairs are those of worlds."""
+    """Yield median and 99 % of the times of control periods (ms); a pair is a world."""
     for axes, where in AXES.items():
-        worlds = range(FIRST_WORLD, FIRST_WORLD + size.period_worlds)
+        worlds = range(size.first_world, size.first_world + size.period_worlds)
         found = [pair.ask("periods", axes=axes, number=number) for number in worlds]
         processor = quartiles([after["cpu"] / before["cpu"] for before, after in found])
         for name, quantile in (("median", 50), ("99 %", 99)):
@@ -235,7 +237,7 @@ def measure_insertions(pair: SidePair, size: Size) -> Iterator[Row]:
 
 
 def write_study(insertions: int) -> str:
-    """Return a study file of the paper's targets with about that many insertions: all targets, or the first ones."""
+    """Return a study file of the paper's targets: `insertions` on the first ones, or all of them repeatedly."""
     targets = [[depth, y] for depth in DEPTHS_OF_TARGETS for y in LATERAL_OF_TARGETS][:insertions]
     repeats = max(1, insertions // len(targets))
     return (

@@ -1,22 +1,22 @@
-"""Measure the exact plant: python benchmarks/plant.py. A JSON summary, times of one run, no thresholds.
+"""Measure the exact plant: python benchmarks/plant.py [--phantoms N] [--json]. Times of one run, no thresholds.
 
 Insertions of drawn phantoms of the preset to 45 mm, in steps of 0.25 mm, with random guide motion: in the plane with
 flips, and in space with rolls by any angle.
 """
 
-import json
 import time
 from collections.abc import Iterable
 from statistics import median
 from typing import Any
 
 import numpy as np
+from measuring import parser_of, show
 
 import flexneedle
 from flexneedle.phantom.draw import draw
 from flexneedle.phantom.plants import ExactPlant
 
-DEPTH_MM, STEP_MM, PHANTOMS = 45.0, 0.25, 12
+DEPTH_MM, STEP_MM = 45.0, 0.25
 
 
 def phantom(axes: int, seed: int) -> tuple[ExactPlant, np.ndarray]:
@@ -50,13 +50,13 @@ def iterations(plant: ExactPlant, rows: np.ndarray) -> float:
     return float(np.mean(found))
 
 
-def summary() -> dict[str, Any]:
+def summary(phantoms: int) -> dict[str, Any]:
     """Times of the kernel, medians over phantoms."""
     begun = time.perf_counter()
     phantom(1, 0)
     first = time.perf_counter() - begun
     plane, space = [], []
-    for seed in range(PHANTOMS):
+    for seed in range(phantoms):
         plant, rows = phantom(1, seed)
         plane.append(seconds(plant, rows) / len(rows))
         plant, rows = phantom(2, seed)
@@ -65,10 +65,18 @@ def summary() -> dict[str, Any]:
         "first_plant_s": round(first, 2),
         "plane_us_per_step": round(1e6 * median(plane), 1),
         "space_us_per_step": round(1e6 * median(space), 1),
-        "plane_iterations": round(median(iterations(*phantom(1, seed)) for seed in range(PHANTOMS)), 2),
-        "space_iterations": round(median(iterations(*phantom(2, seed)) for seed in range(PHANTOMS)), 2),
+        "plane_iterations": round(median(iterations(*phantom(1, seed)) for seed in range(phantoms)), 2),
+        "space_iterations": round(median(iterations(*phantom(2, seed)) for seed in range(phantoms)), 2),
     }
 
 
+def main() -> None:
+    """Measure and print."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--phantoms", type=int, default=12, metavar="N", help="(default: 12)")
+    args = parser.parse_args()
+    show(summary(args.phantoms), as_json=args.json)
+
+
 if __name__ == "__main__":
-    print(json.dumps(summary(), indent=2))
+    main()

@@ -13,7 +13,7 @@ import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import flexneedle
 from decision_time import MOST_GROWTH_MM
 from flexneedle.scenario.files import dump_scenario
-from rig_trials import axial_innovation, percentile, run_insertion, witness
+from rig_trials import SHORT, axial_innovation, percentile, run_insertion, witness
 
 _SPACE_EVERY, _FIRST_SEED = 10, 400_000
 _ROTATION_DEG = 1080.0  # of the emulated rig
@@ -49,10 +49,10 @@ class Result:
     unexplained: int
 
 
-def measure(scenario: str, seed: int, out: Path) -> Result:
+def measure(scenario: str, seed: int, out: Path, *, quick: bool = False) -> Result:
     """Carry out one insertion on the emulated and on the virtual rig."""
     with tempfile.TemporaryDirectory() as folder, witness() as seen:
-        file = _scenario_file(scenario, Path(folder))
+        file = _scenario_file(scenario, Path(folder), SHORT if quick else {})
         found = run_insertion(Path(folder), file, seed, out)
         unexplained = found.unexplained(seen)
     if found.status not in (0, 1):
@@ -77,9 +77,9 @@ def measure(scenario: str, seed: int, out: Path) -> Result:
     )
 
 
-def _scenario_file(scenario: str, folder: Path) -> Path:
-    """Return the file of the preset; in space, rotation is limited to the range of the rig."""
-    made = flexneedle.load_scenario(scenario)
+def _scenario_file(scenario: str, folder: Path, values: Mapping[str, float]) -> Path:
+    """Return the file of the preset with values; in space, rotation is limited to the range of the rig."""
+    made = flexneedle.load_scenario(scenario).with_values(values)
     if not made.setup.half_turns:
         made = made.with_values({"setup.max_rotation_deg": _ROTATION_DEG})
     path = folder / f"{scenario}.toml"
@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--space", action="store_true", help="all in space")
     parser.add_argument("--out", type=Path, default=Path("runs/rig-demo"))
     parser.add_argument("--seed", type=int, default=_FIRST_SEED)
+    parser.add_argument("--quick", action="store_true", help="short insertions; times are not judged")
     args = parser.parse_args()
     print(
         "scenario   seed    outcome  true error  simulated  axial innovation  periods late  ticks  99 %    latest  "
@@ -105,7 +106,7 @@ def main() -> None:
     for number in range(args.insertions):
         scenario = "phantom3d" if args.space or number % _SPACE_EVERY == _SPACE_EVERY - 1 else "phantom"
         seed = args.seed + number
-        one = measure(scenario, seed, args.out / f"{scenario}-{seed}")
+        one = measure(scenario, seed, args.out / f"{scenario}-{seed}", quick=args.quick)
         results.append(one)
         print(
             f"{one.scenario:10} {one.seed:6} {one.outcome:8} {one.true_error:7.3f} mm {one.simulated_error:7.3f} mm "
@@ -114,23 +115,24 @@ def main() -> None:
             flush=True,
         )
     _summarise(results)
-    exceeded = [*_exceeded(results)]
+    exceeded = [*_exceeded(results, quick=args.quick)]
     print("\n".join(exceeded) or "no bound is exceeded")
     sys.exit(bool(exceeded))
 
 
-def _exceeded(results: Sequence[Result]) -> Iterator[str]:
-    """Return a line for each exceeded bound."""
+def _exceeded(results: Sequence[Result], *, quick: bool = False) -> Iterator[str]:
+    """Return a line for each exceeded bound; quick: without bounds of times."""
     undone = sum(one.outcome != "done" for one in results)
     growth = float(np.mean([one.true_error - one.simulated_error for one in results]))
     slowest, missed = max(one.tick_99 for one in results), sum(one.unexplained for one in results)
-    for name, value, most in (
+    bounds = [
         ("insertions that are not done", undone, 0.0),
         ("mean true error above the simulated one, mm", growth, MOST_GROWTH_MM),
         ("99 % of the ticks of the worst insertion, ms", slowest, _MOST_TICK_MS),
         ("ticks left out, not by a stall", missed, 0.0),
         ("late decisions", sum(one.late_periods for one in results), 0.0),
-    ):
+    ]
+    for name, value, most in bounds[:1] if quick else bounds:
         if not value <= most:
             yield f"EXCEEDED: {name}: {value:.4g}, must be at most {most:g}"
 

@@ -21,11 +21,15 @@ from typing import Any, TypeVar
 import numpy as np
 import psutil
 
+import flexneedle
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord, read_truth
 from flexneedle.lab.rig.devices.priority import set_realtime_priority
 from flexneedle.results import Insertion
+from flexneedle.scenario.files import dump_scenario
 
 START_S, END_S, _ABORT_S = 300.0, 60.0, 5.0
+SHORT = {"setup.tip_to_skin_mm": 2.0, "target.depth_mm": 20.0, "target.lateral_mm": 1.0}
+"""Values of a scenario whose insertion takes seconds, for quick runs of campaigns."""
 _STALL_S = 0.005
 _POLL_S = 0.2
 _BAD_INPUT = 2  # exit status
@@ -96,6 +100,13 @@ class EmulatedRig:
 def shipped_rig() -> str:
     """Return the rig file of the package for an emulated rig."""
     return (files("flexneedle.lab.rig") / "rigs" / "emulated.toml").read_text()
+
+
+def write_short(folder: Path) -> Path:
+    """Write the preset with `SHORT` to a folder, and return its file."""
+    path = folder / "short.toml"
+    path.write_text(dump_scenario(flexneedle.load_scenario("phantom").with_values(SHORT)))
+    return path
 
 
 @contextmanager

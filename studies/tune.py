@@ -35,8 +35,8 @@ from flexneedle.results import Plan
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
 STRIDE = 4  # through the targets, so that successive cases mix depths and sides
-ROUNDS = ((5, 20), (2, 50))  # (number of settings, further cases of each)
-BUDGET = sum(settings * cases for settings, cases in ROUNDS)
+ROUNDS, QUICK_ROUNDS = ((5, 20), (2, 50)), ((2, 1), (1, 1))  # (number of settings, further cases of each)
+Rounds = tuple[tuple[int, int], ...]
 FIRST_SEED = 5000  # of the phantoms, one per case; evaluations use 100000 and above
 FAILED_MM = 5.0
 PLAN_SEED = 0
@@ -117,11 +117,13 @@ def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) ->
     ]
 
 
-def halve(trials: list[Trial], controller: str, plans: list[Plan], executor: Executor) -> list[Trial]:
+def halve(
+    trials: list[Trial], controller: str, plans: list[Plan], executor: Executor, rounds: Rounds = ROUNDS
+) -> list[Trial]:
     """Return all trials after the last round: the last round first, each round sorted by score."""
     out: list[Trial] = []
     first = spent = 0
-    for settings, cases in ROUNDS:
+    for settings, cases in rounds:
         trials, out = trials[:settings], trials[settings:] + out
         seeds = range(FIRST_SEED + first, FIRST_SEED + first + cases)
         tasks = [
@@ -129,7 +131,7 @@ def halve(trials: list[Trial], controller: str, plans: list[Plan], executor: Exe
             for trial in trials
             for seed in seeds
         ]
-        errors = list(counted(executor.map(error_of, tasks), spent))
+        errors = list(counted(executor.map(error_of, tasks), spent, find_budget(rounds)))
         further = [tuple(errors[k : k + cases]) for k in range(0, len(errors), cases)]
         trials = sorted(
             (Trial(trial.settings, trial.errors + more) for trial, more in zip(trials, further, strict=True)),
@@ -152,15 +154,20 @@ def plan_for(target: tuple[float, float]) -> Plan:
     return flexneedle.plan(flexneedle.load_scenario("phantom"), target, seed=PLAN_SEED, threads=1)
 
 
-def result(controller: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
+def find_budget(rounds: Rounds) -> int:
+    """Return the number of insertions of all rounds."""
+    return sum(settings * cases for settings, cases in rounds)
+
+
+def result(controller: str, seed: int, trials: list[Trial], rounds: Rounds = ROUNDS) -> dict[str, Any]:
     """Return the record, best trial first."""
     return {
         "controller": controller,
         "chosen": trials[0].settings,
         "score": SCORE,
-        "budget_insertions": BUDGET,
-        "rounds": [{"settings": settings, "further_cases": cases} for settings, cases in ROUNDS],
-        "phantom_seeds": [FIRST_SEED, FIRST_SEED + sum(cases for _, cases in ROUNDS) - 1],
+        "budget_insertions": find_budget(rounds),
+        "rounds": [{"settings": settings, "further_cases": cases} for settings, cases in rounds],
+        "phantom_seeds": [FIRST_SEED, FIRST_SEED + sum(cases for _, cases in rounds) - 1],
         "plan_seed": PLAN_SEED,
         "search_seed": seed,
         "scenario": "phantom",
@@ -192,12 +199,12 @@ def table(found: dict[str, Any]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def counted(errors: Iterable[float], before: int) -> Iterator[float]:
+def counted(errors: Iterable[float], before: int, budget: int) -> Iterator[float]:
     """Yield the errors; on a terminal, print their number."""
     for k, error in enumerate(errors, before + 1):
         if sys.stderr.isatty():
-            end = "\n" if k == BUDGET else ""
-            print(f"\r{k} of {BUDGET} insertions", end=end, file=sys.stderr, flush=True)
+            end = "\n" if k == budget else ""
+            print(f"\r{k} of {budget} insertions", end=end, file=sys.stderr, flush=True)
         yield error
 
 
@@ -212,13 +219,17 @@ def main(arguments: list[str] | None = None) -> None:
         "--seed", type=int, default=0, metavar="N", help="seed of the tried settings (default: 0)"
     )
     parser.add_argument("--out", type=Path, default=RECORDS, metavar="DIR")
+    parser.add_argument("--quick", action="store_true", help="two settings, three insertions")
     chosen = parser.parse_args(arguments)
+    if chosen.quick and chosen.out == RECORDS:
+        parser.error(f"--quick: its settings are no result: name a folder other than {RECORDS} with --out")
+    rounds, targets = (QUICK_ROUNDS, TARGETS[:2]) if chosen.quick else (ROUNDS, TARGETS)
     rng = np.random.default_rng(chosen.seed)
-    first = [Trial(settings) for settings in candidates(SPACES[chosen.controller], ROUNDS[0][0], rng)]
+    first = [Trial(settings) for settings in candidates(SPACES[chosen.controller], rounds[0][0], rng)]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as executor:
-        plans = list(executor.map(plan_for, TARGETS))
-        trials = halve(first, chosen.controller, plans, executor)
-    found = result(chosen.controller, chosen.seed, trials)
+        plans = list(executor.map(plan_for, targets))
+        trials = halve(first, chosen.controller, plans, executor, rounds)
+    found = result(chosen.controller, chosen.seed, trials, rounds)
     chosen.out.mkdir(parents=True, exist_ok=True)
     path = chosen.out / f"{chosen.controller}.json"
     path.write_text(to_text(found), encoding="utf-8")

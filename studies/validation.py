@@ -301,8 +301,15 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of validation.md"
     )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="compute the differences from the model with one element size; needs --out",
+    )
     chosen = parser.parse_args()
-    found = results.compute()
+    if chosen.quick and chosen.out == ROOT / "docs":
+        parser.error(f"--quick: its page is no result: name a folder other than {chosen.out} with --out")
+    found = results.compute(quick=chosen.quick)
     print(summary(found), end="\n\n")
     for path in write(found, chosen.out):
         print(path)

@@ -217,7 +217,7 @@ def _mean(runs: Sequence[Ending], largest: bool = False) -> str:
 def plot_quantiles(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
     """Draw median, 95 % and 99 % quantile of the error in twelve groups of equal size."""
     order = np.argsort(values, kind="stable")
-    groups = np.array_split(order, 12)
+    groups = np.array_split(order, min(12, len(order)))
     middle = [float(np.median(values[group])) for group in groups]
     for share, colour, line in ((0.5, style.ESTIMATE, "-"), (0.95, style.TRUE, "--"), (0.99, style.INK, ":")):
         levels = [float(np.quantile(error[group], share)) for group in groups]

@@ -44,3 +44,9 @@ def test_within_the_bounds_nothing_is_printed():
 def test_each_bound_has_its_line(values, line):
     (found,) = rig_demo._exceeded([GOOD, replace(GOOD, **values)])
     assert line in found
+
+
+def test_a_quick_run_judges_no_time():
+    late = replace(GOOD, tick_99=9.0, late_periods=3, unexplained=1, true_error=0.5)
+    assert list(rig_demo._exceeded([late], quick=True)) == []
+    assert len(list(rig_demo._exceeded([replace(late, outcome="failed")], quick=True))) == 1

@@ -15,20 +15,24 @@ def row(**more):
 
 
 @pytest.mark.parametrize(
-    ("subscribers", "more", "status"),
+    ("subscribers", "more", "status", "options"),
     [
-        (4, {}, 0),
-        (4, {"unexplained": 1}, 1),
-        (4, {"late": 1}, 1),
-        (4, {"outcome": "held"}, 1),
-        (0, {"unexplained": 1, "late": 1}, 0),
+        (4, {}, 0, ()),
+        (4, {"unexplained": 1}, 1, ()),
+        (4, {"unexplained": 1, "late": 1}, 0, ["--quick"]),
+        (4, {"late": 1}, 1, ()),
+        (4, {"outcome": "held"}, 1, ()),
+        (4, {"outcome": "held"}, 1, ["--quick"]),
+        (0, {"unexplained": 1, "late": 1}, 0, ()),
     ],
 )
-def test_the_cost_of_subscribers_is_in_the_exit_status(tmp_path, monkeypatch, subscribers, more, status):
-    def cost(_seed, count, _out):
+def test_the_cost_of_subscribers_is_in_the_exit_status(
+    tmp_path, monkeypatch, subscribers, more, status, options
+):
+    def cost(_seed, count, _out, **_quick):
         return row(**(more if count == subscribers else {}))
 
     monkeypatch.setattr(study, "cost", cost)
     for name in ("CYCLONEDDS_URI", "ROS_DOMAIN_ID"):
         monkeypatch.setenv(name, "0")
-    assert study.main(["--pairs", "2", "--stops", "0", "--out", str(tmp_path)]) == status
+    assert study.main(["--pairs", "2", "--stops", "0", "--out", str(tmp_path), *options]) == status

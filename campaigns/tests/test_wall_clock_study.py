@@ -127,3 +127,11 @@ def test_a_study_goes_on_where_it_was(tmp_path):
         ({"task": 5, "value": 10}, True),
     ]
     assert ran == [1, 2, 3, 5]
+
+
+def test_a_quick_run_needs_a_pair_that_is_done_and_judges_no_error():
+    off = list(study.lines(rows(0.5, pairs=1)))
+    assert study.problems(off, 0) != []
+    assert study.problems(off, 0, quick=True) == []
+    assert study.problems([], 0, quick=True) == ["no pair is complete"]
+    assert study.problems(off, 1, quick=True) == ["1 insertions have no row"]
