@@ -355,6 +355,12 @@ def test_a_needle_is_withdrawn_after_the_same_steps_and_can_be_stopped(rig_panel
     assert not hint.is_visible()
 
 
+def test_motions_that_wait_are_shown_once_the_page_knows_who_is_in_control(visit, server):
+    page = visit([WELCOME.model_copy(update={"rig": "Bench"}), session(), rig("ready", *MOVES, job=7)])
+    server.send(clients())
+    page.wait_for_selector(f"{RIG} >> text={MOVES[1]}")
+
+
 def test_a_needle_that_was_not_measured_is_not_drawn_as_if_it_were(rig_panel):
     page = rig_panel(insertion("refused", rig="Bench", periods=0, summary="the tip may be in tissue"))
     page.wait_for_selector(".scene p.moved >> text=where it is now has not been measured")

@@ -6,7 +6,7 @@ import pytest
 
 from browser_checks import added, painted
 from fake_page import until
-from flexneedle.lab.page.protocol import NamedTarget
+from flexneedle.lab.page.protocol import NamedTarget, RefusedMessage
 from recorded_page import TARGET, insertion, opening, plan, planned, session
 
 pytestmark = pytest.mark.page
@@ -41,6 +41,14 @@ def test_targets_are_added_chosen_and_removed(visit, server):
         {"type": "targets", "what": "remove", "name": "Target 2"},
         {"type": "targets", "what": "choose", "name": "Target 2"},
     ]
+
+
+def test_a_refused_choice_leaves_the_present_target_marked(visit, server):
+    page = visit([*opening(), with_targets(1, (30.0, -4.0, 0.0))], shows=["form"])
+    server.answers["targets"] = RefusedMessage(what="targets", reason="an insertion runs")
+    page.click(".targets input[value='Target 2']")
+    page.wait_for_selector("[role=alert] >> text=an insertion runs")
+    assert page.locator(".targets input:checked").input_value() == "Near"
 
 
 def test_a_name_written_while_a_target_is_added_stays(visit, server):

@@ -26,7 +26,7 @@ export function mount(element, store) {
   let was = "";
   const show = () => {
     const rig = store.get("rig");
-    if (!rig) return;
+    if (!rig || !store.get("clients")) return; // who is in control follows
     if (rig.state !== "armed" && was === "armed") store.set("view confirmed", undefined);
     if (rig.state !== was && waits(rig) && maySteer(store)) store.set("view tab", "rig"); // the motions must be read
     was = rig.state;

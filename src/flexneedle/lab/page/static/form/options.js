@@ -12,6 +12,7 @@ export function followOptions(element, store, link) {
     if (!answer.done) show();
   };
   let known = null; // last shown seed
+  let pending = null; // seed that is not answered
   const seed = make("input", {
     id: "option-seed", type: "number", min: "0", step: "1", inputmode: "numeric", change: () => takeSeed(seed.value.trim() === "" ? NaN : Number(seed.value)),
   });
@@ -19,15 +20,20 @@ export function followOptions(element, store, link) {
   const takeSeed = (value) => {
     const valid = Number.isInteger(value) && value >= 0 && value <= MOST;
     mark(valid ? "" : `must be a whole number from 0 to ${MOST}; the seed is still ${known}`);
-    if (valid) ask({ seed: value });
+    if (valid) askSeed(value);
   };
+  async function askSeed(value) {
+    pending = value;
+    await ask({ seed: value });
+    if (pending === value) pending = null;
+  }
   function mark(text) {
     problem.textContent = text;
     problem.hidden = !text;
     seed.setAttribute("aria-invalid", String(Boolean(text)));
     seed.setAttribute("aria-describedby", problem.id);
   }
-  const next = button("Next", () => takeSeed(known + 1), { "aria-label": "Next seed" });
+  const next = button("Next", () => takeSeed((pending ?? store.get("session").seed) + 1), { "aria-label": "Next seed" });
   const strategy = make("select", { id: "option-strategy", change: () => ask({ strategy: strategy.value }) });
   const controller = make("select", { id: "option-controller", change: () => ask({ controller: controller.value }) });
   const help = make("p.help.quiet", { id: "option-help" });

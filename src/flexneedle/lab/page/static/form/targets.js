@@ -15,22 +15,28 @@ export function followTargets(element, store, link) {
   });
   element.append(list, form);
   let made = "";
-  store.subscribe(["session", "draft"], () => {
+  const again = () => {
+    made = "";
+    show();
+  };
+  store.subscribe(["session", "draft"], show);
+
+  function show() {
     const { targets = [], target } = store.get("session") ?? {};
     const key = JSON.stringify([targets, target]);
     if (key === made) return;
     made = key;
     const focused = list.contains(document.activeElement) && document.activeElement.value; // the radio button of a target
-    list.replaceChildren(...targets.map((each) => entryOf(each, each.name === target, link)));
+    list.replaceChildren(...targets.map((each) => entryOf(each, each.name === target, link, again)));
     if (focused) [...list.querySelectorAll("input")].find(({ value }) => value === focused)?.focus({ preventScroll: true });
-  });
+  }
 }
 
-function entryOf({ name, position }, active, link) {
+function entryOf({ name, position }, active, link, refused) {
   const ask = (what) => link.ask({ type: "targets", what, name });
   const radio = make("input", { type: "radio", name: "target", value: name, checked: active });
   radio.addEventListener("change", async () => {
-    if (!(await ask("choose")).done) radio.checked = false; // the server has kept the other
+    if (!(await ask("choose")).done) refused(); // the server has kept the other
   });
   const where = make("span.quiet.number", {}, position.map((value) => shown(value, 1)).join(", "));
   const remove = button("Remove", () => ask("remove"), { "aria-label": `Remove ${name}` });
