@@ -70,8 +70,9 @@ quick: kernels  ## run every target below with QUICK=1: all it does on a few cas
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	  $(MAKE) --jobs 3 --keep-going --output-sync=target QUICK=1 RUNS="$$folder" $(SCRIPTS)
 
-bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
+bench: setup  ## measure speed: commands, mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py $(call quick,--quick)
+	$(BIN)/python benchmarks/waiting.py $(call quick,--quick)
 	$(BIN)/python benchmarks/plant.py $(call quick,--phantoms 2)
 	$(BIN)/python benchmarks/periods.py $(call quick,--worlds 100120 1)
 	$(BIN)/python benchmarks/em.py $(call quick,--rows 2000 --times 1)

@@ -1,4 +1,4 @@
-"""benchmarks/compare.py: rows of pairs, the study that it writes, and trees that are no checkout."""
+"""benchmarks/compare.py: rows of pairs, the study that it writes, trees that are no checkout; waiting.py: stages."""
 
 import sys
 import tomllib
@@ -8,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import compare
+import waiting
 from compare_side import draw_insertions, find_scenario
 
 
@@ -49,3 +50,9 @@ def test_a_folder_without_a_package_is_refused(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit):
         compare.main()
     assert f"{tmp_path}: no checkout of flexneedle" in capsys.readouterr().err
+
+
+def test_stages_of_a_command_add_up_to_its_wall_clock(tmp_path):
+    found = waiting.measure("--version", Path(waiting.__file__).parents[1] / "src", tmp_path)
+    assert found["imports"] > 0.0
+    assert found["imports"] + found["other"] == pytest.approx(found["wall"])

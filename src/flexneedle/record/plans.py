@@ -24,7 +24,9 @@ def record_plans(
     An error or an interruption is recorded in `run.json` and re-raised.
     """
     with record_status(folder):
-        for strategy in strategies:
+        for number, strategy in enumerate(strategies):
+            if number:
+                folder.write()  # with the plans before this one
             add_plan(folder, scenario, strategy, seed, listeners)
         finish_plans(folder)
     return folder.plans
@@ -33,7 +35,7 @@ def record_plans(
 def add_plan(
     folder: Folder, scenario: Scenario, strategy: str, seed: int, listeners: Sequence[Listener]
 ) -> Plan:
-    """Plan, write the plan to `run.json`, and return it."""
+    """Plan, add the plan to the next write of `run.json`, and return it."""
     made = make_plan(scenario, strategy=strategy, seed=seed, listeners=listeners)
     keep_plan(folder, made)
     return made

@@ -59,6 +59,7 @@ def record_insertion(
         plan = add_plan(folder, scenario, strategy, seed, stream.listeners)
         scenario = with_planned_entry(scenario, plan)
         folder.values["scenario"] = scenario.values()
+        folder.write()
         stream.send(Planned(plan))
         insertion = _insert(folder, scenario, plan, choices, stream)
         finish_insertion(folder, insertion)

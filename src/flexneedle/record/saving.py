@@ -52,10 +52,9 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
 
 
 def keep_plan(folder: Folder, plan: Plan) -> None:
-    """Write a plan and its planning time to `run.json`."""
+    """Add a plan and its planning time to the next write of `run.json`."""
     folder.plans[plan.strategy] = plan
     folder.timing[plan.strategy] = plan_timing(plan)
-    folder.write()
 
 
 def finish_plans(folder: Folder) -> None:

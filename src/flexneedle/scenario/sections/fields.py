@@ -4,9 +4,16 @@ Every quantity is bounded on both sides (1e-6 to 1e6 in its unit in the file), f
 needle, so that no product of valid settings overflows or vanishes.
 """
 
+import ast
+from collections.abc import Iterator
+from inspect import cleandoc, getsource
+from itertools import pairwise
+from textwrap import dedent
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 SMALLEST, LARGEST = 1e-6, 1e6
 
@@ -20,8 +27,32 @@ class Section(BaseModel):
         strict=True,
         allow_inf_nan=False,
         validate_default=True,
-        use_attribute_docstrings=True,
     )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema, with the text below each field as its description.
+
+        Pydantic's use_attribute_docstrings would read all sources in each process that loads a scenario.
+        """
+        schema = handler(core)
+        fields = handler.resolve_ref_schema(schema).get("properties", {})
+        for name, text in (pair for section in cls.__mro__ for pair in _texts_of_fields(section)):
+            if name in fields:
+                fields[name].setdefault("description", text)
+        return schema
+
+
+def _texts_of_fields(section: type) -> Iterator[tuple[str, str]]:
+    """Yield the name of each field of a class with the text below it, nothing for a class without a source."""
+    try:
+        (definition,) = ast.parse(dedent(getsource(section))).body
+    except (OSError, TypeError):
+        return
+    for field, text in pairwise(getattr(definition, "body", ())):
+        match field, text:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(value))):
+                yield name, cleandoc(value)
 
 
 def _not_tiny(value: float) -> float:
