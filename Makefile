@@ -10,11 +10,13 @@ PIP = $(BIN)/python -m pip install --quiet --no-compile --editable
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 # Targets that run scripts, each with a quick mode.
-SCRIPTS := bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning slow docs
+SCRIPTS := demo bench compare bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning slow docs
 
 # With QUICK=1 each of them does everything that it does, on a few cases, in seconds; results go to a temporary folder.
 quick = $(if $(QUICK),$(1))
+ifndef RUNS
 RUNS := $(if $(QUICK),$(shell mktemp -d),runs)
+endif
 OUT = $(or $(DIR),$(RUNS)/$@)
 
 # Run a study, and write its report: $(call study,NAME,FOLDER)
@@ -26,7 +28,7 @@ $(BIN)/flexneedle report $(2)
 endef
 
 help:  ## show this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 
 $(CORE): pyproject.toml
 	@if ! $(BIN)/python $(FITS); then \
@@ -52,7 +54,7 @@ $(STAMP): $(CORE)
 	@touch $@
 
 demo: $(CORE)  ## plan and steer one insertion on the phantom
-	@$(BIN)/flexneedle insert phantom --seed 0
+	@$(BIN)/flexneedle insert phantom --seed 0 $(call quick,--out $(OUT))
 
 kernels: setup  ## compile the kernels, once before the tests start in several processes
 	@$(BIN)/python -c "from flexneedle.phantom.kernels import compile_kernels; compile_kernels(1); compile_kernels(2)"
@@ -66,7 +68,7 @@ test-all: kernels  ## run all tests but the slow ones and the page's: statistics
 test-page: kernels  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "page and not slow" tests/lab/page $(PYTEST_ARGS)
 
-quick: kernels  ## run every target below with QUICK=1: all it does on a few cases; QUICK=1 also works with one target
+quick: kernels  ## try demo and every target below with few cases, as QUICK=1 does with each of them
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
 	  $(MAKE) --jobs 3 --keep-going --output-sync=target QUICK=1 RUNS="$$folder" $(SCRIPTS)
 
@@ -130,7 +132,7 @@ controllers: setup  ## every controller on the same phantoms, and the report (DI
 STUDIES := phantom-published odd-targets mismatch mismatch-doubled imperfections guide-distance gauges
 
 studies: setup  ## 15,000 insertions with other plants, guides and needles, and their reports (two hours)
-	$(foreach each,$(or $(call quick,mismatch-doubled imperfections),$(STUDIES)),$(call study,$(each),$(RUNS)/$(each)))
+	$(foreach each,$(or $(call quick,mismatch-doubled),$(STUDIES)),$(call study,$(each),$(RUNS)/$(each)))
 	$(BIN)/python studies/worst.py $(RUNS)/mismatch-doubled $(or $(call quick,--study $(RUNS)/mismatch-doubled.toml --samples 1),--out docs/images)
 
 tracker: setup  ## compare the simulated tracker with the paper's tables; its estimators, its monitor, and insertions with it (long)
