@@ -32,6 +32,7 @@ from functools import partial
 from itertools import chain, product
 from math import isnan
 from pathlib import Path
+from threading import Timer
 from time import monotonic, sleep
 from typing import Any
 from zlib import crc32
@@ -42,6 +43,7 @@ import psutil
 import flexneedle
 from flexneedle.lab.emulators.emulated_rig.truth import TruthRecord
 from rig_trials import (
+    START_S,
     EmulatedRig,
     emulated_rig,
     insertion,
@@ -171,7 +173,7 @@ def stop(how: str, timing: int, out: Path, *, quick: bool) -> Row:
     after = float(np.random.default_rng(seed).uniform(_EARLIEST_S, latest))
     with rig_with("[ros]\narm = true", seed % 1000, out, quick=quick) as (rig, scenario):
         process = insertion(rig.rig, scenario, out, "--seed", str(seed % 1000))
-        _await_line(process, b"waits for an arm")
+        _await_line(process, b"nothing moves before an arm")
         with Operator() as operator:
             operator.publish("arm true")
             sleep(max(0.0, rig.first_motion(process) + after - monotonic()))
@@ -185,12 +187,17 @@ def stop(how: str, timing: int, out: Path, *, quick: bool) -> Row:
 
 
 def _await_line(process: "subprocess.Popen[bytes]", text: bytes) -> None:
-    """Wait for a line on stderr with a text."""
+    """Wait for a line on stderr with a text; a process that does not print it in time is ended."""
     lines = []
-    for line in process.stderr:
-        if text in line:
-            return
-        lines.append(line.decode())
+    late = Timer(START_S, process.kill)
+    late.start()
+    try:
+        for line in process.stderr:
+            if text in line:
+                return
+            lines.append(line.decode())
+    finally:
+        late.cancel()
     raise SystemExit("".join(["the insertion has ended\n", *lines]))
 
 

@@ -17,7 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 RECIPES = dict(re.findall(r"^([a-z-]+):.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE))
 (SCRIPTS,) = (line.split() for line in re.findall(r"^SCRIPTS := (.*)", MAKEFILE, re.MULTILINE))
-OF_SCRIPTS = re.compile(r"(benchmarks|campaigns|studies)/\w+\.py|flexneedle insert|\$\(call study|-m slow|tools/docs")
+OF_SCRIPTS = re.compile(
+    r"(benchmarks|campaigns|studies)/\w+\.py|flexneedle insert|\$\(call study|-m slow|tools/docs"
+)
 
 
 def test_every_target_that_runs_scripts_has_a_quick_mode_that_ci_runs():
