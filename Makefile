@@ -157,7 +157,7 @@ worlds-space: setup  ## 200 random worlds in space, each with every driver, and 
 	$(call study,worlds-space,$(OUT))
 
 tuning: setup  ## tune each controller with 200 insertions; writes studies/tuning (long)
-	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
+	for method in $(or $(call quick,bevel-only),ce-mpc bevel-only resolved-rate broyden-mpc); do \
 	  $(BIN)/python studies/tune.py $$method $(call quick,--quick --jobs 1 --out $(OUT)) || exit 1; \
 	done
 
