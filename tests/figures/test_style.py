@@ -5,6 +5,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import pytest
+from matplotlib.figure import Figure
 
 from flexneedle.errors import InputError
 from flexneedle.figures import style
@@ -27,6 +28,16 @@ def test_text_stays_text_in_vector_files(figure, tmp_path):
     assert b"/Type3" not in pdf
     assert b"/CIDFontType2" in pdf
     assert "depth (mm)</text>" in (tmp_path / "a.svg").read_text()
+
+
+def test_a_saved_figure_is_drawn_once_for_each_file_and_nothing_is_cut(tmp_path, monkeypatch):
+    drawn, draw = [], Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda *of: drawn.append(draw(*of)))
+    figure = style.new_figure(2.0)
+    figure.subplots().set_ylabel("two\nlines", fontsize=30)
+    style.save(figure, tmp_path, "name")
+    assert len(drawn) == 2
+    assert figure.axes[0].get_tightbbox().x0 > figure.bbox.x0
 
 
 def test_a_notebook_shows_the_picture(figure, monkeypatch):
