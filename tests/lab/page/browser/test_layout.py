@@ -1,5 +1,7 @@
 """Each state and tab of the page at two sizes, light and dark: layout, names of controls, colours."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -74,11 +76,16 @@ def named(page):
 
 
 def check_names(page):
-    """Check that each control has a name for a screen reader."""
-    found = [(role, name) for role, name in named(page) if role in NAMED]
-    assert [role for role, name in found if not name.strip()] == []
-    for role, selector in FOUND.items():
-        assert [each for each, _ in found].count(role) == page.locator(selector).count()
+    """Check that each control has a name for a screen reader, to which a busy browser hands changes later."""
+    wanted = {role: page.locator(selector).count() for role, selector in FOUND.items()}
+    for _ in range(50):
+        painted(page)
+        found = named(page)
+        counts = Counter(role for role, _ in found)
+        if all(counts[role] == count for role, count in wanted.items()):
+            break
+    assert {role: counts[role] for role in wanted} == wanted
+    assert [role for role, name in found if role in NAMED and not name.strip()] == []
 
 
 def whole_session():
