@@ -17,7 +17,9 @@ from measuring import parser_of, show
 from scipy.linalg.lapack import dpbsv
 
 import flexneedle
-from flexneedle import Control, Simulator, State
+from flexneedle import Adaptation, Control, Simulator, State
+from flexneedle.simulator.batch import COLUMNS as OUTPUTS
+from flexneedle.types import ROLL, SPIN
 
 AXES = {1: "plane", 2: "space"}
 DEPTH_MM, SEQUENCES = 45.0, 64
@@ -88,6 +90,40 @@ def measure_depth(repeats: int) -> dict[str, Any]:
     return found
 
 
+def measure_additions(repeats: int) -> dict[str, Any]:
+    """Time of a step in space with one addition, over the time without, in the same round; ten models over one."""
+    scenario = flexneedle.load_scenario(PRESETS[2])
+    simulator, controls = Simulator(scenario, threads=1), draw_insertions(scenario, 80, DEPTH_MM)
+    layers, spun, straight = len(scenario.tissue), controls.copy(), controls.copy()
+    spun[:, :, SPIN], straight[:, :, ROLL] = 0.3, 0.0
+    plain = {"shift": np.zeros(layers - 1), "stiffness": np.ones(layers)}
+    factors = np.random.default_rng(0).uniform(0.5, 2.0, 10)
+    ten = [simulator.adapt(Adaptation(**{**plain, "stiffness": np.full(layers, one)})) for one in factors]
+    loose, bent = (simulator.adapt(Adaptation(**plain, **{k: 0.1})) for k in ("clearance", "bend"))
+    start, count = simulator.start(), len(controls)
+
+    def call(rows: np.ndarray = controls, *, limits: bool = False, **options: Any) -> Callable[[], Any]:
+        return partial(simulator.rollout, start, rows, limits=limits, **options)
+
+    calls = {
+        "limits": call(limits=True),
+        "no roll": call(straight),
+        "spin": call(spun),
+        "clearance": call(models=[loose] * count),
+        "bend": call(models=[bent] * count),
+        "ten models": call(models=ten * (count // 10)),
+        **{f"{name} of each step": call(outputs=(name,)) for name in OUTPUTS},
+        "energy at the end": call(at_end=("energy",)),
+        "states at the end": call(ends=True),
+    }
+    base, found = call(), {}
+    for name, with_it in calls.items():
+        with_it(), base()
+        ratios = [seconds(with_it) / seconds(base) for _ in range(repeats)]
+        found[name] = round(median(ratios), 3)
+    return found
+
+
 def measure_threads(repeats: int) -> dict[str, Any]:
     """The same rollouts on one and two threads, alternately."""
     scenario = flexneedle.load_scenario(PRESETS[1])
@@ -150,6 +186,7 @@ def measure_start(repeats: int) -> dict[str, Any]:
 PARTS: dict[str, Callable[[int], dict[str, Any]]] = {
     "step": measure_step,
     "depth": measure_depth,
+    "additions": measure_additions,
     "threads": measure_threads,
     "plan": measure_plan,
     "help": measure_help,

@@ -16,8 +16,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 import flexneedle
-from flexneedle import Control, Scenario, Simulator
-from flexneedle.mechanics.model import Adaptation
+from flexneedle import Adaptation, Control, Scenario, Simulator
 from flexneedle.scenario.sections.needle import GAUGES
 from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
@@ -155,7 +154,7 @@ def bent(simulator: Simulator, rng: np.random.Generator) -> Simulator:
     bend = float(rng.choice([0.0, 1.0])) * (y if axes == 1 else complex(y, z))
     clearance = float(rng.choice([0.0, rng.uniform(0.0, 0.2)]))
     fitted = Adaptation(np.zeros(layers - 1), np.ones(layers), bend=bend, clearance=clearance)
-    return simulator.with_adaptation(fitted)
+    return simulator.with_model(simulator.adapt(fitted))
 
 
 def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> np.ndarray:
@@ -187,7 +186,7 @@ def run_batch(
     try:
         simulator = Simulator(scenario.with_values({"setup.axes": 2}) if space else scenario)
         simulator = bent(simulator, rng) if adapted else simulator
-        found = simulator.rollout(simulator.start(roll), controls)
+        found = simulator.rollout(simulator.start(roll), controls, outputs=("energy",))
         tips, energy, converged = found.tips, found.energy, found.converged
         _repeat_by_step(simulator, controls[batch % count], roll, tally)
     except Exception as error:  # noqa: BLE001  the study counts exceptions

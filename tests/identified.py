@@ -76,9 +76,8 @@ class Needle:
     def simulator(self, scenario):
         """The simulator with this needle's constants."""
         tissue = np.array(self.shift), np.array(self.modulus), 2.5, np.array(self.variation)
-        return Simulator(scenario, threads=1).with_adaptation(
-            Adaptation(*tissue, self.bevel, self.bend, self.clearance)
-        )
+        nominal = Simulator(scenario, threads=1)
+        return nominal.with_model(nominal.adapt(Adaptation(*tissue, self.bevel, self.bend, self.clearance)))
 
     def measured(self, state):
         """Tip (x, y) as a tracker measures it."""
@@ -171,7 +170,7 @@ def adaptation_of(parameters):
 def stepped(parameters, rows, axial=0.0):
     """States of a needle with these parameters, the start first, moved one step after another."""
     nominal = Simulator(QUIET, 1)
-    simulator = nominal.with_adaptation(adaptation_of(parameters))
+    simulator = nominal.with_model(nominal.adapt(adaptation_of(parameters)))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
     state = start.with_estimate(base_x=base_x, base=(parameters[AT.base],), slope=(parameters[AT.slope],))

@@ -54,7 +54,7 @@ def test_a_record_prints_as_one_short_line(name):
 def test_a_state_gives_the_slope_in_mrad():
     solution = STATE.needle.solution
     sloped = STATE.needle._replace(solution=solution._replace(tip=solution.tip._replace(slope=2e-3)))
-    assert "slope 2.00 mrad" in repr(replace(STATE, needle=sloped))
+    assert "slope 2.00 mrad" in repr(replace(STATE, solved=STATE.solved.with_needle(sloped)))
 
 
 def test_a_plan_and_an_insertion_give_the_target_as_the_terminal_does():

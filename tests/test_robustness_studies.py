@@ -79,13 +79,14 @@ def test_a_step_that_fails_at_first_is_solved_with_a_soft_guide_or_held_segments
 def test_a_failure_is_counted_and_can_be_reproduced(of, monkeypatch, capsys, how):
     """Exit status 1, the count, and the arguments that reproduce the failure."""
 
-    def rollout(_simulator, _state, controls):
+    def rollout(_simulator, _state, controls, outputs):
         n, m = controls.shape[:2]
         tips, converged = np.zeros((n, m, 5)), np.ones((n, m), dtype=bool)
         if how == "exceptions":
             raise ZeroDivisionError("a bug")
         tips[3, 7, 1] = np.nan if how == "not_finite" else 0.0
         converged[3, 7] = how != "unconverged"
+        assert outputs == ("energy",)
         return Trajectories(controls, tips, np.zeros((n, m)), converged)
 
     def step(rod, s, *arguments, whole=plants.step):

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from flexneedle.loop.insertions import insert
     from flexneedle.loop.rig import Rig
     from flexneedle.loop.virtual import VirtualRig
+    from flexneedle.mechanics.model import Adaptation
     from flexneedle.phantom.draw import Truth
     from flexneedle.phantom.plants import Plant
     from flexneedle.planning.events import Event, Iterated
@@ -80,6 +81,7 @@ __all__ = [
     "ROLL",
     "SPIN",
     "THETA",
+    "Adaptation",
     "Clock",
     "CommandError",
     "Control",
@@ -148,6 +150,7 @@ _HOMES = {
     "loop.insertions": "insert",
     "loop.rig": "Rig",
     "loop.virtual": "VirtualRig",
+    "mechanics.model": "Adaptation",
     "phantom.draw": "Truth",
     "phantom.plants": "Plant",
     "planning.events": "Event Iterated",

@@ -13,7 +13,7 @@ from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_o
 from flexneedle.control.controllers import adaptive_mpc
 from flexneedle.control.interface import travel_left
 from flexneedle.control.path import path_of_plan
-from flexneedle.costs.weighted_sum import evaluate_cost
+from flexneedle.costs.weighted_sum import TIPS_ONLY, evaluate_cost, outputs_of
 from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world
@@ -132,7 +132,8 @@ def test_the_current_path_is_never_replaced_by_a_worse_one(quick_plan, along):
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.current[None])[0]
         listed = adaptive_mpc.cost_terms(task, estimate, ADAPTIVE.begin(task), ahead)
-        current = float(evaluate_cost(listed, adaptive_mpc.rollout_as_measured(estimate, kept))[0])
+        found = adaptive_mpc.rollout_as_measured(estimate, kept, outputs_of(listed))
+        current = float(evaluate_cost(listed, found)[0])
         assert decided(quick_plan, estimate, path=path)[0].cost <= current + 1e-9
 
 
@@ -198,9 +199,8 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
     """In tissue three times as stiff the guide step differs from the same state."""
     estimate = estimate_of(along(quick_plan, 55, base=(0.3,)))
-    stiff = replace(
-        estimate, simulator=estimate.nominal.with_adaptation(Adaptation(np.zeros(1), np.full(2, 3.0)))
-    )
+    model = estimate.nominal.adapt(Adaptation(np.zeros(1), np.full(2, 3.0)))
+    stiff = replace(estimate, simulator=estimate.nominal.with_model(model))
     assert decide(quick_plan, stiff).cost != decide(quick_plan, estimate).cost
     assert decide(quick_plan, stiff).command.dg_y != decide(quick_plan, estimate).command.dg_y
 
@@ -286,9 +286,9 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the median of a few
     searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
     """
-    plant = Simulator(PHANTOM, threads=1).with_adaptation(
-        Adaptation(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
-    )
+    nominal = Simulator(PHANTOM, threads=1)
+    own = Adaptation(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
+    plant = nominal.with_model(nominal.adapt(own))
     state = plant.start(quick_plan.roll)
     for row in quick_plan.controls:
         state = plant.step(state, Control.of(row))
@@ -332,8 +332,8 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
     task = task_of(estimate.nominal, quick_plan)
     memory, rollout = ADAPTIVE.begin(task), adaptive_mpc.rollout_as_measured
 
-    def lost(fitted, controls):
-        trajectories = rollout(fitted, controls)
+    def lost(fitted, controls, wanted=TIPS_ONLY):
+        trajectories = rollout(fitted, controls, wanted)
         return replace(trajectories, converged=np.zeros_like(trajectories.converged))
 
     monkeypatch.setattr(adaptive_mpc, "rollout_as_measured", lost)

@@ -10,7 +10,7 @@ from flexneedle.control import mpc
 from flexneedle.control.controllers import CONTROLLERS
 from flexneedle.control.interface import is_at_depth
 from flexneedle.costs.terms import CE_MPC
-from flexneedle.costs.weighted_sum import evaluate_cost
+from flexneedle.costs.weighted_sum import evaluate_cost, outputs_of
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import DB_X, DB_Y, DG_Y, DG_Z, ROLL, STILL, Control, X, Y
@@ -113,7 +113,6 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     reference, nominal = mpc.plan_window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc.make_controls(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
-    trajectories = simulator.rollout(state, controls)
     settings = mpc.CeMpc(horizon=1)
     charged = CE_MPC.terms(
         settings,
@@ -121,6 +120,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
         orientation=settings.orientation_weight_mm,
         nominal=nominal[:, [DG_Y, DG_Z]],
     )
+    trajectories = simulator.rollout(state, controls, **outputs_of(charged)._asdict())
     best = evaluate_cost(charged, trajectories).min()
     assert choice.cost <= best + 0.002
 

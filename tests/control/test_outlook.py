@@ -127,10 +127,11 @@ def test_derivatives_just_perturbed_are_renewed_along_the_path_ahead():
     passed = (new.grid > tips[0, X]) & (new.grid < tips[-1, X])
     renewed = {one.parameter for one in estimate.perturbed} | {AT.run_out}
     for one in estimate.perturbed:
+        simulator = estimate.nominal.with_model(one.model)
         moved, axis = one.state, estimate.state
         expected = []
         for row in controls:
-            moved = one.simulator.replay(moved, [row])[0]
+            moved = simulator.replay(moved, [row])[0]
             axis = estimate.simulator.replay(axis, [row])[0]
             expected.append((moved.tip[Y] - axis.tip[Y]) / one.step)
         by_hand = np.interp(new.grid[passed], tips[:, X], expected)

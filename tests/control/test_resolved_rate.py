@@ -130,7 +130,7 @@ def test_nominal_controls_insert_by_the_way_and_leave_room_for_the_disturbance(
         }
     )  # fmt: skip
     centred = state.needle._replace(boundary=state.needle.boundary._replace(guide=0.0))
-    start = replace(state, needle=centred)
+    start = replace(state, solved=state.solved.with_needle(centred))
     rows = resolved_rate.nominal_controls(scenario, quick_plan, start, way, low, roll)
     assert rows[:, DB_X].sum() == pytest.approx(way)
     assert rows[:, DB_X].min() > 0.0

@@ -77,26 +77,31 @@ def test_no_derivative_is_older_than_a_round():
     assert len(estimate.perturbed) < 0.5 * len(everyone)
 
 
-def test_derivatives_from_the_stops_equal_derivatives_from_the_start():
-    """The moves that are not simulated again do not depend on the parameter."""
+def test_a_parameter_has_no_effect_before_the_depth_where_it_begins():
+    """It is not simulated there; the derivatives are the same if it is."""
     estimate, _ = off_the_prior()
-    assert len(estimate.stops) > 4
-    whole = replace(estimate, stops=estimate.stops[:1])
-    again = replace(whole, prior=replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf)))
-    jacobian = fit.jacobian_of(finely(estimate))
-    np.testing.assert_allclose(jacobian, fit.jacobian_of(finely(whole)), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jacobian, fit.jacobian_of(finely(again)), rtol=1e-6, atol=1e-6)
+    prior = replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf))
+    jacobian, again = (fit.jacobian_of(finely(one)) for one in (estimate, replace(estimate, prior=prior)))
+    np.testing.assert_allclose(jacobian, again, rtol=1e-6, atol=1e-6)
     assert np.abs(jacobian[:, AT.cells + 9]).max() > 1e-4
 
 
-def test_the_stops_are_states_on_the_way():
-    """They equal the stepped states bit for bit, before the move into the tissue and every eight moves in it."""
+def test_insertions_simulated_together_are_those_simulated_alone_and_step_by_step():
+    """To the bit, whatever the companions: tips, states and models."""
     estimate, _ = off_the_prior()
-    states = stepped(estimate.parameters, commands(55), estimate.axial)
-    assert [first for first, _ in estimate.stops] == [0, 28, 36, 44, 52]
-    for first, state in estimate.stops:
-        assert state == states[first]
-    np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
+    sets = [
+        estimate.parameters + step * (np.arange(estimate.parameters.size) == k)
+        for k, step in enumerate(estimate.prior.steps)
+    ]
+    found = estimate.simulate_all(sets)
+    for k in (0, AT.bend, AT.clearance, AT.modulus + 1, AT.shift, len(sets) - 1):
+        alone = estimate.simulate_with(sets[k])
+        states = stepped(sets[k], commands(55), estimate.axial)
+        assert found.states[k] == alone.state == states[-1]
+        assert found.tips[k].tobytes() == alone.tips.tobytes()
+        np.testing.assert_array_equal(found.tips[k], [state.tip for state in states])
+        assert found.models[k].nodes.tobytes() == alone.simulator.model.nodes.tobytes()
+    assert len({tips.tobytes() for tips in found.tips}) > 10
 
 
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
@@ -126,7 +131,7 @@ def misfit(estimate, readings, before):
     rows, p = np.array([done.applied for done in estimate.moves]), estimate.parameters
     y = estimate.tips[:, Y]
     y = y[readings.index] + readings.part * (y[readings.index + 1] - y[readings.index])
-    first = estimate.stops[0][1].bevel.real
+    first = estimate.start.bevel.real
     sides = first * np.cumprod(np.where(rows[:, ROLL] > 0.0, -1.0, 1.0))[readings.index]
     left = readings.y - y - p[AT.run_out] * sides
     return 0.5 * (left**2 / variance).sum() + 0.5 * off @ estimate.prior.precision @ off
@@ -140,7 +145,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], fit.improve_fit, idn.Identified.simulate_with
+    costs, tried, improved, with_ = [], [], fit.improve_fit, idn.Identified.simulate_each
 
     def spied(estimate):
         tried.append(0)
@@ -150,11 +155,12 @@ def test_a_step_never_fits_worse(monkeypatch):
         return fitted
 
     def counted(estimate, parameters):
-        tried[-1] += 1
-        return with_(estimate, parameters)
+        for one in with_(estimate, parameters):
+            tried[-1] += 1
+            yield one
 
     monkeypatch.setattr(idn, "improve_fit", spied)
-    monkeypatch.setattr(idn.Identified, "simulate_with", counted)
+    monkeypatch.setattr(idn.Identified, "simulate_each", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
             Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1))),
@@ -186,8 +192,13 @@ def with_nan(estimate):
 
 def not_converged(estimate):
     needle = estimate.state.needle
-    solution = needle.solution._replace(converged=False)
-    return replace(estimate, state=replace(estimate.state, needle=needle._replace(solution=solution)))
+    solution = needle.solution._replace(converged=0.0)
+    return replace(
+        estimate,
+        state=replace(
+            estimate.state, solved=estimate.state.solved.with_needle(needle._replace(solution=solution))
+        ),
+    )
 
 
 @pytest.mark.parametrize("spoil", [with_nan, not_converged])
@@ -195,14 +206,15 @@ def not_converged(estimate):
 def test_a_trial_step_that_fails_is_refused(monkeypatch, spoil, failing):
     """Shorter steps are tried; if all of them fail, the parameters stay."""
     estimate, readings = off_the_prior()
-    simulate, tried = idn.Identified.simulate_with, []
+    simulate, tried = idn.Identified.simulate_each, []
 
-    def simulate_with(self, parameters):
-        tried.append(parameters)
-        other, stays = simulate(self, parameters), np.array_equal(parameters, estimate.parameters)
-        return spoil(other) if len(tried) <= failing and not stays else other
+    def simulate_each(self, parameters):
+        for other in simulate(self, parameters):
+            tried.append(other.parameters)
+            stays = np.array_equal(other.parameters, estimate.parameters)
+            yield spoil(other) if len(tried) <= failing and not stays else other
 
-    monkeypatch.setattr(idn.Identified, "simulate_with", simulate_with)
+    monkeypatch.setattr(idn.Identified, "simulate_each", simulate_each)
     fitted = fit.improve_fit(estimate)
     assert len(tried) >= 3
     assert fitted.state.converged

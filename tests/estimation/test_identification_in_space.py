@@ -56,7 +56,7 @@ def followed(count, scenario=QUIET, turn=0.0, truth=True, given=lambda one: one,
     own = Adaptation(
         np.zeros(1), np.ones(2), cell=cells, variation=np.ones(1), bevel=1.0, bend=BEND if truth else 0.0
     )
-    needle = model.with_adaptation(own)
+    needle = model.with_model(model.adapt(own))
     state = needle.start(turn)
     base, slope = BASE * by, SLOPE * by
     state = needle.step(

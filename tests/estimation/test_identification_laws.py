@@ -110,7 +110,8 @@ def test_the_estimate_is_the_fitted_insertion_carried_out_again():
     states = stepped(estimate.parameters, commands(50), estimate.axial)
     assert states[-1] == estimate.state
     np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
-    now = Simulator(QUIET, 1).with_adaptation(adaptation_of(estimate.parameters))
+    nominal = Simulator(QUIET, 1)
+    now = nominal.with_model(nominal.adapt(adaptation_of(estimate.parameters)))
     forward = Control(db_x=1.0)
     assert estimate.simulator.step(states[-1], forward) == now.step(states[-1], forward)
 

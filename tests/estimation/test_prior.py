@@ -77,10 +77,10 @@ def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
     assert low == 0.0
     assert high > 1.0
     assert high * offset <= 0.7 * min(heights)
-    widest = Simulator(scenario, 1).with_adaptation(
+    widest = Simulator(scenario, 1).adapt(
         Adaptation(np.zeros(len(heights) - 1), np.ones(len(heights)), bevel=high)
     )
-    assert widest._model.bevel_offset <= 0.7 * min(heights)
+    assert widest.bevel_offset <= 0.7 * min(heights)
 
 
 def test_a_needle_without_a_bevel_has_no_factor_to_bound():

@@ -88,8 +88,8 @@ def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
 def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
     rollout, calls = adaptive_mpc.rollout_as_measured, itertools.count()
 
-    def lost(fitted, controls):
-        outcome = rollout(fitted, controls)
+    def lost(*args, **wanted):
+        outcome = rollout(*args, **wanted)
         kept = next(calls) < 8
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 

@@ -1,21 +1,15 @@
 """The constants of a needle whose tissue, bevel and bend an observer has estimated."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from flexneedle.mechanics import law, spring
 from flexneedle.mechanics.law import tables
-from flexneedle.mechanics.model import (
-    CONTACT,
-    GUIDE,
-    Adaptation,
-    Model,
-    adapt,
-    contact_nodes,
-    tissue_layers,
-)
+from flexneedle.mechanics.model import Adaptation, Model, adapt, contact_nodes, pack, tissue_layers
+from flexneedle.mechanics.work import CONTACT, GUIDE
 from flexneedle.scenario.tissue.ogden import Ogden
 from reference.interpreted import interpreted
 
@@ -71,8 +65,9 @@ def along(top, bottom, estimate, height=EQUAL):
 
 def tip_spring(model, depth, u=0.7):
     """Return energy and both stiffnesses of the tip spring with the tip at a depth, sharpest law and least height."""
-    model = model._replace(layers=model.layers.view(np.recarray))
-    return PLAIN.spring_energy(model, depth, depth, u), *PLAIN.spring_law(model, depth, depth, u)
+    packed = pack([model])
+    w = SimpleNamespace(constants=model, layers=packed.layers[0], laws=packed.laws)
+    return PLAIN.spring_energy(w, depth, depth, u), *PLAIN.spring_law(w, depth, depth, u)
 
 
 ESTIMATES = {

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexneedle.mechanics import law as laws
-from flexneedle.mechanics.law import CELLS, tables
+from flexneedle.mechanics.law import CELLS, PER_UNIT, ROWS, Response, tables
 from flexneedle.scenario.tissue.laws import LAWS
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.scenario.tissue.linear import Linear
@@ -16,7 +16,6 @@ from flexneedle.scenario.tissue.ogden import Ogden
 from reference.interpreted import interpreted
 
 PLAIN = interpreted(laws)
-response, stored_energy = PLAIN.response, PLAIN.stored_energy
 MU, ALPHA, HEIGHT, WIDTH = 1.82e-3, 8.74, 20.0, 5.2  # the phantom's first layer
 SIZE = {"shear_modulus_kpa": 1e3 * MU, "compression_length_mm": HEIGHT, "engaged_width_mm": WIDTH}
 LIMIT = Ogden.limit
@@ -38,6 +37,19 @@ def layer(alpha=ALPHA):
 def of(law, e):
     """Return energy, force and stiffness of a law at one relative compression."""
     return tuple(float(each(np.array([e]))[0]) for each in (law.energy, law.force, law.stiffness))
+
+
+def response(table, e):
+    """Return the response of a table at e, its sharpness by e."""
+    cells = table[CELLS, PER_UNIT]
+    found = PLAIN.response(table, 0.0, e * cells)
+    return Response(found.secant, found.tangent, found.sharpness * cells)
+
+
+def stored_energy(table, e):
+    """Return the energy of a table at e."""
+    cells = table[CELLS, PER_UNIT]
+    return PLAIN.stored_energy(table, 0.0, e * cells) / cells**2
 
 
 def tabled(law, e):
@@ -199,5 +211,11 @@ def test_layers_of_one_law_share_a_table():
     assert place == [0, 1, 2, 0, 2]
     assert len(laws) == 3
     together = tables(laws)
+    rows = together.reshape(-1, 8)
     for each, k in zip(tissue, place, strict=True):
-        np.testing.assert_array_equal(together[k], tables([each])[0])
+        table = tables([each])[0]
+        np.testing.assert_array_equal(together[k], table)
+        for e in (0.2, 0.95):
+            cells = e * table[CELLS, PER_UNIT]
+            assert PLAIN.response(rows, float(k * ROWS), cells) == PLAIN.response(table, 0.0, cells)
+            assert PLAIN.stored_energy(rows, float(k * ROWS), cells) == PLAIN.stored_energy(table, 0.0, cells)

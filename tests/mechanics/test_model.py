@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from flexneedle.mechanics.model import CONTACT, contact_nodes, insert_essential, tissue_layers
+from flexneedle.mechanics.model import contact_nodes, insert_essential, tissue_layers
+from flexneedle.mechanics.work import CONTACT
 
 MU = np.array([1.0e-3, 4.0e-3])
 LAW = np.array([0, 1])

@@ -14,8 +14,10 @@ def cubic(x):
 
 def sampled(x, y, slope, n):
     """Return x, y + iz and its slope (n,) at equal arc lengths."""
-    poses = np.full((n, 5), np.nan)
-    equal_arc_nodes(x, y, slope, poses)
+    curves = [np.stack([column, 9.0 + 0.0 * column]) for column in (x, y, slope)]  # another after it
+    poses = np.full((2, n, 5), np.nan)
+    equal_arc_nodes(*curves, np.full(2, x.size), poses)
+    poses = poses[0]
     return poses[:, 0], poses[:, 1] + 1j * poses[:, 2], poses[:, 3] + 1j * poses[:, 4]
 
 

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flexneedle import Control
-from flexneedle.phantom.loads import clamp
 from flexneedle.types import PSI, THETA, Z
 from reference import kirchhoff
+from reference.bent_rods import PLAIN
+from reference.interpreted import Record
 from reference.rods import IDEAL, plant
 from reference.space_insertions import Inserted, angle_between, turned, wander
 from reference.space_validation import inserted_straight, largest_lag
@@ -165,7 +166,7 @@ def held(needle):
     """Return forces and moment of base and guide, and the positions and frame that they move."""
     s = needle.s
     forces = s["base_force"].copy(), s["guide_force"].copy(), s["base_moment"].copy()
-    return forces, (s["base"].copy(), s["guide"].copy(), np.array(clamp(s)))
+    return forces, (s["base"].copy(), s["guide"].copy(), np.array(PLAIN.clamp(Record(s))))
 
 
 def travel(before, now):

@@ -41,7 +41,7 @@ def long_beam(depth: float, *, spacing: float, bevel: float = 0.0, bevel_length:
 
 def tight(scenario: Scenario, threads: int | None = 1, *, slide: float = 1e-7) -> Simulator:
     """Return a simulator whose solves end only when the shortening changes by less than `slide` (mm)."""
-    constants = Simulator(scenario, threads)._model._replace(slide=slide)
+    constants = Simulator(scenario, threads).model._replace(slide=slide)
     return Simulator(scenario, threads, constants=constants)
 
 
@@ -69,7 +69,8 @@ def with_number(state: State, place: int, value: float) -> State:
     """Return the state with the number at a place in `numbers` replaced."""
     values = list(_leaves(state.needle))
     values[place] = value
-    return replace(state, needle=_refilled(state.needle, iter(values)))
+    needle = _refilled(state.needle, iter(values))
+    return replace(state, solved=state.solved.with_needle(needle))
 
 
 def _leaves(record):

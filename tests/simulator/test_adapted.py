@@ -12,6 +12,7 @@ from flexneedle.types import ROLL, THETA
 from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, numbers, repeat, tight
 
 PHANTOM = load_scenario("phantom")
+SIMULATOR = Simulator(PHANTOM, threads=1)
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 STIFFNESS = PHANTOM.needle.bending_stiffness
 LENGTH = PHANTOM.needle.length_mm
@@ -23,9 +24,14 @@ def adaptation(stiffness=(1.0, 1.0), shift=None, **others):
     return Adaptation(still if shift is None else np.array(shift), np.array(stiffness), **others)
 
 
+def adapted(simulator, estimated):
+    """Return the simulator with estimated constants."""
+    return simulator.with_model(simulator.adapt(estimated))
+
+
 def bent(scenario, bend, roll=0.0):
     """Return the simulator of a needle with a natural bend, and the needle at the start."""
-    simulator = tight(scenario, slide=1e-10).with_adaptation(adaptation(bend=bend))
+    simulator = adapted(tight(scenario, slide=1e-10), adaptation(bend=bend))
     return simulator, simulator.step(simulator.start(roll), Control())
 
 
@@ -67,9 +73,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
         simulator = Simulator(scenario, threads=1)
         state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
         length = scenario.needle.length_mm
-        state = simulator.with_adaptation(adaptation((1.0,), bend=0.5 * kappa * length**2)).step(
-            state, Control()
-        )
+        state = adapted(simulator, adaptation((1.0,), bend=0.5 * kappa * length**2)).step(state, Control())
         errors.append(
             [
                 state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
@@ -109,9 +113,8 @@ SAME = {  # boundaries displaced by whole intervals, so that the contact points 
 @pytest.mark.parametrize(("estimated", "changes"), SAME.values(), ids=SAME)
 def test_estimated_constants_equal_another_scenario(estimated, changes):
     """An insertion to 39 mm with a roll and guide motion; in steps."""
-    adapted = Simulator(PHANTOM, threads=1).with_adaptation(estimated)
     ends = []
-    for simulator in (adapted, Simulator(PHANTOM.with_values(changes), threads=1)):
+    for simulator in (adapted(SIMULATOR, estimated), Simulator(PHANTOM.with_values(changes), threads=1)):
         state = insert_to(simulator, 37.0)
         for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2)):
             state = simulator.step(state, control)
@@ -133,17 +136,17 @@ def rows_of(count):
 @pytest.mark.parametrize("bend", [0.0, 0.5])
 def test_a_replay_is_repeated_steps_bit_for_bit(bend):
     """From the start and from a state on the way."""
-    simulator, rows = Simulator(PHANTOM, threads=1), rows_of(80)
+    rows = rows_of(80)
     assert (rows[:, ROLL] > 0).sum() > 3
     estimated = adaptation(
         (1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend
     )
-    adapted = simulator.with_adaptation(estimated)
-    state = simulator.start().with_estimate(base=(0.3, 0.0), slope=(-1e-3, 0.0))
+    simulator = adapted(SIMULATOR, estimated)
+    state = SIMULATOR.start().with_estimate(base=(0.3, 0.0), slope=(-1e-3, 0.0))
     for first, last in ((0, 50), (50, 80)):
-        after, tips = adapted.replay(state, rows[first:last])
+        after, tips = simulator.replay(state, rows[first:last])
         for k in range(first, last):
-            state = adapted.step(state, Control.of(rows[k]))
+            state = simulator.step(state, Control.of(rows[k]))
             np.testing.assert_array_equal(tips[k - first], state.tip)
         assert after == state
         assert after.strain_energy == state.strain_energy
@@ -166,7 +169,7 @@ def test_a_pickled_simulator_keeps_its_adaptation_and_threads():
     """After the threads were used; the simulator that was adapted is unchanged."""
     nominal = Simulator(PHANTOM, threads=2)
     before = insert_to(nominal, 10.0)
-    simulator = nominal.with_adaptation(adaptation((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
+    simulator = adapted(nominal, adaptation((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
     assert insert_to(nominal, 10.0) == before
     state = insert_to(simulator, 10.0)
     rows = np.tile(rows_of(30), (16, 1, 1))

@@ -18,7 +18,7 @@ TOLERANCE = 1e-9  # mm
 
 def loose(clearance, **others):
     """The simulator of the phantom with a clearance (mm)."""
-    return EXACT.with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=clearance, **others))
+    return EXACT.with_model(EXACT.adapt(Adaptation(np.zeros(1), np.ones(2), clearance=clearance, **others)))
 
 
 def off_centre(state):
@@ -135,7 +135,10 @@ def test_rollouts_converge_and_equal_steps():
 def test_a_clearance_however_small_is_solved(preset, clearance):
     """A needle that nothing bends touches its guide without force, on no side in particular."""
     scenario = load_scenario(preset).with_values({"needle.bevel.offset_mm": 0.0})
-    simulator = Simulator(scenario).with_adaptation(Adaptation(np.zeros(1), np.ones(2), clearance=clearance))
+    simulator = Simulator(scenario)
+    simulator = simulator.with_model(
+        simulator.adapt(Adaptation(np.zeros(1), np.ones(2), clearance=clearance))
+    )
     states = repeat(simulator, simulator.start(), Control(db_x=1.0), 40)
     moved = simulator.step(states[-1], Control(dg_y=clearance))
     assert all(state.converged for state in (*states, moved))

@@ -94,6 +94,6 @@ def test_a_step_that_cuts_nothing_is_not_divided(command):
     """Pulling back, or moving the guide alone."""
     simulator = Simulator(PHANTOM, threads=1)
     state = simulator.replay(simulator.start(), [Control(db_x=30.0, dg_y=0.3)])[0]
-    undivided = Simulator(PHANTOM, threads=1, constants=simulator._model._replace(zone=-1.0))
+    undivided = Simulator(PHANTOM, threads=1, constants=simulator.model._replace(zone=-1.0))
     here, there = simulator.step(state, command), undivided.step(state, command)
     np.testing.assert_array_equal(numbers(here), numbers(there))

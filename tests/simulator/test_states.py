@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.errors import CommandError, InputError, StateError
-from flexneedle.mechanics import insertion
+from flexneedle.mechanics.rollout import rollout
 from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.problems import key_path
 from reference.cases import insert_to, numbers, repeat, with_number
@@ -40,12 +40,12 @@ def same_future(one, other):
 )
 def test_copies_are_equal_and_have_the_same_future(state, duplicate):
     """Copied, deeply copied, pickled; no kernel is compiled for the copy."""
-    kernels = len(insertion.rollout.signatures)
+    kernels = len(rollout.signatures)
     twin = duplicate(state)
     assert twin == state
     assert hash(twin) == hash(state)
     assert same_future(twin, state)
-    assert len(insertion.rollout.signatures) == kernels
+    assert len(rollout.signatures) == kernels
 
 
 def test_states_compare_by_value(state):

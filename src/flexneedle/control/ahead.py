@@ -16,7 +16,9 @@ def predict_planned_shape(task: Task, estimate: Estimate) -> Shape | None:
     The guide moves, and the needle rolls, as planned at the same depths of the tip; the base moves to its planned pose.
     """
     rows = remaining_controls(task, estimate)
-    predicted = estimate.simulator.rollout(estimate.state, rows[None], limits=False, rough=True, shapes=True)
+    predicted = estimate.simulator.rollout(
+        estimate.state, rows[None], limits=False, rough=True, at_end=("shapes",)
+    )
     if not predicted.converged.all():
         return None
     nodes = predicted.shapes[0, -1]

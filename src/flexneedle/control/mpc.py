@@ -8,6 +8,7 @@ from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.interface import Decision, travel_left
 from flexneedle.control.limits import guide_reach, largest_guide_step
 from flexneedle.costs.terms import CE_MPC
+from flexneedle.costs.weighted_sum import outputs_of
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Variables, find_best
 from flexneedle.results import Plan
@@ -73,7 +74,9 @@ def choose_step(
     charged = CE_MPC.terms(
         control, target=plan.target, reference=reference, orientation=weight, nominal=steps_of_guide
     )
-    found = find_best(variables, partial(simulator.rollout, state), charged, search, rng)
+    wanted = outputs_of(charged)
+    rollout = partial(simulator.rollout, state, outputs=wanted.outputs, at_end=wanted.at_end)
+    found = find_best(variables, rollout, charged, search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
     command = Control.of(found.trajectories.controls[0, 0].tolist())
     return Decision(command, why, found.cost, spread, samples=found.samples)

@@ -59,18 +59,35 @@ class Outlook:
         bevel = bevel_directions(estimate.state.bevel, controls, estimate.axes)
         axis = laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
         depth = np.maximum.accumulate(tips[:, X])
-        for one in estimate.perturbed:
-            ended = one.simulator.rollout(one.state, controls[None], limits=False, rough=True, shapes=True)
-            moved = ended.tips[0]
-            bent[one.parameter] = laterals(ended.shapes[0, -1] - shape, Y, estimate.axes) / one.step
+        perturbed = estimate.perturbed
+        if perturbed:
+            ended = estimate.nominal.rollout(
+                [one.state for one in perturbed],
+                np.tile(controls, (len(perturbed), 1, 1)),
+                models=[one.model for one in perturbed],
+                limits=False,
+                rough=True,
+                at_end=("shapes",),
+            )
+        for k, one in enumerate(perturbed):
+            bent[one.parameter] = laterals(ended.shapes[k, -1] - shape, Y, estimate.axes) / one.step
             curves[one.parameter] = np.interp(
-                self.grid, depth, (laterals(moved, Y, estimate.axes) - axis) / one.step
+                self.grid, depth, (laterals(ended.tips[k], Y, estimate.axes) - axis) / one.step
             )
         for k, direction in zip(
             range(*estimate.slots.run_out.indices(len(curves))), directions(1.0, estimate.axes), strict=True
         ):
             curves[k] = np.interp(self.grid, depth, bevel * direction)
         return replace(self, curves=curves, bent=bent)
+
+    def at(self, depth: float) -> Laterals:
+        """Return the derivatives (K,) of the lateral position at a depth (mm)."""
+        place = np.clip((depth - self.grid[0]) / (self.grid[1] - self.grid[0]), 0.0, self.grid.size - 1.001)
+        left = int(place)
+        part: Laterals = self.curves[:, left] + (place - left) * (
+            self.curves[:, left + 1] - self.curves[:, left]
+        )
+        return part
 
     def sd(self, estimate: Identified, target: float, miss: complex, *, guided: bool) -> float:
         """Return the standard deviation (mm), on an axis, of the miss at the depth `target` (mm).
@@ -84,7 +101,7 @@ class Outlook:
     def sd_to_come(self, estimate: Identified, target: float) -> float:
         """Return the standard deviation (mm), on an axis, of the miss after all corrections, by the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
-        end, axes = np.array([np.interp(target, self.grid, curve) for curve in self.curves]), estimate.axes
+        end, axes = self.at(target), estimate.axes
         to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= target - UNCORRECTED * step)
         slopes = self.curves[:, to_come]
         then = estimate.precision + (slopes @ slopes.conj().T).real / estimate.reading_variance
@@ -99,7 +116,7 @@ class Outlook:
         Corrections of the path to come undo the miss at the depth `target` (mm) but for `miss_sd` (mm); by this they
         move the nodes by `lever` (n,), relative to the tip.
         """
-        end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
+        end = self.at(target)
         left = self.bent - np.outer(end, lever)
         parts = np.stack([left.real, left.imag])
         variance = _SHAPE_FACTOR**2 * np.einsum("akn,kl,aln->na", parts, estimate.covariance, parts)
@@ -108,5 +125,5 @@ class Outlook:
 
     def sd_now(self, estimate: Identified, target: float) -> float:
         """Return the standard deviation (mm), on an axis, of the tip's lateral position at a depth if uncorrected."""
-        end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
+        end = self.at(target)
         return float(np.sqrt((end.conj() @ np.linalg.solve(estimate.precision, end)).real / estimate.axes))

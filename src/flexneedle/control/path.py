@@ -219,13 +219,13 @@ class Ahead:
         rows = np.arange(len(corrections))[:, None]
         wanted = np.interp(depth, self.path.depth, self.path.guide[:, axis])
         wanted += (1.0 - part) * padded[rows, at] + part * padded[rows, at + 1]
-        wanted = np.clip(wanted, least, greatest)
-        most = self.step * np.diff(depth, axis=1) / self.advance
-        guide = np.empty_like(wanted)
-        guide[:, 0] = self.state.guide[axis]
-        for k in range(most.shape[1]):
-            guide[:, k + 1] = np.clip(wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k])
-        return guide
+        wanted = np.clip(wanted, least, greatest).T
+        most = (self.step * np.diff(depth, axis=1) / self.advance).T
+        guide = np.empty(wanted.shape)
+        guide[0] = self.state.guide[axis]
+        for k, step in enumerate(most):
+            guide[k + 1] = np.minimum(np.maximum(wanted[k + 1], guide[k] - step), guide[k] + step)
+        return guide.T
 
     def correct(self, z: Floats) -> GuidePath:
         """Return the path with the corrections of a sample (d,)."""

@@ -4,13 +4,14 @@ The users are the planner (`plan`) and two controllers (`ce_mpc`, `adaptive_mpc`
 problem instead. A cost is the weighted sum of its terms, in the order of this file. A term is added by one decorated
 function:
 
-    @cost_term("mJ", plan=Weight("energy", "energy_weight_per_mj", "1/mJ", 5.0, "Weight of …", "raise it to …"))
+    @cost_term("mJ", at_end=("energy",), plan=Weight("energy", "energy_weight_per_mj", "1/mJ", 5.0, "Weight of …"))
     def energy_at_end(trajectories):
         return trajectories.energy[:, -1]
 
 The key of each weight then is a setting of its user: in scenario files, `flexneedle scenario schema`, the page's form
-and docs/reference/scenario.md. Reports list the term by its name. A function takes `Trajectories` and returns one
-number for each sequence, (N,). It gets its further arguments by name from the values that the user provides: always
+and docs/reference/scenario.md. Reports list the term by its name. It names the outputs of a rollout that it takes, of
+each step (`outputs`) or of the last (`at_end`); others are not computed. A function takes `Trajectories` and returns
+one number for each sequence, (N,). It gets its further arguments by name from the values that the user provides: always
 `target` (x, y, z in mm); the others are those that the functions below take.
 
 A term outside of the package is a function of `trajectories`, or of `trajectories` and `target`. It is listed in a
@@ -72,6 +73,7 @@ def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float
 
 @cost_term(
     "mJ",
+    at_end=("energy",),
     plan=Weight(
         "energy", "energy_weight_per_mj", "1/mJ", 5.0,
         "γ₂, weight of the final strain energy W of the tissue.",
@@ -93,6 +95,7 @@ def energy_at_end(trajectories: Trajectories) -> Floats:
 
 @cost_term(
     "mm²",
+    outputs=("deflection",),
     plan=Weight(
         "deflection", "deflection_weight", "1/mm²", 0.002,
         "Q, weight of the needle's mean square deflection (mm²), summed over the steps.",
@@ -242,6 +245,7 @@ def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
 
 @cost_term(
     "mJ",
+    outputs=("energy",),
     ce_mpc=Weight(
         "energy", "energy_weight_per_mj", "1/mJ", 2.74,
         "Weight of the tissue's strain energy after each step of the horizon, in mm² per mJ.",

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,13 @@ from flexneedle.types import DB_X, Floats, X
 class Trajectories:
     """N sequences of m control steps, and their simulation.
 
-    controls (N, m, 9): columns of `Control`; tips (N, m, 5): poses after each step, mm and rad; energy (N, m): strain
-    energy of the tissue, mJ; converged (N, m). On demand, else of size 0: deflection (N, m): mean square of the
-    needle's lateral deflection, mm², as in the planner; shapes (N, m, n, 5): poses at the needle's nodes, mm and rad.
+    controls (N, m, 9): columns of `Control`; tips (N, m, 5): poses after each step, mm and rad; converged (N, m).
+
+    On demand, of each step, or (N, 1, …) of the last alone, else of size 0: energy (N, m): strain energy of the tissue,
+    mJ. deflection: mean square of the needle's lateral deflection, mm², as in the planner. stretch: least stretch of
+    the tissue at the needle. strain: largest bending strain of the needle. loads (N, m, 6): force y, z (N) and moment
+    y, z (N·mm) of the clamp on the needle, force y, z of the guide. shapes (N, m, n, 5): poses at the needle's nodes,
+    mm and rad. ends (N,): states after the last step.
     """
 
     controls: Floats
@@ -28,6 +32,10 @@ class Trajectories:
     converged: NDArray[np.bool_]
     deflection: Floats = field(default_factory=lambda: np.empty((0, 0)))
     shapes: Floats = field(default_factory=lambda: np.empty((0, 0, 0, 0)))
+    stretch: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    strain: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    loads: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    ends: Sequence[Any] = ()
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -36,7 +44,7 @@ class Trajectories:
         return inside
 
     def __repr__(self) -> str:
-        sequences, steps = self.energy.shape
+        sequences, steps = self.converged.shape
         share = f"{np.mean(self.converged):.0%} converged"
         return f"<Trajectories of {sequences} sequences of {steps} steps, {share}>"
 
@@ -54,11 +62,34 @@ class Term:
     name: str
     weight: float
     value: Callable[[Trajectories], Floats]
+    outputs: tuple[str, ...] = ()  # of each step of a rollout that it takes
+    at_end: tuple[str, ...] = ()  # of the last step
+
+
+class Wanted(NamedTuple):
+    """Names of outputs of a rollout: of each step, and of the last alone."""
+
+    outputs: tuple[str, ...]
+    at_end: tuple[str, ...]
+
+
+TIPS_ONLY = Wanted((), ())
+
+
+def outputs_of(terms: Sequence[Term]) -> Wanted:
+    """Return the outputs of a rollout that terms with a weight take."""
+    charged = [term for term in terms if term.weight != 0.0]
+    outputs = {name for term in charged for name in term.outputs}
+    at_end = {name for term in charged for name in term.at_end} - outputs
+    return Wanted(tuple(sorted(outputs)), tuple(sorted(at_end)))
 
 
 def evaluate_terms(terms: Sequence[Term], trajectories: Trajectories) -> dict[str, Floats]:
-    """Return the weighted terms (N,) by name."""
-    return {term.name: term.weight * term.value(trajectories) for term in terms}
+    """Return the weighted terms (N,) by name; those without a weight are 0."""
+    none = np.zeros(len(trajectories.controls))
+    return {
+        term.name: term.weight * term.value(trajectories) if term.weight != 0.0 else none for term in terms
+    }
 
 
 def evaluate_cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
@@ -92,17 +123,25 @@ class CostTerm:
     value: TermFunction
     unit: str
     weights: Mapping[str, Weight]
+    outputs: tuple[str, ...] = ()
+    at_end: tuple[str, ...] = ()
 
 
+_OWN = ("deflection", "energy")  # outputs for the terms of a user
 TERMS: list[CostTerm] = []
 """The table, in the order of `flexneedle.costs.terms`."""
 
 
-def cost_term(unit: str, **weights: Weight) -> Callable[[TermFunction], TermFunction]:
-    """Return a decorator that enters a function in the table; weights: by user."""
+def cost_term(
+    unit: str, *, outputs: tuple[str, ...] = (), at_end: tuple[str, ...] = (), **weights: Weight
+) -> Callable[[TermFunction], TermFunction]:
+    """Return a decorator that enters a function in the table.
+
+    outputs, at_end: outputs of a rollout that it takes, of each step or of the last; weights: by user.
+    """
 
     def enter(value: TermFunction) -> TermFunction:
-        TERMS.append(CostTerm(value, unit, weights))
+        TERMS.append(CostTerm(value, unit, weights, outputs, at_end))
         return value
 
     return enter
@@ -148,9 +187,12 @@ class Cost:
         each passed to every function that takes it.
         """
         weights = self.weights(settings) if weights is None else weights
-        found = [Term(w.name, weights[w.name], _bind_values(term.value, values)) for term, w in self.rows()]
+        found = [
+            Term(w.name, weights[w.name], _bind_values(term.value, values), term.outputs, term.at_end)
+            for term, w in self.rows()
+        ]
         own = [
-            Term(each.term, each.weight, _check_values(each.term, _bind_values(each.function, values)))
+            Term(each.term, each.weight, _check_values(each.term, _bind_values(each.function, values)), _OWN)
             for each in settings.own_terms or ()
         ]
         return *found, *own
@@ -169,7 +211,7 @@ def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callabl
             found = np.asarray(value(_lock_arrays(trajectories)), dtype=float)
         except Exception as error:
             raise InputError(f"cost term {name} raises {type(error).__name__}: {error}") from error
-        if found.shape != (expected := trajectories.energy.shape[:1]):
+        if found.shape != (expected := trajectories.converged.shape[:1]):
             raise InputError(f"cost term {name}: must return an array of shape {expected}, not {found.shape}")
         if np.isnan(found[trajectories.converged.all(axis=1)]).any():
             raise InputError(f"cost term {name}: must return numbers, not NaN")
@@ -180,7 +222,10 @@ def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callabl
 
 def _lock_arrays(trajectories: Trajectories) -> Trajectories:
     """Return the trajectories with arrays that cannot be changed."""
-    views = {each.name: getattr(trajectories, each.name).view() for each in fields(trajectories)}
+    arrays = {each.name: getattr(trajectories, each.name) for each in fields(trajectories)}
+    views: dict[str, Any] = {
+        name: array.view() for name, array in arrays.items() if isinstance(array, np.ndarray)
+    }
     for view in views.values():
         view.flags.writeable = False
     return replace(trajectories, **views)

@@ -69,7 +69,13 @@ def replay_scaled(
     simulator: Simulator, state: State, rows: Floats, axial_scale: float
 ) -> tuple[State, Floats]:
     """Return the state and the tips (m, 5) after motions (m, 9) that advance the needle `axial_scale` times as far."""
+    scaled, extra = scale_advance(rows, axial_scale)
+    after, tips = simulator.replay(state, scaled)
+    return after.discount_advance(extra), tips
+
+
+def scale_advance(rows: Floats, axial_scale: float) -> tuple[Floats, float]:
+    """Return motions (m, 9) that advance the needle `axial_scale` times as far, and how much further (mm) in all."""
     scaled = rows.copy()
     scaled[:, DB_X] *= axial_scale
-    after, tips = simulator.replay(state, scaled)
-    return after.discount_advance(float(scaled[:, DB_X].sum() - rows[:, DB_X].sum())), tips
+    return scaled, float(scaled[:, DB_X].sum() - rows[:, DB_X].sum())

@@ -6,15 +6,14 @@ periods.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
-from flexneedle.estimation.axial import replay_scaled
-from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, adapt_model
+from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, adapt_models
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
-from flexneedle.types import Floats, Laterals, X, laterals
+from flexneedle.types import DB_X, Laterals, X, laterals
 
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a step: the first that does not raise the cost
 
@@ -32,7 +31,7 @@ def improve_fit(fitted: Fitted) -> Fitted:
     off = fitted.parameters - prior.mean
     gradient = (weighted @ np.concatenate(fitted.residuals)).real - prior.precision @ off
     precision = (weighted @ jacobian).real + prior.precision
-    fitted = replace(fitted, precision=precision)
+    fitted = fitted.change(precision=precision)
     step = np.linalg.solve(precision, gradient)
     if not np.isfinite(step).all():
         return fitted.simulate_with(fitted.parameters)
@@ -43,8 +42,9 @@ def improve_fit(fitted: Fitted) -> Fitted:
         return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
 
     most, trial = cost(fitted), fitted
-    for share in _SHARES:
-        trial = fitted.simulate_with(fitted.parameters + share * (goal - fitted.parameters))
+    tried = [fitted.parameters + share * (goal - fitted.parameters) for share in _SHARES]
+    # Most often the first will do; if not, the others take as long together as another one.
+    for trial in chain(fitted.simulate_each(tried[:1]), fitted.simulate_each(tried[1:])):
         if trial.state.converged and cost(trial) <= most:
             break
     return trial
@@ -68,26 +68,36 @@ LEADING_ROUND = 2
 
 
 def differentiate(fitted: Fitted, which: Sequence[int] | None = None) -> Fitted:
-    """Simulate curves again, a few steps ahead (default: those that are due)."""
+    """Simulate curves again, a few steps ahead (default: those that are due).
+
+    All needles are simulated together, each from its start, the present one with them.
+    """
+    due = [k for k in (due_parameters(fitted) if which is None else which) if not fitted.slots.is_offset(k)]
+    steps = fitted.prior.steps
+    parameters = [fitted.parameters + np.where(np.arange(steps.size) == k, steps, 0.0) for k in due]
     ahead = controls(ROUND, db_x=fitted.nominal.scenario.setup.max_advance_mm)
-    base = np.concatenate([fitted.tips, fitted.simulator.replay(fitted.state, ahead)[1]])
-    depth = np.maximum.accumulate(base[:, X])
-    curves, members = fitted.curves.copy(), []
-    for k in due_parameters(fitted) if which is None else which:
-        if fitted.slots.is_offset(k):
+    goal = float(fitted.tips[:, X].max()) + float(ahead[:, DB_X].sum())
+    begun = [j for j, k in enumerate(due) if goal >= fitted.prior.begins[k]]
+    models, states, tips = fitted.simulate_all([fitted.parameters, *(parameters[j] for j in begun)])
+    others = [parameters[j] for j in range(len(due)) if j not in begun]
+    unreached = iter(adapt_models(fitted.nominal, fitted.slots, fitted.settings.cell_mm, others))
+    rows = np.tile(ahead, (len(models), 1, 1))
+    later = fitted.nominal.rollout(states, rows, models=models, limits=False).tips
+    base, *moved = np.concatenate([tips, later], axis=1)
+    depth, curves, members = np.maximum.accumulate(base[:, X]), fitted.curves.copy(), []
+    for j, k in enumerate(due):
+        step = float(steps[k])
+        if j not in begun:  # the needle has not come where it matters
+            members.append(Perturbed(k, step, next(unreached), fitted.state))
             continue
-        parameters = fitted.parameters.copy()
-        parameters[k] += fitted.prior.steps[k]
-        if depth[-1] < fitted.prior.begins[k]:
-            simulator = adapt_model(fitted.nominal, fitted.settings, parameters)
-            members.append(Perturbed(k, float(fitted.prior.steps[k]), simulator, fitted.state))
-            continue
-        member, tips = _perturb(fitted, parameters, k, ahead)
-        members.append(member)
+        place = begun.index(j)
+        members.append(Perturbed(k, step, models[1 + place], states[1 + place]))
         for curve, sensor in zip(curves[:, k], fitted.sensors, strict=True):
-            moved = laterals(tips, sensor.column, fitted.axes) - laterals(base, sensor.column, fitted.axes)
-            curve[:] = np.interp(fitted.grid, depth, moved / fitted.prior.steps[k])
-    return replace(fitted, curves=curves, perturbed=tuple(members), period=fitted.period + 1)
+            change = laterals(moved[place], sensor.column, fitted.axes) - laterals(
+                base, sensor.column, fitted.axes
+            )
+            curve[:] = np.interp(fitted.grid, depth, change / step)
+    return fitted.change(curves=curves, perturbed=tuple(members), period=fitted.period + 1)
 
 
 def due_parameters(fitted: FittedInsertion) -> Iterator[int]:
@@ -99,21 +109,3 @@ def due_parameters(fitted: FittedInsertion) -> Iterator[int]:
     for k in range(fitted.slots.modulus, fitted.parameters.size):
         if k % ROUND == fitted.period % ROUND:
             yield k
-
-
-def _perturb(fitted: FittedInsertion, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
-    """Return the needle with another value of parameter k, and its tips (m + 1 + a, 5), including a steps `ahead`.
-
-    Moves before the parameter has an effect are not simulated again.
-    """
-    simulator = adapt_model(fitted.nominal, fitted.settings, parameters)
-    begins = float(fitted.prior.begins[k])
-    reached = int(np.argmax(np.append(fitted.tips[:, X], np.inf) > begins))  # by the move before this one
-    first, state = max((stop for stop in fitted.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
-    if first == 0:
-        state = fitted.settle_start(simulator, parameters)
-    before = np.concatenate([fitted.tips[:first], state.tip[None]])
-    now, tips = replay_scaled(simulator, state, fitted.rows[first:], fitted.axial_scale)
-    later = simulator.replay(now, ahead)[1]
-    member = Perturbed(k, float(fitted.prior.steps[k]), simulator, now)
-    return member, np.concatenate([before, tips, later])

@@ -1,24 +1,30 @@
 """The insertion simulated with fitted parameters, and its readings."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from flexneedle.estimation.axial import replay_scaled
+from flexneedle.estimation.axial import scale_advance
 from flexneedle.estimation.lateral import components, from_components
 from flexneedle.estimation.move_means import MoveMeans
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.prior import Prior, Priors, Slots
 from flexneedle.estimation.sensors import Sensor, sensors_of
-from flexneedle.mechanics.model import Adaptation
+from flexneedle.mechanics.model import Adaptation, Model, adapt
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import STILL, THETA, Floats, Laterals, X, Y, Z, laterals
+from flexneedle.types import STILL, THETA, Floats, Laterals, Y, Z, laterals
 
 _REST = np.array([STILL])
-_MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
+_OF_MOVES = (
+    "slots",
+    "rows",
+    "sensors",
+    "readings",
+)  # depend on scenario and moves, the last also on the bevel
 # An offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops, relative to it.
 _UNEVEN = 0.2
 
@@ -29,8 +35,16 @@ class Perturbed:
 
     parameter: int
     step: float
-    simulator: Simulator
+    model: Model
     state: State
+
+
+class Simulated(NamedTuple):
+    """Insertions with P sets of parameters: their models, their states now, and tip poses (P, m + 1, 5)."""
+
+    models: list[Model]
+    states: list[State]
+    tips: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +58,7 @@ class FittedInsertion:
     parameters: Floats  # posterior means (K,)
     state: State
     tips: Floats  # tip poses (m + 1, 5) at the ends of the m moves, the start first
-    stops: tuple[tuple[int, State], ...]  # state before some of the moves
+    start: State  # the scenario's, before the first move
     grid: Floats  # depths of the tip (g,), mm
     curves: Laterals  # derivatives (S, K, g) of the sensors' quantities over the depths, the lateral position first
     precision: Floats  # inverse covariance (K, K) of the parameters
@@ -89,12 +103,12 @@ class FittedInsertion:
             for sensor, readings in zip(self.sensors, self.readings, strict=True)
         ]
 
-    @property
+    @cached_property
     def laterals(self) -> list[Laterals]:
         """Lateral quantity (m + 1,) of the tips for each sensor; the first is their position (mm)."""
         return [laterals(self.tips, sensor.column, self.axes) for sensor in self.sensors]
 
-    @property
+    @cached_property
     def residuals(self) -> list[Laterals]:
         """Lateral residuals (r,) of each sensor: readings minus the model's quantities."""
         return [
@@ -114,55 +128,80 @@ class FittedInsertion:
         slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes
 
-    def simulate_with(self, parameters: Floats) -> Self:
-        """Return the insertion simulated again with these parameters, in segments."""
-        simulator = adapt_model(self.nominal, self.settings, parameters)
-        state = self.settle_start(simulator, parameters)
-        inside = int(np.argmax(np.append(self.tips[1:, X], np.inf) > 0.0))
-        ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
-        stops, parts, first = [], [state.tip[None]], 0
-        for last in ends:
-            stops.append((first, state))
-            if last > first:
-                state, tips = replay_scaled(simulator, state, self.rows[first:last], self.axial_scale)
-                parts.append(tips)
-            first = last
-        return replace(
-            self,
-            simulator=simulator,
-            parameters=parameters,
-            state=state,
-            tips=np.concatenate(parts),
-            stops=tuple(stops),
-        )
+    def change(self, **changes: Any) -> Self:
+        """Return the insertion with changes, but the same moves: properties of these are kept."""
+        made = replace(self, **changes)
+        kept = _OF_MOVES if made.state.bevel == self.state.bevel else _OF_MOVES[:-1]
+        vars(made).update({name: value for name, value in vars(self).items() if name in kept})
+        return made
 
-    def settle_start(self, simulator: Simulator, parameters: Floats) -> State:
-        """Return the state of the start, settled in the model (`simulator`) with these parameters (K,)."""
-        start = self.nominal.start(self.stops[0][1].roll)
-        moved = start.with_estimate(
-            base_x=float(start.base[0]) + self.axial,
-            base=(start.base[Y : Z + 1] + components(parameters[self.slots.base])).tolist(),
-            slope=(start.base[THETA:] + components(parameters[self.slots.slope])).tolist(),
+    def simulate_with(self, parameters: Floats) -> Self:
+        """Return the insertion simulated again with these parameters (K,)."""
+        return next(self.simulate_each([parameters]))
+
+    def simulate_each(self, parameters: Sequence[Floats]) -> Iterator[Self]:
+        """Yield the insertion simulated again with each set of parameters, (K,) each, all at once."""
+        models, states, tips = self.simulate_all(parameters)
+        for k, each in enumerate(parameters):
+            simulator = self.nominal.with_model(models[k])
+            yield self.change(simulator=simulator, parameters=each, state=states[k], tips=tips[k])
+
+    def simulate_all(self, parameters: Sequence[Floats]) -> Simulated:
+        """Return the insertion simulated again with each set of parameters, (K,) each."""
+        models = adapt_models(self.nominal, self.slots, self.settings.cell_mm, parameters)
+        scaled, extra = scale_advance(self.rows, self.axial_scale)
+        rows = np.concatenate([_REST, scaled])  # at rest the start is settled in its model
+        clamps = [each[: self.slots.slope.stop].tobytes() for each in parameters]
+        starts = dict(zip(clamps, parameters, strict=True))
+        placed = {clamp: self._place_start(each) for clamp, each in starts.items()}
+        found = self.nominal.rollout(
+            [placed[clamp] for clamp in clamps],
+            np.tile(rows, (len(models), 1, 1)),
+            models=models,
+            limits=False,
+            ends=True,
         )
-        return simulator.replay(moved, _REST)[0]
+        return Simulated(models, [state.discount_advance(extra) for state in found.ends], found.tips)
+
+    def _place_start(self, parameters: Floats) -> State:
+        """Return the start with these parameters (K,), not settled."""
+        base, slope = components(parameters[self.slots.base]), components(parameters[self.slots.slope])
+        return self.start.with_estimate(
+            base_x=float(self.start.base[0]) + self.axial,
+            base=(self.start.base[Y : Z + 1] + base).tolist(),
+            slope=(self.start.base[THETA:] + slope).tolist(),
+        )
 
 
 Fitted = TypeVar("Fitted", bound=FittedInsertion)
 
 
-def adapt_model(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
-    """Return the model with these parameters (K,); nominal: the scenario's model, to which they refer."""
-    layers, slots = len(nominal.scenario.tissue), Slots.of(nominal.scenario)
+def adapt_models(nominal: Simulator, slots: Slots, cell: float, parameters: Sequence[Floats]) -> list[Model]:
+    """Return the models with sets of parameters, (K,) each; nominal: the scenario's model, to which they refer.
+
+    Those with the same tissue share it. cell: length (mm) of the cells of the modulus.
+    """
+    layers = len(nominal.scenario.tissue)
     shift = slots.modulus + layers
     variation = shift + layers - 1
-    return nominal.with_adaptation(
-        Adaptation(
-            shift=parameters[shift:variation],
-            stiffness=np.exp(parameters[slots.modulus : shift]),
-            cell=settings.cell_mm,
-            variation=np.exp(parameters[variation:]),
-            bevel=float(parameters[slots.bevel]),
-            bend=from_components(parameters[slots.bend]),
-            clearance=float(parameters[slots.clearance]),
+    tissues: dict[bytes, Model] = {}
+    models = []
+    for each in parameters:
+        key = each[slots.modulus :].tobytes()
+        if key not in tissues:
+            tissue = Adaptation(
+                shift=each[shift:variation],
+                stiffness=np.exp(each[slots.modulus : shift]),
+                cell=cell,
+                variation=np.exp(each[variation:]),
+            )
+            tissues[key] = adapt(nominal.model, tissue)
+        needle = Adaptation(
+            shift=np.zeros(layers - 1),
+            stiffness=np.ones(layers),
+            bevel=float(each[slots.bevel]),
+            bend=from_components(each[slots.bend]),
+            clearance=float(each[slots.clearance]),
         )
-    )
+        models.append(adapt(tissues[key], needle))
+    return models

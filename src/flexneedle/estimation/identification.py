@@ -16,6 +16,7 @@ import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class Identification:
             prior.mean,
             state,
             state.tip[None],
-            ((0, state),),
+            state,
             grid,
             np.zeros(
                 (len(sensors_of(scenario)), prior.mean.size, grid.size),
@@ -110,7 +111,8 @@ class Identified(FittedInsertion):
     def tip_at(self, time: float) -> Point:
         """Return the estimated position of the tip (mm) at `time`."""
         x, y, z = position_along(self.moves, self.tips, time)
-        left = sum(done.left_to_turn(time) for done in self.moves if time < done.motion.ended)
+        running = takewhile(lambda done: time < done.motion.ended, reversed(self.moves))
+        left = sum(done.left_to_turn(time) for done in running)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
         return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
@@ -142,8 +144,7 @@ class Identified(FittedInsertion):
         bevel = fitted.state.bevel * cmath.exp(-1j * since)
         y = complex(fitted.laterals[0][newest] + left[-1] + fitted.run_out * bevel)
         inside = fitted.tips[-1, X] > 0.0
-        return replace(
-            fitted,
+        return fitted.change(
             residual=low_pass(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
             measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
@@ -157,8 +158,7 @@ class Identified(FittedInsertion):
         unexplained = position.unexplained(scenario, self.settings)
         variance = readings.axial_variance(position.sd(scenario) or 0.0, unexplained)
         found, covariance = fit_axial_error(without, travel, variance, axial_prior(scenario.control))
-        return replace(
-            self,
+        return self.change(
             axial=float(found[0]),
             axial_scale=1.0 + float(found[1]),
             axial_covariance=covariance,

@@ -1,6 +1,7 @@
 """The moves of an insertion, and the readings taken during each."""
 
 import cmath
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.estimation.sensors import SENSORS, Sensor
-from flexneedle.types import STILL, Control, Floats, Measurement, Motion, Point, Pose, X, Y, Z
+from flexneedle.types import STILL, Control, Floats, Measurement, Motion, Point, Pose
 
 _KEPT = 100  # readings of a move at rest that are kept one by one
 _ROUNDING_S = 1e-9
@@ -161,12 +162,11 @@ def position_along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
 
     Between moves the tip rests.
     """
-    if not moves:
-        return Pose.of(tips[-1]).point
-    times = [limit for done in moves for limit in (done.motion.travel_begun, done.motion.ended)]
-    at = [end for k in range(len(moves)) for end in (k, k + 1)]
-    x, y, z = (float(np.interp(time, times, tips[at, column])) for column in (X, Y, Z))
-    return x, y, z
+    last = bisect_right(moves, time, key=lambda done: done.motion.travel_begun) - 1
+    if last < 0:
+        return Pose.of(tips[0]).point
+    part = moves[last].part(time)
+    return Pose.of((1.0 - part) * tips[last] + part * tips[last + 1]).point
 
 
 def _variance_of_mean(variances: Sequence[float | None]) -> float:

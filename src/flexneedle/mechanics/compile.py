@@ -66,7 +66,9 @@ def inner(function: _Function) -> _Function:
 
     Its caller owns the arrays: counting references to them would take a third of a step.
     """
-    compiled: _Function = _njit(nogil=True, error_model="numpy", _nrt=False)(function)
+    compiled: _Function = _njit(
+        nogil=True, error_model="numpy", _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(function)
     return compiled
 
 

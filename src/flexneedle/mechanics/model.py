@@ -1,14 +1,19 @@
 """The constants of a needle in layered tissue, as flat arrays for the kernels (docs/theory.md section 2)."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.arguments import make_refusal
+from flexneedle.mechanics.law import CELLS, PER_UNIT, ROWS
+from flexneedle.mechanics.needle import to_parts
+from flexneedle.mechanics.rollout import Models
+from flexneedle.mechanics.work import CONTACT, ESSENTIAL, GUIDE
+
 Floats = NDArray[np.float64]
 
-CONTACT, ESSENTIAL, GUIDE = range(3)
-"""Kinds of node: a tissue spring, a prescribed lateral position, the guide's."""
 # Edges of the intervals of the contact points just below the skin, in spacings. There the free needle is held by little
 # but its tip: with even intervals and steps a thin one ends up to 0.3 mm off, with these 0.04 mm (decision 0014).
 _SKIN_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5)
@@ -25,7 +30,7 @@ NODE = np.dtype(
         ("stiffness", np.float64),  # initial stiffness (N/mm)
         ("weight", np.float64),  # layer weight w_c
         ("law", np.int64),  # index of its table
-        ("kind", np.int64),  # CONTACT, ESSENTIAL or GUIDE
+        ("kind", np.float64),  # CONTACT, ESSENTIAL or GUIDE
     ]
 )
 
@@ -110,29 +115,68 @@ def contact_nodes(
     return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]), GUIDE)
 
 
-def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
+def insert_essential(nodes: Nodes, x: Floats, kind: float = ESSENTIAL) -> Nodes:
     """Return `nodes` with essential nodes of a kind added at `x` (mm), in order of x."""
     added = records(NODE, x=x, reach=1.0, height=1.0, kind=kind)
     return np.insert(nodes, nodes["x"].searchsorted(x), added)
 
 
 class Adaptation(NamedTuple):
-    """Estimated changes of a model's constants."""
+    """Changes of a model's constants.
 
-    shift: Floats  # shift of the ends of all layers but the last (k − 1,), mm
-    stiffness: Floats  # factor on the modulus of each layer (k,)
-    cell: float = 1.0  # length (mm) of cells along the depth from the skin
-    # further factor on the modulus in each cell (c,); the last cell has no end
+    shift (k − 1,): of the ends of all k layers but the last, mm. stiffness (k,): factors on the moduli. cell: length of
+    cells along the depth from the skin, mm. variation (c,): further factors in the cells, of which the last has no end.
+    bevel: factor on the bevel's offset. bend: lateral distance of the free needle's tip from the straight, mm (in space
+    y + iz), relative to the bevel's direction, with which it turns. clearance: of the needle in the guide, to either
+    side, mm.
+    """
+
+    shift: Floats
+    stiffness: Floats
+    cell: float = 1.0
     variation: Floats = np.ones(1)
-    bevel: float = 1.0  # factor on the bevel offset
-    # lateral distance (mm) of the free needle's tip from the straight, relative to the bevel's direction, with
-    # which it turns
+    bevel: float = 1.0
     bend: Any = 0.0
-    clearance: float = 0.0  # clearance of the needle in the guide, to either side (mm)
+    clearance: float = 0.0
+
+
+def check_adaptation(model: Model, adaptation: Adaptation) -> None:
+    """Raise InputError, with the rule, for changes that the model cannot take."""
+    layers = model.layers.size
+    for name, shape in (("shift", (layers - 1,)), ("stiffness", (layers,))):
+        if np.shape(values := getattr(adaptation, name)) != shape:
+            raise make_refusal(name, values, f"must be an array {shape}")
+    for name in ("stiffness", "variation", "cell"):
+        values = np.asarray(getattr(adaptation, name), dtype=float)
+        if not (values.size and (values > 0.0).all() and np.isfinite(values).all()):
+            raise make_refusal(name, values, "must be finite and above 0")
+    for name in ("shift", "bevel", "bend", "clearance"):
+        values = np.asarray(getattr(adaptation, name))
+        if not np.isfinite(values).all() or (name in ("bevel", "clearance") and values < 0.0):
+            raise make_refusal(name, values, "must be finite, bevel and clearance at least 0")
+    if isinstance(adaptation.bend, complex) and not isinstance(model.curvature, complex):
+        raise make_refusal("bend", adaptation.bend, "must be a real number in the plane")
 
 
 def adapt(model: Model, adaptation: Adaptation) -> Model:
-    """Return the model with other constants and its contact points in place.
+    """Return the model with other constants and its contact points in place."""
+    same = (
+        not adaptation.shift.any()
+        and (adaptation.stiffness == 1.0).all()
+        and (adaptation.variation == 1.0).all()
+    )
+    tissue = model if same else _adapt_tissue(model, adaptation)
+    return tissue._replace(
+        bevel_offset=model.bevel_offset * adaptation.bevel,
+        # Of one type with and without an adaptation, so that kernels are compiled once.
+        curvature=type(model.curvature)(2.0 * adaptation.bend / model.length**2),
+        # Below the tolerance of the solve the side that the needle bears on would be rounding.
+        clearance=adaptation.clearance if adaptation.clearance > model.slide else 0.0,
+    )
+
+
+def _adapt_tissue(model: Model, adaptation: Adaptation) -> Model:
+    """Return the model with other tissue.
 
     A contact is as stiff as the tissue along its interval; its law is the law of the layer at its middle.
     """
@@ -149,15 +193,7 @@ def adapt(model: Model, adaptation: Adaptation) -> Model:
     changed = nodes.copy()
     changed["stiffness"][contact] = _integral(bottoms, layers["stiffness"], nodes)[contact]
     changed["height"][contact], changed["law"][contact] = at["height"][contact], at["law"][contact]
-    return model._replace(
-        bevel_offset=model.bevel_offset * adaptation.bevel,
-        nodes=changed,
-        layers=layers,
-        # Of one type with and without an adaptation, so that kernels are compiled once.
-        curvature=type(model.curvature)(2.0 * adaptation.bend / model.length**2),
-        # Below the tolerance of the solve the side that the needle bears on would be rounding.
-        clearance=adaptation.clearance if adaptation.clearance > model.slide else 0.0,
-    )
+    return model._replace(nodes=changed, layers=layers)
 
 
 def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
@@ -171,3 +207,60 @@ def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
         return total
 
     return up_to(nodes["x"] + nodes["reach"]) - up_to(nodes["x"] - nodes["reach"])
+
+
+# ---- models as arrays of numbers, for kernels
+
+
+def pack(models: Sequence[Model]) -> Models:
+    """Return models, M of them, as arrays of kernels; those with few nodes or layers get more that have no effect."""
+    n, depth = max(one.nodes.size for one in models), max(one.layers.size for one in models)
+    laws, first, rows = [], {}, 0
+    for one in models:
+        if id(one.laws) not in first:
+            first[id(one.laws)] = rows
+            laws.append(one.laws.reshape(-1, one.laws.shape[-1]))
+            rows += len(laws[-1])
+    apart = {(id(one.nodes), id(one.laws)): one for one in models}
+    nodes = {key: _node_columns(one, n, first[key[1]]) for key, one in apart.items()}
+    axes = 2 if isinstance(models[0].curvature, complex) else 1
+    return Models(
+        np.array([_constants(one) for one in models]),
+        to_parts(np.array([one.curvature for one in models]), axes),
+        np.array([nodes[id(one.nodes), id(one.laws)] for one in models]),
+        np.array([_layer_columns(one, depth, first[id(one.laws)]) for one in models]),
+        np.concatenate(laws) if len(laws) > 1 else laws[0],
+    )
+
+
+_BEYOND = (np.inf, 1.0, 1.0, 0.0, 1.0, 0.0, CONTACT, 0.0)  # a node that no tip comes to
+
+
+def _constants(one: Model) -> tuple[float, ...]:
+    bevel = one.bevel_offset, one.bevel_length
+    exact = one.clearance, one.tolerance, one.slide
+    return 1.0 / one.bending_stiffness, one.length, *bevel, one.part, one.zone, *exact
+
+
+def _node_columns(one: Model, size: int, first: int) -> Floats:
+    """Return the nodes (size, 8) in the columns of `work`; added ones are beyond any tip."""
+    nodes, columns = one.nodes, np.empty((size, 8))
+    law, contact = nodes["law"], nodes["kind"] == CONTACT
+    columns[nodes.size :] = _BEYOND
+    own = columns[: nodes.size].T
+    own[0], own[1], own[2] = nodes["x"], 1.0 / nodes["reach"], nodes["height"]
+    own[3] = nodes["stiffness"] * contact
+    own[4] = one.laws[law, CELLS, PER_UNIT] / nodes["height"] * contact
+    own[5], own[6], own[7] = first + ROWS * law, nodes["kind"], nodes["weight"]
+    return columns
+
+
+def _layer_columns(one: Model, size: int, first: int) -> Floats:
+    """Return the layers (size, 5) in the columns of `work`; added ones are below the last, which has no end."""
+    layers, columns = one.layers, np.empty((size, 5))
+    columns[layers.size :] = np.inf, 1.0, 0.0, 1.0, 0.0
+    own = columns[: layers.size].T
+    own[0], own[1], own[2] = layers["end"], layers["height"], layers["stiffness"]
+    own[3] = one.laws[layers["law"], CELLS, PER_UNIT] / layers["height"]
+    own[4] = first + ROWS * layers["law"]
+    return columns

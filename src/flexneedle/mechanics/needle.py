@@ -1,4 +1,8 @@
-"""Records of the needle and its solve, and their form as plain tuples, which kernels return."""
+"""Records of the needle and its solve, and their places in the arrays of kernels.
+
+In kernels, every number of a record is a number or the lanes of several needles (`lanes`); the numbers of iterations
+and of nodes, and truth values, are floats.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,10 +12,8 @@ from numpy.typing import NDArray
 from flexneedle.mechanics.compile import inner
 from flexneedle.mechanics.lateral import Lateral
 
+Floats = NDArray[np.float64]
 Laterals = NDArray[Any]
-Work = NDArray[Any]
-
-Plain = tuple[Any, ...]
 
 
 class NodePose(NamedTuple):
@@ -64,7 +66,6 @@ class Iterate(NamedTuple):
     spring: Lateral  # compression of the tip spring
     shortening: float  # shortening (mm)
     guide: Bearing  # the needle in its guide
-    behind: int  # number of nodes behind the tip
 
 
 class Loads(NamedTuple):
@@ -82,9 +83,10 @@ class Equilibrium(NamedTuple):
     tip: NodePose
     last: Iterate
     loads: Loads
-    iterations: int
+    behind: float  # number of nodes behind the tip
+    iterations: float
     residual: float
-    converged: bool
+    converged: float  # 1 or 0
 
 
 class NeedleState(NamedTuple):
@@ -103,70 +105,121 @@ class Path(NamedTuple):
     y: Lateral
 
 
-@inner
-def to_plain(needle: NeedleState) -> Plain:
-    """Return a needle as tuples without names, for `from_plain`.
-
-    Kernels return these. Compiled code that makes a named tuple for Python calls Python: if a signal's handler raises
-    there, as Ctrl-C does, the process crashes.
-    """
-    boundary, cut, solution = needle.boundary, needle.cut, needle.solution
-    base, begun, tip, last, loads = boundary.base, cut.tip, solution.tip, solution.last, solution.loads
-    guide, channel = last.guide, needle.channel
-    return (
-        (base.x, base.y, base.slope),
-        (boundary.guide, boundary.bevel, boundary.load),
-        (begun.x, begun.y, begun.slope),
-        (cut.channel.front, cut.channel.rest, cut.spin),
-        (channel.front, channel.rest),
-        (tip.x, tip.y, tip.slope),
-        (last.spring, last.shortening, last.behind),
-        (guide.wall, guide.give, guide.y, guide.force),
-        (loads.tip, loads.reaction, loads.shear, loads.moment),
-        (solution.iterations, solution.residual, solution.converged),
-    )
-
-
-def from_plain(plain: Plain) -> NeedleState:
-    """Return the needle of `to_plain`."""
-    base, imposed, begun, cut, channel, tip, last, guide, loads, found = plain
-    (front, rest, spin), (spring, shortening, behind) = cut, last
-    return NeedleState(
-        Boundary(NodePose(*base), *imposed),
-        Cut(NodePose(*begun), CutChannel(front, rest), spin),
-        CutChannel(*channel),
-        Equilibrium(
-            NodePose(*tip), Iterate(spring, shortening, Bearing(*guide), behind), Loads(*loads), *found
-        ),
-    )
-
-
 def start(base: NodePose, tip: NodePose, bevel: Lateral, guide: Lateral) -> NeedleState:
     """Return the straight needle in air, before a solve, with the guide on it."""
     none = 0.0 * bevel
     channel = CutChannel(0.0, none)
     solution = Equilibrium(
         tip,
-        Iterate(none, 0.0, Bearing(none, 0.0, none, none), 0),
+        Iterate(none, 0.0, Bearing(none, 0.0, none, none)),
         Loads(none, none, none, none),
-        0,
-        0.0,
-        True,
+        behind=0.0,
+        iterations=0.0,
+        residual=0.0,
+        converged=1.0,
     )
     return NeedleState(Boundary(base, guide, bevel, none), Cut(tip, channel, 0.0), channel, solution)
 
 
-def work_array(rest: Laterals) -> Work:
-    """Return the solver's array (n,) for rest positions (n,): by node, left of it (a, g, B), of it, and the solution.
+# ---- a needle as a row of numbers: its reals, then its laterals with one number an axis
 
-    a1, g1, b11, b12 are taken before an essential node, all else after.
-    """
-    real, across = np.dtype(np.float64), rest.dtype
-    reals = [
-        (name, real)
-        for name in ("g1", "g2", "b11", "b12", "b22", "stiffness", "share", "sharpness", "turning")
-    ]
-    laterals = [
-        (name, across) for name in ("a1", "a2", "fixed", "force", "new_u", "y", "slope", "shear", "moment")
-    ]
-    return np.zeros(rest.size, np.dtype([*reals, *laterals]))
+REALS, LATERALS = 12, 19
+BEHIND = 8
+"""Place of the number of nodes behind the tip."""
+
+
+@inner
+def apart(needle: NeedleState) -> tuple[tuple[float, ...], tuple[Lateral, ...]]:
+    """Return the reals and the laterals of a needle."""
+    boundary, cut, channel, solution = needle.boundary, needle.cut, needle.channel, needle.solution
+    base, begun, tip, last, loads = boundary.base, cut.tip, solution.tip, solution.last, solution.loads
+    guide = last.guide
+    reals = (
+        base.x,
+        begun.x,
+        cut.channel.front,
+        cut.spin,
+        channel.front,
+        tip.x,
+        last.shortening,
+        guide.give,
+        solution.behind,
+        solution.iterations,
+        solution.residual,
+        solution.converged,
+    )
+    laterals = (
+        base.y,
+        base.slope,
+        boundary.guide,
+        boundary.bevel,
+        boundary.load,
+        begun.y,
+        begun.slope,
+        cut.channel.rest,
+        channel.rest,
+        tip.y,
+        tip.slope,
+        last.spring,
+        guide.wall,
+        guide.y,
+        guide.force,
+        loads.tip,
+        loads.reaction,
+        loads.shear,
+        loads.moment,
+    )
+    return reals, laterals
+
+
+@inner
+def together(reals: tuple[float, ...], laterals: tuple[Lateral, ...]) -> NeedleState:
+    """Return the needle of these reals and laterals."""
+    base_x, begun_x, cut_front, spin, front, tip_x, shortening, give, behind, iterations, residual, good = (
+        reals
+    )
+    base_y, base_slope, guide, bevel, load, begun_y, begun_slope, cut_rest, rest = laterals[:9]
+    tip_y, tip_slope, spring, wall, guide_y, guide_force, force, reaction, shear, moment = laterals[9:]
+    return NeedleState(
+        Boundary(NodePose(base_x, base_y, base_slope), guide, bevel, load),
+        Cut(NodePose(begun_x, begun_y, begun_slope), CutChannel(cut_front, cut_rest), spin),
+        CutChannel(front, rest),
+        Equilibrium(
+            NodePose(tip_x, tip_y, tip_slope),
+            Iterate(spring, shortening, Bearing(wall, give, guide_y, guide_force)),
+            Loads(force, reaction, shear, moment),
+            behind,
+            iterations,
+            residual,
+            good,
+        ),
+    )
+
+
+def row_size(axes: int) -> int:
+    """Return the number of numbers of a needle."""
+    return REALS + axes * LATERALS
+
+
+def to_row(needle: NeedleState, axes: int) -> Floats:
+    """Return the numbers (REALS + axes LATERALS,) of a needle."""
+    reals, laterals = apart.py_func(needle)  # type: ignore[attr-defined]
+    return np.concatenate([np.array(reals, dtype=float), to_parts(np.array(laterals), axes).ravel()])
+
+
+def from_row(row: Floats) -> NeedleState:
+    """Return the needle of `to_row`."""
+    laterals = from_parts(row[REALS:].reshape(LATERALS, -1))
+    needle: NeedleState = together.py_func(row[:REALS].tolist(), laterals.tolist())  # type: ignore[attr-defined]
+    return needle
+
+
+def to_parts(laterals: Laterals, axes: int) -> Floats:
+    """Return the parts (…, axes) of laterals (…)."""
+    return np.stack([laterals.real, laterals.imag][:axes], axis=-1)
+
+
+def from_parts(parts: Floats) -> Laterals:
+    """Return the laterals (…) of parts (…, axes): real in the plane, complex in space."""
+    laterals: Laterals = parts[..., 0] if parts.shape[-1] == 1 else parts[..., 0] + 1j * parts[..., 1]
+    return laterals

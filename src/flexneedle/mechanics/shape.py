@@ -10,6 +10,7 @@ from flexneedle.mechanics.lateral import Lateral, dot, square, times
 
 Floats = NDArray[np.float64]
 Laterals = NDArray[Any]
+Whole = NDArray[np.int64]
 
 _NEWTON = 4  # iterations; the integrand of the arc length is within a percent or so of 1
 
@@ -56,7 +57,8 @@ def sample(x: Floats, y: Laterals, slope: Laterals, count: int, out: Floats) -> 
     for k in range(count - 1):
         if x[k + 1] > x[k]:
             total += _arc(*_cubic(x, y, slope, k), 1.0)
-    n, k, before = out.shape[0], 0, 0.0
+    n, before = out.shape[0], 0.0
+    k = 0 * n
     for i in range(1, n - 1):
         goal = total * i / (n - 1)
         while k < count - 2:
@@ -77,6 +79,10 @@ def sample(x: Floats, y: Laterals, slope: Laterals, count: int, out: Floats) -> 
 
 
 @kernel
-def equal_arc_nodes(x: Floats, y: Laterals, slope: Laterals, out: Floats) -> None:
-    """Fill poses (n, 5) at equal arc lengths ∫(1 + ½|y'|²) dx of the Hermite cubics through x, y, slope (k,)."""
-    sample(x, y, slope, x.size, out)
+def equal_arc_nodes(x: Floats, y: Laterals, slope: Laterals, count: Whole, out: Floats) -> None:
+    """Fill poses (N, n, 5) at equal arc lengths ∫(1 + ½|y'|²) dx of the Hermite cubics through x, y, slope (N, k).
+
+    The curve of each begins at its first `count` (N,) points.
+    """
+    for j in range(x.shape[0]):
+        sample(x[j], y[j], slope[j], count[j], out[j])

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from flexneedle.mechanics.compile import inner
-from flexneedle.mechanics.law import response, stored_energy
+from flexneedle.mechanics.law import CELLS, PER_UNIT, response, stored_energy
 from flexneedle.phantom.rod import Records, Rod, State
 from flexneedle.phantom.space import (
     Floats,
@@ -57,9 +57,11 @@ class Before(NamedTuple):
 @inner
 def _law(table: Floats, height: float, stiffness: float, u: float) -> tuple[float, float, float, float]:
     """Return W′/u (N/mm), W″ (N/mm), W (mJ) and stretch of tissue displaced by u ≥ 0 (mm)."""
-    e = u / height
-    law = response(table, e)
-    stored = stiffness * height * height * stored_energy(table, e)
+    e, per_unit = u / height, table[CELLS, PER_UNIT]
+    place = e * per_unit
+    law = response(table, 0.0, place)
+    width = height / per_unit
+    stored = stiffness * width * width * stored_energy(table, 0.0, place)
     return stiffness * law.secant, stiffness * law.tangent, stored, 1.0 - e
 
 

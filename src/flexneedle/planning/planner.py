@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flexneedle.arguments import check_point, check_whole
-from flexneedle.costs.weighted_sum import RolloutFunction, Trajectories
+from flexneedle.costs.weighted_sum import RolloutFunction, Term, Trajectories, outputs_of
 from flexneedle.errors import InputError
 from flexneedle.planning import STRATEGIES
 from flexneedle.planning.cross_entropy import Search, elite_count
@@ -173,7 +173,7 @@ def _carry_out(
         iterations=solution.search_state.iterations,
         converged=solution.search_state.converged,
         history=solution.search_state.history,
-        limit=find_limit(simulator.scenario, problem, _make_rollout(simulator), rows, states),
+        limit=find_limit(simulator.scenario, problem, _make_rollout(simulator, ()), rows, states),
         scenario=simulator.scenario,
     )
 
@@ -192,7 +192,7 @@ def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) ->
     """Return the least and greatest y (mm) at a depth (mm) that the bevel alone reaches, at the axis's z."""
     simulator, axis = Simulator(scenario, threads), scenario.entry.lateral(depth)
     problem = make_problem(scenario, (depth, axis.real, axis.imag), "steering")
-    least, greatest = reach(_make_rollout(simulator), problem)
+    least, greatest = reach(_make_rollout(simulator, ()), problem)
     return axis.real + least, axis.real + greatest
 
 
@@ -204,7 +204,7 @@ def _search(
     most_rolls: int = MOST_ROLLS,
 ) -> Solution:
     """Return the best primitives, or the best rolls where only the bevel is free."""
-    plan, rollout = simulator.scenario.plan, _make_rollout(simulator)
+    plan, rollout = simulator.scenario.plan, _make_rollout(simulator, problem.terms)
     if problem.bevel_alone:
         share = 1 if problem.entry_coordinates or problem.narrow else _SHARE_OF_A_SEARCH
         search = _search_settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
@@ -212,13 +212,15 @@ def _search(
     return search_primitives(rollout, problem, _search_settings(plan, plan.samples), rng, progress)
 
 
-def _make_rollout(simulator: Simulator) -> RolloutFunction:
-    start, free = simulator.start(), simulator.scenario.entry.free
+def _make_rollout(simulator: Simulator, terms: Sequence[Term]) -> RolloutFunction:
+    start, free, wanted = simulator.start(), simulator.scenario.entry.free, outputs_of(terms)
 
     def rollout(controls: Floats) -> Trajectories:
         # Base and guide are mounted at a free entry by the first control, which no limit applies to.
         axes = mounted_axes(simulator.scenario, controls[:, 0]) if free else None
-        return simulator.rollout(start, controls, deflection=True, limits=not free, axes=axes)
+        return simulator.rollout(
+            start, controls, outputs=wanted.outputs, at_end=wanted.at_end, limits=not free, axes=axes
+        )
 
     return rollout
 

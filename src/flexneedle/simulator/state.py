@@ -9,13 +9,15 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.lateral import lateral
-from flexneedle.mechanics.model import CONTACT, ESSENTIAL, Model
+from flexneedle.mechanics.model import Model
 from flexneedle.mechanics.needle import Laterals
-from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
+from flexneedle.mechanics.rollout import Outputs
+from flexneedle.mechanics.shape import beam_energy
+from flexneedle.mechanics.work import CONTACT, ESSENTIAL
 from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.batch import sample_shapes
 from flexneedle.types import THETA, Floats, Lateral
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
@@ -57,31 +59,45 @@ class State:
     Attributes:
         scenario: Scenario of the simulator.
         model: Constants of the simulator.
-        needle: The needle and the channel, input of the next step.
         clamp: Part of the base pose that no command moved.
-        rest: Rest positions (k,) of the contacts, input of the next step.
-        compression: Compressions (k,) of the contacts, input of the next step.
-        mesh: Solution (j,) at the nodes behind the tip, including measured points: x; y, slope, shear, moment and force
-            on the needle; stored energy, the same times w_c.
-        spring_energy: Energy of the tip spring.
         roll: The needle's angle about its axis, with whole turns; 0 bends the path towards +y, π/2 towards +z.
+        solved: The needle after its last solve.
     """
 
     scenario: Scenario
     model: Model
-    needle: nd.NeedleState
     clamp: nd.NodePose
-    rest: Laterals
-    compression: Laterals
-    mesh: NDArray[Any]
-    spring_energy: float
     roll: float
+    solved: "Solved"
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Take the values of a copy or a pickle; for arrays that can be written to, kernels would be compiled again."""
-        self.__dict__.update(
-            {name: _freeze(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
-        )
+        """Take the values of a copy or a pickle, read-only."""
+        self.__dict__.update(_frozen(values))
+
+    @cached_property
+    def needle(self) -> nd.NeedleState:
+        """The needle and the channel."""
+        return nd.from_row(self.solved.row)
+
+    @cached_property
+    def rest(self) -> Laterals:
+        """Rest positions (k,) of the contacts."""
+        return _freeze(nd.from_parts(self.solved.rest))
+
+    @cached_property
+    def compression(self) -> Laterals:
+        """Compressions (k,) of the contacts."""
+        return _freeze(nd.from_parts(self.solved.compression))
+
+    @property
+    def mesh(self) -> NDArray[Any]:
+        """Solution (j,) at the nodes behind the tip."""
+        return self.solved.mesh
+
+    @property
+    def spring_energy(self) -> float:
+        """Energy of the tip spring."""
+        return self.solved.spring_energy
 
     @property
     def tip(self) -> Floats:
@@ -120,12 +136,12 @@ class State:
     @property
     def converged(self) -> bool:
         """Whether the last solve reached its tolerance."""
-        return self.needle.solution.converged
+        return self.needle.solution.converged > 0.0
 
     @property
     def iterations(self) -> int:
         """Newton iterations of the last solve."""
-        return self.needle.solution.iterations
+        return int(self.needle.solution.iterations)
 
     @property
     def residual(self) -> float:
@@ -135,9 +151,10 @@ class State:
     @cached_property
     def nodes(self) -> Floats:
         """Needle state X: poses (n, 5) at n equal arc lengths from base to tip: x, y, z, θ, ψ."""
-        nodes = np.empty((self.scenario.needle.nodes, insertion.POSE_SIZE))
-        equal_arc_nodes(*self._curve(), nodes)
-        return _freeze(nodes)
+        x, y, slope = self._curve()
+        across = self.solved.rest.shape[1]
+        curve = np.concatenate([x[:, None], nd.to_parts(y, across), nd.to_parts(slope, across)], axis=1)
+        return _freeze(sample_shapes(curve, self.scenario.needle.nodes))
 
     @cached_property
     def contacts(self) -> Contacts:
@@ -204,7 +221,7 @@ class State:
         )
         load = across(boundary.load, tip_load)
         needle = self.needle._replace(boundary=boundary._replace(base=pose, load=load))
-        return replace(self, needle=needle, clamp=moved)
+        return replace(self, solved=self.solved.with_needle(needle), clamp=moved)
 
     def discount_advance(self, extra: float) -> "State":
         """Return the state with this part (mm) of the base's advance counted as an error, which is no travel."""
@@ -220,8 +237,9 @@ class State:
         return first, second, third
 
     def _bytes(self) -> tuple[bytes, ...]:
-        numbers = np.array([*_flatten(self.needle), *self.clamp, self.spring_energy, self.roll])
-        return tuple(array.tobytes() for array in (numbers, self.rest, self.compression, self.mesh))
+        clamp, solved = np.array([*self.clamp, self.roll]), self.solved
+        arrays = clamp, solved.row, solved.rest, solved.compression, solved.solution, solved.stored
+        return tuple(array.tobytes() for array in arrays)
 
     def __eq__(self, other: object) -> bool:
         """Return whether scenario and arrays are the same, to the bit: 0 is not −0, and NaN equals the same NaN."""
@@ -263,40 +281,75 @@ def _row(pose: nd.NodePose) -> Floats:
     return np.array([pose.x, y, z, theta, psi])
 
 
-def _flatten(record: tuple[Any, ...]) -> list[Any]:
-    """Return all numbers of nested records."""
-    return [number for part in record for number in (_flatten(part) if isinstance(part, tuple) else [part])]
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A needle after a solve, as arrays of numbers of kernels; the first three are the input of the next step.
 
-
-def freeze_solve(
-    start: State, model: Model, needle: nd.NeedleState, rest: Laterals, u: Laterals, w: nd.Work
-) -> State:
-    """Return the state after a solve of `model`, frozen, for `start`'s scenario.
-
-    `model` may have more essential nodes than the scenario's.
+    row: numbers of the needle (`to_row`). rest, compression (k, axes): of the contacts, mm. x, weight (j,): of the
+    nodes behind the tip, including measured points. solution (j, 5, axes): y, slope, shear, moment, and force on the
+    needle there. stored (j + 1,): energies of the nodes, and of the tip spring (mJ).
     """
-    count = needle.solution.last.behind
-    stored = np.zeros(count)
-    spring = insertion.energies(model, needle, u, stored)
-    across, nodes = rest.dtype, model.nodes[:count]
-    names = [
-        ("x", stored.dtype),
-        *((name, across) for name in _ACROSS),
-        *((name, stored.dtype) for name in _ENERGIES),
-    ]
-    mesh = np.zeros(count, names)
-    for name in _ACROSS:
-        mesh[name] = w[name][:count]
-    mesh["x"], mesh["energy"], mesh["weighted"] = nodes["x"], stored, nodes["weight"] * stored
-    own = np.flatnonzero(model.nodes["kind"] != ESSENTIAL)
-    return replace(
-        start,
-        needle=needle,
-        rest=_freeze(rest[own]),
-        compression=_freeze(u[own]),
-        mesh=_freeze(mesh),
-        spring_energy=spring,
-    )
+
+    row: Floats
+    rest: Floats
+    compression: Floats
+    x: Floats
+    weight: Floats
+    solution: Floats
+    stored: Floats
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Take the values of a copy or a pickle, read-only."""
+        self.__dict__.update(_frozen(values))
+
+    @staticmethod
+    def of(model: Model, out: Outputs, number: int) -> "Solved":
+        """Return a needle from the outputs of a rollout of `model`, which may have measured points."""
+        ends, nodes = out.ends, model.nodes
+        row = ends.needles[number]
+        behind = int(row[nd.BEHIND])
+        own = nodes["kind"] != ESSENTIAL
+        stored = np.append(out.stored[number, :behind], out.stored[number, -1])
+        rest, compression = ends.rest[number, : nodes.size][own], ends.compression[number, : nodes.size][own]
+        solution = out.solution[number, :behind]
+        arrays = row, rest, compression, nodes["x"][:behind], nodes["weight"][:behind], solution, stored
+        return Solved(*(_freeze(array.copy()) for array in arrays))
+
+    @staticmethod
+    def unsolved(needle: nd.NeedleState, nodes: int, axes: int) -> "Solved":
+        """Return a needle before its first solve."""
+        none = np.zeros((nodes, axes))
+        return Solved(
+            nd.to_row(needle, axes), none, none, none[:0, 0], none[:0, 0], np.zeros((0, 5, axes)), np.zeros(1)
+        )
+
+    def with_needle(self, needle: nd.NeedleState) -> "Solved":
+        """Return the same with other numbers of the needle, for the next solve."""
+        return replace(self, row=_freeze(nd.to_row(needle, self.rest.shape[1])))
+
+    @cached_property
+    def mesh(self) -> NDArray[Any]:
+        """Solution (j,) at the nodes behind the tip by name: x; y, slope, shear, moment, force; energy, weighted."""
+        across = nd.from_parts(self.solution)
+        real = self.x.dtype
+        mesh = np.zeros(
+            self.x.size,
+            [("x", real), *((n, across.dtype) for n in _ACROSS), *((n, real) for n in _ENERGIES)],
+        )
+        mesh["x"], mesh["energy"] = self.x, self.stored[:-1]
+        mesh["weighted"] = self.weight * self.stored[:-1]
+        for k, name in enumerate(_ACROSS):
+            mesh[name] = across[:, k]
+        return _freeze(mesh)
+
+    @property
+    def spring_energy(self) -> float:
+        """Energy of the tip spring (mJ)."""
+        return float(self.stored[-1])
+
+
+def _frozen(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: _freeze(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
 
 def _freeze(array: _Array) -> _Array:

@@ -22,7 +22,7 @@ from flexneedle.control.limits import guide_may_move
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
-from flexneedle.costs.weighted_sum import Term, Trajectories
+from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.lateral import bevel_directions
@@ -168,7 +168,8 @@ def search_path(
     elite = elite_count(samples, _ELITE_FRACTION)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
     charged = cost_terms(task, fitted, memory, ahead)
-    return find_best(variables, partial(rollout_as_measured, fitted), charged, search, rng, first=first)
+    rollout = partial(rollout_as_measured, fitted, wanted=outputs_of(charged))
+    return find_best(variables, rollout, charged, search, rng, first=first)
 
 
 def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
@@ -179,9 +180,11 @@ def _aim_of_rolls(task: Task, fitted: Identified, ahead: Ahead) -> complex:
     return complex(-past_target(along, task.plan.target)[0])
 
 
-def rollout_as_measured(fitted: Identified, controls: Floats) -> Trajectories:
+def rollout_as_measured(fitted: Identified, controls: Floats, wanted: Wanted = TIPS_ONLY) -> Trajectories:
     """Return trajectories of controls (N, m, 9) on the fitted model, with tips as a perfect tracker measures them."""
-    predicted = fitted.simulator.rollout(fitted.state, controls, limits=False, rough=True)
+    predicted = fitted.simulator.rollout(
+        fitted.state, controls, outputs=wanted.outputs, at_end=wanted.at_end, limits=False, rough=True
+    )
     off = fitted.run_out * bevel_directions(fitted.state.bevel, controls, fitted.axes) + fitted.residual
     predicted.tips[:, :, Y] += off.real
     predicted.tips[:, :, Z] += off.imag
@@ -278,7 +281,7 @@ def _forecast(
     past = complex(past_target(found.trajectories, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
     both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.lean_guide(found.z)[None])[0]])
-    shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, shapes=True).shapes
+    shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, at_end=("shapes",)).shapes
     nodes, leaning = shapes[:, -1]
     before = memory.outlook or Outlook.of(fitted)
     outlook = before.renew(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)

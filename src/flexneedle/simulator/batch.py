@@ -1,0 +1,135 @@
+"""Rollouts of many needles at once: memory, threads, and outputs by name."""
+
+import os
+import threading
+from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.mechanics import rollout as kernel
+from flexneedle.mechanics.lanes import WIDTH
+from flexneedle.mechanics.needle import row_size
+from flexneedle.mechanics.rollout import LOADS, POSE_SIZE, SOLUTION, Models, Outputs, Starts
+from flexneedle.mechanics.shape import equal_arc_nodes
+from flexneedle.mechanics.work import Workspace, workspace
+from flexneedle.types import Floats
+
+Whole = NDArray[np.int64]
+
+COLUMNS = ("energy", "stretch", "deflection", "loads", "strain", "shapes")
+"""Names of the outputs of a rollout besides tips and convergence."""
+_STEPS_WORTH_A_THREAD = 1000
+_CHUNKS_A_THREAD = 16
+_memory = threading.local()  # scratch memory of each thread: to take new memory costs as much as some steps
+
+
+def run(
+    models: Models,
+    model_of: Whole,
+    starts: Starts,
+    state_of: Whole,
+    commands: Floats,
+    axes: Floats,
+    threads: int,
+    *,
+    every_step: Collection[str] = (),
+    at_end: Collection[str] = (),
+    ends: bool = False,
+    held: Floats | None = None,
+) -> Outputs:
+    """Return the outputs of N sequences of commands (N, m, 9); their arrays have rows for needles that fill a group.
+
+    model_of, state_of (N,): places of the constants and the start of each sequence. axes (N, 2, axes): lines from which
+    deflections count. every_step, at_end: names of `COLUMNS`, of each step or of the last alone. ends: whether the
+    states at the end are wanted. held (N, axes): tip positions without commands, m = 0.
+    """
+    count, steps = commands.shape[:2]
+    size = -(-count // WIDTH) * WIDTH
+    n, across = models.nodes.shape[1], models.curvature.shape[1]
+    kept = dict.fromkeys(every_step, steps) | {
+        name: min(1, steps) for name in at_end if name not in every_step
+    }
+
+    def column(name: str, *shape: int) -> Floats:
+        wanted = kept.get(name, 0)
+        return np.empty((size, wanted, *shape)) if wanted else np.empty((0, 0, *(0 for _ in shape)))
+
+    out = Outputs(
+        np.empty((size, steps, POSE_SIZE)),
+        np.empty((size, steps)),
+        column("energy"),
+        column("stretch"),
+        column("deflection"),
+        column("loads", LOADS),
+        column("strain"),
+        column("shapes", n + 2, 1 + 2 * across),
+        _no_starts()
+        if not ends
+        else Starts(
+            np.empty((size, row_size(across))), np.empty((size, n, across)), np.empty((size, n, across))
+        ),
+        np.empty((size, n, len(SOLUTION), across) if ends else (0, 0, 0, 0)),
+        np.empty((size, n + 1) if ends else (0, 0)),
+    )
+    sequence = np.minimum(np.arange(size), count - 1)
+    who = model_of[sequence], state_of[sequence], sequence
+    tips = np.full((count, across), np.nan) if held is None else held
+
+    def part(first: int, last: int) -> None:
+        space = _workspace(n, models.layers.shape[1], across)
+        kernel.rollout(space, models, starts, *who, commands, tips, axes, first, last, out)
+
+    threads = min(threads, count * steps // _STEPS_WORTH_A_THREAD, size // WIDTH)
+    if threads <= 1:
+        part(0, size)
+    else:
+        edges = np.unique(np.linspace(0, size // WIDTH, threads * _CHUNKS_A_THREAD + 1).astype(int)) * WIDTH
+        chunks = iter([*zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)])
+
+        def work() -> None:
+            for chunk in chunks:
+                part(*chunk)
+
+        # This thread works too: where all are woken at once, two may begin on one core.
+        others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+        work()
+        for other in others:
+            other.result()
+    return out
+
+
+def sample_shapes(curves: Floats, nodes: int) -> Floats:
+    """Return poses (…, nodes, 5) at equal arc lengths of curves (…, k, 1 + 2 axes) of a rollout."""
+    rows = curves.reshape(-1, *curves.shape[-2:])
+    across = curves.shape[-1] // 2
+    x = rows[:, :, 0].copy()
+    y, slope = (
+        rows[:, :, k : k + across].copy().view(float if across == 1 else complex)[..., 0]
+        for k in (1, 1 + across)
+    )
+    out = np.empty((len(rows), nodes, POSE_SIZE))
+    equal_arc_nodes(x, y, slope, 1 + np.argmax(x >= x[:, -1:], axis=1), out)
+    return out.reshape(*curves.shape[:-2], nodes, POSE_SIZE)
+
+
+def _no_starts() -> Starts:
+    return Starts(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
+
+
+def _workspace(nodes: int, layers: int, axes: int) -> Workspace:
+    key = nodes, layers, axes
+    if getattr(_memory, "key", None) != key:
+        _memory.key, _memory.space = key, workspace(*key)
+    space: Workspace = _memory.space
+    return space
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="rollout")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a child
