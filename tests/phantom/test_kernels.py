@@ -16,13 +16,13 @@ import sys
 
 import flexneedle
 from flexneedle.control.controllers import CONTROLLERS
-from flexneedle.mechanics import insertion, shape
+from flexneedle.mechanics import rollout, shape
 from flexneedle.phantom import equilibrium, rod, space
 from flexneedle.phantom.plants import PLANTS
 from flexneedle.phantom.kernels import compile_kernels, find_uncompiled
 
 def signatures():
-    parts = {"insertion": insertion, "shape": shape, "equilibrium": equilibrium, "rod": rod, "space": space}
+    parts = {"rollout": rollout, "shape": shape, "equilibrium": equilibrium, "rod": rod, "space": space}
     found = {f"{part}.{name}": value for part, module in parts.items() for name, value in vars(module).items()}
     return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
 
@@ -30,8 +30,7 @@ preset, axes = sys.argv[1], int(sys.argv[2])
 compile_kernels(axes)
 before = signatures()
 assert not find_uncompiled(axes)
-entries = "insertion.settle", "insertion.rollout", "insertion.energies", "shape.equal_arc_nodes"
-entries += "equilibrium.step", "rod._frames", "rod.tip_angles"
+entries = "rollout.rollout", "shape.equal_arc_nodes", "equilibrium.step", "rod._frames", "rod.tip_angles"
 assert all(before[name] == 1 for name in entries), before
 quick = {"samples": 16, "iterations": 2}
 scenario = flexneedle.load_scenario(preset).with_values({
