@@ -59,13 +59,13 @@ def painted(page):
 
 
 def arrived(page):
-    """Wait until everything that the server has sent is received and painted: an answer comes after it."""
+    """Wait until all news from the server is received and painted: an answer follows it."""
     page.evaluate("flexneedle.link.ask({ type: 'ping' })")
     painted(page)
 
 
 def added(page, server, tone, *news, canvases=FLAT):
-    """Number of pixels in each canvas that news from the server blend with a tone."""
+    """Return the number of pixels in each canvas that news from the server blends with a tone."""
     page.evaluate(_KEEP, list(canvases))
     server.send(*news)
     arrived(page)
@@ -78,7 +78,7 @@ _ALL_PANELS = """flexneedle.store.get('connection') === 'open' &&
 
 
 def loaded(page):
-    """Wait until a page has all its panels, and what the server has sent until now is received and painted."""
+    """Wait until a page has all its panels, and has received and painted all news from the server."""
     page.wait_for_selector("[data-panel=status] .connection")
     until(page, _ALL_PANELS)
     arrived(page)

@@ -39,7 +39,7 @@ class _Place:
 
     @property
     def is_folder(self) -> bool:
-        """Whether it is a package without `__init__.py`."""
+        """Whether the module is a package without `__init__.py`."""
         return self.spec.origin is None and bool(self.folders)
 
     @property

@@ -18,7 +18,7 @@ LATERAL = (40.0, 5.0)
 DAILY = ((25.0, -5.0), LATERAL)
 HELD = {"setup.max_guide_travel_mm": 0.05, "target.lateral_mm": 0.0, "plan.flip_weight": 1e5}
 CARELESS = {"plan.accuracy_weight_per_mm": 0.0}
-# Where the quality of the plan doesn't matter.
+# For tests in which the quality of the plan doesn't matter.
 COARSE = {"plan.samples": 32, "plan.iterations": 4, "plan.max_iterations": 4}
 
 

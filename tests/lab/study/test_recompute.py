@@ -267,7 +267,7 @@ def test_what_differs_from_the_recorded_row_is_noted(copied, changed, recorded, 
 
 
 def test_an_error_of_the_progress_ends_it(uninterrupted):
-    """This cancels it."""
+    """An exception of the callback cancels the computation."""
 
     class CancelledError(Exception):
         pass

@@ -24,7 +24,7 @@ export function mount(element, store, link) {
   });
 }
 
-// Whether a key redoes (true) or undoes (false) a change; null: neither, or what is typed in a field is meant.
+// Return whether a key redoes (true) or undoes (false) a change; null: neither, or the key is typed in a field.
 function stepOf({ key, ctrlKey, metaKey, altKey, shiftKey, target }) {
   if (key.toLowerCase() !== "z" || !(ctrlKey || metaKey) || altKey || target.closest?.(TYPED)) return null;
   return shiftKey;

@@ -94,7 +94,7 @@ class SectionView {
   #handlesOf({ map, plane, layers, guide, target, height }) {
     const edit = (values) => this.#link.edit(values);
     const u = lateral(plane, ...target);
-    // What a handle moves is read when it is moved: keys may be faster than the drawing.
+    // Target and scene are read when a handle moves: keys may be faster than the drawing.
     const [targetNow, sceneNow] = [() => shownTarget(this.#store), () => shownScene(this.#store)];
     const move = (x, to) => edit(targetEdit(this.#store, lifted(plane, x, to, targetNow())));
     const handles = [{

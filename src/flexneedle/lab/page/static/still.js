@@ -27,7 +27,7 @@ export function stillNote(store) {
   return note;
 }
 
-// Where the needle of a rig is drawn if it may be elsewhere now; "" if it is there.
+// Return a note that the needle of a rig may be elsewhere than drawn; "" if it is there.
 function whereNotNow(store) {
   const live = store.get("insertion live");
   if (live?.moved) return MOVED;

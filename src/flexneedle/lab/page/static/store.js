@@ -1,7 +1,7 @@
 // State of the page by key. A message of the server is the state of its key (as `ServerMessage.key` in protocol.py):
 //   "session", "scene", "clients", "job plan", "iteration steering", "plan manipulation", "insertion live", …
 //   "rows live" | "rows first" | "rows second": all rows, by index
-//   "shape KIND SOURCE", such as "shape needle live": the newest frame; `track` has those of all periods
+//   "shape KIND SOURCE", such as "shape needle live": the newest frame; `track` has the frames of all periods
 // State of this browser alone has keys that begin with "view ", and "connection", "refusals", "draft".
 //
 // A subscriber is called once before the next paint, for any number of changed keys.

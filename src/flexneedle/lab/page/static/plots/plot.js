@@ -121,7 +121,7 @@ export function rangeOf(_chart, low, high) {
   return [low - around, high + around];
 }
 
-// Columns of two runs as those of one chart.
+// Columns of two runs, joined for one chart.
 function joined(one, two) {
   const modes = one.map(() => EXPAND);
   return uPlot.join([one, two], [modes, modes]);

@@ -231,7 +231,7 @@ export class Shapes {
 
 const translucent = (how) => new MeshBasicMaterial({ transparent: true, depthWrite: false, ...how });
 
-// Colour of the stretch scale at a share from 0 to 1, as three.js takes those of vertices: linear, not as on a screen.
+// Colour of the stretch scale at a share from 0 to 1, linear as three.js takes colours of vertices, not as on a screen.
 function rampAt(share) {
   const place = Math.min(Math.max(share, 0), 1) * (STRETCH.length - 1);
   const low = Math.min(Math.floor(place), STRETCH.length - 2);
