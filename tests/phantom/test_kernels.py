@@ -92,9 +92,15 @@ def test_sources_written_again_are_not_compiled(monkeypatch):
 
 @pytest.mark.usefixtures("cache")
 def test_a_plan_compiles_no_phantom(monkeypatch):
-    monkeypatch.setattr(kernels, "_compiling_exact_plant", None)
-    monkeypatch.setattr(plants, "PLANTS", None)
+    compiled = []
+    exact = "exact, in a second process"
+    monkeypatch.setattr(kernels, "_compiling_exact_plant", lambda: nullcontext(compiled.append(exact)))
+    monkeypatch.setattr(kernels, "compile_plant", lambda _scenario, kind: compiled.append(kind))
+    monkeypatch.setattr(plants, "PLANTS", ("exact", "model"))
     compile_kernels(1, phantoms=False)
+    assert compiled == []
+    compile_kernels(1)
+    assert compiled == [exact, "exact", "model"]
 
 
 @pytest.mark.usefixtures("_one_process")

@@ -38,7 +38,7 @@ def test_ndicapi_reads_poses_and_frame_numbers(device, command):
     read = [(frame(line, handle), transform(line, handle)) for handle in handles]
     ndicapy.ndiCommand(line, "TSTOP:")
     ndicapy.ndiClose(line)
-    for name, (number, values) in zip(SENSORS, read, strict=False):
+    for name, (number, values) in zip(SENSORS[:2], read, strict=True):
         true = sensor_pose(name, number, 0)
         np.testing.assert_allclose(values[4:7], true.position, atol=0.0051)
         np.testing.assert_allclose(values[:4], true.orientation, atol=5.1e-5)

@@ -121,9 +121,10 @@ def test_a_broken_worker_fails_its_jobs_and_the_server_continues(tmp_path, scrip
 
 
 def wait_for(condition):
-    """Wait for the server's thread, which has no event to wait for."""
+    """Wait for the server's thread, which has no event to wait for; fail at the deadline."""
     end = monotonic() + PATIENCE_S
-    while not condition() and monotonic() < end:
+    while not condition():
+        assert monotonic() < end, "the condition did not hold in time"
         Event().wait(0.01)
 
 

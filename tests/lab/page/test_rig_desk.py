@@ -125,6 +125,7 @@ def test_control_is_lost_just_after_the_insertion_has_continued(bench):
     bench.refuses_to_arm()
     bench.reports("holding", waits=2)
     bench.arm(JOB)
+    assert bench.shown == "armed"
 
 
 @pytest.mark.parametrize("state", ["stopped", "fault", "ended"])

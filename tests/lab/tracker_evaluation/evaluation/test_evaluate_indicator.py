@@ -71,6 +71,7 @@ def test_single_samples_of_shuffled_sensors_and_environments_are_not_mixed_up(tm
     rng.shuffle(rows)
     found = evaluate_table(write_csv(tmp_path / "t.csv", rows), EvaluationOptions()).values()["results"]
     starts = {("ref2", "noisy"): 1.0, ("ref2", "ideal"): 2.0, ("ref1", "noisy"): 3.0, ("ref1", "ideal"): 4.0}
+    assert len(found) == len(starts)
     for one in found:
         start, samples = starts[one["sensor"], one["environment"]], one["indicator"]["samples"]
         assert start <= samples["min"] < samples["p95"] < start + 0.5001

@@ -42,7 +42,9 @@ def with_references(tracker):
 
 
 def test_without_errors_a_reading_is_the_true_pose():
-    for frame in frames(5):
+    found = frames(5)
+    assert len(found) == 5
+    for frame in found:
         reading = frame.readings["tip"]
         assert reading.position == pytest.approx((10.0 + frame.time, 2.0, 0.5))
         assert reading.orientation == pytest.approx((np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
