@@ -1,9 +1,11 @@
-"""Checks of a page in a browser: pixels that a part adds to its drawings, and parts that are wider than their box."""
+"""Steps and checks of a page in a browser: buttons, pixels that a part adds to drawings, parts wider than their box."""
 
 from fake_page import until
 
 PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 FLAT = ("[data-panel=section] canvas", "[data-panel=axial] canvas")
+BAR = "[data-panel=actions]"
+FOCUSED = "document.activeElement.textContent"
 
 # Antialiased and translucent parts have few pixels of their very tone; all of theirs are between what was there and it.
 BLENDS = """
@@ -51,6 +53,11 @@ def show(page, panel):
     key = {"space": "view scene", "section": "view scene"}.get(panel, "view tab")
     page.evaluate("([key, panel]) => flexneedle.store.set(key, panel)", [key, panel])
     page.wait_for_selector(f"section.{panel}:not([hidden])", state="attached")
+
+
+def click_button(page, text, panel=BAR):
+    """Click a button of the action bar, or of another panel, by its whole name."""
+    page.locator(panel).get_by_role("button", name=text, exact=True).click()
 
 
 def painted(page):
