@@ -8,7 +8,7 @@ import numpy as np
 
 import flexneedle
 from flexneedle.control.controllers.adaptive_mpc import AdaptiveMpc
-from flexneedle.estimation.fit import differentiate
+from flexneedle.estimation.fit import differentiate, simulate_due
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import POSITION, SENSORS
@@ -152,7 +152,8 @@ def off_the_prior(needle="all"):
     estimate, _ = fitted(needle, 55)
     sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
     off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
-    off_prior = differentiate(estimate.simulate_with(estimate.parameters + off), range(sd.size))
+    off_prior = estimate.simulate_with(estimate.parameters + off)
+    off_prior = differentiate(off_prior, simulate_due(off_prior, off_prior.parameters, range(sd.size)))
     return off_prior, off_prior.readings[0]
 
 

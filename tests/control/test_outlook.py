@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle.control import outlook as ol
-from flexneedle.control.outlook import Outlook
+from flexneedle.control.outlook import Outlook, predict_ends
 from flexneedle.types import Control, X, Y
 from identified import AT, fitted
 
@@ -106,24 +106,21 @@ def test_it_is_never_below_the_unexplained_part_and_grows_with_a_miss_that_stays
 
 
 def ahead_of(estimate, steps=12):
-    """Controls (m, 9) with a roll on the way, the tips (m, 5) of the estimated needle as the tracker measures them, and
-    its shape (n, 5) at the end.
-    """
+    """Controls (m, 9) with a roll on the way, and the tips (m, 5) of the estimated needle."""
     rows = [Control(db_x=2.0, dg_y=0.05, flip=k == 5) for k in range(steps)]
     state, tips = estimate.state, []
     for row in rows:
         state = estimate.simulator.replay(state, [row])[0]
         tips.append(state.tip)
-        tips[-1][Y] += estimate.off_axis(state.bevel).real
-    return np.array(rows), np.array(tips), state.nodes
+    return np.array(rows), np.array(tips)
 
 
 def test_derivatives_just_perturbed_are_renewed_along_the_path_ahead():
     """Each is the difference of two needles moved on, one with another value; the other derivatives are kept."""
     estimate, _ = fitted("all", 50)
-    controls, tips, shape = ahead_of(estimate)
+    controls, tips = ahead_of(estimate)
     old = Outlook.of(estimate)
-    new = old.renew(estimate, controls, tips, shape)
+    new = old.renew(estimate, predict_ends(estimate, controls[None]))
     passed = (new.grid > tips[0, X]) & (new.grid < tips[-1, X])
     renewed = {one.parameter for one in estimate.perturbed} | {AT.run_out}
     for one in estimate.perturbed:
@@ -143,8 +140,8 @@ def test_derivatives_just_perturbed_are_renewed_along_the_path_ahead():
 
 def test_the_run_out_is_on_the_bevels_side():
     estimate, _ = fitted("run-out", 30)
-    controls, tips, shape = ahead_of(estimate)
-    curve = Outlook.of(estimate).renew(estimate, controls, tips, shape).curves[AT.run_out]
+    controls, tips = ahead_of(estimate)
+    curve = Outlook.of(estimate).renew(estimate, predict_ends(estimate, controls[None])).curves[AT.run_out]
     side = estimate.state.bevel.real
     assert np.interp(tips[3, X], estimate.grid, curve) == side
     assert np.interp(tips[9, X], estimate.grid, curve) == -side

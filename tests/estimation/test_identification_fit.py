@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.estimation import fit
 from flexneedle.estimation import identification as idn
-from flexneedle.estimation.fit import differentiate
+from flexneedle.estimation.fit import differentiate, simulate_due
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import ROLL, Control, Measurement, Motion, X, Y
@@ -34,7 +34,8 @@ def finely(estimate):
     """The estimate with all derivatives simulated now, on a grid so fine that interpolation loses nothing."""
     grid = np.arange(estimate.grid[0], estimate.grid[-1], 0.05)
     size = estimate.parameters.size
-    return differentiate(replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size))), range(size))
+    estimate = replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size)))
+    return differentiate(estimate, simulate_due(estimate, estimate.parameters, range(size)))
 
 
 def test_derivatives_agree_with_central_differences():
@@ -145,7 +146,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], fit.improve_fit, idn.Identified.simulate_each
+    costs, tried, improved, with_ = [], [], fit.improve_fit, idn.Identified.take
 
     def spied(estimate):
         tried.append(0)
@@ -154,13 +155,12 @@ def test_a_step_never_fits_worse(monkeypatch):
             costs.append((misfit(estimate, readings, estimate), misfit(fitted, readings, estimate)))
         return fitted
 
-    def counted(estimate, parameters):
-        for one in with_(estimate, parameters):
-            tried[-1] += 1
-            yield one
+    def counted(estimate, *which):
+        tried[-1] += 1
+        return with_(estimate, *which)
 
     monkeypatch.setattr(idn, "improve_fit", spied)
-    monkeypatch.setattr(idn.Identified, "simulate_each", counted)
+    monkeypatch.setattr(idn.Identified, "take", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
             Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1))),
@@ -206,15 +206,15 @@ def not_converged(estimate):
 def test_a_trial_step_that_fails_is_refused(monkeypatch, spoil, failing):
     """Shorter steps are tried; if all of them fail, the parameters stay."""
     estimate, readings = off_the_prior()
-    simulate, tried = idn.Identified.simulate_each, []
+    take, tried = idn.Identified.take, []
 
-    def simulate_each(self, parameters):
-        for other in simulate(self, parameters):
-            tried.append(other.parameters)
-            stays = np.array_equal(other.parameters, estimate.parameters)
-            yield spoil(other) if len(tried) <= failing and not stays else other
+    def take_spoilt(self, parameters, *which):
+        other = take(self, parameters, *which)
+        tried.append(parameters)
+        stays = np.array_equal(parameters, estimate.parameters)
+        return spoil(other) if len(tried) <= failing and not stays else other
 
-    monkeypatch.setattr(idn.Identified, "simulate_each", simulate_each)
+    monkeypatch.setattr(idn.Identified, "take", take_spoilt)
     fitted = fit.improve_fit(estimate)
     assert len(tried) >= 3
     assert fitted.state.converged

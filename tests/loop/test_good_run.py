@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
+import flexneedle
 from flexneedle.control.controllers import DEFAULT
 from flexneedle.loop import insertions
+from flexneedle.loop.events import PeriodEnded
 from flexneedle.loop.rig import Rig
 from flexneedle.loop.virtual import VirtualRig
 from flexneedle.phantom.plants import PLANTS
@@ -71,6 +74,24 @@ def test_the_record_ends_with_the_true_state(plan, real):
     assert done.reached
     assert done.periods[-1].estimate.x >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
     assert done.periods[-2].estimate.x < plan.target[0] - PHANTOM.control.depth_tolerance_mm
+
+
+def test_products_of_matrices_have_one_thread_during_an_insertion(plan):
+    """Its results would depend on their number; the caller's number is restored."""
+    counts = []
+
+    def count_threads(event):
+        if isinstance(event, PeriodEnded):
+            counts.append(number_of_threads())
+
+    def number_of_threads():
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        flexneedle.insert(PHANTOM, plan, controller="open-loop", listeners=[count_threads])
+        assert number_of_threads() == {2}
+    assert counts == [{1}] * len(counts)
+    assert len(counts) > 20
 
 
 @pytest.mark.long

@@ -103,7 +103,7 @@ def test_given_samples_form_the_first_iteration_and_are_kept_in_bounds():
     tape, first = Taped(), np.tile([[0.1], [0.2], [9.0], [0.3], [0.4]], (1, 4))
     search(tape, first=first)
     np.testing.assert_array_equal(tape.rows[0][:, 0], [0.1, 0.2, 1.0, 0.3, 0.4])
-    assert [len(rows) for rows in tape.rows] == [5, 16, 16, 1]
+    assert [len(rows) for rows in tape.rows] == [5, 16, 16]
 
 
 def test_where_every_sample_fails_the_cost_is_infinite_and_the_mean_is_kept():

@@ -13,7 +13,7 @@ from flexneedle.mechanics.model import Adaptation, pack
 from flexneedle.mechanics.rollout import Outputs
 from flexneedle.mechanics.work import workspace
 from flexneedle.simulator import batch
-from flexneedle.simulator.simulator import _drive, _lines, _starts
+from flexneedle.simulator.sequences import drive, lines, pack_states
 from flexneedle.simulator.state import Solved, State
 from flexneedle.types import Floats
 from reference.draws import draw_controls, draw_scenario, in_space
@@ -70,11 +70,11 @@ def run_together(insertions: Sequence[Insertion], threads: int = 1) -> list[dict
     """Return the bytes of all outputs of each insertion, and of its state at the end, from one rollout."""
     packed, own = pack([one.simulator.model for one in insertions]), np.arange(len(insertions))
     states = [one.state for one in insertions]
-    starts, lines = _starts(states, packed.nodes.shape[1]), _lines(states, len(states))
-    rows = _drive(states, np.stack([one.rows for one in insertions]))
+    starts, axes = pack_states(states, packed.nodes.shape[1]), lines(states, len(states))
+    rows = drive(states, np.stack([one.rows for one in insertions]))
     wanted = {"every_step": batch.COLUMNS, "ends": True}
     with mock.patch.object(batch, "_STEPS_WORTH_A_THREAD", 1):
-        out = batch.run(packed, own, starts, own, rows, lines, threads, **wanted)
+        out = batch.run(packed, own, starts, own, rows, axes, threads, **wanted)
     return [_bytes_of(out, k, one) for k, one in enumerate(insertions)]
 
 

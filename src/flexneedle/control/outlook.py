@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flexneedle.costs.weighted_sum import Trajectories
 from flexneedle.estimation.identification import Identified
 from flexneedle.estimation.lateral import bevel_directions, directions
 from flexneedle.types import Floats, Laterals, X, Y, laterals
@@ -50,30 +51,19 @@ class Outlook:
         curves = estimate.curves[0]
         return Outlook(estimate.grid, curves, np.zeros((len(curves), nodes), curves.dtype))
 
-    def renew(self, estimate: Identified, controls: Floats, tips: Floats, shape: Floats) -> "Outlook":
-        """Return the derivatives, new for the parameters that the estimate has just perturbed, along controls (m, 9).
+    def renew(self, estimate: Identified, predicted: Trajectories) -> "Outlook":
+        """Return the derivatives, new for the parameters that the estimate has just perturbed.
 
-        tips (m, 5), shape (n, 5): measured tips, and the shape at the end, predicted for these controls.
+        predicted: of `predict_ends`, along whose first controls the derivatives are.
         """
         curves, bent = self.curves.copy(), self.bent.copy()
-        bevel = bevel_directions(estimate.state.bevel, controls, estimate.axes)
-        axis = laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
-        depth = np.maximum.accumulate(tips[:, X])
-        perturbed = estimate.perturbed
-        if perturbed:
-            ended = estimate.nominal.rollout(
-                [one.state for one in perturbed],
-                np.tile(controls, (len(perturbed), 1, 1)),
-                models=[one.model for one in perturbed],
-                limits=False,
-                rough=True,
-                at_end=("shapes",),
-            )
-        for k, one in enumerate(perturbed):
-            bent[one.parameter] = laterals(ended.shapes[k, -1] - shape, Y, estimate.axes) / one.step
-            curves[one.parameter] = np.interp(
-                self.grid, depth, (laterals(ended.tips[k], Y, estimate.axes) - axis) / one.step
-            )
+        bevel = bevel_directions(estimate.state.bevel, predicted.controls[0], estimate.axes)
+        across, shapes = (laterals(p, Y, estimate.axes) for p in (predicted.tips, predicted.shapes[:, -1]))
+        depth = np.maximum.accumulate(predicted.tips[0, :, X])
+        first = len(across) - len(estimate.perturbed)
+        for k, one in enumerate(estimate.perturbed, first):
+            bent[one.parameter] = (shapes[k] - shapes[0]) / one.step
+            curves[one.parameter] = np.interp(self.grid, depth, (across[k] - across[0]) / one.step)
         for k, direction in zip(
             range(*estimate.slots.run_out.indices(len(curves))), directions(1.0, estimate.axes), strict=True
         ):
@@ -127,3 +117,19 @@ class Outlook:
         """Return the standard deviation (mm), on an axis, of the tip's lateral position at a depth if uncorrected."""
         end = self.at(target)
         return float(np.sqrt((end.conj() @ np.linalg.solve(estimate.precision, end)).real / estimate.axes))
+
+
+def predict_ends(estimate: Identified, controls: Floats) -> Trajectories:
+    """Return trajectories, with shapes at the end, of controls (N, m, 9), and of the perturbed needles with the first.
+
+    All are simulated together.
+    """
+    count, perturbed = len(controls), estimate.perturbed
+    return estimate.nominal.rollout(
+        [estimate.state] * count + [one.state for one in perturbed],
+        np.concatenate([controls, np.repeat(controls[:1], len(perturbed), axis=0)]),
+        models=[estimate.simulator.model] * count + [one.model for one in perturbed],
+        limits=False,
+        rough=True,
+        at_end=("shapes",),
+    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -42,6 +42,10 @@ class Trajectories:
         """Steps (N, m) that advance and end with the tip in the tissue."""
         inside: NDArray[np.bool_] = (self.tips[:, :, X] > 0.0) & (self.controls[:, :, DB_X] > 0.0)
         return inside
+
+    def only(self, number: int) -> "Trajectories":
+        """Return one of the sequences (N = 1)."""
+        return Trajectories(*(getattr(self, each.name)[number : number + 1] for each in fields(self)))
 
     def __repr__(self) -> str:
         sequences, steps = self.converged.shape
@@ -93,9 +97,9 @@ def evaluate_terms(terms: Sequence[Term], trajectories: Trajectories) -> dict[st
 
 
 def evaluate_cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
-    """Return the sum (N,) of the weighted terms; infinite where the model did not converge."""
+    """Return the sum (N,) of the weighted terms; infinite where it is not finite or the model did not converge."""
     total: Floats = np.sum(list(evaluate_terms(terms, trajectories).values()), axis=0)
-    return np.where(trajectories.converged.all(axis=1), total, np.inf)
+    return np.where(trajectories.converged.all(axis=1) & np.isfinite(total), total, np.inf)
 
 
 @dataclass(frozen=True)
@@ -121,10 +125,19 @@ class CostTerm:
     """A row of the table: a function, the unit of its values, and its weights by user."""
 
     value: TermFunction
-    unit: str
-    weights: Mapping[str, Weight]
+    unit: str = ""
+    weights: Mapping[str, Weight] = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
     at_end: tuple[str, ...] = ()
+
+    @cached_property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the arguments of the function."""
+        return tuple(signature(self.value).parameters)
+
+    def bind(self, values: Mapping[str, Any]) -> Callable[[Trajectories], Floats]:
+        """Return the function with its arguments bound, as far as the values have them."""
+        return partial(self.value, **{name: values[name] for name in self.arguments if name in values})
 
 
 _OWN = ("deflection", "energy")  # outputs for the terms of a user
@@ -188,19 +201,14 @@ class Cost:
         """
         weights = self.weights(settings) if weights is None else weights
         found = [
-            Term(w.name, weights[w.name], _bind_values(term.value, values), term.outputs, term.at_end)
+            Term(w.name, weights[w.name], term.bind(values), term.outputs, term.at_end)
             for term, w in self.rows()
         ]
         own = [
-            Term(each.term, each.weight, _check_values(each.term, _bind_values(each.function, values)), _OWN)
+            Term(each.term, each.weight, _check_values(each.term, CostTerm(each.function).bind(values)), _OWN)
             for each in settings.own_terms or ()
         ]
         return *found, *own
-
-
-def _bind_values(value: TermFunction, values: Mapping[str, Any]) -> Callable[[Trajectories], Floats]:
-    """Return the function with its arguments bound, as far as the values have them."""
-    return partial(value, **{name: values[name] for name in signature(value).parameters if name in values})
 
 
 def _check_values(name: str, value: Callable[[Trajectories], Floats]) -> Callable[[Trajectories], Floats]:

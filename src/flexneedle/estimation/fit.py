@@ -5,21 +5,29 @@ a few steps ahead of it too. A few of the curves are simulated again each period
 periods.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, adapt_models
+from flexneedle.estimation.fitted import Fitted, FittedInsertion, Perturbed, Simulated, adapt_models
 from flexneedle.estimation.lateral import directions
 from flexneedle.simulator.control import controls
-from flexneedle.types import DB_X, Laterals, X, laterals
+from flexneedle.types import Floats, Laterals, X, laterals
 
-_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a step: the first that does not raise the cost
+_SHARES = (0.5, 0.2, 0.05, 0.0)  # of a step that raises the cost: the first that does not
+
+
+class DueNeedles(NamedTuple):
+    """The needle with some parameters, and needles with one of them larger, simulated together from their starts."""
+
+    due: list[int]  # parameters whose curves are simulated
+    begun: list[int]  # due parameters to whose depth the needle has come: larger in needles 1, 2, …
+    simulated: Simulated
 
 
 def improve_fit(fitted: Fitted) -> Fitted:
-    """Return the insertion after a Gauss–Newton step to the maximum a posteriori within the bounds.
+    """Return the insertion after a Gauss–Newton step to the maximum a posteriori within the bounds, differentiated.
 
     The step is shortened until the cost does not rise.
     """
@@ -33,21 +41,27 @@ def improve_fit(fitted: Fitted) -> Fitted:
     precision = (weighted @ jacobian).real + prior.precision
     fitted = fitted.change(precision=precision)
     step = np.linalg.solve(precision, gradient)
-    if not np.isfinite(step).all():
-        return fitted.simulate_with(fitted.parameters)
-    goal = np.clip(fitted.parameters + step, *prior.bounds)
+    whole = step if np.isfinite(step).all() else np.zeros_like(step)
+    goal = np.clip(fitted.parameters + whole, *prior.bounds)
 
     def cost(other: FittedInsertion) -> float:
         squares = np.abs(np.concatenate(other.residuals)) ** 2
         return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
 
-    most, trial = cost(fitted), fitted
-    tried = [fitted.parameters + share * (goal - fitted.parameters) for share in _SHARES]
-    # Most often the first will do; if not, the others take as long together as another one.
-    for trial in chain(fitted.simulate_each(tried[:1]), fitted.simulate_each(tried[1:])):
-        if trial.state.converged and cost(trial) <= most:
+    most = cost(fitted)
+
+    def is_worse(other: FittedInsertion) -> bool:
+        return not (other.state.converged and cost(other) <= most)
+
+    # Most often the whole step will do: the needles for the derivatives there are simulated with it.
+    needles = simulate_due(fitted, goal)
+    if not is_worse(trial := fitted.take(goal, needles.simulated)):
+        return differentiate(trial, needles)
+    shorter = [fitted.parameters + share * (goal - fitted.parameters) for share in _SHARES]
+    for trial in fitted.simulate_each(shorter):
+        if not is_worse(trial):
             break
-    return trial
+    return differentiate(trial)
 
 
 def jacobian_of(fitted: FittedInsertion) -> Laterals:
@@ -67,37 +81,47 @@ LEADING_ROUND = 2
 """Periods in which the curves of base, bend, bevel and clearance are."""
 
 
-def differentiate(fitted: Fitted, which: Sequence[int] | None = None) -> Fitted:
-    """Simulate curves again, a few steps ahead (default: those that are due).
-
-    All needles are simulated together, each from its start, the present one with them.
-    """
+def simulate_due(
+    fitted: FittedInsertion, parameters: Floats, which: Iterable[int] | None = None
+) -> DueNeedles:
+    """Return the needles for the derivatives to the parameters `which` (default: those that are due)."""
     due = [k for k in (due_parameters(fitted) if which is None else which) if not fitted.slots.is_offset(k)]
-    steps = fitted.prior.steps
-    parameters = [fitted.parameters + np.where(np.arange(steps.size) == k, steps, 0.0) for k in due]
+    depth = float(fitted.tips[:, X].max()) + ROUND * fitted.nominal.scenario.setup.max_advance_mm
+    begun = [k for k in due if depth >= fitted.prior.begins[k]]
+    return DueNeedles(due, begun, fitted.simulate_all([parameters, *_enlarge(fitted, parameters, begun)]))
+
+
+def _enlarge(fitted: FittedInsertion, parameters: Floats, which: Sequence[int]) -> list[Floats]:
+    """Return the parameters (K,) with each of some larger by its step."""
+    steps = np.diag(fitted.prior.steps)
+    return [parameters + steps[k] for k in which]
+
+
+def differentiate(fitted: Fitted, needles: DueNeedles | None = None) -> Fitted:
+    """Return the insertion with its curves renewed from needles, a few steps ahead (default: those that are due)."""
+    needles = needles or simulate_due(fitted, fitted.parameters)
+    models, states, tips = needles.simulated
+    others = [k for k in needles.due if k not in needles.begun]
+    larger = _enlarge(fitted, fitted.parameters, others)
+    unreached = zip(
+        others, adapt_models(fitted.nominal, fitted.slots, fitted.settings.cell_mm, larger), strict=True
+    )
     ahead = controls(ROUND, db_x=fitted.nominal.scenario.setup.max_advance_mm)
-    goal = float(fitted.tips[:, X].max()) + float(ahead[:, DB_X].sum())
-    begun = [j for j, k in enumerate(due) if goal >= fitted.prior.begins[k]]
-    models, states, tips = fitted.simulate_all([fitted.parameters, *(parameters[j] for j in begun)])
-    others = [parameters[j] for j in range(len(due)) if j not in begun]
-    unreached = iter(adapt_models(fitted.nominal, fitted.slots, fitted.settings.cell_mm, others))
     rows = np.tile(ahead, (len(models), 1, 1))
     later = fitted.nominal.rollout(states, rows, models=models, limits=False).tips
     base, *moved = np.concatenate([tips, later], axis=1)
-    depth, curves, members = np.maximum.accumulate(base[:, X]), fitted.curves.copy(), []
-    for j, k in enumerate(due):
-        step = float(steps[k])
-        if j not in begun:  # the needle has not come where it matters
-            members.append(Perturbed(k, step, next(unreached), fitted.state))
-            continue
-        place = begun.index(j)
-        members.append(Perturbed(k, step, models[1 + place], states[1 + place]))
+    depth, curves = np.maximum.accumulate(base[:, X]), fitted.curves.copy()
+    steps = fitted.prior.steps.tolist()
+    for k, tip in zip(needles.begun, moved, strict=True):
         for curve, sensor in zip(curves[:, k], fitted.sensors, strict=True):
-            change = laterals(moved[place], sensor.column, fitted.axes) - laterals(
-                base, sensor.column, fitted.axes
-            )
-            curve[:] = np.interp(fitted.grid, depth, change / step)
-    return fitted.change(curves=curves, perturbed=tuple(members), period=fitted.period + 1)
+            change = laterals(tip, sensor.column, fitted.axes) - laterals(base, sensor.column, fitted.axes)
+            curve[:] = np.interp(fitted.grid, depth, change / steps[k])
+    reached = zip(needles.begun, models[1:], states[1:], strict=True)
+    perturbed = (
+        *(Perturbed(k, steps[k], model, state) for k, model, state in reached),
+        *(Perturbed(k, steps[k], model, fitted.state) for k, model in unreached),
+    )
+    return fitted.change(curves=curves, perturbed=perturbed, period=fitted.period + 1)
 
 
 def due_parameters(fitted: FittedInsertion) -> Iterator[int]:

@@ -141,10 +141,16 @@ class FittedInsertion:
 
     def simulate_each(self, parameters: Sequence[Floats]) -> Iterator[Self]:
         """Yield the insertion simulated again with each set of parameters, (K,) each, all at once."""
-        models, states, tips = self.simulate_all(parameters)
-        for k, each in enumerate(parameters):
-            simulator = self.nominal.with_model(models[k])
-            yield self.change(simulator=simulator, parameters=each, state=states[k], tips=tips[k])
+        simulated = self.simulate_all(parameters)
+        return (self.take(each, simulated, k) for k, each in enumerate(parameters))
+
+    def take(self, parameters: Floats, simulated: Simulated, number: int = 0) -> Self:
+        """Return the insertion with parameters (K,) and the needle that was simulated with them."""
+        models, states, tips = simulated
+        simulator = self.nominal.with_model(models[number])
+        return self.change(
+            simulator=simulator, parameters=parameters, state=states[number], tips=tips[number]
+        )
 
     def simulate_all(self, parameters: Sequence[Floats]) -> Simulated:
         """Return the insertion simulated again with each set of parameters, (K,) each."""

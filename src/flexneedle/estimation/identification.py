@@ -30,7 +30,7 @@ from flexneedle.estimation.axial import (
     replay_scaled,
 )
 from flexneedle.estimation.estimate import describe_estimate
-from flexneedle.estimation.fit import ROUND, differentiate, improve_fit
+from flexneedle.estimation.fit import ROUND, differentiate, improve_fit, simulate_due
 from flexneedle.estimation.fitted import FittedInsertion
 from flexneedle.estimation.lateral import directions, from_components, variance_of
 from flexneedle.estimation.moves import Move, assign_readings, position_along
@@ -72,7 +72,7 @@ class Identification:
             prior.precision,
             axial_covariance=axial_prior(scenario.control),
         )
-        return differentiate(start, range(prior.mean.size))
+        return differentiate(start, simulate_due(start, prior.mean, range(prior.mean.size)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Identified(FittedInsertion):
             return self.without_reading()
         extended = replace(self, moves=assign_readings(self.moves, measurements))._fit_axially()
         readings = extended.readings[0]
-        fitted = differentiate(improve_fit(extended))
+        fitted = improve_fit(extended)
         left, ahead = fitted.residuals[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
         since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from flexneedle.arguments import check_instance
 from flexneedle.control import controller_tables
 from flexneedle.control.controllers import DEFAULT, with_controller_defaults
@@ -86,7 +88,9 @@ def check_choices(scenario: Scenario, strategy: str, choices: Choices) -> None:
 def carry_out(scenario: Scenario, plan: Plan, choices: Choices, stream: Stream) -> Insertion:
     """Execute a plan in its scenario, which has the plan's entry; otherwise as `insert`."""
     steering = prepare(scenario, plan, choices, stream)
-    with choices.rig.open(scenario, plan, choices.seed, stream) as ports:
+    # Threads of a product of small matrices change its rounding, and wait for each other where other work runs.
+    one_thread = threadpool_limits(1, user_api="blas")
+    with one_thread, choices.rig.open(scenario, plan, choices.seed, stream) as ports:
         insertion = run(steering, ports)
     insertion = replace(insertion, **choices.parts, **choices.rig.results())
     reason = "; ".join(filter(None, (insertion.reason, choices.rig.explain(insertion))))

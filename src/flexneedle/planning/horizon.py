@@ -81,11 +81,16 @@ def find_best(
     search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
 
     latest: list[Samples] = []
+    best_cost, best = np.inf, None
 
     def evaluate(z: Floats) -> Floats:
+        nonlocal best_cost, best
         drawn = rollout(variables.controls(z))
-        latest[:] = [Samples(drawn.tips, evaluate_cost(terms, drawn))]
-        return latest[0].costs
+        costs = evaluate_cost(terms, drawn)
+        if costs[least := int(np.argmin(costs))] < best_cost:
+            best_cost, best = costs[least], drawn.only(least)
+        latest[:] = [Samples(drawn.tips, costs)]
+        return costs
 
     def show(info: dict[str, Any]) -> None:
         progress({**info, "samples": latest[0]})
@@ -93,9 +98,9 @@ def find_best(
     opening = ce.sample(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
     search_state = ce.minimize(evaluate, search_state, settings, rng, show, opening)
-    trajectories = rollout(variables.controls(search_state.best[None]))
-    charged = {name: float(value[0]) for name, value in evaluate_terms(terms, trajectories).items()}
-    return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state, latest[0])
+    found = rollout(variables.controls(search_state.best[None])) if best is None else best
+    charged = {name: float(value[0]) for name, value in evaluate_terms(terms, found).items()}
+    return Found(search_state.best, search_state.best_cost, charged, found, search_state, latest[0])
 
 
 def count_iterations(progress: OnIteration, before: int, usual: int, least: float) -> OnIteration:

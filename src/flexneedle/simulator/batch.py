@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
@@ -49,31 +49,8 @@ def run(
     count, steps = commands.shape[:2]
     size = -(-count // WIDTH) * WIDTH
     n, across = models.nodes.shape[1], models.curvature.shape[1]
-    kept = dict.fromkeys(every_step, steps) | {
-        name: min(1, steps) for name in at_end if name not in every_step
-    }
-
-    def column(name: str, *shape: int) -> Floats:
-        wanted = kept.get(name, 0)
-        return np.empty((size, wanted, *shape)) if wanted else np.empty((0, 0, *(0 for _ in shape)))
-
-    out = Outputs(
-        np.empty((size, steps, POSE_SIZE)),
-        np.empty((size, steps)),
-        column("energy"),
-        column("stretch"),
-        column("deflection"),
-        column("loads", LOADS),
-        column("strain"),
-        column("shapes", n + 2, 1 + 2 * across),
-        _no_starts()
-        if not ends
-        else Starts(
-            np.empty((size, row_size(across))), np.empty((size, n, across)), np.empty((size, n, across))
-        ),
-        np.empty((size, n, len(SOLUTION), across) if ends else (0, 0, 0, 0)),
-        np.empty((size, n + 1) if ends else (0, 0)),
-    )
+    kept = {name: min(1, steps) for name in at_end} | dict.fromkeys(every_step, steps)
+    out = _make_outputs(size, steps, n, across, kept, ends)
     sequence = np.minimum(np.arange(size), count - 1)
     who = model_of[sequence], state_of[sequence], sequence
     tips = np.full((count, across), np.nan) if held is None else held
@@ -82,23 +59,54 @@ def run(
         space = _workspace(n, models.layers.shape[1], across)
         kernel.rollout(space, models, starts, *who, commands, tips, axes, first, last, out)
 
-    threads = min(threads, count * steps // _STEPS_WORTH_A_THREAD, size // WIDTH)
+    _share(part, size, min(threads, count * steps // _STEPS_WORTH_A_THREAD, size // WIDTH))
+    return out
+
+
+def _make_outputs(
+    size: int, steps: int, nodes: int, across: int, kept: Mapping[str, int], ends: bool
+) -> Outputs:
+    """Return memory for the outputs of `size` sequences, of as many steps as are kept of each by name."""
+
+    def column(name: str, *shape: int) -> Floats:
+        wanted = kept.get(name, 0)
+        return np.empty((size, wanted, *shape)) if wanted else np.empty((0, 0, *(0 for _ in shape)))
+
+    def at_end(*shape: int) -> Floats:
+        return np.empty((size, *shape) if ends else (0, *(0 for _ in shape)))
+
+    return Outputs(
+        np.empty((size, steps, POSE_SIZE)),
+        np.empty((size, steps)),
+        column("energy"),
+        column("stretch"),
+        column("deflection"),
+        column("loads", LOADS),
+        column("strain"),
+        column("shapes", nodes + 2, 1 + 2 * across),
+        Starts(at_end(row_size(across)), at_end(nodes, across), at_end(nodes, across)),
+        at_end(nodes, len(SOLUTION), across),
+        at_end(nodes + 1),
+    )
+
+
+def _share(part: Callable[[int, int], None], size: int, threads: int) -> None:
+    """Carry out `part` of all sequences, in groups of needles, on some threads."""
     if threads <= 1:
         part(0, size)
-    else:
-        edges = np.unique(np.linspace(0, size // WIDTH, threads * _CHUNKS_A_THREAD + 1).astype(int)) * WIDTH
-        chunks = iter([*zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)])
+        return
+    edges = np.unique(np.linspace(0, size // WIDTH, threads * _CHUNKS_A_THREAD + 1).astype(int)) * WIDTH
+    chunks = iter([*zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)])
 
-        def work() -> None:
-            for chunk in chunks:
-                part(*chunk)
+    def work() -> None:
+        for chunk in chunks:
+            part(*chunk)
 
-        # This thread works too: where all are woken at once, two may begin on one core.
-        others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
-        work()
-        for other in others:
-            other.result()
-    return out
+    # This thread works too: where all are woken at once, two may begin on one core.
+    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    work()
+    for other in others:
+        other.result()
 
 
 def sample_shapes(curves: Floats, nodes: int) -> Floats:
@@ -115,10 +123,6 @@ def sample_shapes(curves: Floats, nodes: int) -> Floats:
     return out.reshape(*curves.shape[:-2], nodes, POSE_SIZE)
 
 
-def _no_starts() -> Starts:
-    return Starts(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
-
-
 def _workspace(nodes: int, layers: int, axes: int) -> Workspace:
     key = nodes, layers, axes
     if getattr(_memory, "key", None) != key:
@@ -133,3 +137,8 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a child
+
+
+def count_cores() -> int:
+    """Return the number of cores that the process may use; of all cores where the system does not report that."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -17,8 +17,8 @@ MOVES = ROLL
 ROUNDING_S = 1e-7
 """Largest time (s) by which a travel may be shorter than its duration."""
 _SIZES = "give the sizes one by one: controls(4, 30, db_x=1.0)"
-_ROWS_A_PART = 8000
-_SLACK = 1e-9  # rounding of sums of steps, mm or rad
+SLACK = 1e-9
+"""Rounding of sums of steps, mm or rad, and of half turns."""
 
 
 def controls(*shape: int, **columns: ArrayLike) -> Floats:
@@ -97,30 +97,8 @@ class Limits:
         `moved` (7,) is the sum of the steps of each column of travel before them, `roll` the needle's angle (rad). A
         driver may have ended a little beyond a limit: there it may rest, and return.
         """
-        # In parts that stay in the cache: of all sequences at once, a check takes as long as their simulation.
-        sequences = rows[None] if rows.ndim == 2 else rows
-        part = max(1, _ROWS_A_PART // max(1, rows.shape[-2]))
-        for first in range(0, len(sequences), part):
-            few = sequences[first : first + part]
-            if not self._are_moves_within(moved, few):
-                self._check_moves(moved, few)
-            self._check_rotation(few, roll)
-
-    def _are_moves_within(self, moved: Floats, rows: Floats) -> bool:
-        """Return whether all values are finite and all travel is within its limits, by the extremes of each column."""
-        columns = np.ascontiguousarray(
-            rows.reshape(-1, rows.shape[-1]).T
-        )  # along which numpy is ten times faster
-        if not (columns.size and np.isfinite(columns.sum())):
-            return False
-        sizes = np.maximum(columns.max(axis=1), -columns.min(axis=1))[:MOVES]
-        if (sizes > self.step + _SLACK).any() or sizes[[bool(reason) for reason in self.fixed]].any():
-            return False
-        used = np.flatnonzero(sizes)
-        sums = np.cumsum(columns[used].reshape(len(used), *rows.shape[:-1]), axis=-1)
-        low, high = self.travel[used].T - moved[used]
-        least, most = sums.min(axis=(1, 2), initial=0.0), sums.max(axis=(1, 2), initial=0.0)
-        return bool((low <= least).all() and (most <= high).all())
+        self._check_moves(moved, rows)
+        self._check_rotation(rows, roll)
 
     def _check_moves(self, moved: Floats, rows: Floats) -> None:
         """Raise CommandError for the first value that is not finite, or that moves the base or the guide too far."""
@@ -128,22 +106,22 @@ class Limits:
             self._refuse(rows, ~np.isfinite(rows), "must be a finite number")
         steps = rows[..., :MOVES]
         for column, reason in enumerate(self.fixed):
-            if reason and (moving := np.abs(steps[..., column]) > _SLACK).any():
+            if reason and (moving := np.abs(steps[..., column]) > SLACK).any():
                 value = float(steps[..., column][moving][0])
                 raise CommandError(COLUMNS[column], value, 0.0, f"must be 0 {reason}")
-        if (bad := np.abs(steps) > self.step + _SLACK).any():
+        if (bad := np.abs(steps) > self.step + SLACK).any():
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
         before = travel - steps
-        if (bad := travel > np.maximum(self.travel[:, 1], before) + _SLACK).any():
+        if (bad := travel > np.maximum(self.travel[:, 1], before) + SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at most", self.travel[:, 1])
-        if (bad := travel < np.minimum(self.travel[:, 0], before) - _SLACK).any():
+        if (bad := travel < np.minimum(self.travel[:, 0], before) - SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at least", self.travel[:, 0])
 
     def _check_rotation(self, rows: Floats, roll: float) -> None:
         if self.half_turns:
             halves, spin = rows[..., ROLL] / np.pi, rows[..., SPIN]
-            if (bad := np.abs(halves - np.rint(halves)) > _SLACK).any():
+            if (bad := np.abs(halves - np.rint(halves)) > SLACK).any():
                 rule = f"must be half turns with {self.half_turns}"
                 raise CommandError("roll", float(rows[..., ROLL][bad][0]), np.pi, rule)
             if (bad := spin != 0.0).any():
@@ -151,7 +129,7 @@ class Limits:
         elif math.isfinite(self.rotation):
             steps = rows[..., ROLL:].reshape(*rows.shape[:-2], -1)
             angle = roll + np.cumsum(steps, axis=-1)
-            if (bad := np.abs(angle) > np.maximum(self.rotation, np.abs(angle - steps)) + _SLACK).any():
+            if (bad := np.abs(angle) > np.maximum(self.rotation, np.abs(angle - steps)) + SLACK).any():
                 rule = f"angle of the needle must be at most {self.rotation:g} rad to either side"
                 rule += f" (setup.max_rotation_deg = {math.degrees(self.rotation):g})"
                 raise CommandError("roll", float(angle[bad][0]), self.rotation, rule)

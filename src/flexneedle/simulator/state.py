@@ -308,9 +308,10 @@ class Solved:
         ends, nodes = out.ends, model.nodes
         row = ends.needles[number]
         behind = int(row[nd.BEHIND])
-        own = nodes["kind"] != ESSENTIAL
-        stored = np.append(out.stored[number, :behind], out.stored[number, -1])
-        rest, compression = ends.rest[number, : nodes.size][own], ends.compression[number, : nodes.size][own]
+        stored = np.concatenate([out.stored[number, :behind], out.stored[number, -1:]])
+        rest, compression = ends.rest[number, : nodes.size], ends.compression[number, : nodes.size]
+        if (measured := nodes["kind"] == ESSENTIAL).any():
+            rest, compression = rest[~measured], compression[~measured]
         solution = out.solution[number, :behind]
         arrays = row, rest, compression, nodes["x"][:behind], nodes["weight"][:behind], solution, stored
         return Solved(*(_freeze(array.copy()) for array in arrays))

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from flexneedle.control.interface import Controller, Decision
 from flexneedle.control.limits import guide_may_move
-from flexneedle.control.outlook import UNCORRECTED, Outlook
+from flexneedle.control.outlook import UNCORRECTED, Outlook, predict_ends
 from flexneedle.control.path import Ahead, GuidePath, path_of_plan, propose_samples
 from flexneedle.costs.terms import ADAPTIVE_MPC, past_target
 from flexneedle.costs.weighted_sum import TIPS_ONLY, Term, Trajectories, Wanted, outputs_of
@@ -281,10 +281,9 @@ def _forecast(
     past = complex(past_target(found.trajectories, task.plan.target)[0])
     miss = past.real if fitted.axes == 1 else past
     both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.lean_guide(found.z)[None])[0]])
-    shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, at_end=("shapes",)).shapes
-    nodes, leaning = shapes[:, -1]
-    before = memory.outlook or Outlook.of(fitted)
-    outlook = before.renew(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
+    predicted = predict_ends(fitted, both)
+    nodes, leaning = predicted.shapes[:2, -1]
+    outlook = (memory.outlook or Outlook.of(fitted)).renew(fitted, predicted)
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     sd = outlook.sd(fitted, task.plan.target[0], miss, guided=guided)
     by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]

@@ -13,7 +13,7 @@ from flexneedle.errors import InputError, describe_error
 from flexneedle.lab.study.provenance import REMEDY, StudyCode, find_difference
 from flexneedle.lab.study.worker import set_up_worker
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.simulator.simulator import count_cores
+from flexneedle.simulator.batch import count_cores
 
 _CONNECT_S = 20
 _LAST_PORT = 65535

@@ -137,20 +137,23 @@ class Monitor:
         if not verdict.ok:
             return replace(self, rejected=True), verdict
         since = measurement.time - self.settings.indicator_window_s + 1e-9
-        kept = tuple(one for one in self.recent if one.time > since)
-        monitor = replace(self, recent=(*kept, measurement), repeats=self._count_repeats(measurement, tip_at))
-        monitor, jump = monitor._check_jump(measurement, tip_at)
-        verdict = rules.first_bad(
-            monitor._verdicts(measurement, tip_at(measurement.time), max_innovation, jump)
-        )
+        recent = (*[one for one in self.recent if one.time > since], measurement)
+        repeats = self._count_repeats(measurement, tip_at)
+        jump, jumped = self._check_jump(measurement, tip_at)
+        predicted = tip_at(measurement.time)
+        verdict = rules.first_bad(self._verdicts(measurement, predicted, max_innovation, jump, repeats))
         if verdict.ok:
-            return replace(monitor, good=measurement, rejected=False, jumped=None), verdict
-        return replace(monitor, rejected=self.rejected or verdict.kind is not VerdictKind.MISSING), verdict
+            good = replace(
+                self, recent=recent, repeats=repeats, good=measurement, rejected=False, jumped=None
+            )
+            return good, verdict
+        rejected = self.rejected or verdict.kind is not VerdictKind.MISSING
+        return replace(self, recent=recent, repeats=repeats, rejected=rejected, jumped=jumped), verdict
 
-    def _check_jump(self, measurement: Measurement, tip_at: TipAt) -> "tuple[Monitor, Verdict]":
-        """Return the state after the check of a reading for a jump, and its verdict."""
+    def _check_jump(self, measurement: Measurement, tip_at: TipAt) -> tuple[Verdict, _Jump | None]:
+        """Return the verdict on a reading that may have jumped, and the jump since the last good one, if any."""
         if self.good is None:
-            return self, OK
+            return OK, self.jumped
         settings, time = self.settings, measurement.time
         limit = settings.speed_limit_mm_s * abs(time - self.good.time) + settings.jump_margin_mm
         if self.jumped is not None:
@@ -160,8 +163,8 @@ class Monitor:
             predicted = Measurement(time, *tip_at(time))
             verdict = verdict if not rules.check_jump(measurement, predicted, self.jumped.limit).ok else OK
         if verdict.ok or self.jumped is not None or not settings.enabled:
-            return self, verdict
-        return replace(self, jumped=_Jump(time, limit)), verdict
+            return verdict, self.jumped
+        return verdict, _Jump(time, limit)
 
     def check_field(self) -> "tuple[Monitor, Verdict]":
         """Return the state after a check of the field by the reference sensors, and the verdict.
@@ -211,7 +214,12 @@ class Monitor:
         return [one.frame for one in self.recent if one.frame is not None]
 
     def _verdicts(
-        self, measurement: Measurement, predicted: Point, max_innovation: float, jump: Verdict
+        self,
+        measurement: Measurement,
+        predicted: Point,
+        max_innovation: float,
+        jump: Verdict,
+        repeats: _Repeats | None,
     ) -> Iterator[Verdict]:
         settings = self.settings
         measured = (measurement.x, measurement.y, measurement.z)[: 1 + self.axes]
@@ -223,8 +231,8 @@ class Monitor:
             if self.axes == 1:
                 yield rules.check_out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
             yield jump
-            if self.repeats is not None:
-                yield rules.check_frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
+            if repeats is not None:
+                yield rules.check_frozen(repeats.count, repeats.travel, settings.frozen_travel_mm)
 
     def _count_repeats(self, newest: Measurement, tip_at: TipAt) -> _Repeats | None:
         """Return the readings with the newest one's position; a reading without a tip changes nothing."""
