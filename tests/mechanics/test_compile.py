@@ -111,6 +111,14 @@ def test_the_stamp_of_the_sources_has_their_times(package):
     assert compiling.source_stamp(package.home) != before
 
 
+def test_python_cannot_call_a_function_of_kernels():
+    """A kernel calls it, and `interpret` runs it; without the error, the process would end."""
+    twice = compiling.inner(lambda x: 2.0 * x)
+    with pytest.raises(TypeError, match=r"in Python, call interpret\(<lambda>\)"):
+        twice(4.0)
+    assert compiling.interpret(twice)(4.0) == compiling.kernel(lambda x: twice(x))(4.0) == 8.0
+
+
 def test_without_compilation_one_line_says_what_to_do():
     command = [sys.executable, "-m", "flexneedle", "plan", "phantom"]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numba as nb
 from numba.core import config as _numba_config
-from numba.core.registry import cpu_target
+from numba.core.registry import CPUDispatcher, cpu_target
 
 from flexneedle import types
 from flexneedle.caches import kernel_folder
@@ -61,15 +61,30 @@ def _columns() -> list[tuple[str, int]]:
     return [(name, value) for name, value in vars(types).items() if type(value) is int]
 
 
+class _InnerDispatcher(CPUDispatcher):
+    """A compiled function that has no wrapper for Python: the call of one would end the process."""
+
+    def __call__(self, *_args: object, **_named: object) -> None:
+        name = self.py_func.__name__
+        raise TypeError(f"{name}() is compiled for kernels only: in Python, call interpret({name})")
+
+
 def inner(function: _Function) -> _Function:
     """Compile a function that only kernels call and that allocates no array.
 
     Its caller owns the arrays: counting references to them would take a third of a step.
     """
-    compiled: _Function = _njit(
+    compiled: Any = _njit(
         nogil=True, error_model="numpy", _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
     )(function)
+    compiled.__class__ = _InnerDispatcher
     return compiled
+
+
+def interpret(function: _Function) -> _Function:
+    """Return a compiled function as Python runs it."""
+    source: Any = function
+    return source.py_func
 
 
 def kernel(function: _Function) -> _Function:

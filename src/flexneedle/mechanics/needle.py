@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.compile import inner, interpret
 from flexneedle.mechanics.lateral import Lateral
 
 Floats = NDArray[np.float64]
@@ -203,15 +203,14 @@ def row_size(axes: int) -> int:
 
 def to_row(needle: NeedleState, axes: int) -> Floats:
     """Return the numbers (REALS + axes LATERALS,) of a needle."""
-    reals, laterals = apart.py_func(needle)  # type: ignore[attr-defined]
+    reals, laterals = interpret(apart)(needle)
     return np.concatenate([np.array(reals, dtype=float), to_parts(np.array(laterals), axes).ravel()])
 
 
 def from_row(row: Floats) -> NeedleState:
     """Return the needle of `to_row`."""
     laterals = from_parts(row[REALS:].reshape(LATERALS, -1))
-    needle: NeedleState = together.py_func(row[:REALS].tolist(), laterals.tolist())  # type: ignore[attr-defined]
-    return needle
+    return interpret(together)(row[:REALS].tolist(), laterals.tolist())
 
 
 def to_parts(laterals: Laterals, axes: int) -> Floats:
